@@ -1,0 +1,47 @@
+# Needs Python >= 3.11 and make, nothing else.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check -q
+RUNS ?= runs
+
+.PHONY: demo test test-all check bench setup clean
+
+# The installation is repeated when what is installed changes.
+$(VENV)/.demo: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) install -c constraints.txt torch
+	$(PIP) install -c constraints.txt -e '.[video,tensorboard]'
+	touch $@
+
+$(VENV)/.dev: $(VENV)/.demo
+	$(PIP) install -c constraints.txt -e '.[dev]'
+	touch $@
+
+setup: $(VENV)/.dev
+
+demo: $(VENV)/.demo
+	$(BIN)/rlcli train cartpole --runs-dir $(RUNS) --name demo
+	$(BIN)/rlcli eval cartpole --runs-dir $(RUNS) --episodes 500
+	$(BIN)/rlcli play cartpole --runs-dir $(RUNS) --video $(RUNS)/cartpole.mp4
+	@echo
+	@echo "policy and logs: $$(ls -d $(RUNS)/cartpole/*-demo* | tail -n 1)"
+	@echo "video:           $(RUNS)/cartpole.mp4"
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest -m 'not slow' -n 2 tests
+
+test-all: $(VENV)/.dev
+	$(BIN)/python -m pytest -n 2 tests
+
+check: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(VENV)/.dev
+	$(BIN)/python benchmarks/env_step.py
+	$(BIN)/python benchmarks/train.py
+
+clean:
+	rm -rf $(VENV) .pytest_cache .ruff_cache

@@ -1,0 +1,1 @@
+"""Views of a `VecEnv` for other libraries."""

@@ -1,0 +1,126 @@
+"""The command table, and the one place where an error becomes an exit code."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import sys
+import traceback
+from typing import Any
+
+import typer
+from typer._click.exceptions import ClickException, UsageError
+
+from rlcli.cli.console import console
+from rlcli.errors import ConfigError, RlcliError
+
+COMMANDS = {
+    "list-tasks": "list_tasks",
+    "show": "show",
+    "validate": "validate",
+    "train": "train",
+    "play": "play",
+    "eval": "eval",
+}
+"""Command -> module of `rlcli.cli` that registers it."""
+
+_SETTINGS = {
+    "help_option_names": ["-h", "--help"],
+    "token_normalize_func": lambda name: name.replace("_", "-"),
+}
+
+app = typer.Typer(
+    context_settings=_SETTINGS,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Train, play, evaluate and export robot-control policies in MuJoCo.",
+)
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    version: bool = typer.Option(False, "--version", help="Print the version and exit.", is_eager=True),
+) -> None:
+    if version:
+        import rlcli
+
+        console.data(f"rlcli {rlcli.__version__}")
+        raise typer.Exit
+
+
+def build() -> typer.Typer:
+    """The app with every command registered; command modules import nothing heavy."""
+    for name, module in COMMANDS.items():
+        command = importlib.import_module(f"rlcli.cli.{module}").command
+        app.command(name, context_settings=_SETTINGS)(command)
+    return app
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    console.json, console.debug = "--json" in arguments, "--debug" in arguments
+    try:
+        result = build()(arguments, prog_name="rlcli", standalone_mode=False)
+        return result if isinstance(result, int) else 0
+    except RlcliError as error:
+        return _report(error)
+    except UsageError as error:
+        return _usage(error, arguments)
+    except ClickException as error:
+        console.error("usage", error.exit_code, error.format_message(), None, [])
+        return error.exit_code
+    except (KeyboardInterrupt, typer.Abort):
+        console.error("stopped", 130, "interrupted", None, [])
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        return _machine(error)
+    except Exception as error:
+        console.error(
+            "bug",
+            1,
+            f"this is a bug in rlcli: {type(error).__name__}: {error}",
+            "please report it with the lines above",
+            [],
+        ) if console.json else traceback.print_exc()
+        return 1
+
+
+def _report(error: RlcliError) -> int:
+    problems: list[dict[str, Any]] = []
+    if isinstance(error, ConfigError):
+        problems = [{"where": p.where, "path": p.path, "message": p.message, "hint": p.hint} for p in error.problems]
+    if console.debug:
+        traceback.print_exc()
+    console.error(error.kind, error.exit_code, error.message, error.hint, problems)
+    return error.exit_code
+
+
+def _usage(error: UsageError, arguments: list[str]) -> int:
+    hint = "rlcli --help" if error.ctx is None else f"{error.ctx.command_path} --help"
+    match = re.match(r"No such option: --([A-Za-z_][\w-]*(?:\.[\w-]+)+)", error.format_message())
+    if match:
+        key = match[1]
+        given = next(
+            (a for a in arguments if a.startswith(f"--{key}") or a.startswith(f"--{key.replace('-', '_')}")),
+            "",
+        )
+        value = given.partition("=")[2]
+        if not value and given in arguments[:-1]:
+            value = arguments[arguments.index(given) + 1]
+        hint = f"overrides have no dashes: {given.lstrip('-').partition('=')[0]}={value or 'VALUE'}"
+    console.error("usage", 2, error.format_message(), hint, [])
+    return 2
+
+
+def _machine(error: OSError) -> int:
+    if console.debug:
+        traceback.print_exc()
+    place = f"{error.filename}: " if error.filename else ""
+    console.error("machine", 10, f"{place}{error.strerror or error}", None, [])
+    return 10

@@ -1,0 +1,82 @@
+"""Everything that is printed: data on stdout, messages on stderr, one JSON document with `--json`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(slots=True)
+class Console:
+    """How much to say, and whether to say it as JSON."""
+
+    json: bool = False
+    quiet: bool = False
+    verbose: bool = False
+    debug: bool = False
+
+    def data(self, text: str) -> None:
+        """The result, as text for people; left out with --json."""
+        if not self.json:
+            _write(sys.stdout, text)
+
+    def document(self, command: str, **content: Any) -> None:
+        """The result, as JSON; left out without --json."""
+        if self.json:
+            _write(
+                sys.stdout,
+                json.dumps({"schema": SCHEMA_VERSION, "command": command, **content}, indent=2, default=str),
+            )
+
+    def info(self, text: str) -> None:
+        """A message about what is being done."""
+        if not self.quiet:
+            _write(sys.stderr, text)
+
+    def detail(self, text: str) -> None:
+        """A message for -v."""
+        if self.verbose and not self.quiet:
+            _write(sys.stderr, text)
+
+    def warn(self, text: str) -> None:
+        """Something the user should know, but that stops nothing."""
+        _write(sys.stderr, f"warning: {text}")
+
+    def error(self, kind: str, code: int, message: str, hint: str | None, problems: list[dict[str, Any]]) -> None:
+        """Why the command failed."""
+        if self.json:
+            error = {"kind": kind, "exit_code": code, "message": message, "hint": hint, "problems": problems}
+            _write(sys.stdout, json.dumps({"schema": SCHEMA_VERSION, "error": error}, indent=2))
+        lines = message.splitlines() or [""]
+        _write(sys.stderr, "\n".join(f"error: {line}" for line in lines))
+        if hint:
+            _write(sys.stderr, f"hint: {hint}")
+
+    def table(self, columns: list[str], rows: list[list[str]], title: str | None = None) -> None:
+        """A table on stdout; plain columns where stdout is not a terminal."""
+        if self.json:
+            return
+        if sys.stdout.isatty():
+            from rich.console import Console as Rich
+            from rich.table import Table
+
+            table = Table(*columns, title=title, title_justify="left")
+            for row in rows:
+                table.add_row(*row)
+            Rich().print(table)
+            return
+        widths = [max(len(cell) for cell in column) for column in zip(columns, *rows, strict=True)]
+        for row in [columns, *rows]:
+            cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+            _write(sys.stdout, "  ".join(cells).rstrip())
+
+
+console = Console()
+
+
+def _write(stream: Any, text: str) -> None:
+    print(text, file=stream, flush=True)

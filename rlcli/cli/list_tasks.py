@@ -1,0 +1,72 @@
+"""`rlcli list-tasks`: what is installed, from metadata and a cache; nothing of a plugin is imported."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from rlcli.cli.console import console
+from rlcli.cli.options import Debug, Json
+from rlcli.probe import Details, cached, probe
+from rlcli.registry import catalog
+
+
+def command(
+    pattern: Annotated[str | None, typer.Argument(help="Show only names or summaries that contain this.")] = None,
+    probe_all: Annotated[
+        bool,
+        typer.Option("--probe", help="Load every task in a process of its own and refresh what is known of it."),
+    ] = False,
+    json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """List installed tasks."""
+    entries, broken = catalog()
+    details = probe(entries) if probe_all else cached(entries)
+    shared = {e.name for e in entries if sum(other.name == e.name for other in entries) > 1}
+    rows = []
+    for entry in entries:
+        known = details.get(entry.qualified, Details())
+        if pattern and pattern.lower() not in f"{entry.name} {known.summary}".lower():
+            continue
+        rows.append((entry, known))
+    console.table(
+        ["TASK", "PLUGIN", "WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "SUMMARY"],
+        [
+            [
+                entry.qualified if entry.name in shared else entry.name,
+                f"{entry.distribution} {entry.version}",
+                known.workflow or "?",
+                _number(known.observation_size),
+                _number(known.action_size),
+                _number(known.num_envs),
+                known.agent or "",
+                (known.broken and f"broken: {known.broken}")
+                or known.summary
+                or "(rlcli list-tasks --probe tells more)",
+            ]
+            for entry, known in rows
+        ],
+    )
+    for bad in broken:
+        console.warn(f"{bad.distribution}: {bad.reason}; its tasks are not listed")
+    console.document(
+        "list-tasks",
+        tasks=[
+            {
+                "name": entry.name,
+                "qualified": entry.qualified,
+                "ambiguous": entry.name in shared,
+                "distribution": entry.distribution,
+                "version": entry.version,
+                **known.record(),
+            }
+            for entry, known in rows
+        ],
+        broken=[{"distribution": bad.distribution, "reason": bad.reason} for bad in broken],
+    )
+
+
+def _number(value: int | None) -> str:
+    return "?" if value is None else str(value)

@@ -1,0 +1,68 @@
+"""Options that several commands share, so that a flag means the same everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+Overrides = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[KEY.PATH=VALUE]...", help="Overrides; agent.x=... addresses the chosen agent."),
+]
+Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
+Debug = Annotated[bool, typer.Option("--debug", help="Tracebacks of errors.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Errors and results only.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", help="YAML merged over the task; `agent:` in it addresses the chosen agent."),
+]
+Agent = Annotated[str | None, typer.Option("--agent", help="Which of the task's agents.")]
+NumEnvs = Annotated[int | None, typer.Option("--num-envs", help="Short for scene.num_envs=N.")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of everything random; -1 draws one and records it.")]
+Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
+RunsDir = Annotated[Path | None, typer.Option("--runs-dir", help="Runs folder; else RLCLI_RUNS_DIR, else runs/.")]
+CheckpointRef = Annotated[
+    str | None,
+    typer.Option("--checkpoint", help="RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest."),
+]
+Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Accepted; nothing opens a window unasked.")]
+
+
+def flags(**values: Any) -> Mapping[str, Any]:
+    """Flag values by dotted key, without those that were not given."""
+    return {key.replace("__", "."): value for key, value in values.items() if value is not None}
+
+
+def draw_seed(seed: int) -> int:
+    """The seed, drawn if it is -1."""
+    if seed != -1:
+        return seed
+    import secrets
+
+    return secrets.randbelow(2**31)
+
+
+def choose_device(wanted: str) -> str:
+    """auto, cpu, cuda or cuda:N -> a torch device that exists.
+
+    Raises:
+        UsageError: for something else.
+        DeviceError: for a device that is not there.
+    """
+    from rlcli.errors import DeviceError, UsageError
+
+    if wanted in ("auto", "cpu"):
+        return "cpu"
+    kind, _, index = wanted.partition(":")
+    if kind != "cuda" or (index and not index.isdigit()):
+        raise UsageError(f"no device '{wanted}'", hint="auto, cpu, cuda or cuda:N")
+    import torch
+
+    if not torch.cuda.is_available():
+        found = f"torch {torch.__version__} sees no CUDA device"
+        raise DeviceError(f"device '{wanted}' is not available: {found}", hint="--device cpu")
+    raise DeviceError(f"no simulation engine for device '{wanted}'", hint="--device cpu")

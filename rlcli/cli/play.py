@@ -1,0 +1,117 @@
+"""`rlcli play`: watch a policy, in a window, as a video, or as numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rlcli.cli.console import console
+from rlcli.cli.options import (
+    CheckpointRef,
+    ConfigFile,
+    Debug,
+    Headless,
+    Json,
+    NumEnvs,
+    Overrides,
+    Quiet,
+    RunsDir,
+    Seed,
+    draw_seed,
+)
+
+
+def command(
+    task: Annotated[
+        str | None, typer.Argument(help="A task: its newest run is played. Not needed with --checkpoint.")
+    ] = None,
+    overrides: Overrides = None,
+    checkpoint: CheckpointRef = None,
+    policy: Annotated[str, typer.Option("--policy", help="trained, zero or random.")] = "trained",
+    video: Annotated[
+        Path | None, typer.Option("--video", help="Write one episode to FILE.mp4 or FILE.gif, offscreen.")
+    ] = None,
+    viewer: Annotated[str, typer.Option("--viewer", help="auto, native or none.")] = "auto",
+    stochastic: Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")] = False,
+    num_envs: NumEnvs = None,
+    seed: Seed = 42,
+    config: ConfigFile = None,
+    runs_dir: RunsDir = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+    headless: Headless = False,
+) -> None:
+    """Play a policy."""
+    from rlcli.cli.session import open_session
+    from rlcli.errors import UsageError, did_you_mean
+
+    console.quiet = quiet
+    if viewer not in ("auto", "native", "none"):
+        near = did_you_mean(viewer, ("auto", "native", "none"))
+        raise UsageError(f"no viewer '{viewer}'", hint=near or "viewers: auto, native, none")
+    if video is not None:
+        from rlcli.viewer.video import check_video
+
+        check_video(video)
+    session = open_session(
+        task,
+        overrides or [],
+        checkpoint=checkpoint,
+        policy=policy,
+        stochastic=stochastic,
+        num_envs=num_envs,
+        seed=draw_seed(seed),
+        config=config,
+        runs_dir=runs_dir,
+    )
+    if video is not None:
+        _video(session, video)
+    elif _window(viewer, headless):
+        from rlcli.viewer.native import run
+
+        run(session.env, session.act)
+    else:
+        _statistics(session)
+
+
+def _window(viewer: str, headless: bool) -> bool:
+    from rlcli.viewer.gl import has_display
+
+    return viewer == "native" or (viewer == "auto" and has_display() and not headless)
+
+
+def _video(session: Any, file: Path) -> None:
+    from rlcli.rl.rollout import evaluate
+    from rlcli.viewer.video import Renderer, VideoWriter
+
+    env = session.env
+    renderer = Renderer(env.engine.model, env.config.viewer)
+    ended = False
+    with VideoWriter(file, 1.0 / env.step_dt) as writer:
+
+        def frame(step: Any) -> None:
+            nonlocal ended
+            ended = ended or bool(step.terminated[0] | step.truncated[0])
+            if not ended:  # the next episode's first state is not this one's last
+                writer.add(renderer.draw(*env.world(0)))
+
+        evaluation = evaluate(env, session.act, env.num_envs, frame)
+        frames = writer.frames
+    renderer.close()
+    summary = evaluation.summary()
+    console.info(f"{frames} frames of environment 0 at {1.0 / env.step_dt:g} a second, drawn with {renderer.backend}")
+    console.data(str(file))
+    console.document("play", video=str(file), frames=frames, fps=1.0 / env.step_dt, gl=renderer.backend, **summary)
+
+
+def _statistics(session: Any) -> None:
+    from rlcli.cli.eval import _show
+    from rlcli.rl.rollout import evaluate
+
+    console.info("no window asked for, or no display: one episode an environment, as numbers (--video FILE.mp4 draws)")
+    summary = evaluate(session.env, session.act, session.env.num_envs).summary()
+    _show(summary)
+    console.document("play", video=None, **summary)

@@ -1,0 +1,91 @@
+"""What play and eval share: which run and checkpoint, which policy, and the environment they act in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rlcli.cli.console import console
+from rlcli.cli.options import flags
+
+POLICIES = ("trained", "zero", "random")
+
+
+@dataclass(slots=True)
+class Session:
+    """An environment with a policy in it."""
+
+    env: Any
+    act: Any
+    run: Any
+    checkpoint: Path | None
+    resolved: Any
+
+
+def open_session(
+    task: str | None,
+    overrides: list[str],
+    *,
+    checkpoint: str | None,
+    policy: str,
+    stochastic: bool,
+    num_envs: int | None,
+    seed: int,
+    config: Path | None,
+    runs_dir: Path | None,
+) -> Session:
+    """Find, check and build; heavy imports begin only when files and configuration are in order."""
+    from rlcli.config.load import resolve
+    from rlcli.errors import UsageError, did_you_mean
+    from rlcli.registry import find_task
+    from rlcli.rl.load import resolve_run
+    from rlcli.rl.run import default_runs_dir, find_checkpoint
+
+    if policy not in POLICIES:
+        raise UsageError(
+            f"no policy '{policy}'", hint=did_you_mean(policy, POLICIES) or f"policies: {', '.join(POLICIES)}"
+        )
+    if task is not None and "=" in task:
+        overrides, task = [task, *overrides], None
+    if task is None and checkpoint is None:
+        raise UsageError("play what?", hint="a TASK, or --checkpoint RUN|latest")
+    values = flags(scene__num_envs=num_envs)
+    run = folder = None
+    if policy == "trained" or checkpoint is not None:
+        name = None if task is None else find_task(task).name
+        run, folder, why = find_checkpoint(checkpoint or "latest", runs_dir or default_runs_dir(), name)
+        console.info(f"checkpoint {folder} ({why})")
+        resolved = resolve_run(run, play=True, config_file=config, overrides=overrides, flags=values)
+    else:
+        assert task is not None
+        resolved = resolve(find_task(task), play=True, config_file=config, overrides=overrides, flags=values)
+    return _build(resolved, run, folder, policy, stochastic, seed)
+
+
+def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic: bool, seed: int) -> Session:
+    import torch
+
+    from rlcli.envs.vec_env import make_env
+    from rlcli.random import derive
+    from rlcli.rl.checkpoint import open_checkpoint
+    from rlcli.rl.load import policy_of, require_fit
+    from rlcli.rl.rollout import random_policy, zero_policy
+
+    torch.set_num_threads(1)
+    trained, checkpoint = None, None
+    if policy == "trained":
+        assert folder is not None
+        checkpoint = open_checkpoint(folder)
+        trained = policy_of(checkpoint)
+    # evaluation sees other episodes than training did
+    env = make_env(resolved, seed=derive(seed, "evaluation"))
+    if checkpoint is not None and trained is not None:
+        require_fit(checkpoint, env.layout)
+        generator = torch.Generator().manual_seed(derive(seed, "play"))
+        act = (lambda obs: trained.sample(obs, generator)) if stochastic else trained
+    elif policy == "zero":
+        act = zero_policy(env)
+    else:
+        act = random_policy(env, resolved.agent.action_bound if resolved.agent else 1.0, derive(seed, "play"))
+    return Session(env, act, run, folder, resolved)

@@ -1,0 +1,1 @@
+"""Configuration: strict YAML, the schema of a task, and the layers that make up a resolved one."""

@@ -1,0 +1,193 @@
+"""Layers of raw configuration, merged in order, each value keeping the place it was written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
+from typing import Any
+
+from rlcli.config import strict_yaml
+from rlcli.config.strict_yaml import Document, Path, YamlError
+from rlcli.errors import ConfigError, Problem
+
+_KEY = re.compile(r'"([^"]+)"|([^.="\s]+)')
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where a value was written: `layer` is task, agent, play, config, override or flag."""
+
+    layer: str
+    where: str
+
+
+@dataclass(slots=True)
+class Layers:
+    """Merged data and, for every path in it, the origin of its value."""
+
+    data: dict[str, Any] = field(default_factory=dict)
+    origins: dict[Path, Origin] = field(default_factory=dict)
+
+    def merge(self, patch: Mapping[str, Any], origin: Callable[[Path], Origin], at: Path = ()) -> None:
+        """Merge a patch: mappings key by key, everything else replaced. `origin` is asked with paths in the patch."""
+        self._merge(patch, origin, at, ())
+
+    def _merge(self, patch: Mapping[str, Any], origin: Callable[[Path], Origin], at: Path, inner: Path) -> None:
+        target = self._mapping(at, origin(inner))
+        for key, value in patch.items():
+            path, source = (*at, key), (*inner, key)
+            if isinstance(value, dict) and isinstance(target.get(key), dict):
+                self._merge(value, origin, path, source)
+                continue
+            self._forget(path)
+            target[key] = _copy(value)
+            for below in _paths(value):
+                self.origins[path + below] = origin(source + below)
+
+    def set(self, path: Path, value: Any, origin: Origin) -> None:
+        """Set one value, as an override does; missing mappings on the way are made.
+
+        Raises:
+            LookupError: if the path leads into something that has no such member.
+        """
+        target: Any = self.data
+        taken: Path = ()
+        for step in path[:-1]:
+            target, taken = self._step(target, step, taken, origin)
+        last: str | int = path[-1]
+        if isinstance(target, list):
+            last = _index(target, last, taken)
+        elif not isinstance(target, dict):
+            raise LookupError(f"'{taken[-1]}' is a value, not a mapping")
+        taken = (*taken, last)
+        self._forget(taken)
+        target[last] = value
+        for below in _paths(value):
+            self.origins[taken + below] = origin
+
+    def get(self, path: Path, default: Any = None) -> Any:
+        """The value at a path."""
+        value: Any = self.data
+        for step in path:
+            if not isinstance(value, dict) or step not in value:
+                return default
+            value = value[step]
+        return value
+
+    def origin(self, path: Path) -> Origin | None:
+        """The origin of the value at a path, or of the nearest thing around it."""
+        for length in range(len(path), -1, -1):
+            if path[:length] in self.origins:
+                return self.origins[path[:length]]
+        return None
+
+    def place(self, path: Path) -> str:
+        """Where a path was written, for a message."""
+        origin = self.origin(path)
+        return origin.where if origin else "configuration"
+
+    def _step(self, target: Any, step: str | int, taken: Path, origin: Origin) -> tuple[Any, Path]:
+        if isinstance(target, list):
+            index = _index(target, step, taken)
+            return target[index], (*taken, index)
+        if not isinstance(target, dict):
+            raise LookupError(f"'{taken[-1]}' is a value, not a mapping")
+        path = (*taken, step)
+        if target.get(str(step)) is None:
+            target[str(step)] = {}
+            self._forget(path)
+            self.origins[path] = origin
+        return target[str(step)], path
+
+    def _mapping(self, path: Path, origin: Origin) -> dict[str, Any]:
+        target = self.data
+        for depth, step in enumerate(path):
+            if not isinstance(target.get(str(step)), dict):
+                target[str(step)] = {}
+                self.origins[path[: depth + 1]] = origin
+            target = target[str(step)]
+        return target
+
+    def _forget(self, path: Path) -> None:
+        for known in [p for p in self.origins if p[: len(path)] == path]:
+            del self.origins[known]
+
+
+def read(file: FilePath, name: str | None = None) -> Document:
+    """Read a strict YAML file.
+
+    Raises:
+        ConfigError: if it cannot be read or parsed, with the position.
+    """
+    name = name or str(file)
+    try:
+        return strict_yaml.load(file.read_bytes())
+    except OSError as error:
+        raise ConfigError([Problem(name, "", f"cannot be read: {error.strerror or error}")]) from None
+    except YamlError as error:
+        raise ConfigError([Problem(f"{name}:{error.line}:{error.column}", "", error.message)]) from None
+
+
+def marked(document: Document, name: str, layer: str, at: Path = ()) -> Callable[[Path], Origin]:
+    """The origin function of a document's part below `at`."""
+
+    def origin(path: Path) -> Origin:
+        full = at + path
+        while full not in document.marks and full:
+            full = full[:-1]
+        line, column = document.marks.get(full, (1, 1))
+        return Origin(layer, f"{name}:{line}:{column}")
+
+    return origin
+
+
+def parse_override(text: str) -> tuple[Path, Any]:
+    """`rewards.alive.weight=2` -> (path, value); a key that holds a dot is quoted: joints.".*".damping=1.
+
+    Raises:
+        ConfigError: if it is not of that form.
+    """
+    where = f"override '{text}'"
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise ConfigError([Problem(where, "", "is not of the form key.path=value")])
+    path: list[str] = []
+    rest = key.strip()
+    while rest:
+        match = _KEY.match(rest)
+        if not match:
+            raise ConfigError([Problem(where, "", f"'{key}' is not a dotted key")])
+        path.append(match[1] or match[2])
+        rest = rest[match.end() :]
+        if rest:
+            if rest[0] != "." or len(rest) == 1:
+                raise ConfigError([Problem(where, "", f"'{key}' is not a dotted key")])
+            rest = rest[1:]
+    if not path:
+        raise ConfigError([Problem(where, "", "has no key before '='")])
+    try:
+        return tuple(path), strict_yaml.load_value(value)
+    except YamlError as error:
+        raise ConfigError([Problem(where, ".".join(path), error.message)]) from None
+
+
+def _index(target: list[Any], step: str | int, taken: Path) -> int:
+    if not str(step).isdigit() or int(step) >= len(target):
+        raise LookupError(f"'{taken[-1]}' is a list of {len(target)}, and '{step}' is not one of its indices")
+    return int(step)
+
+
+def _paths(value: Any) -> list[Path]:
+    if isinstance(value, dict):
+        return [(), *((key, *below) for key, item in value.items() for below in _paths(item))]
+    if isinstance(value, list):
+        return [(), *((index, *below) for index, item in enumerate(value) for below in _paths(item))]
+    return [()]
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _copy(item) for key, item in value.items()}
+    return [_copy(item) for item in value] if isinstance(value, list) else value

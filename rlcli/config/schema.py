@@ -1,0 +1,346 @@
+"""The schema of a task: every key of a `task.yaml` with its unit, its range and its default.
+
+Terms (the entries of `rewards:`, `events:`, ...) are open here: their parameters are the keyword-only parameters of
+the function they name, checked by `rlcli.config.terms`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+_FRACTION = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*/\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*\Z")
+
+
+def _fraction(value: Any) -> Any:
+    """`1/120` is a number where a number is expected."""
+    if isinstance(value, str) and (match := _FRACTION.match(value)):
+        try:
+            return float(match[1]) / float(match[2])
+        except (ValueError, ZeroDivisionError):
+            return value
+    return value
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise ValueError(f"the lower end {value[0]:g} is above the upper end {value[1]:g}")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_fraction)]
+Positive = Annotated[float, BeforeValidator(_fraction), Field(gt=0)]
+NotNegative = Annotated[float, BeforeValidator(_fraction), Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+Vec3 = tuple[Number, Number, Number]
+Quaternion = tuple[Number, Number, Number, Number]
+Range = Annotated[tuple[Number, Number], AfterValidator(_ordered)]
+Names = str | Annotated[list[str], Field(min_length=1)]
+
+
+class StrictModel(BaseModel):
+    """Base of every configuration model: unknown keys, wrong types, NaN and later changes are refused."""
+
+    model_config = ConfigDict(
+        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+
+class TermConfig(StrictModel):
+    """One term: the function it calls, and that function's parameters as further keys."""
+
+    model_config = ConfigDict(extra="allow")
+
+    func: str
+    """Name of the function, looked up in the task's own terms, then in rlcli.mdp."""
+
+    @property
+    def params(self) -> dict[str, Any]:
+        """The parameters of the function, validated, defaults filled in."""
+        return dict(self.model_extra or {})
+
+
+class RewardConfig(TermConfig):
+    """A reward term; its contribution a step is weight x value x step_dt."""
+
+    weight: Number
+    """Signed weight."""
+
+
+class TerminationConfig(TermConfig):
+    """A termination term."""
+
+    time_out: bool = False
+    """True: ends the episode as truncated (the value of the last state is bootstrapped), not as terminated."""
+
+
+class EventConfig(TermConfig):
+    """Something that happens to some environments at some time."""
+
+    mode: Literal["startup", "reset", "interval"]
+    """startup: once; reset: when an episode starts; interval: again and again."""
+    interval_range_s: Range | None = None
+    """[low, high] time between two firings [s], drawn an environment; required by mode interval."""
+
+    @model_validator(mode="after")
+    def _interval(self) -> EventConfig:
+        if (self.mode == "interval") != (self.interval_range_s is not None):
+            raise ValueError("interval_range_s belongs to mode interval, and mode interval needs it")
+        if self.interval_range_s is not None and self.interval_range_s[0] <= 0:
+            raise ValueError("interval_range_s must be above 0")
+        return self
+
+
+class ObservationConfig(TermConfig):
+    """An observation term; its columns are clipped, then scaled."""
+
+    clip: Range | None = None
+    """[low, high] limits."""
+    scale: Number | list[Number] | None = None
+    """Factor, one for all columns or one each."""
+
+
+class ActionConfig(TermConfig):
+    """An action term; it takes its columns of the policy's output."""
+
+
+class SuccessConfig(TermConfig):
+    """When an episode counts as a success: the term held during its last `hold_s` seconds and time ran out."""
+
+    hold_s: NotNegative = 1.0
+    """How long the condition must have held when the episode times out [s]."""
+
+
+class SimConfig(StrictModel):
+    """The simulation."""
+
+    dt: Annotated[float, BeforeValidator(_fraction), Field(gt=0, le=0.1)]
+    """Physics time step [s]."""
+    render_interval: Count = 1
+    """Physics steps between two rendered frames."""
+    gravity: Vec3 = (0.0, 0.0, -9.81)
+    """Gravity in the world frame [m/s^2]."""
+    integrator: Literal["euler", "rk4", "implicit", "implicitfast"] | None = None
+    """MuJoCo's integrator; null takes the first entity's MJCF."""
+    iterations: Count | None = None
+    """Solver iterations; null takes the first entity's MJCF."""
+    ls_iterations: Count | None = None
+    """Line-search iterations of the solver; null takes the first entity's MJCF."""
+    engine_threads: Count | None = None
+    """Threads that step physics; null is every core this process may use."""
+
+
+class ViewerConfig(StrictModel):
+    """Where the camera stands."""
+
+    eye: Vec3 = (4.0, 4.0, 3.0)
+    """Camera position [m], world frame of the environment shown."""
+    lookat: Vec3 = (0.0, 0.0, 0.0)
+    """Point the camera looks at [m]."""
+    width: Annotated[int, Field(ge=16, le=3840)] = 640
+    """Picture width [pixels]."""
+    height: Annotated[int, Field(ge=16, le=2160)] = 480
+    """Picture height [pixels]."""
+
+
+Color = tuple[
+    Annotated[float, Field(ge=0, le=1)],
+    Annotated[float, Field(ge=0, le=1)],
+    Annotated[float, Field(ge=0, le=1)],
+]
+
+
+class GroundConfig(StrictModel):
+    """A ground plane at z = 0."""
+
+    size: Positive = 100.0
+    """Edge length [m]."""
+    friction: NotNegative = 1.0
+    """Sliding friction."""
+
+
+class DomeLightConfig(StrictModel):
+    """Light from everywhere."""
+
+    color: Color = (0.9, 0.9, 0.9)
+    """Red, green, blue in [0, 1]."""
+    intensity: NotNegative = 500.0
+    """Strength; 1000 is full white on a white surface."""
+
+
+class DistantLightConfig(DomeLightConfig):
+    """Parallel light from one direction, with shadows."""
+
+    direction: Vec3 = (0.3, 0.2, -1.0)
+    """Direction the light travels, world frame."""
+
+
+class LightsConfig(StrictModel):
+    """The lights of the scene."""
+
+    dome: DomeLightConfig | None = None
+    """Ambient light."""
+    distant: DistantLightConfig | None = None
+    """Sun-like light."""
+
+
+class JointConfig(StrictModel):
+    """What a task changes on joints of an entity; null keeps what the MJCF says."""
+
+    damping: NotNegative | None = None
+    """Viscous damping [N s/m or N m s/rad]."""
+    stiffness: NotNegative | None = None
+    """Spring stiffness [N/m or N m/rad]."""
+    armature: NotNegative | None = None
+    """Rotor inertia [kg or kg m^2]."""
+    friction_loss: NotNegative | None = None
+    """Dry friction [N or N m]."""
+    range: Range | None = None
+    """Position limits [m or rad]."""
+    effort_limit: Positive | None = None
+    """Largest force of the joint's actuator [N or N m]."""
+    actuator: Literal["motor", "position", "velocity"] | None = None
+    """Actuator to add where the MJCF has none of this kind; an action term adds what it needs by itself."""
+    kp: Positive | None = None
+    """Gain of a position actuator [N/m or N m/rad]."""
+    kv: NotNegative | None = None
+    """Gain of a velocity actuator, or damping of a position actuator [N s/m or N m s/rad]."""
+
+
+class InitialStateConfig(StrictModel):
+    """The default state of an entity, which resets start from."""
+
+    joint_pos: dict[str, Number] = {}
+    """Joint name or regex -> position [m or rad]."""
+    joint_vel: dict[str, Number] = {}
+    """Joint name or regex -> velocity [m/s or rad/s]."""
+
+
+class EntityConfig(StrictModel):
+    """A robot or object: an MJCF file attached to the scene under the entity's name."""
+
+    model: str
+    """MJCF file, relative to the task's folder."""
+    pos: Vec3 = (0.0, 0.0, 0.0)
+    """Position of the MJCF's origin in the environment's frame [m]."""
+    quat: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    """Orientation (w, x, y, z)."""
+    joints: dict[str, JointConfig] = {}
+    """Joint name or regex -> what to change; where two match, the later one wins key by key."""
+    init: InitialStateConfig = InitialStateConfig()
+    """Default joint state; a joint not named starts at the MJCF's qpos0, at rest."""
+    soft_joint_pos_limit_factor: Annotated[float, BeforeValidator(_fraction), Field(gt=0, le=1)] = 1.0
+    """Share of the joint range, about its middle, that counts as inside the soft limits."""
+
+    @model_validator(mode="after")
+    def _unit(self) -> EntityConfig:
+        if math.hypot(*self.quat) < 1e-6:
+            raise ValueError("quat must not be zero")
+        return self
+
+
+class SceneConfig(StrictModel):
+    """What stands in each environment."""
+
+    num_envs: Annotated[int, Field(ge=1, le=1 << 24)] = 1024
+    """Environments simulated in parallel."""
+    env_spacing: NotNegative = 4.0
+    """Distance between environments on the grid that viewers draw [m]; physics runs at each world's origin."""
+    ground: GroundConfig | None = GroundConfig()
+    """Ground plane; null for none."""
+    lights: LightsConfig = LightsConfig(dome=DomeLightConfig())
+    """Lights."""
+    entities: Annotated[dict[str, EntityConfig], Field(min_length=1)]
+    """Name -> robot or object."""
+
+
+class TaskConfig(StrictModel):
+    """A whole task. Manager-based tasks fill actions ... terminations, direct tasks `params`."""
+
+    summary: str = ""
+    """One line that says what the task is."""
+    sim: SimConfig
+    """Physics."""
+    decimation: Count
+    """Physics steps an environment step; step_dt = dt x decimation."""
+    episode_length_s: Positive
+    """Length of an episode [s]; it is truncated there."""
+    scene: SceneConfig
+    """Environments, ground, lights, robots."""
+    viewer: ViewerConfig = ViewerConfig()
+    """Camera of videos and windows."""
+    actions: dict[str, ActionConfig | None] = {}
+    """Action terms, in the order of the policy's output; null removes one."""
+    observations: dict[str, dict[str, ObservationConfig | None]] = {}
+    """Groups of observation terms, in order; the policy reads the group `policy`."""
+    events: dict[str, EventConfig | None] = {}
+    """Event terms."""
+    rewards: dict[str, RewardConfig | None] = {}
+    """Reward terms."""
+    terminations: dict[str, TerminationConfig | None] = {}
+    """Termination terms."""
+    success: SuccessConfig | None = None
+    """What makes an episode a success in `eval`."""
+    reward_dt_scaling: bool = True
+    """Multiply manager-based rewards by step_dt, so that returns do not depend on the control rate."""
+    divergence_reward: Number | None = None
+    """Reward of the step in which an environment diverged; null: that of its last finite state, terminated."""
+    params: dict[str, Any] = {}
+    """Parameters of a direct task, checked by the task's own Params."""
+    clip_actions: Positive | None = None
+    """Direct tasks: actions are clamped to +-this before pre_physics_step."""
+    clip_observations: Positive | None = None
+    """Direct tasks: observations are clamped to +-this."""
+    play: dict[str, Any] = {}
+    """Patch of this configuration for play and eval."""
+    agents: dict[str, Any] = {}
+    """Name -> settings of a trainer; `default` names the one to use, by itself or by device."""
+
+    @model_validator(mode="after")
+    def _times(self) -> TaskConfig:
+        if self.episode_length_s < self.step_dt:
+            raise ValueError(
+                f"episode_length_s ({self.episode_length_s:g} s) is shorter than one step"
+                f" (dt x decimation = {self.step_dt:g} s)"
+            )
+        return self
+
+    @property
+    def step_dt(self) -> float:
+        """Control period [s]."""
+        return self.sim.dt * self.decimation
+
+    @property
+    def max_episode_length(self) -> int:
+        """Steps of an episode; the small slack absorbs rounding, so that 5 s at 1/60 s is 300 steps."""
+        return math.ceil(self.episode_length_s / self.step_dt - 1e-6)
+
+
+class AgentConfig(StrictModel):
+    """What every trainer's settings have in common; a trainer's own model extends it."""
+
+    trainer: str
+    """Name of a trainer (entry-point group rlcli.trainers)."""
+    algorithm: str
+    """Algorithm of that trainer."""
+    task: dict[str, Any] = {}
+    """Patch of the task for what this agent was tuned for."""
+    max_iterations: Count | None = None
+    """Iterations to train for."""
+    max_steps: Count | None = None
+    """Environment steps to train for."""
+    save_interval: Count | None = None
+    """Iterations between checkpoints; null: every 60 s and at the end."""
+    torch_threads: Count | None = None
+    """Threads of the update; null: min(4, cores). Results are equal only for an equal number."""
+    action_bound: Positive | None = 1.0
+    """The policy's actions are clipped to +-this in training, play and export alike; null: unbounded."""
+
+    @model_validator(mode="after")
+    def _budget(self) -> AgentConfig:
+        if self.max_iterations is None and self.max_steps is None:
+            raise ValueError("one of max_iterations and max_steps is needed")
+        return self

@@ -1,0 +1,200 @@
+"""Strict YAML: the YAML 1.2 scalars people expect, positions for every value, and nothing that can run or explode.
+
+Built on the event stream of PyYAML's pure-Python parser (the C parser crashes on deep nesting). Refused, each with
+its position: duplicate keys, anchors, tags, merge keys, a second document, ambiguous scalars (`on`, `010`, `.nan`).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from typing import Any
+
+import yaml
+from yaml import events
+
+MAX_BYTES = 256 * 1024
+MAX_DEPTH = 32
+MAX_ITEMS = 20_000
+MAX_SCALAR = 16 * 1024
+
+Path = tuple[str | int, ...]
+Mark = tuple[int, int]
+
+_INT = re.compile(r"[-+]?(0|[1-9][0-9]{0,18})\Z")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]{1,4})?\Z")
+_OCTAL = re.compile(r"[-+]?0[0-9]+\Z")
+_NOT_FINITE = re.compile(r"[-+]?\.(inf|nan)\Z", re.IGNORECASE)
+_WORDS = {"yes", "no", "on", "off", "y", "n"}
+_CONSTANTS = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+}
+
+
+class YamlError(ValueError):
+    """A file that is not strict YAML; `line` and `column` count from 1 (0 when unknown)."""
+
+    def __init__(self, message: str, mark: Any = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.line = mark.line + 1 if mark else 0
+        self.column = mark.column + 1 if mark else 0
+
+
+@dataclass(slots=True)
+class Document:
+    """A parsed mapping and the position (line, column) of every key and item, by path."""
+
+    data: dict[str, Any]
+    marks: dict[Path, Mark] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class _Frame:
+    container: dict[str, Any] | list[Any]
+    path: Path
+    key: str | None = None
+
+
+def load(text: str | bytes) -> Document:
+    """Parse one document whose top level is a mapping.
+
+    Raises:
+        YamlError: with the position of the first thing that is not allowed.
+    """
+    value, marks = _parse(_decode(text))
+    if value is None:
+        value = {}
+    if not isinstance(value, dict):
+        raise YamlError("the top level must be a mapping (key: value)")
+    return Document(value, marks)
+
+
+def load_value(text: str) -> Any:
+    """Parse one value as it would be read after a key: `1e-3`, `[1, 2]`, `{a: 1}`, `text`."""
+    return _parse(_decode(text))[0]
+
+
+def _decode(text: str | bytes) -> str:
+    if len(text) > MAX_BYTES:
+        raise YamlError(f"larger than {MAX_BYTES} bytes")
+    if isinstance(text, bytes):
+        try:
+            text = text.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise YamlError(f"not UTF-8: {error.reason} at byte {error.start}") from None
+    return text.removeprefix("\ufeff")
+
+
+def _parse(text: str) -> tuple[Any, dict[Path, Mark]]:
+    try:
+        return _Reader().read(text)
+    except yaml.MarkedYAMLError as error:
+        raise YamlError(
+            error.problem or error.context or "syntax error", error.problem_mark or error.context_mark
+        ) from None
+    except yaml.YAMLError as error:
+        raise YamlError(str(error).split("\n")[0]) from None
+    except RecursionError:
+        raise YamlError("nested too deeply") from None
+
+
+class _Reader:
+    def __init__(self) -> None:
+        self.marks: dict[Path, Mark] = {}
+        self.stack: list[_Frame] = []
+        self.root: Any = None
+
+    def read(self, text: str) -> tuple[Any, dict[Path, Mark]]:
+        documents = 0
+        for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
+            if count > MAX_ITEMS:
+                raise YamlError(f"more than {MAX_ITEMS} items", event.start_mark)
+            self._refuse(event)
+            if isinstance(event, events.DocumentStartEvent):
+                documents += 1
+                if documents > 1:
+                    raise YamlError("only one document per file", event.start_mark)
+            elif isinstance(event, events.ScalarEvent):
+                self._put(_scalar(event), event.start_mark)
+            elif isinstance(event, events.MappingStartEvent):
+                self._open({}, event.start_mark)
+            elif isinstance(event, events.SequenceStartEvent):
+                self._open([], event.start_mark)
+            elif isinstance(event, (events.MappingEndEvent, events.SequenceEndEvent)):
+                self.stack.pop()
+        return self.root, self.marks
+
+    def _refuse(self, event: events.Event) -> None:
+        if getattr(event, "anchor", None):
+            raise YamlError("anchors and aliases are not allowed; write the value again", event.start_mark)
+        tag = getattr(event, "tag", None)
+        if tag not in (None, "!"):
+            raise YamlError(f"tags are not allowed ({str(tag)[:60]})", event.start_mark)
+
+    def _open(self, container: dict[str, Any] | list[Any], mark: Any) -> None:
+        if len(self.stack) >= MAX_DEPTH:
+            raise YamlError(f"nested deeper than {MAX_DEPTH} levels", mark)
+        if self.stack and isinstance(self.stack[-1].container, dict) and self.stack[-1].key is None:
+            raise YamlError("keys must be text", mark)
+        self.stack.append(_Frame(container, self._put(container, mark)))
+
+    def _put(self, value: Any, mark: Any) -> Path:
+        place = (mark.line + 1, mark.column + 1)
+        if not self.stack:
+            self.root = value
+            self.marks[()] = place
+            return ()
+        frame = self.stack[-1]
+        if isinstance(frame.container, list):
+            path = (*frame.path, len(frame.container))
+            frame.container.append(value)
+        elif frame.key is None:
+            return self._key(frame, value, mark)
+        else:
+            path = (*frame.path, frame.key)
+            frame.container[frame.key] = value
+            frame.key = None
+        self.marks.setdefault(path, place)
+        return path
+
+    def _key(self, frame: _Frame, key: Any, mark: Any) -> Path:
+        if not isinstance(key, str):
+            raise YamlError(f"keys must be text, found {key!r}; quote it", mark)
+        path = (*frame.path, key)
+        if key == "<<":
+            raise YamlError("merge keys (<<) are not allowed", mark)
+        if key in frame.container:
+            raise YamlError(f"duplicate key '{key}' (first on line {self.marks[path][0]})", mark)
+        assert isinstance(frame.container, dict)
+        frame.container[key] = None
+        frame.key = key
+        self.marks[path] = (mark.line + 1, mark.column + 1)
+        return path
+
+
+def _scalar(event: events.ScalarEvent) -> Any:
+    text = event.value
+    if len(text) > MAX_SCALAR:
+        raise YamlError(f"a value longer than {MAX_SCALAR} characters", event.start_mark)
+    if not event.implicit[0]:  # quoted or block: always text
+        return text
+    if text in _CONSTANTS:
+        return _CONSTANTS[text]
+    if _OCTAL.match(text):
+        raise YamlError(f"{text} is ambiguous (octal in YAML 1.1); drop the leading 0 or quote it", event.start_mark)
+    if _INT.match(text):
+        return int(text)
+    if _FLOAT.match(text):
+        number = float(text)
+        if math.isinf(number):
+            raise YamlError(f"the number {text[:20]} is out of range", event.start_mark)
+        return number
+    if _NOT_FINITE.match(text):
+        raise YamlError(f"{text} is not allowed; write a number, or null for none", event.start_mark)
+    if text.lower() in _WORDS:
+        raise YamlError(f"{text} is ambiguous; write true or false, or quote it", event.start_mark)
+    return text

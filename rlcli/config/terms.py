@@ -1,0 +1,252 @@
+"""Term signatures, read from source text with `ast`: files are checked without importing a stranger's code.
+
+A term is a public function whose first parameter is `env`, or a class whose `__init__` takes `(self, env, *, ...)`
+(named in YAML by its class name in snake_case). Its keyword-only parameters are its YAML keys.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Union
+
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from rlcli.config.schema import (
+    ActionConfig,
+    EventConfig,
+    Names,
+    Number,
+    ObservationConfig,
+    Range,
+    RewardConfig,
+    StrictModel,
+    SuccessConfig,
+    TermConfig,
+    TerminationConfig,
+)
+
+SECTIONS: dict[str, type[TermConfig]] = {
+    "actions": ActionConfig,
+    "observations": ObservationConfig,
+    "events": EventConfig,
+    "rewards": RewardConfig,
+    "terminations": TerminationConfig,
+    "success": SuccessConfig,
+}
+"""Section of the YAML -> what its terms have in common."""
+
+SELECTORS = ("Joints", "Bodies", "Sites", "Sensors", "Actuators")
+"""Aliases of `rlcli.task` that pick elements of the term's `entity`."""
+
+_TYPES: dict[str, Any] = {
+    "float": Number,
+    "int": int,
+    "bool": bool,
+    "str": str,
+    "None": None,
+    "Entity": str,
+    "Range": Range,
+    **dict.fromkeys(SELECTORS, Names),
+}
+_MDP = Path(__file__).resolve().parent.parent / "mdp"
+
+
+class SignatureError(ValueError):
+    """A term's signature uses something that YAML cannot express."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One keyword-only parameter: its YAML type, its default, and the selector alias it was written with."""
+
+    name: str
+    type: Any
+    default: Any
+    required: bool
+    alias: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """A term as its source declares it."""
+
+    name: str
+    attribute: str
+    is_class: bool
+    file: Path
+    line: int
+    summary: str
+    parameters: tuple[Parameter, ...]
+    error: str | None = None
+
+
+@dataclass(slots=True)
+class Vocabulary:
+    """The terms that a task's YAML may name: its own first, then those of `rlcli.mdp` for the section."""
+
+    own: dict[str, Signature] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, files: tuple[Path, ...]) -> Vocabulary:
+        """Read the task's own term files; a later file wins."""
+        own: dict[str, Signature] = {}
+        for file in files:
+            own.update(read_terms(file))
+        return cls(own)
+
+    def find(self, section: str, name: str) -> Signature | None:
+        """The term `name` of a section, or None."""
+        return self.own.get(name) or builtin_terms(section).get(name)
+
+    def names(self, section: str) -> list[str]:
+        """Every name that may stand in `func` in a section."""
+        return sorted({*self.own, *builtin_terms(section)})
+
+    def other_section(self, section: str, name: str) -> str | None:
+        """Another section that has a built-in term of this name."""
+        return next((other for other in SECTIONS if other != section and name in builtin_terms(other)), None)
+
+
+@functools.cache
+def builtin_terms(section: str) -> dict[str, Signature]:
+    """The terms of `rlcli.mdp` for a section of the YAML."""
+    return read_terms(_MDP / f"{section}.py")
+
+
+def read_terms(file: Path) -> dict[str, Signature]:
+    """The terms that a Python file defines, by YAML name.
+
+    Raises:
+        SyntaxError: if the file is not Python.
+    """
+    tree = ast.parse(file.read_text(encoding="utf-8"), filename=str(file))
+    terms: dict[str, Signature] = {}
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef) and _takes_env(node.args, 0) and not node.name.startswith("_"):
+            terms[node.name] = _signature(node, node, node.name, file)
+        elif isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            init = next((n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"), None)
+            if init is not None and _takes_env(init.args, 1):
+                name = snake_case(node.name)
+                terms[name] = _signature(node, init, name, file)
+    return terms
+
+
+def read_params(file: Path, class_name: str) -> type[StrictModel] | None:
+    """The `Params` model nested in a direct task's class, rebuilt from its source; None if there is none."""
+    tree = ast.parse(file.read_text(encoding="utf-8"), filename=str(file))
+    task = next((n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == class_name), None)
+    params = next((n for n in task.body if isinstance(n, ast.ClassDef) and n.name == "Params"), None) if task else None
+    if params is None:
+        return None
+    fields: dict[str, Any] = {}
+    for node in params.body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            fields[node.target.id] = (annotation_type(node.annotation), _field_default(node.value))
+    return create_model("Params", __base__=StrictModel, **fields)
+
+
+def params_model(signature: Signature, section: str) -> type[BaseModel]:
+    """The model of a term's YAML entry: the section's own keys and the function's parameters, nothing else."""
+    fields: dict[str, Any] = {p.name: (p.type, ... if p.required else p.default) for p in signature.parameters}
+    return create_model(signature.name, __base__=_closed(section), **fields)
+
+
+def snake_case(name: str) -> str:
+    """`JointEffort` -> `joint_effort`."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
+
+
+def annotation_type(node: ast.expr) -> Any:
+    """The YAML type of an annotation.
+
+    Raises:
+        SignatureError: for anything but float, int, bool, str, Literal, tuple, list, `X | None` and the aliases.
+    """
+    if isinstance(node, ast.Constant) and node.value is None:
+        return None
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return annotation_type(ast.parse(node.value, mode="eval").body)
+    name = _last_name(node)
+    if name in _TYPES:
+        return _TYPES[name]
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitOr):
+        return Union[annotation_type(node.left), annotation_type(node.right)]  # noqa: UP007  (built at run time)
+    if isinstance(node, ast.Subscript):
+        items = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        outer = _last_name(node.value)
+        if outer == "Literal":
+            return Literal[tuple(ast.literal_eval(item) for item in items)]
+        if outer == "list" and len(items) == 1:
+            return list[annotation_type(items[0])]  # type: ignore[misc]
+        if outer == "tuple":
+            if len(items) == 2 and isinstance(items[1], ast.Constant) and items[1].value is ...:
+                return tuple[annotation_type(items[0]), ...]  # type: ignore[misc]
+            return tuple[tuple(annotation_type(item) for item in items)]  # type: ignore[misc]
+    raise SignatureError(f"annotation '{ast.unparse(node)}' is not one that YAML can express")
+
+
+@functools.cache
+def _closed(section: str) -> type[TermConfig]:
+    base = SECTIONS[section]
+    return type(base.__name__, (base,), {"model_config": ConfigDict(extra="forbid"), "__module__": __name__})
+
+
+def _signature(node: ast.FunctionDef | ast.ClassDef, call: ast.FunctionDef, name: str, file: Path) -> Signature:
+    parameters: list[Parameter] = []
+    error = None
+    for argument, default in zip(call.args.kwonlyargs, call.args.kw_defaults, strict=True):
+        try:
+            parameters.append(_parameter(argument, default))
+        except (SignatureError, ValueError) as problem:
+            error = f"parameter '{argument.arg}': {problem}"
+    if error is None:
+        error = _selector_error(parameters)
+    summary = (ast.get_docstring(node) or ast.get_docstring(call) or "").split("\n")[0]
+    return Signature(
+        name, node.name, isinstance(node, ast.ClassDef), file, call.lineno, summary, tuple(parameters), error
+    )
+
+
+def _selector_error(parameters: list[Parameter]) -> str | None:
+    selectors = [p.name for p in parameters if p.alias in SELECTORS]
+    if selectors and not any(p.name == "entity" and p.alias == "Entity" for p in parameters):
+        return f"'{selectors[0]}' selects elements of an entity, so the term also needs 'entity: Entity'"
+    return None
+
+
+def _parameter(argument: ast.arg, default: ast.expr | None) -> Parameter:
+    if argument.annotation is None:
+        raise SignatureError("has no annotation")
+    alias = _last_name(argument.annotation)
+    return Parameter(
+        argument.arg,
+        annotation_type(argument.annotation),
+        None if default is None else ast.literal_eval(default),
+        default is None,
+        alias if alias in SELECTORS or alias == "Entity" else None,
+    )
+
+
+def _field_default(node: ast.expr | None) -> Any:
+    if node is None:
+        return ...
+    if isinstance(node, ast.Call) and _last_name(node.func) == "Field":
+        arguments = [ast.literal_eval(argument) for argument in node.args]
+        keywords = {k.arg: ast.literal_eval(k.value) for k in node.keywords if k.arg}
+        return Field(*arguments, **keywords)
+    return ast.literal_eval(node)
+
+
+def _takes_env(arguments: ast.arguments, position: int) -> bool:
+    return len(arguments.args) > position and arguments.args[position].arg == "env"
+
+
+def _last_name(node: ast.expr) -> str | None:
+    if isinstance(node, ast.Name):
+        return node.id
+    return node.attr if isinstance(node, ast.Attribute) else None

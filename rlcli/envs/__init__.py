@@ -1,0 +1,1 @@
+"""Environments: one step loop, and the two workflows that fill it."""

@@ -1,0 +1,174 @@
+"""`ArticulationView`: the robots of all environments as tensors, with OmniIsaacGymEnvs' method names."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rlcli.errors import TaskError, did_you_mean, listing
+from rlcli.sim.entity import Entity, as_index
+from rlcli.sim.rotations import rotate_inverse
+from rlcli.sim.selection import Columns
+
+if TYPE_CHECKING:
+    from rlcli.envs.vec_env import VecEnv
+
+
+class ArticulationView:
+    """One entity in every environment. Register it with `scene.add`; it works once the simulation runs.
+
+    Columns are the entity's hinge and slide joints in the model's order. `indices` picks environments, and values then
+    have one row each. Positions are in each environment's own frame. Unlike its model, a setter may be called any
+    number of times a step, and getters are never stale.
+
+    Args:
+        entity: name of the entity in the YAML's scene.
+        name: the view's own name, for dictionaries of observations.
+    """
+
+    def __init__(self, entity: str, name: str | None = None) -> None:
+        self.entity_name = entity
+        self.name = name or entity
+
+    def bind(self, env: VecEnv) -> None:
+        """Connect to the running simulation; the framework calls it.
+
+        Raises:
+            TaskError: if the scene has no such entity.
+        """
+        if self.entity_name not in env.entities:
+            near = did_you_mean(self.entity_name, env.entities) or f"entities: {listing(env.entities)}"
+            raise TaskError(f"ArticulationView('{self.entity_name}'): no such entity in the scene", hint=near)
+        self._env = env
+        self._entity: Entity = env.entities[self.entity_name]
+        engine = env.engine
+        self._qpos, self._qvel, self._ctrl = engine.field("qpos"), engine.field("qvel"), engine.field("ctrl")
+        self._actuators = {kind: _actuator_columns(self._entity, kind) for kind in ("motor", "position", "velocity")}
+
+    @property
+    def count(self) -> int:
+        """Number of robots, one an environment."""
+        return self._env.num_envs
+
+    @property
+    def num_dof(self) -> int:
+        """Hinge and slide joints."""
+        return len(self._entity.joint_names)
+
+    @property
+    def dof_names(self) -> list[str]:
+        """Joint names, in column order."""
+        return list(self._entity.joint_names)
+
+    def get_dof_index(self, name: str) -> int:
+        """Column of a joint.
+
+        Raises:
+            TaskError: if there is no such joint.
+        """
+        if name not in self._entity.joint_names:
+            near = did_you_mean(name, self._entity.joint_names) or f"joints: {listing(self._entity.joint_names)}"
+            raise TaskError(f"view '{self.name}' has no joint '{name}'", hint=near)
+        return self._entity.joint_names.index(name)
+
+    def get_joint_positions(self, indices: Tensor | None = None, clone: bool = True) -> Tensor:
+        """Joint positions. (n, num_dof) [m or rad]; without clone a live view, to be read only."""
+        return _rows(self._entity.data.joint_pos, indices, clone)
+
+    def get_joint_velocities(self, indices: Tensor | None = None, clone: bool = True) -> Tensor:
+        """Joint velocities. (n, num_dof) [m/s or rad/s]; without clone a live view, to be read only."""
+        return _rows(self._entity.data.joint_vel, indices, clone)
+
+    def get_dof_limits(self) -> Tensor:
+        """Lower and upper limits, infinite where a joint has none. (num_envs, num_dof, 2) [m or rad]"""
+        return self._entity.data.joint_pos_limits.expand(self.count, -1, -1)
+
+    def get_world_poses(self, indices: Tensor | None = None, clone: bool = True) -> tuple[Tensor, Tensor]:
+        """Root positions [m] and orientations (w, x, y, z), in each environment's frame. (n, 3), (n, 4)"""
+        data = self._entity.data
+        return _rows(data.root_pos_w, indices, clone), _rows(data.root_quat_w, indices, clone)
+
+    def get_velocities(self, indices: Tensor | None = None, clone: bool = True) -> Tensor:
+        """Root velocities, world frame: linear [m/s], angular [rad/s]. (n, 6)"""
+        data = self._entity.data
+        return _rows(torch.cat([data.root_lin_vel_w, data.root_ang_vel_w], dim=1), indices, clone)
+
+    def set_joint_positions(self, positions: Tensor, indices: Tensor | None = None) -> None:
+        """Set joint positions, and with them the targets of position actuators. (n, num_dof) [m or rad]"""
+        self._write(self._qpos, positions, indices, self._entity.qpos_columns)
+        self._command("position", positions, indices)
+
+    def set_joint_velocities(self, velocities: Tensor, indices: Tensor | None = None) -> None:
+        """Set joint velocities, and with them the targets of velocity actuators. (n, num_dof) [m/s or rad/s]"""
+        self._write(self._qvel, velocities, indices, self._entity.dof_columns)
+        self._command("velocity", velocities, indices)
+
+    def set_joint_efforts(self, efforts: Tensor, indices: Tensor | None = None) -> None:
+        """Forces of the joints' motors until set again, under each motor's limit. (n, num_dof) [N or N m]"""
+        self._command("motor", efforts, indices)
+
+    def set_joint_position_targets(self, positions: Tensor, indices: Tensor | None = None) -> None:
+        """Targets of position actuators. (n, num_dof) [m or rad]"""
+        self._command("position", positions, indices)
+
+    def set_joint_velocity_targets(self, velocities: Tensor, indices: Tensor | None = None) -> None:
+        """Targets of velocity actuators. (n, num_dof) [m/s or rad/s]"""
+        self._command("velocity", velocities, indices)
+
+    def set_world_poses(self, positions: Tensor, orientations: Tensor, indices: Tensor | None = None) -> None:
+        """Set root poses of a floating robot, in each environment's frame. (n, 3) [m], (n, 4) w, x, y, z"""
+        root = self._floating()[0]
+        self._write(self._qpos, torch.cat([positions, orientations], dim=1), indices, torch.arange(root, root + 7))
+
+    def set_velocities(self, velocities: Tensor, indices: Tensor | None = None) -> None:
+        """Set root velocities of a floating robot, world frame. (n, 6) [m/s, rad/s]"""
+        qpos, dof = self._floating()
+        rows = slice(None) if indices is None else indices.long()
+        quat = self._qpos[rows][:, qpos + 3 : qpos + 7].float()
+        local = torch.cat([velocities[:, :3], rotate_inverse(quat, velocities[:, 3:])], dim=1)
+        self._write(self._qvel, local, indices, torch.arange(dof, dof + 6))
+
+    def _floating(self) -> tuple[int, int]:
+        if self._entity.root_qpos is None or self._entity.root_dof is None:
+            raise TaskError(f"view '{self.name}': '{self.entity_name}' is fixed to the world and cannot be moved")
+        return self._entity.root_qpos, self._entity.root_dof
+
+    def _command(self, kind: str, values: Tensor, indices: Tensor | None) -> None:
+        joints, controls, gear = self._actuators[kind]
+        if len(controls):
+            self._write(self._ctrl, values[:, joints] / gear, indices, controls)
+
+    def _write(self, field: Tensor, values: Tensor, indices: Tensor | None, columns: Tensor) -> None:
+        index = as_index(columns.tolist())
+        if indices is None:
+            field[:, index] = values.to(field.dtype)
+        elif isinstance(index, slice):
+            field[indices.long(), index] = values.to(field.dtype)
+        else:
+            field[indices.long()[:, None], index] = values.to(field.dtype)
+
+
+def _rows(values: Tensor, indices: Tensor | None, clone: bool) -> Tensor:
+    if indices is not None:
+        return values[indices.long()]
+    return values.clone() if clone else values
+
+
+def _actuator_columns(entity: Entity, kind: str) -> tuple[Columns, Tensor, Tensor]:
+    """Joint columns that have an actuator of the kind, those actuators' control columns, and their gears."""
+    columns = entity.actuators_of(kind)
+    joints = [joint for joint, _ in columns]
+    controls = [actuator for _, actuator in columns]
+    gear = (
+        np.array([entity.engine.model.actuator_gear[a, 0] for a in controls])
+        if kind == "motor"
+        else np.ones(len(controls))
+    )
+    return (
+        as_index(joints),
+        torch.tensor(controls, dtype=torch.int64),
+        torch.tensor(gear, dtype=torch.float32),
+    )

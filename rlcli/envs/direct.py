@@ -1,0 +1,262 @@
+"""The direct workflow: one task class with OmniIsaacGymEnvs' hooks and buffers."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from rlcli.config.schema import StrictModel, TaskConfig
+from rlcli.envs.articulation import ArticulationView
+from rlcli.envs.vec_env import Layout, TermLayout, VecEnv
+from rlcli.errors import ConfigError, RlcliError, TaskError
+from rlcli.managers.termination import DIVERGED
+from rlcli.random import stream
+from rlcli.registry import load_object
+from rlcli.sim.scene import Scene
+from rlcli.sim.selection import IdSelection, Selection
+
+_RESET = stream("direct.reset")
+
+
+class DirectTask:
+    """Base of a direct task. The framework owns the buffers; the hooks fill them.
+
+    Order of a step: `pre_physics_step`, physics, `progress_buf += 1`, `get_observations`, `get_states`,
+    `calculate_metrics`, `is_done`; then `reset_idx` for the environments that ended, and their observations again.
+    """
+
+    num_observations: ClassVar[int]
+    """Columns of obs_buf."""
+    num_actions: ClassVar[int]
+    """Columns of the action."""
+    num_states: ClassVar[int] = 0
+    """Columns of states_buf, the critic's view; 0 for none."""
+    observation_names: ClassVar[tuple[str, ...]] = ()
+    """Names of the columns of obs_buf, for messages and exports."""
+    Params: type[StrictModel] = StrictModel
+    """Model of the YAML's `params:`."""
+
+    def __init__(self, env: DirectEnv, params: StrictModel) -> None:
+        self.env = env
+        self.cfg: TaskConfig = env.config
+        self.params: Any = params
+        self.num_envs = env.num_envs
+        self.device = env.device
+        self.step_dt = env.step_dt
+        self.max_episode_length = env.max_episode_length
+        n = self.num_envs
+        self.obs_buf = torch.zeros(n, self.num_observations, device=self.device)
+        """(num_envs, num_observations)"""
+        self.states_buf = torch.zeros(n, self.num_states, device=self.device)
+        """(num_envs, num_states)"""
+        self.rew_buf = torch.zeros(n, device=self.device)
+        """(num_envs,)"""
+        self.reset_buf = torch.ones(n, dtype=torch.int64, device=self.device)
+        """Raised where an episode ends, from `is_done` to the end of the next `pre_physics_step`. (num_envs,) int64"""
+        self.progress_buf = torch.zeros(n, dtype=torch.int64, device=self.device)
+        """Steps of the running episode. (num_envs,) int64"""
+        self.extras: dict[str, Any] = {}
+        """Numbers and (num_envs,) tensors to log, by name."""
+
+    def set_up_scene(self, scene: Scene) -> None:
+        """Register views with `scene.add`; `scene.spec` is the MjSpec, still open."""
+
+    def post_reset(self) -> None:
+        """Called once, when the simulation runs: look up indices."""
+
+    def reset_idx(self, env_ids: Tensor) -> None:
+        """Write start states; the environments are in their default state. env_ids (n,) int64, sorted"""
+
+    def pre_physics_step(self, actions: Tensor) -> None:
+        """Apply the actions. (num_envs, num_actions)"""
+        raise NotImplementedError
+
+    def get_observations(self) -> Any:
+        """Fill obs_buf."""
+        raise NotImplementedError
+
+    def get_states(self) -> Any:
+        """Fill states_buf, if the task has one."""
+
+    def calculate_metrics(self) -> None:
+        """Fill rew_buf."""
+        raise NotImplementedError
+
+    def is_done(self) -> None:
+        """Raise reset_buf where the task ended an episode; the framework adds the time-out."""
+        raise NotImplementedError
+
+    def draws(self, env_ids: Tensor, name: str = "reset") -> IdSelection:
+        """Random numbers for these environments' running episodes: `draws(ids).uniform(-1, 1, (k,))` is (n, k).
+
+        They depend on the seed, the environment, its episode and `name`, and on nothing else.
+        """
+        ids = env_ids.numpy()
+        return IdSelection(ids, self.env.seed, self.env.episode_index.numpy()[ids], stream(f"direct.{name}"))
+
+
+class DirectEnv(VecEnv):
+    """Runs a `DirectTask` in the environment loop."""
+
+    def _prepare(self, scene: Scene) -> None:
+        source, config = self.resolved.source, self.config
+        assert source.task is not None
+        try:
+            task_class = load_object(source.task)
+        except RlcliError:
+            raise
+        except Exception as error:
+            raise TaskError(
+                f"task '{source.name}' is broken: {source.task}: {type(error).__name__}: {error}"
+            ) from error
+        if not (isinstance(task_class, type) and issubclass(task_class, DirectTask)):
+            raise TaskError(f"task '{source.name}' is broken: {source.task} is not a DirectTask")
+        try:
+            params = task_class.Params.model_validate(config.params)
+        except ValueError as error:
+            raise ConfigError([self.resolved.problem(("params",), " ".join(str(error).split()))]) from None
+        self.task: DirectTask = task_class(self, params)
+        self.task.set_up_scene(scene)
+        scene.add_motors()
+
+    def _build(self) -> None:
+        for view in self.views:
+            if isinstance(view, ArticulationView):
+                view.bind(self)
+        task = self.task
+        self._returns = torch.zeros(self.num_envs, device=self.device)
+        self._fresh = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self._reset_hook = task.reset_idx
+        task.reset_idx = self._reset_stale  # type: ignore[method-assign]
+        # three buffers in turn: consecutive observations share no memory
+        self._obs = itertools.cycle([torch.zeros_like(task.obs_buf) for _ in range(3)])
+        self._states = itertools.cycle([torch.zeros_like(task.states_buf) for _ in range(3)])
+        self._rewards = itertools.cycle([torch.zeros_like(task.rew_buf) for _ in range(3)])
+        self._final_obs = torch.zeros_like(task.obs_buf)
+        self._final_states = torch.zeros_like(task.states_buf)
+        self._observed = False
+        self._causes: dict[str, Tensor] = {}
+        task.post_reset()
+
+    def _layout(self) -> Layout:
+        task = self.task
+        names = task.observation_names
+        size = task.num_observations
+        terms = tuple(TermLayout(name, 1) for name in names) if len(names) == size else (TermLayout("obs_buf", size),)
+        groups = {"policy": terms}
+        if task.num_states:
+            groups["critic"] = (TermLayout("states_buf", task.num_states),)
+        return Layout(
+            groups,
+            (TermLayout("actions", task.num_actions),),
+            self.step_dt,
+            self.physics_dt,
+            self.config.decimation,
+        )
+
+    def _start_over(self) -> None:
+        self._observed = False
+
+    def _act(self, action: Tensor) -> None:
+        bound = self.config.clip_actions
+        self.task.pre_physics_step(action.clamp(-bound, bound) if bound is not None else action)
+        self.task.reset_buf.zero_()
+        self._fresh.zero_()
+
+    def _judge(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        task = self.task
+        task.progress_buf += 1
+        self._fill()
+        task.calculate_metrics()
+        task.is_done()
+        failed = task.reset_buf.bool()
+        truncated = self.episode_length_buf >= self.max_episode_length
+        self._causes = {"time_out": truncated, "task": failed}
+        reward = next(self._rewards).copy_(task.rew_buf)
+        if diverged is not None:
+            self._causes[DIVERGED] = diverged
+            failed = failed | diverged
+            if self.config.divergence_reward is not None:
+                reward.masked_fill_(diverged, self.config.divergence_reward)
+        self._returns += reward
+        self._observed = True
+        return reward, failed, truncated
+
+    def _final(self, finished: Tensor, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor] | None:
+        self._final_obs.copy_(self.task.obs_buf)
+        self._final_states.copy_(self.task.states_buf)
+        return self._group(self._final_obs, self._final_states)
+
+    def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        return (
+            ended.read(self._returns),
+            {},
+            {name: ended.read(fired) for name, fired in self._causes.items()},
+        )
+
+    def _restart_workflow(self, selection: Selection) -> None:
+        ids = selection.read(self._ids)
+        self._reset_hook(ids)
+        self.task.progress_buf[ids] = 0
+        self.task.reset_buf[ids] = 1
+        self._fresh[ids] = True
+        selection.write(self._returns, 0.0)
+
+    def _observe(self) -> dict[str, Tensor]:
+        """Running environments keep what `_judge` observed; only those just reset take a second look."""
+        task, obs, states = self.task, next(self._obs), next(self._states)
+        if not self._observed:
+            self._fill()
+        obs.copy_(task.obs_buf)
+        states.copy_(task.states_buf)
+        if self._observed and bool(self._fresh.any()):
+            self._fill()
+            fresh = self._fresh[:, None]
+            task.obs_buf.copy_(torch.where(fresh, task.obs_buf, obs, out=obs))
+            task.states_buf.copy_(torch.where(fresh, task.states_buf, states, out=states))
+        self._observed = False
+        self._require_finite(obs, "the observation")
+        return self._group(obs, states)
+
+    def _fill(self) -> None:
+        task, bound = self.task, self.config.clip_observations
+        task.get_observations()
+        task.get_states()
+        if bound is not None:
+            task.obs_buf.clamp_(-bound, bound)
+            task.states_buf.clamp_(-bound, bound)
+
+    def _group(self, obs: Tensor, states: Tensor) -> dict[str, Tensor]:
+        return {"policy": obs, "critic": states} if self.task.num_states else {"policy": obs}
+
+    def _reset_stale(self, env_ids: Tensor) -> None:
+        """What the task sees as its own `reset_idx`.
+
+        Tasks in OIGE's style call it at the start of `pre_physics_step` for every raised flag. The framework has reset
+        those environments already, so for them it only lowers the flags.
+        """
+        stale = env_ids[~self._fresh[env_ids]]
+        self.task.reset_buf[env_ids] = 0
+        self.task.progress_buf[env_ids] = 0
+        if len(stale):
+            self._reset_hook(stale)
+            self.episode_length_buf[stale] = 0
+
+    def _workflow_state(self) -> dict[str, Tensor]:
+        task = self.task
+        buffers = {
+            name: value.clone()
+            for name, value in vars(task).items()
+            if isinstance(value, Tensor) and value.dim() and value.shape[0] == self.num_envs
+        }
+        return {**buffers, "_returns": self._returns.clone(), "_fresh": self._fresh.clone()}
+
+    def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
+        for name, value in state.items():
+            target = getattr(self if name in ("_returns", "_fresh") else self.task, name)
+            target.copy_(value)
+        self._observed = True

@@ -1,0 +1,133 @@
+"""The manager-based workflow: actions, observations, events, rewards and terminations as lists of small terms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from rlcli.config.terms import SELECTORS
+from rlcli.envs.vec_env import Layout, TermLayout, VecEnv
+from rlcli.managers.action import ActionManager
+from rlcli.managers.event import EventManager
+from rlcli.managers.observation import ObservationManager
+from rlcli.managers.reward import RewardManager
+from rlcli.managers.termination import TerminationManager
+from rlcli.sim.scene import ActuatorNeed, Scene
+from rlcli.sim.selection import Selection
+
+
+class ManagedEnv(VecEnv):
+    """A manager-based task. A step: actions, physics, terminations, rewards, resets, events, observations."""
+
+    def _prepare(self, scene: Scene) -> None:
+        scene.add_actuators(self._actuator_needs())
+
+    def _bind(self) -> None:
+        binder = self._binder
+        self._actions = binder.bind_all("actions")
+        self._events = binder.bind_all("events")
+        self._terminations = binder.bind_all("terminations")
+        self._rewards = binder.bind_all("rewards")
+        self._observations = {group: binder.bind_group(group) for group in self.config.observations}
+
+    def _build(self) -> None:
+        # in this order: a term's first value may use what stands before it
+        n, device = self.num_envs, self.device
+        self.action_manager = ActionManager(self._actions, n, device)
+        self.termination_manager = TerminationManager(self._terminations, n, device)
+        self.event_manager = EventManager(self._events, n, self.step_dt, device)
+        self.event_manager.startup(self._everyone())
+        reward_dt = self.step_dt if self.config.reward_dt_scaling else 1.0
+        self.reward_manager = RewardManager(self._rewards, n, reward_dt, device)
+        self.observation_manager = ObservationManager(self._observations, n, device)
+
+    def _layout(self) -> Layout:
+        observations = {
+            group: tuple(
+                TermLayout(term.name, size, tuple(next(iter(term.elements.values()), [])))
+                for term, size in self.observation_manager.sizes(group)
+            )
+            for group in self.config.observations
+        }
+        actions = tuple(
+            TermLayout(t.name, t.instance.size, t.instance.elements, t.instance.unit) for t in self.action_manager.terms
+        )
+        return Layout(observations, actions, self.step_dt, self.physics_dt, self.config.decimation)
+
+    def _act(self, action: Tensor) -> None:
+        self.action_manager.process(action)
+
+    def _judge(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        terminated, truncated = self.termination_manager.compute(diverged)
+        reward = self.reward_manager.compute()
+        if diverged is not None and self.config.divergence_reward is not None:
+            self.reward_manager.replace(diverged, reward, self.config.divergence_reward)
+        return reward, terminated, truncated
+
+    def _explain(self, what: str) -> None:
+        if what == "the reward":
+            self.reward_manager.explain()
+
+    def _final(self, finished: Tensor, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor] | None:
+        if self.final_obs_of == "truncated" and not bool((truncated & ~terminated).any()):
+            return None
+        return self.observation_manager.compute_final()
+
+    def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        terms = self.reward_manager.episode_sums(ended)
+        returns = torch.stack(list(terms.values())).sum(dim=0)
+        return returns, terms, self.termination_manager.causes(ended)
+
+    def _restart_workflow(self, selection: Selection) -> None:
+        self.event_manager.reset(selection)
+        self.action_manager.reset(selection)
+        self.reward_manager.reset(selection)
+        self.termination_manager.reset(selection)
+
+    def _between(self) -> None:
+        steps = self._ids.new_full((self.num_envs,), self.common_step)
+        self.event_manager.interval(lambda mask: self.engine.select(mask, self.seed, steps))
+
+    def _observe(self) -> dict[str, Tensor]:
+        return self.observation_manager.compute()
+
+    def _workflow_state(self) -> dict[str, Tensor]:
+        state: dict[str, Tensor] = {}
+        for name, part in self._parts().items():
+            state.update({f"{name}.{key}": value for key, value in part.state_dict().items()})
+        return state
+
+    def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
+        for name, part in self._parts().items():
+            prefix = f"{name}."
+            part.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+
+    def _parts(self) -> dict[str, ActionManager | EventManager | RewardManager]:
+        parts: dict = {
+            "action": self.action_manager,
+            "event": self.event_manager,
+            "reward": self.reward_manager,
+        }
+        terms = [
+            *self.action_manager.terms,
+            *self.termination_manager.terms,
+            *self.reward_manager.terms,
+            *(term for group in self.observation_manager.groups.values() for term in group.terms),
+        ]
+        return {**parts, **{"term." + ".".join(map(str, t.path)): t for t in terms if t.state_dict()}}
+
+    def _actuator_needs(self) -> list[ActuatorNeed]:
+        needs = []
+        for name, config in self.config.actions.items():
+            assert config is not None
+            signature = self.resolved.vocabulary.find("actions", config.func)
+            assert signature is not None
+            kind = getattr(self._binder.load(signature), "actuator", None)
+            joints = next((p.name for p in signature.parameters if p.alias == SELECTORS[0]), None)
+            if kind is not None and joints is not None:
+                needs.append(
+                    ActuatorNeed(config.params["entity"], config.params[joints], kind, ("actions", name, joints))
+                )
+        return needs

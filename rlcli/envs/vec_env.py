@@ -1,0 +1,465 @@
+"""The one environment loop: act, simulate, judge, restart what ended, observe.
+
+Autoreset is same-step: the observation returned with a finished episode is already the next episode's first, and the
+finished one's true last observation is in `final_obs`. `terminated` and `truncated` are two tensors everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import torch
+from torch import Tensor
+
+from rlcli.config.load import Resolved
+from rlcli.errors import ConfigError, DivergedError
+from rlcli.managers.term import Binder
+from rlcli.sim.engine import open_engine
+from rlcli.sim.entity import Entity, SimData
+from rlcli.sim.names import NameProblem
+from rlcli.sim.scene import Scene
+from rlcli.sim.selection import Selection
+
+
+@dataclass(frozen=True, slots=True)
+class Episodes:
+    """Episodes that just ended, one a row."""
+
+    ids: Tensor
+    """Environments. (n,) int64"""
+    returns: Tensor
+    """Undiscounted sums of rewards. (n,)"""
+    lengths: Tensor
+    """Environment steps. (n,) int64"""
+    reward_terms: dict[str, Tensor]
+    """Term -> its share of the return, weight included. (n,) each"""
+    causes: dict[str, Tensor]
+    """Termination -> whether it fired at the end. (n,) bool each"""
+    truncated: Tensor
+    """Ended by time alone. (n,) bool"""
+    success: Tensor | None
+    """Met the task's success condition; None where the task has none. (n,) bool"""
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """What one step gave. Tensors are not written to again before the step after the next one."""
+
+    obs: dict[str, Tensor]
+    """Group -> observations, of the new episode where one has just begun. (num_envs, d) float32"""
+    reward: Tensor
+    """(num_envs,) float32"""
+    terminated: Tensor
+    """The task ended the episode: its last state has no future. (num_envs,) bool"""
+    truncated: Tensor
+    """Time ran out: bootstrap from `final_obs`, unless it was terminated as well. (num_envs,) bool"""
+    final_obs: dict[str, Tensor] | None
+    """True last observations, full size; rows are valid where an episode ended (with `final_obs_of = "truncated"`:
+    where it ended by time). None if there is no such row. Valid until the next step."""
+    episodes: Episodes | None
+    """The episodes that ended, if any."""
+
+
+@dataclass(frozen=True, slots=True)
+class TermLayout:
+    """Some columns of an observation group or of the action: where they come from."""
+
+    name: str
+    size: int
+    elements: tuple[str, ...] = ()
+    unit: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The contract between a policy and its environment; a checkpoint keeps it."""
+
+    observations: dict[str, tuple[TermLayout, ...]]
+    actions: tuple[TermLayout, ...]
+    step_dt: float
+    dt: float
+    decimation: int
+
+    def size(self, group: str = "policy") -> int:
+        """Columns of an observation group."""
+        return sum(term.size for term in self.observations[group])
+
+    @property
+    def action_size(self) -> int:
+        """Columns of the action."""
+        return sum(term.size for term in self.actions)
+
+    def record(self) -> dict[str, Any]:
+        """As plain JSON."""
+
+        def terms(items: tuple[TermLayout, ...]) -> list[dict[str, Any]]:
+            return [{"name": t.name, "size": t.size, "elements": list(t.elements), "unit": t.unit} for t in items]
+
+        return {
+            "observations": {group: terms(items) for group, items in self.observations.items()},
+            "actions": terms(self.actions),
+            "step_dt": self.step_dt,
+            "dt": self.dt,
+            "decimation": self.decimation,
+        }
+
+
+class VecEnv(ABC):
+    """`num_envs` copies of a task, stepped together.
+
+    Building one compiles the model and resolves every name of the configuration (phase 2 of validation).
+
+    Args:
+        resolved: a validated configuration.
+        seed: of every random draw of the environment.
+        device: where the engine and all tensors live.
+
+    Raises:
+        ConfigError: with everything that does not fit the compiled model.
+    """
+
+    def __init__(self, resolved: Resolved, *, seed: int = 42, device: str = "cpu") -> None:
+        self.config = resolved.task
+        self.resolved = resolved
+        self.seed = seed
+        self.device = torch.device(device)
+        self.step_dt = self.config.step_dt
+        self.physics_dt = self.config.sim.dt
+        self.max_episode_length = self.config.max_episode_length
+        self.num_envs = self.config.scene.num_envs
+        self.final_obs_of = "finished"
+        self.seconds = {"physics": 0.0, "step": 0.0}
+        self.divergences = 0
+        self._playing = True
+        self._counters()
+        self._open(resolved)
+        self._bind()
+        self._success = self._binder.success()
+        self._binder.raise_problems()
+        self._build()
+        self._success_hold = torch.zeros(self.num_envs, device=self.device)
+        self._hold_steps = math.ceil(self.config.success.hold_s / self.step_dt - 1e-6) if self.config.success else 0
+        self.layout = self._layout()
+
+    # --- what callers use ---
+
+    def reset(self, seed: int | None = None) -> dict[str, Tensor]:
+        """Start a new episode everywhere. With a seed, the random streams start over as in a new environment.
+
+        Returns:
+            Group -> observations. (num_envs, d) float32
+        """
+        if seed is not None:
+            self.seed = seed
+            self.episode_index.zero_()
+            self.common_step = 0
+        else:
+            self.episode_index += 1
+        self._start_over()
+        self._restart(self._everyone())
+        return self._observe()
+
+    def step(self, action: Tensor) -> StepResult:
+        """Apply one action for `decimation` physics steps. action (num_envs, a) float32
+
+        Raises:
+            DivergedError: for an action, observation or reward that is not finite; divergence of the simulation is not
+                an error, it ends the episode of that environment.
+        """
+        if not self._playing:
+            raise RuntimeError("the environment is paused")
+        start = time.perf_counter()
+        if tuple(action.shape) != (self.num_envs, self.layout.action_size):
+            raise ValueError(
+                f"action has shape {tuple(action.shape)}, expected {(self.num_envs, self.layout.action_size)}"
+            )
+        self._require_finite(action, "the policy's action")
+
+        self._act(action)
+        diverged = self._simulate()
+        self.episode_length_buf += 1
+        self.common_step += 1
+        reward, terminated, truncated = self._judge(diverged)
+        self._require_finite(reward, "the reward")
+        self._hold_success()
+
+        final_obs, episodes = None, None
+        finished = terminated | truncated
+        ended = self._select(finished)
+        if ended is not None:
+            final_obs = self._final(finished, terminated, truncated)
+            episodes = self._episodes(ended, terminated, truncated)
+            self.episode_index += finished
+            # selected again: the new episode draws from its own counter
+            self._restart(self._select(finished))  # type: ignore[arg-type]
+        self._between()
+        obs = self._observe()
+        self.seconds["step"] += time.perf_counter() - start
+        return StepResult(obs, reward, terminated, truncated, final_obs, episodes)
+
+    def is_playing(self) -> bool:
+        """False while paused; no step runs then."""
+        return self._playing
+
+    def pause(self, paused: bool = True) -> None:
+        """Pause or go on."""
+        self._playing = not paused
+
+    def close(self) -> None:
+        """Let go of the engine."""
+        self.engine.close()
+
+    def world(self, env: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """One environment as MuJoCo's own structures."""
+        return self.engine.world(env)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Copies of everything that the next steps depend on, at a step boundary."""
+        own = {
+            "episode_length": self.episode_length_buf.clone(),
+            "episode_index": self.episode_index.clone(),
+            "common_step": torch.tensor(self.common_step),
+            "seed": torch.tensor(self.seed),
+            "success_hold": self._success_hold.clone(),
+        }
+        engine = {f"engine.{name}": value for name, value in self.engine.state_dict().items()}
+        return {
+            **own,
+            **engine,
+            **{f"workflow.{name}": value for name, value in self._workflow_state().items()},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Take back what `state_dict` gave; returns the observations of that moment."""
+        self.episode_length_buf.copy_(state["episode_length"])
+        self.episode_index.copy_(state["episode_index"])
+        self.common_step = int(state["common_step"])
+        self.seed = int(state["seed"])
+        self._success_hold.copy_(state["success_hold"])
+        self.engine.load_state_dict(_below(state, "engine."))
+        self.sim.refresh()
+        self._load_workflow_state(_below(state, "workflow."))
+        return self._observe()
+
+    # --- the workflow's part ---
+
+    @abstractmethod
+    def _prepare(self, scene: Scene) -> None:
+        """Complete the scene before it is compiled."""
+
+    def _bind(self) -> None:
+        """Resolve the names of the configuration, once entities exist."""
+
+    @abstractmethod
+    def _build(self) -> None:
+        """Make managers, or start the task."""
+
+    @abstractmethod
+    def _layout(self) -> Layout:
+        """Observation and action columns."""
+
+    @abstractmethod
+    def _act(self, action: Tensor) -> None:
+        """Turn the policy's action into controls."""
+
+    @abstractmethod
+    def _judge(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Reward, terminated, truncated. (num_envs,) each"""
+
+    @abstractmethod
+    def _final(self, finished: Tensor, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor] | None:
+        """True last observations, before anything is reset."""
+
+    @abstractmethod
+    def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        """Returns, reward terms and causes of the episodes that end. (n,) each"""
+
+    @abstractmethod
+    def _restart_workflow(self, selection: Selection) -> None:
+        """Write the start states of new episodes and forget the old ones."""
+
+    @abstractmethod
+    def _observe(self) -> dict[str, Tensor]:
+        """Observations of the state as it is."""
+
+    def _explain(self, what: str) -> None:
+        """Called with what is not finite: raise a DivergedError that names the term, if it can be named."""
+
+    def _start_over(self) -> None:
+        """Called before a reset of all environments."""
+
+    def _between(self) -> None:
+        """After resets, before observations: commands and interval events."""
+
+    @abstractmethod
+    def _workflow_state(self) -> dict[str, Tensor]:
+        """What the workflow carries from step to step."""
+
+    @abstractmethod
+    def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `_workflow_state` gave."""
+
+    # --- shared parts of the loop ---
+
+    def _simulate(self) -> Tensor | None:
+        start = time.perf_counter()
+        self.engine.step(self.config.decimation)
+        self.seconds["physics"] += time.perf_counter() - start
+        diverged = self.engine.diverged()
+        if diverged is not None:
+            self._put_back(diverged)
+        self.sim.refresh()
+        if not _finite(self.sim.qvel):
+            diverged = self._mend_silent(diverged)
+        return diverged
+
+    def _put_back(self, diverged: Tensor) -> None:
+        """Return diverged worlds to their last finite state: they are judged by that, not by MuJoCo's own reset."""
+        self.divergences += int(diverged.sum())
+        selection = self._select(diverged)
+        if selection is not None:
+            self.engine.reset(selection)
+            self.sim.restore_rows(selection)
+            self.engine.forward(selection)
+
+    def _mend_silent(self, diverged: Tensor | None) -> Tensor:
+        """Worlds that are not finite without a warning (a NaN time step does that) go to the default state."""
+        silent = ~self.sim.qvel.isfinite().all(dim=1)
+        self.divergences += int(silent.sum())
+        selection = self._select(silent)
+        assert selection is not None
+        self.engine.reset(selection)
+        self.engine.forward(selection)
+        self.sim.refresh_rows(selection)
+        return silent if diverged is None else silent | diverged
+
+    def _hold_success(self) -> None:
+        if self._success is not None:
+            self._success_hold += 1.0
+            self._success_hold *= self._success()
+
+    def _episodes(self, ended: Selection, terminated: Tensor, truncated: Tensor) -> Episodes:
+        returns, terms, causes = self._terms_of(ended)
+        timed_out = ended.read(truncated) & ~ended.read(terminated)
+        success = None
+        if self._success is not None:
+            success = timed_out & (ended.read(self._success_hold) >= self._hold_steps)
+        return Episodes(
+            ended.read(self._ids),
+            returns,
+            ended.read(self.episode_length_buf),
+            terms,
+            causes,
+            timed_out,
+            success,
+        )
+
+    def _restart(self, selection: Selection) -> None:
+        self.engine.reset(selection)
+        self._restart_workflow(selection)
+        selection.write(self.episode_length_buf, 0)
+        selection.write(self._success_hold, 0.0)
+        self.engine.forward(selection)
+        self.sim.refresh_rows(selection)
+
+    def _select(self, mask: Tensor) -> Selection | None:
+        return self.engine.select(mask, self.seed, self.episode_index)
+
+    def _everyone(self) -> Selection:
+        everyone = self._select(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
+        assert everyone is not None
+        return everyone
+
+    def _require_finite(self, values: Tensor, what: str) -> None:
+        if _finite(values):
+            return
+        self._explain(what)
+        bad = ~values.isfinite()
+        rows = bad.any(dim=1) if bad.dim() > 1 else bad
+        first = int(rows.nonzero()[0, 0])
+        raise DivergedError(
+            f"{what} is not finite in {int(rows.sum())} of {self.num_envs} environments, first in environment {first}"
+            f" (step {self.common_step})"
+        )
+
+    # --- construction ---
+
+    def _open(self, resolved: Resolved) -> None:
+        config = self.config
+        scene = Scene(config.scene, config.sim, resolved.source.root)
+        self._binder = Binder(self, resolved)
+        self._prepare(scene)
+        problems = [resolved.problem(p.path, str(p), p.hint) for p in scene.problems]
+        if problems:
+            raise ConfigError(problems)
+        scene.spec.visual.global_.offwidth = config.viewer.width
+        scene.spec.visual.global_.offheight = config.viewer.height
+        self.spec = scene.spec
+        model = scene.compile()
+        self.engine = open_engine(model, self.num_envs, device=str(self.device), threads=config.sim.engine_threads)
+        self.sim = SimData(self.engine)
+        self.entities: dict[str, Entity] = {}
+        for name, entity in config.scene.entities.items():
+            try:
+                self.entities[name] = Entity(name, entity, self.engine, self.sim)
+            except NameProblem as problem:
+                problems.append(resolved.problem(("scene", "entities", name, "init"), str(problem), problem.hint))
+        if problems:
+            raise ConfigError(problems)
+        self._set_default(model)
+        self.views = scene.views
+        self.env_origins = grid(self.num_envs, config.scene.env_spacing).to(self.device)
+
+    def _set_default(self, model: mujoco.MjModel) -> None:
+        qpos, qvel = torch.tensor(model.qpos0), torch.zeros(model.nv, dtype=torch.float64)
+        for entity in self.entities.values():
+            qpos[entity.qpos_columns] = entity.data.default_joint_pos[0].double()
+            qvel[entity.dof_columns] = entity.data.default_joint_vel[0].double()
+        self.engine.set_default(qpos, qvel)
+        self.engine.reset(self._everyone())
+        self.sim.refresh()
+
+    def _counters(self) -> None:
+        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+        """Steps of the running episode. (num_envs,)"""
+        self.episode_index = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+        """Episodes begun before the running one; random streams are keyed by it. (num_envs,)"""
+        self._ids = torch.arange(self.num_envs, device=self.device)
+        self.common_step = 0
+
+
+def grid(num_envs: int, spacing: float) -> Tensor:
+    """Origins of environments on a square grid about the world's origin. (num_envs, 3) [m]"""
+    rows = math.ceil(math.sqrt(num_envs))
+    index = torch.arange(num_envs)
+    xy = torch.stack([index // rows, index % rows], dim=1).float() - (rows - 1) / 2
+    return torch.cat([xy * spacing, torch.zeros(num_envs, 1)], dim=1)
+
+
+def make_env(resolved: Resolved, *, seed: int = 42, device: str = "cpu") -> VecEnv:
+    """The environment of a resolved task, in the task's own workflow."""
+    if resolved.source.task is None:
+        from rlcli.envs.managed import ManagedEnv
+
+        return ManagedEnv(resolved, seed=seed, device=device)
+    from rlcli.envs.direct import DirectEnv
+
+    return DirectEnv(resolved, seed=seed, device=device)
+
+
+def _finite(values: Tensor) -> bool:
+    # one pass: a sum is finite only if every summand is (an overflow is looked at closely by the caller)
+    return math.isfinite(float(values.sum())) or bool(values.isfinite().all())
+
+
+def _below(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+
+
+__all__ = ["Episodes", "Layout", "StepResult", "TermLayout", "VecEnv", "grid", "make_env"]

@@ -1,0 +1,67 @@
+"""Actions: the policy's vector is cut into terms, each turns its part into controls."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from rlcli.managers.term import BoundTerm
+from rlcli.sim.selection import Selection
+
+
+class ActionTerm(Protocol):
+    """An action term is a class `Name(env, *, ...)`."""
+
+    size: int
+    """Columns of the policy's vector that it takes."""
+    elements: tuple[str, ...]
+    """What the columns drive, in order."""
+    unit: str
+    """Unit of the command that reaches the actuators."""
+
+    def process(self, action: Tensor) -> None:
+        """Take this step's columns and write the controls. (num_envs, size)"""
+        ...
+
+
+class ActionManager:
+    """Keeps the raw actions of this step and the last, and hands each term its columns."""
+
+    def __init__(self, terms: list[BoundTerm], num_envs: int, device: torch.device) -> None:
+        self.terms = terms
+        self.size = sum(term.instance.size for term in terms)
+        self.action = torch.zeros(num_envs, self.size, device=device)
+        """The policy's action of this step. (num_envs, size)"""
+        self.prev_action = torch.zeros_like(self.action)
+        """That of the step before; zero at the start of an episode. (num_envs, size)"""
+        self._process = []
+        start = 0
+        for term in terms:
+            self._process.append((term.instance.process, self.action[:, start : start + term.instance.size]))
+            start += term.instance.size
+
+    def process(self, action: Tensor) -> None:
+        """Take one step's action."""
+        self.prev_action.copy_(self.action)
+        self.action.copy_(action)
+        for process, columns in self._process:
+            process(columns)
+
+    def reset(self, selection: Selection) -> None:
+        """New episodes begin without a past action."""
+        selection.write(self.action, 0.0)
+        selection.write(self.prev_action, 0.0)
+        for term in self.terms:
+            term.reset(selection)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Both actions."""
+        return {"action": self.action.clone(), "prev_action": self.prev_action.clone()}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `state_dict` gave."""
+        self.action.copy_(state["action"])
+        self.prev_action.copy_(state["prev_action"])

@@ -1,0 +1,83 @@
+"""Rewards: weight x value x step_dt a term, summed; the sums of an episode are kept term by term."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from rlcli.errors import DivergedError
+from rlcli.managers.term import BoundTerm, check_shape
+from rlcli.sim.selection import Selection
+
+
+class RewardManager:
+    """Terms with weight 0 are not called."""
+
+    def __init__(self, terms: list[BoundTerm], num_envs: int, dt: float, device: torch.device) -> None:
+        self.terms = terms
+        self._factors = [term.config.weight * dt for term in terms]  # type: ignore[attr-defined]
+        self._values = torch.zeros(len(terms), num_envs, device=device)
+        self._sums = torch.zeros(len(terms), num_envs, device=device)
+        self._rows = list(self._values.unbind(0))
+        self._active = [
+            (term.call, row, factor)
+            for term, row, factor in zip(terms, self._rows, self._factors, strict=True)
+            if factor != 0.0
+        ]
+        self._totals = [torch.zeros(num_envs, device=device) for _ in range(3)]
+        self._next = 0
+        for term in terms:
+            check_shape(term, term.call(), (num_envs,), "rewards")
+
+    def compute(self) -> Tensor:
+        """This step's reward. (num_envs,)
+
+        The terms are added one after the other: torch's own sum over rows rounds differently for different numbers of
+        environments.
+        """
+        self._next = (self._next + 1) % len(self._totals)
+        total = self._totals[self._next].zero_()
+        for call, row, factor in self._active:
+            total += torch.mul(call(), factor, out=row)
+        self._sums += self._values
+        return total
+
+    def replace(self, mask: Tensor, total: Tensor, reward: float) -> None:
+        """Give the masked environments another reward for this step; the terms' sums take the difference evenly out."""
+        self._sums -= torch.where(mask, self._values, 0.0)
+        total.masked_fill_(mask, reward)
+
+    def episode_sums(self, ended: Selection) -> dict[str, Tensor]:
+        """Term -> sum over the episode of the selected environments. (n,) each"""
+        return {term.name: ended.read(row) for term, row in zip(self.terms, self._sums, strict=True)}
+
+    def explain(self) -> None:
+        """Name the term that made a reward that is not finite.
+
+        Raises:
+            DivergedError: if there is one.
+        """
+        for term, row in zip(self.terms, self._rows, strict=True):
+            bad = ~row.isfinite()
+            if bool(bad.any()):
+                raise DivergedError(
+                    f"reward term '{term.name}' ({term.config.func}) is not finite in {int(bad.sum())} environments,"
+                    f" first in environment {int(bad.nonzero()[0, 0])}"
+                )
+
+    def reset(self, selection: Selection) -> None:
+        """Episode sums start at zero."""
+        for row in self._sums:
+            selection.write(row, 0.0)
+        for term in self.terms:
+            term.reset(selection)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The running sums."""
+        return {"sums": self._sums.clone()}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `state_dict` gave."""
+        self._sums.copy_(state["sums"])

@@ -1,0 +1,174 @@
+"""Binding terms: names in the YAML become objects and ids once, when the environment is built."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from torch import Tensor
+
+from rlcli.config.load import Resolved
+from rlcli.config.schema import TermConfig
+from rlcli.config.strict_yaml import Path
+from rlcli.config.terms import SELECTORS, Signature
+from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
+from rlcli.random import stream
+from rlcli.registry import load_module
+from rlcli.sim.names import NameProblem
+
+if TYPE_CHECKING:
+    from rlcli.envs.vec_env import VecEnv
+
+
+@dataclass(frozen=True, slots=True)
+class BoundTerm:
+    """A term with its parameters resolved. `call` takes what the manager gives: nothing, or a selection."""
+
+    name: str
+    path: Path
+    config: TermConfig
+    call: Callable[..., Any]
+    elements: dict[str, list[str]]
+    """Selector parameter -> the names it resolved to."""
+    stream: np.uint64
+    """The term's random stream."""
+
+    @property
+    def instance(self) -> Any:
+        """The object of a class term; the function of a function term."""
+        return self.call
+
+    def reset(self, selection: Any) -> None:
+        """Tell a term with memory that these environments start a new episode."""
+        if hasattr(self.call, "reset"):
+            self.call.reset(selection)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What a term with memory carries from step to step."""
+        return self.call.state_dict() if hasattr(self.call, "state_dict") else {}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state_dict` gave."""
+        if hasattr(self.call, "load_state_dict"):
+            self.call.load_state_dict(state)
+
+
+class Binder:
+    """Binds the terms of one environment, and gathers every problem before any is raised."""
+
+    def __init__(self, env: VecEnv, resolved: Resolved) -> None:
+        self.env = env
+        self.resolved = resolved
+        self.problems: list[Problem] = []
+
+    def bind(self, section: str, path: Path, config: TermConfig) -> BoundTerm | None:
+        """A bound term, or None if something in it does not resolve."""
+        signature = self.resolved.vocabulary.find(section, config.func)
+        assert signature is not None  # phase 1 has looked it up
+        params, elements = self._resolve(signature, path, config)
+        if params is None:
+            return None
+        target = self.load(signature)
+        try:
+            call = target(self.env, **params) if signature.is_class else functools.partial(target, self.env, **params)
+        except (NameProblem, ValueError) as problem:
+            self.problems.append(self.resolved.problem(path, str(problem), getattr(problem, "hint", None)))
+            return None
+        name = str(path[-1])
+        return BoundTerm(name, path, config, call, elements, stream(".".join(str(step) for step in path)))
+
+    def bind_all(self, section: str) -> list[BoundTerm]:
+        """The terms of a section, in order."""
+        configs = getattr(self.resolved.task, section)
+        bound = [self.bind(section, (section, name), config) for name, config in configs.items()]
+        return [term for term in bound if term is not None]
+
+    def bind_group(self, group: str) -> list[BoundTerm]:
+        """The terms of an observation group, in order."""
+        configs = self.resolved.task.observations[group]
+        bound = [self.bind("observations", ("observations", group, name), c) for name, c in configs.items() if c]
+        return [term for term in bound if term is not None]
+
+    def success(self) -> Callable[[], Tensor] | None:
+        """The task's success condition."""
+        config = self.resolved.task.success
+        term = self.bind("success", ("success",), config) if config is not None else None
+        return term.call if term is not None else None
+
+    def load(self, signature: Signature) -> Any:
+        """Import a term.
+
+        Raises:
+            TaskError: if its module does not import.
+        """
+        source = self.resolved.source
+        if signature.file in source.term_files:
+            module = source.term_modules[source.term_files.index(signature.file)]
+            try:
+                return getattr(load_module(module), signature.attribute)
+            except Exception as error:
+                raise TaskError(f"{signature.file}: cannot be imported: {type(error).__name__}: {error}") from error
+        return getattr(importlib.import_module(f"rlcli.mdp.{signature.file.stem}"), signature.attribute)
+
+    def raise_problems(self) -> None:
+        """Report everything at once.
+
+        Raises:
+            ConfigError: if anything did not resolve.
+        """
+        if self.problems:
+            raise ConfigError(self.problems)
+
+    def _resolve(
+        self, signature: Signature, path: Path, config: TermConfig
+    ) -> tuple[dict[str, Any] | None, dict[str, list[str]]]:
+        params = config.params
+        elements: dict[str, list[str]] = {}
+        good = True
+        for parameter in signature.parameters:
+            if parameter.alias == "Entity":
+                name = params[parameter.name]
+                entity = self.env.entities.get(name)
+                if entity is None:
+                    near = did_you_mean(name, self.env.entities) or f"entities: {listing(self.env.entities)}"
+                    self._problem(path, parameter.name, f"no entity '{name}' in the scene", near)
+                    return None, elements
+                params[parameter.name] = entity
+        for parameter in signature.parameters:
+            if parameter.alias in SELECTORS and params[parameter.name] is not None:
+                try:
+                    index, names = params["entity"].select(parameter.alias, params[parameter.name])
+                except NameProblem as problem:
+                    self._problem(path, parameter.name, str(problem), problem.hint)
+                    good = False
+                    continue
+                params[parameter.name], elements[parameter.name] = index, names
+        return (params if good else None), elements
+
+    def _problem(self, path: Path, parameter: str, message: str, hint: str | None) -> None:
+        self.problems.append(self.resolved.problem((*path, parameter), message, hint))
+
+
+def check_shape(term: BoundTerm, value: Any, expected: tuple[int, ...], what: str) -> None:
+    """A term's first value must be a tensor of the expected shape.
+
+    Raises:
+        ConfigError: naming manager, term, what was found and what was expected.
+    """
+    shape = tuple(value.shape) if isinstance(value, Tensor) else None
+    if shape == expected:
+        return
+    found = f"a tensor of shape {shape}" if shape is not None else f"a {type(value).__name__}"
+    raise ConfigError(
+        [
+            Problem(
+                what,
+                ".".join(map(str, term.path)),
+                f"'{term.config.func}' gave {found}, expected a tensor of shape {expected}",
+            )
+        ]
+    )

@@ -1,0 +1,137 @@
+"""Event terms: each acts on a `Selection` of environments, whose draws depend on nothing but seed, term and episode."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from rlcli.sim.rotations import from_euler, multiply
+from rlcli.sim.selection import Selection
+from rlcli.task import Bodies, Entity, Joints, Range
+
+if TYPE_CHECKING:
+    from rlcli.envs.managed import ManagedEnv
+
+
+def reset_joints_by_offset(
+    env: ManagedEnv,
+    selection: Selection,
+    *,
+    entity: Entity = "robot",
+    joints: Joints = ".*",
+    position: Range = (0.0, 0.0),
+    velocity: Range = (0.0, 0.0),
+) -> None:
+    """Default joint state plus uniform offsets [m or rad, m/s or rad/s], positions kept within the soft limits."""
+    data = entity.data
+    default_pos, default_vel = data.default_joint_pos[:, joints], data.default_joint_vel[:, joints]
+    shape = (default_pos.shape[1],)
+    _write_joints(
+        entity,
+        selection,
+        joints,
+        selection.read(default_pos) + selection.uniform(*position, shape),
+        selection.read(default_vel) + selection.uniform(*velocity, shape),
+    )
+
+
+def reset_joints_by_scale(
+    env: ManagedEnv,
+    selection: Selection,
+    *,
+    entity: Entity = "robot",
+    joints: Joints = ".*",
+    position: Range = (1.0, 1.0),
+    velocity: Range = (1.0, 1.0),
+) -> None:
+    """Default joint state times uniform factors, positions kept within the soft limits."""
+    data = entity.data
+    default_pos, default_vel = data.default_joint_pos[:, joints], data.default_joint_vel[:, joints]
+    shape = (default_pos.shape[1],)
+    _write_joints(
+        entity,
+        selection,
+        joints,
+        selection.read(default_pos) * selection.uniform(*position, shape),
+        selection.read(default_vel) * selection.uniform(*velocity, shape),
+    )
+
+
+def reset_root_state_uniform(
+    env: ManagedEnv,
+    selection: Selection,
+    *,
+    entity: Entity = "robot",
+    x: Range = (0.0, 0.0),
+    y: Range = (0.0, 0.0),
+    z: Range = (0.0, 0.0),
+    roll: Range = (0.0, 0.0),
+    pitch: Range = (0.0, 0.0),
+    yaw: Range = (0.0, 0.0),
+    linear_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006 (read, never written)
+    angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
+) -> None:
+    """Default root state plus uniform offsets: position [m], attitude [rad], velocity [m/s, rad/s], world frame."""
+    default = selection.read(entity.data.default_root_state)
+    offset = torch.stack([selection.uniform(*bounds) for bounds in (x, y, z)], dim=1)
+    turn = from_euler(*(selection.uniform(*bounds) for bounds in (roll, pitch, yaw)))
+    velocity = torch.stack([selection.uniform(*bounds) for bounds in (*linear_velocity, *angular_velocity)], dim=1)
+    entity.write_root_pose(selection, default[:, :3] + offset, multiply(default[:, 3:7], turn))
+    entity.write_root_velocity(selection, default[:, 7:10] + velocity[:, :3], default[:, 10:] + velocity[:, 3:])
+
+
+def reset_scene_to_default(env: ManagedEnv, selection: Selection) -> None:
+    """Every entity to its default state."""
+    for entity in env.entities.values():
+        data = entity.data
+        if entity.joint_names:
+            entity.write_joint_positions(selection, selection.read(data.default_joint_pos))
+            entity.write_joint_velocities(selection, selection.read(data.default_joint_vel))
+        if entity.is_floating:
+            root = selection.read(data.default_root_state)
+            entity.write_root_pose(selection, root[:, :3], root[:, 3:7])
+            entity.write_root_velocity(selection, root[:, 7:10], root[:, 10:])
+
+
+def push_by_setting_velocity(
+    env: ManagedEnv,
+    selection: Selection,
+    *,
+    entity: Entity = "robot",
+    linear_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
+    angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
+) -> None:
+    """Add a uniform draw to the root's velocity, world frame [m/s, rad/s]."""
+    push = torch.stack([selection.uniform(*bounds) for bounds in (*linear_velocity, *angular_velocity)], dim=1)
+    data = entity.data
+    entity.write_root_velocity(
+        selection,
+        selection.read(data.root_lin_vel_w) + push[:, :3],
+        selection.read(data.root_ang_vel_w) + push[:, 3:],
+    )
+
+
+def apply_external_force_torque(
+    env: ManagedEnv,
+    selection: Selection,
+    *,
+    entity: Entity = "robot",
+    bodies: Bodies = ".*",
+    force: Range = (0.0, 0.0),
+    torque: Range = (0.0, 0.0),
+) -> None:
+    """A uniform wrench on bodies, world frame, each component drawn [N, N m]; it lasts until changed or reset."""
+    wrench = entity.engine.field("xfrc_applied").view(env.num_envs, -1)
+    ids = torch.as_tensor(entity.body_ids)[bodies]
+    columns = (ids[:, None] * 6 + torch.arange(6)).flatten()
+    shape = (len(ids), 3)
+    drawn = torch.cat([selection.uniform(*force, shape), selection.uniform(*torque, shape)], dim=2)
+    selection.write(wrench, drawn.flatten(1), columns)
+
+
+def _write_joints(entity: Entity, selection: Selection, joints: Joints, position: Tensor, velocity: Tensor) -> None:
+    low, high = entity.data.soft_joint_pos_limits[joints].unbind(dim=1)
+    entity.write_joint_positions(selection, position.clamp_(low, high), joints)
+    entity.write_joint_velocities(selection, velocity, joints)

@@ -1,0 +1,20 @@
+"""Success conditions: true of the states that an episode should end in. (num_envs,) bool each."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from rlcli.sim.rotations import wrap_to_pi
+from rlcli.task import Entity, Joints
+
+if TYPE_CHECKING:
+    from rlcli.envs.vec_env import VecEnv
+
+
+def joints_near(
+    env: VecEnv, *, entity: Entity = "robot", joints: Joints = ".*", target: float = 0.0, tolerance: float
+) -> Tensor:
+    """Every joint is within `tolerance` of `target` [m or rad], the difference wrapped to (-pi, pi]. (num_envs,)"""
+    return (wrap_to_pi(entity.data.joint_pos[:, joints] - target).abs_() < tolerance).all(dim=1)

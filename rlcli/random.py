@@ -1,0 +1,69 @@
+"""Counter-based random numbers: a draw depends on (seed, stream, environment, counter, index) and nothing else.
+
+So environment 7 lives the same life whatever the number of environments or threads, and whoever else resets or
+draws. The mixing function is the finaliser of SplitMix64 (Steele, Lea and Flood 2014).
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+Keys = NDArray[np.uint64]
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_MIX1 = np.uint64(0xBF58476D1CE4E5B9)
+_MIX2 = np.uint64(0x94D049BB133111EB)
+_S30, _S27, _S31, _S40 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(40)
+_TO_UNIT = np.float32(2.0**-24)
+
+
+def stream(name: str) -> np.uint64:
+    """The stream of a term, from its name."""
+    return np.uint64(int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little"))
+
+
+def mix(x: Keys) -> Keys:
+    """SplitMix64's finaliser: a bijection of 64-bit words whose output bits all depend on all input bits."""
+    x = (x ^ (x >> _S30)) * _MIX1
+    x = (x ^ (x >> _S27)) * _MIX2
+    return x ^ (x >> _S31)
+
+
+def row_keys(seed: int, env_ids: NDArray[np.int64], counters: NDArray[np.int64]) -> Keys:
+    """One key a row, from the seed, the environment and a counter (its episode, or its step). (n,)"""
+    with np.errstate(over="ignore"):
+        start = mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64) + _GOLDEN)
+        return mix(mix(start + env_ids.astype(np.uint64) * _GOLDEN) + counters.astype(np.uint64) * _GOLDEN)
+
+
+def bits(keys: Keys, stream: np.uint64, index: int, count: int) -> Keys:
+    """`count` words a row, those of index `index`, `index + 1`, ... of a stream. (n, count)"""
+    with np.errstate(over="ignore"):
+        offsets = np.arange(index + 1, index + count + 1, dtype=np.uint64) * _GOLDEN + stream
+        return mix(keys[:, None] + offsets)
+
+
+def uniform(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
+    """Uniform in [0, 1), multiples of 2**-24. (n, count)"""
+    return (bits(keys, stream, index, count) >> _S40).astype(np.float32) * _TO_UNIT
+
+
+def normal(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
+    """Standard normal, by Box and Muller's transform of two uniforms each. (n, count)"""
+    u = uniform(keys, stream, index, 2 * count)
+    radius = np.sqrt(-2.0 * np.log1p(-u[:, :count].astype(np.float64)))
+    return (radius * np.cos(2.0 * np.pi * u[:, count:])).astype(np.float32)
+
+
+def integers(keys: Keys, stream: np.uint64, index: int, count: int, high: int) -> NDArray[np.int64]:
+    """Whole numbers in [0, high). (n, count)"""
+    return (uniform(keys, stream, index, count).astype(np.float64) * high).astype(np.int64)
+
+
+def derive(seed: int, name: str) -> int:
+    """A 31-bit seed for a library that wants its own, independent for each name."""
+    with np.errstate(over="ignore"):
+        return int(mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64) ^ stream(name))[0] >> np.uint64(33))

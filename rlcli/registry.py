@@ -1,0 +1,271 @@
+"""Tasks and trainers by name, from the metadata of installed distributions; a plugin is imported only when it is used.
+
+Distributions are read one by one, so that a broken one costs its own row and nothing else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from rlcli.errors import DependencyError, TaskError, did_you_mean, listing
+from rlcli.task import API_VERSION, TaskSpec
+
+TASKS = "rlcli.tasks"
+TRAINERS = "rlcli.trainers"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One entry point: what can be known of it without importing anything."""
+
+    name: str
+    value: str
+    distribution: str
+    version: str
+
+    @property
+    def qualified(self) -> str:
+        """`distribution:name`, unique even where two distributions share a name."""
+        return f"{self.distribution}:{self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Broken:
+    """A distribution whose metadata cannot be read."""
+
+    distribution: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSource:
+    """A task that was found: its name, its files, and what imports its code."""
+
+    name: str
+    root: Path
+    config: Path
+    distribution: str | None
+    version: str | None
+    term_files: tuple[Path, ...]
+    term_modules: tuple[str, ...]
+    task: str | None
+    task_file: Path | None
+
+    @property
+    def label(self) -> str:
+        """How messages name the YAML file."""
+        try:
+            return str(self.config.relative_to(Path.cwd()))
+        except ValueError:
+            return str(self.config)
+
+    def record(self) -> dict[str, str | None]:
+        """What a run stores to find the task again."""
+        folder = None if self.distribution else str(self.root)
+        return {
+            "name": self.name,
+            "distribution": self.distribution,
+            "version": self.version,
+            "folder": folder,
+        }
+
+
+def catalog(group: str = TASKS) -> tuple[list[Entry], list[Broken]]:
+    """Every entry of a group, sorted by name then distribution, and the distributions that could not be read."""
+    entries: dict[tuple[str, str], Entry] = {}
+    broken: list[Broken] = []
+    wanted = _wanted()
+    for distribution in metadata.distributions():
+        try:
+            name = distribution.metadata["Name"] or "?"
+            if wanted is not None and name.lower() not in wanted:
+                continue
+            for point in distribution.entry_points:
+                if point.group == group:
+                    entry = Entry(point.name, point.value, name, distribution.version)
+                    entries.setdefault((entry.name, name.lower()), entry)
+        except Exception as error:
+            place = getattr(distribution, "_path", "?")
+            broken.append(Broken(Path(str(place)).name, f"malformed metadata ({type(error).__name__}: {error})"))
+    return sorted(entries.values(), key=lambda e: (e.name, e.distribution)), broken
+
+
+def find_task(name: str) -> TaskSource:
+    """A task by name, by `distribution:name`, or by the path of a folder with a `task.yaml`.
+
+    Raises:
+        TaskError: unknown, ambiguous, broken, or built for a newer rlcli.
+    """
+    if _is_path(name):
+        return folder_task(Path(name))
+    entry = find_entry(TASKS, name, what="task")
+    spec = load_entry(entry, TaskSpec)
+    if spec.api > API_VERSION:
+        raise TaskError(
+            f"task '{entry.qualified}' ({entry.version}) needs plugin API {spec.api}; this rlcli has {API_VERSION}",
+            hint="pip install --upgrade rlcli",
+        )
+    return packaged_task(entry, spec)
+
+
+def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
+    """The files of a task in an installed package."""
+    root = _folder(spec.package, entry)
+    config = root / spec.config
+    if not config.is_file():
+        raise TaskError(f"task '{entry.qualified}' is broken: {config} does not exist")
+    task_module = spec.task.partition(":")[0] if spec.task else None
+    return TaskSource(
+        name=entry.name,
+        root=root,
+        config=config,
+        distribution=entry.distribution,
+        version=entry.version,
+        term_files=tuple(_module_file(module, entry) for module in spec.terms),
+        term_modules=spec.terms,
+        task=spec.task,
+        task_file=_module_file(task_module, entry) if task_module else None,
+    )
+
+
+def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
+    """A folder with a `task.yaml`, and optionally `terms.py` and `task.py` (a class `Task`)."""
+    root = folder.resolve()
+    config = root / file
+    if not config.is_file():
+        found = listing(sorted(p.name for p in root.iterdir())) if root.is_dir() else "no such folder"
+        raise TaskError(f"'{folder}' is not a task: it has no {file} ({found})")
+    terms, task = root / "terms.py", root / "task.py"
+    return TaskSource(
+        name=root.name,
+        root=root,
+        config=config,
+        distribution=None,
+        version=None,
+        term_files=(terms,) if terms.is_file() else (),
+        term_modules=(str(terms),) if terms.is_file() else (),
+        task=f"{task}:Task" if task.is_file() else None,
+        task_file=task if task.is_file() else None,
+    )
+
+
+def find_entry(group: str, name: str, *, what: str) -> Entry:
+    """One entry of a group by its name or `distribution:name`."""
+    entries, _ = catalog(group)
+    matches = [e for e in entries if name in (e.name, e.qualified)]
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        owners = " and ".join(f"{e.distribution} {e.version}" for e in matches)
+        choices = " or ".join(e.qualified for e in matches)
+        raise TaskError(f"{what} '{name}' is offered by {owners}", hint=f"name one: {choices}")
+    names = [e.name for e in entries]
+    installed = listing(sorted({f"{e.distribution} {e.version}" for e in entries}))
+    near = did_you_mean(name, names)
+    where = f"installed: {listing(names)} (from {installed})"
+    raise TaskError(f"no {what} '{name}'", hint=f"{near}; {where}" if near else where)
+
+
+def load_entry(entry: Entry, kind: type) -> Any:
+    """Import what an entry point names; whatever the plugin raises is said with its owner."""
+    try:
+        value = load_object(entry.value)
+    except DependencyError:
+        raise
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        raise TaskError(
+            f"plugin {entry.distribution} {entry.version} is broken: '{entry.name}' = {entry.value}:"
+            f" {type(error).__name__}: {error}{_place(error)}"
+        ) from error
+    if not isinstance(value, kind):
+        raise TaskError(
+            f"plugin {entry.distribution} {entry.version} is broken: '{entry.name}' = {entry.value} is a"
+            f" {type(value).__name__}, not a {kind.__name__}"
+        )
+    return value
+
+
+def load_object(reference: str) -> Any:
+    """`package.module:Name` or `/path/file.py:Name` -> the object."""
+    module_name, _, attribute = reference.rpartition(":")
+    value: Any = load_module(module_name)
+    for part in attribute.split("."):
+        value = getattr(value, part)
+    return value
+
+
+def load_module(name: str) -> Any:
+    """Import a module by its dotted name, or a file of a task folder by its path. Its prints go to stderr."""
+    with _stdout_to_stderr():
+        if not name.endswith(".py"):
+            return importlib.import_module(name)
+        file = Path(name)
+        alias = f"rlcli_folder_task_{abs(hash(str(file.resolve()))):x}_{file.stem}"
+        if alias not in sys.modules:
+            spec = importlib.util.spec_from_file_location(alias, file)
+            if spec is None or spec.loader is None:
+                raise ImportError(f"cannot import {file}")
+            module = importlib.util.module_from_spec(spec)
+            sys.modules[alias] = module
+            try:
+                spec.loader.exec_module(module)
+            except BaseException:
+                del sys.modules[alias]
+                raise
+        return sys.modules[alias]
+
+
+def _wanted() -> set[str] | None:
+    """Distributions that RLCLI_PLUGINS allows (`none` leaves the built-ins), or None for all."""
+    value = os.environ.get("RLCLI_PLUGINS")
+    if value is None or not value.strip():
+        return None
+    return {"rlcli", *(name.strip().lower() for name in value.split(",") if name.strip().lower() != "none")}
+
+
+def _is_path(name: str) -> bool:
+    return any(mark in name for mark in ("/", os.sep)) or name in (".", "..") or (Path(name) / "task.yaml").is_file()
+
+
+def _folder(package: str, entry: Entry) -> Path:
+    found = importlib.util.find_spec(package)
+    if found is None or not found.submodule_search_locations:
+        raise TaskError(f"task '{entry.qualified}' is broken: '{package}' is not a package")
+    return Path(next(iter(found.submodule_search_locations)))
+
+
+def _module_file(module: str, entry: Entry) -> Path:
+    try:
+        found = importlib.util.find_spec(module)
+    except ImportError as error:
+        raise TaskError(f"task '{entry.qualified}' is broken: {error}") from error
+    if found is None or not found.origin:
+        raise TaskError(f"task '{entry.qualified}' is broken: there is no module '{module}'")
+    return Path(found.origin)
+
+
+def _place(error: BaseException) -> str:
+    traceback = error.__traceback__
+    last = None
+    while traceback is not None:
+        last = (traceback.tb_frame.f_code.co_filename, traceback.tb_lineno)
+        traceback = traceback.tb_next
+    own = isinstance(error, SyntaxError) or last is None or last[0].startswith("<frozen")
+    return "" if own or last is None else f" ({last[0]}:{last[1]})"
+
+
+@contextlib.contextmanager
+def _stdout_to_stderr() -> Iterator[None]:
+    with contextlib.redirect_stdout(sys.stderr):
+        yield

@@ -1,0 +1,1 @@
+"""Training: the trainer protocol, runs and checkpoints, rollouts and evaluation."""

@@ -1,0 +1,163 @@
+"""Checkpoints: folders of safetensors and JSON, complete or absent, verified before use, never unpickled."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+from safetensors import SafetensorError
+from torch import Tensor
+
+from rlcli.errors import CheckpointError
+from rlcli.rl.files import disk_error, sync_folder, to_json, write_atomic, write_synced
+from rlcli.rl.trainer import TrainerState
+
+FORMAT = 1
+PARTS = ("policy", "trainer", "env", "rng")
+"""Tensor files: the policy alone, critic and optimiser, environment, generators."""
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """A verified checkpoint folder."""
+
+    folder: Path
+    manifest: dict[str, Any]
+
+    @property
+    def step(self) -> int:
+        """Environment steps at which it was written."""
+        return int(self.manifest["step"])
+
+    def json(self, name: str) -> dict[str, Any]:
+        """A JSON file of the checkpoint."""
+        return _json(self._data(name), self.folder / name)
+
+    def tensors(self, part: str) -> dict[str, Tensor]:
+        """The tensors of a part.
+
+        Raises:
+            CheckpointError: if the file is not what safetensors reads.
+        """
+        name = f"{part}.safetensors"
+        try:
+            return safetensors.torch.load(self._data(name))
+        except (SafetensorError, ValueError, KeyError) as error:
+            raise CheckpointError(f"{self.folder / name} is corrupt: {error}") from None
+
+    def state(self) -> TrainerState:
+        """Everything a trainer goes on from."""
+        return TrainerState({part: self.tensors(part) for part in PARTS}, self.json("state.json"))
+
+    def _data(self, name: str) -> bytes:
+        file = self.folder / name
+        entry = self.manifest["files"].get(name)
+        if entry is None:
+            raise CheckpointError(f"{self.folder} has no {name}")
+        try:
+            data = file.read_bytes()
+        except OSError as error:
+            raise CheckpointError(f"{file} cannot be read: {error.strerror}") from None
+        if len(data) != entry["size"] or hashlib.sha256(data).hexdigest() != entry["sha256"]:
+            raise CheckpointError(
+                f"{file} is corrupt: it is not what the manifest says ({len(data)} bytes of {entry['size']})",
+                hint="choose an older checkpoint with RUN@step:N",
+            )
+        return data
+
+
+def save(checkpoints: Path, step: int, state: TrainerState, extra: Mapping[str, Any]) -> Path:
+    """Write a checkpoint: into a temporary folder, every file synced, the manifest last, then one rename.
+
+    Args:
+        checkpoints: the run's folder of checkpoints.
+        step: environment steps.
+        state: what the trainer gave.
+        extra: further JSON-able entries of the manifest.
+
+    Raises:
+        MachineError: if the disk refuses; nothing half-written is left.
+    """
+    target = checkpoints / f"{step:012d}"
+    if target.exists():
+        return target
+    temporary = checkpoints / f".tmp-{os.getpid()}-{secrets.token_hex(4)}"
+    values = dict(state.values)
+    contents: dict[str, bytes] = {"policy.json": to_json(values["policy"]).encode()}
+    contents["state.json"] = to_json(values).encode()
+    for part in PARTS:
+        tensors = {name: value.detach().contiguous() for name, value in state.tensors[part].items()}
+        contents[f"{part}.safetensors"] = safetensors.torch.save(tensors)
+    files = {name: {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in contents.items()}
+    manifest = {"format": FORMAT, "step": step, **extra, "files": files}
+    try:
+        temporary.mkdir(parents=True)
+        for name, data in contents.items():
+            write_synced(temporary / name, data)
+        write_synced(temporary / "manifest.json", to_json(manifest).encode())
+        sync_folder(temporary)
+        os.rename(temporary, target)
+        sync_folder(checkpoints)
+    except OSError as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise disk_error(target, error) from error
+    write_atomic(checkpoints / "latest", target.name + "\n")
+    return target
+
+
+def open_checkpoint(folder: Path) -> Checkpoint:
+    """Open a checkpoint and check its manifest; the files are checked as they are read.
+
+    Raises:
+        CheckpointError: if it is missing, incomplete, corrupt or of another format.
+    """
+    file = folder / "manifest.json"
+    try:
+        manifest = _json(file.read_bytes(), file)
+    except OSError:
+        raise CheckpointError(f"{folder} is not a checkpoint: it has no manifest.json") from None
+    if manifest.get("format") != FORMAT:
+        raise CheckpointError(
+            f"{folder} has checkpoint format {manifest.get('format')}; this rlcli reads {FORMAT}",
+            hint="use the rlcli version that run.json names",
+        )
+    files = manifest.get("files")
+    if not isinstance(files, dict) or not all(
+        isinstance(e, dict) and isinstance(e.get("size"), int) and isinstance(e.get("sha256"), str)
+        for e in files.values()
+    ):
+        raise CheckpointError(f"{file} is corrupt: its list of files is malformed")
+    if not isinstance(manifest.get("step"), int):
+        raise CheckpointError(f"{file} is corrupt: it has no step")
+    return Checkpoint(folder, manifest)
+
+
+def steps(checkpoints: Path) -> list[int]:
+    """Steps of the complete checkpoints of a run, ascending."""
+    if not checkpoints.is_dir():
+        return []
+    return sorted(int(p.name) for p in checkpoints.iterdir() if p.name.isdigit() and (p / "manifest.json").is_file())
+
+
+def clean(checkpoints: Path) -> None:
+    """Remove what killed writers left."""
+    for leftover in checkpoints.glob(".tmp-*"):
+        shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _json(data: bytes, file: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError):
+        raise CheckpointError(f"{file} is corrupt: not JSON") from None
+    if not isinstance(value, dict):
+        raise CheckpointError(f"{file} is corrupt: not a JSON object")
+    return value

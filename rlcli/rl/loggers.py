@@ -1,0 +1,124 @@
+"""Where metrics go: always `metrics.jsonl`, and TensorBoard where it is installed."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from rlcli.errors import DependencyError, MachineError, UsageError, did_you_mean
+from rlcli.rl.files import disk_error, write_atomic
+from rlcli.rl.run import Run
+
+LOGGERS = ("tensorboard", "none")
+
+
+class Logger(Protocol):
+    """Takes the metrics of every iteration."""
+
+    def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
+        """Record one iteration."""
+        ...
+
+    def close(self) -> None:
+        """Flush and let go."""
+        ...
+
+
+class JsonLines:
+    """`metrics.jsonl`: one object an iteration, on the disk as soon as the iteration is over."""
+
+    def __init__(self, file: Path, *, resume_after: int | None = None) -> None:
+        self._path = file
+        if resume_after is not None:
+            _cut(file, resume_after)
+        try:
+            self._file = file.open("a", encoding="utf-8", buffering=1)
+        except OSError as error:
+            raise disk_error(file, error) from error
+
+    def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
+        """Append one line."""
+        try:
+            self._file.write(json.dumps({"iteration": iteration, "step": step, **metrics}) + "\n")
+        except OSError as error:
+            raise disk_error(self._path, error) from error
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class TensorBoard:
+    """Event files in `tb/`."""
+
+    def __init__(self, folder: Path, *, resume_after_step: int | None = None) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        purge = None if resume_after_step is None else resume_after_step + 1
+        try:
+            self._writer: Any = SummaryWriter(str(folder), purge_step=purge)
+        except OSError as error:
+            raise disk_error(folder, error) from error
+
+    def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
+        """Add scalars at the environment step."""
+        for name, value in metrics.items():
+            self._writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Flush and close."""
+        self._writer.close()
+
+
+def check_loggers(names: Sequence[str] | None) -> list[str]:
+    """The loggers to use; by default TensorBoard where it is installed.
+
+    Raises:
+        UsageError: for a name that is no logger.
+        DependencyError: for one that is not installed.
+    """
+    installed = importlib.util.find_spec("tensorboard") is not None
+    if not names:
+        return ["tensorboard"] if installed else []
+    for name in names:
+        if name not in LOGGERS:
+            raise UsageError(
+                f"no logger '{name}'", hint=did_you_mean(name, LOGGERS) or f"loggers: {', '.join(LOGGERS)}"
+            )
+    if "tensorboard" in names and not installed:
+        raise DependencyError("TensorBoard is not installed", hint='pip install "rlcli[tensorboard]"')
+    return [name for name in names if name != "none"]
+
+
+def open_loggers(run: Run, names: Sequence[str], *, resume: tuple[int, int] | None = None) -> list[Logger]:
+    """The loggers of a run; `resume` is the (iteration, step) it goes on after."""
+    iteration, step = resume if resume is not None else (None, None)
+    loggers: list[Logger] = [JsonLines(run.metrics, resume_after=iteration)]
+    if "tensorboard" in names:
+        loggers.append(TensorBoard(run.folder / "tb", resume_after_step=step))
+    return loggers
+
+
+def read_metrics(file: Path) -> list[dict[str, Any]]:
+    """The lines of a metrics file; a last line cut short by a kill is left out."""
+    rows = []
+    for line in file.read_text(encoding="utf-8").splitlines():
+        try:
+            rows.append(json.loads(line))
+        except ValueError:
+            break
+    return rows
+
+
+def _cut(file: Path, iteration: int) -> None:
+    """Drop what a killed run wrote after the checkpoint it is resumed from."""
+    if not file.exists():
+        return
+    try:
+        rows = [row for row in read_metrics(file) if row["iteration"] <= iteration]
+        write_atomic(file, "".join(json.dumps(row) + "\n" for row in rows))
+    except (OSError, MachineError) as error:
+        raise disk_error(file, error) if isinstance(error, OSError) else error from error

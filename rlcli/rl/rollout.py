@@ -1,0 +1,115 @@
+"""A policy in an environment: whole episodes, each environment's first, so that short ones do not count double."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rlcli.envs.vec_env import StepResult, VecEnv
+
+Act = Callable[[Tensor], Tensor]
+
+
+@dataclass(slots=True)
+class Evaluation:
+    """Finished episodes, one entry each."""
+
+    returns: list[float] = field(default_factory=list)
+    lengths: list[int] = field(default_factory=list)
+    successes: list[bool] = field(default_factory=list)
+    truncated: list[bool] = field(default_factory=list)
+    reward_terms: dict[str, list[float]] = field(default_factory=dict)
+    causes: dict[str, list[bool]] = field(default_factory=dict)
+    diverged: int = 0
+
+    def summary(self) -> dict[str, Any]:
+        """Means with 95 % intervals, as plain JSON."""
+        result: dict[str, Any] = {
+            "episodes": len(self.returns),
+            "return": _mean(self.returns),
+            "length": _mean([float(n) for n in self.lengths]),
+            "reward_terms": {name: _mean(values)["mean"] for name, values in self.reward_terms.items()},
+            "terminations": {name: sum(v) / max(1, len(self.returns)) for name, v in self.causes.items()},
+            "diverged": self.diverged,
+        }
+        if self.successes:
+            result["success"] = proportion(sum(self.successes), len(self.successes))
+        return result
+
+
+def evaluate(
+    env: VecEnv, act: Act, episodes: int, on_step: Callable[[StepResult], None] = lambda _: None
+) -> Evaluation:
+    """Run exactly `episodes` episodes: how many each environment contributes is fixed beforehand.
+
+    Counting the first episodes to finish anywhere would favour short ones.
+    """
+    quota = torch.full((env.num_envs,), episodes // env.num_envs)
+    quota[: episodes % env.num_envs] += 1
+    result = Evaluation()
+    start = env.divergences
+    obs = env.reset(seed=env.seed)["policy"]
+    with torch.no_grad():
+        while bool((quota > 0).any()):
+            step = env.step(act(obs))
+            obs = step.obs["policy"]
+            on_step(step)
+            if step.episodes is not None:
+                _take(result, step, quota)
+    result.diverged = env.divergences - start
+    return result
+
+
+def zero_policy(env: VecEnv) -> Act:
+    """Always the zero action."""
+    action = torch.zeros(env.num_envs, env.layout.action_size, device=env.device)
+    return lambda obs: action
+
+
+def random_policy(env: VecEnv, bound: float | None, seed: int) -> Act:
+    """Uniform actions within the bound, or standard Gaussian ones where there is none."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (env.num_envs, env.layout.action_size)
+    if bound is None:
+        return lambda obs: torch.randn(shape, generator=generator)
+    return lambda obs: (torch.rand(shape, generator=generator) * 2.0 - 1.0) * bound
+
+
+def proportion(hits: int, count: int) -> dict[str, float]:
+    """A share with its 95 % interval (Wilson's score interval, Wilson 1927)."""
+    z = 1.959963984540054
+    share = hits / count
+    middle = (share + z * z / (2 * count)) / (1 + z * z / count)
+    half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
+    return {"rate": share, "low": max(0.0, middle - half), "high": min(1.0, middle + half)}
+
+
+def _take(result: Evaluation, step: StepResult, quota: Tensor) -> None:
+    ended = step.episodes
+    assert ended is not None
+    for row, env in enumerate(ended.ids.tolist()):
+        if quota[env] <= 0:
+            continue
+        quota[env] -= 1
+        result.returns.append(float(ended.returns[row]))
+        result.lengths.append(int(ended.lengths[row]))
+        result.truncated.append(bool(ended.truncated[row]))
+        if ended.success is not None:
+            result.successes.append(bool(ended.success[row]))
+        for name, values in ended.reward_terms.items():
+            result.reward_terms.setdefault(name, []).append(float(values[row]))
+        for name, fired in ended.causes.items():
+            result.causes.setdefault(name, []).append(bool(fired[row]))
+
+
+def _mean(values: list[float]) -> dict[str, float]:
+    count = max(1, len(values))
+    mean = sum(values) / count
+    variance = sum((v - mean) ** 2 for v in values) / max(1, count - 1)
+    half = 1.96 * math.sqrt(variance / count)
+    return {"mean": mean, "std": math.sqrt(variance), "low": mean - half, "high": mean + half}

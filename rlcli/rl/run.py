@@ -1,0 +1,232 @@
+"""Run folders: what was run, with what, and what came of it; and how a command line names one."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+import rlcli
+from rlcli.errors import CheckpointError, MachineError, did_you_mean, listing
+from rlcli.rl.files import disk_error, to_json, write_atomic
+
+CONFIG = "config.yaml"
+RECORD = "run.json"
+
+
+@dataclass(slots=True)
+class Run:
+    """One training run's folder. `record` is the content of run.json."""
+
+    folder: Path
+    record: dict[str, Any] = field(default_factory=dict)
+    _lock: FileLock | None = None
+
+    @property
+    def config(self) -> Path:
+        """The resolved configuration."""
+        return self.folder / CONFIG
+
+    @property
+    def checkpoints(self) -> Path:
+        """The folder of checkpoints."""
+        return self.folder / "checkpoints"
+
+    @property
+    def metrics(self) -> Path:
+        """One JSON line an iteration."""
+        return self.folder / "metrics.jsonl"
+
+    def update(self, **entries: Any) -> None:
+        """Change entries of run.json."""
+        self.record.update(entries)
+        write_atomic(self.folder / RECORD, to_json(self.record))
+
+    def lock(self) -> None:
+        """Keep a second writer out.
+
+        Raises:
+            MachineError: if another process is writing to this run.
+        """
+        self._lock = FileLock(self.folder / ".lock", timeout=0)
+        try:
+            self._lock.acquire()
+        except Timeout:
+            self._lock = None
+            raise MachineError(f"{self.folder} is being written to by another process") from None
+
+    def unlock(self) -> None:
+        """Let others write again."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def discard(self) -> None:
+        """Remove a run that never began."""
+        self.unlock()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def create_run(runs_dir: Path, task: str, name: str | None, config: str, record: Mapping[str, Any]) -> Run:
+    """Make a new run folder with its configuration in it; two that start in the same second get two folders.
+
+    Raises:
+        MachineError: if the folder cannot be made or written.
+    """
+    parent = runs_dir / task
+    now = datetime.now(UTC)
+    stem = now.strftime("%Y-%m-%d_%H-%M-%S") + (f"-{name}" if name else "")
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        folder = _fresh_folder(parent, stem)
+    except OSError as error:
+        raise disk_error(parent, error) from error
+    run = Run(folder)
+    try:
+        run.checkpoints.mkdir()
+        write_atomic(run.config, config)
+        run.update(started=now.isoformat(timespec="microseconds"), state="running", **record)
+        run.lock()
+    except (OSError, MachineError) as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise disk_error(folder, error) if isinstance(error, OSError) else error from error
+    return run
+
+
+def open_run(folder: Path) -> Run:
+    """Open an existing run.
+
+    Raises:
+        CheckpointError: if it is not a run.
+    """
+    file = folder / RECORD
+    try:
+        record = json.loads(file.read_bytes())
+    except OSError:
+        raise CheckpointError(f"{folder} is not a run: it has no {RECORD}") from None
+    except ValueError:
+        raise CheckpointError(f"{file} is corrupt: not JSON") from None
+    if not isinstance(record, dict) or not isinstance(record.get("task"), dict):
+        raise CheckpointError(f"{file} is corrupt: it does not name a task")
+    return Run(folder, record)
+
+
+def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[Run, str]:
+    """A run by its folder, its name, or `latest`; and why it was chosen.
+
+    Raises:
+        CheckpointError: if there is none.
+    """
+    if reference == "latest":
+        runs = list_runs(runs_dir, task)
+        if not runs:
+            of = f" of {task}" if task else ""
+            raise CheckpointError(f"there is no run{of} in {runs_dir}", hint=f"rlcli train {task or 'TASK'} makes one")
+        return runs[-1], f"newest run of {task}" if task else f"newest run in {runs_dir}"
+    for candidate in (
+        Path(reference),
+        runs_dir / reference,
+        *([runs_dir / task / reference] if task else []),
+    ):
+        if (candidate / RECORD).is_file():
+            return open_run(candidate), "as named"
+    matches = [run for run in list_runs(runs_dir, None) if run.folder.name == reference]
+    if len(matches) == 1:
+        return matches[0], "as named"
+    names = [run.folder.name for run in list_runs(runs_dir, None)]
+    near = did_you_mean(reference, names)
+    raise CheckpointError(f"no run '{reference}'", hint=near or f"runs in {runs_dir}: {listing(names[-5:])}")
+
+
+def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
+    """Runs under a folder, oldest first; what is not a run is passed over."""
+    runs = []
+    for file in runs_dir.glob(f"*/*/{RECORD}"):
+        try:
+            run = open_run(file.parent)
+        except CheckpointError:
+            continue
+        if task is None or run.record["task"].get("name") == task:
+            runs.append(run)
+    return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name))
+
+
+def find_checkpoint(reference: str, runs_dir: Path, task: str | None = None) -> tuple[Run, Path, str]:
+    """A checkpoint by `RUN`, `RUN@best`, `RUN@step:N`, `latest` or its folder; and why it was chosen.
+
+    Raises:
+        CheckpointError: if there is none.
+    """
+    from rlcli.rl.checkpoint import steps
+
+    folder = Path(reference)
+    if (folder / "manifest.json").is_file():
+        return open_run(folder.resolve().parent.parent), folder, "as named"
+    name, _, which = reference.partition("@")
+    run, why = find_run(name, runs_dir, task)
+    have = steps(run.checkpoints)
+    if not have:
+        raise CheckpointError(f"{run.folder} has no complete checkpoint")
+    if not which:
+        return run, run.checkpoints / f"{have[-1]:012d}", f"{why}, its newest checkpoint"
+    if which == "best":
+        best = run.record.get("best")
+        if best not in have:
+            raise CheckpointError(
+                f"{run.folder} has no best checkpoint: it was not evaluated",
+                hint="leave out @best for the newest",
+            )
+        return run, run.checkpoints / f"{best:012d}", "its best evaluation"
+    kind, _, number = which.partition(":")
+    if kind == "step" and number.isdigit():
+        if int(number) not in have:
+            raise CheckpointError(
+                f"{run.folder} has no checkpoint at step {number}", hint=f"steps: {listing(map(str, have))}"
+            )
+        return run, run.checkpoints / f"{int(number):012d}", "as named"
+    raise CheckpointError(
+        f"'{reference}' does not name a checkpoint",
+        hint="RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest",
+    )
+
+
+def environment_record(engine_threads: int, torch_threads: int) -> dict[str, Any]:
+    """What results depend on besides the configuration."""
+    packages = ("mujoco", "torch", "numpy", "stable-baselines3", "safetensors")
+    return {
+        "rlcli": rlcli.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "versions": {name: metadata.version(name) for name in packages},
+        "engine_threads": engine_threads,
+        "torch_threads": torch_threads,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "pid": os.getpid(),
+    }
+
+
+def default_runs_dir() -> Path:
+    """RLCLI_RUNS_DIR, or `runs` in the current folder."""
+    return Path(os.environ.get("RLCLI_RUNS_DIR") or "runs")
+
+
+def _fresh_folder(parent: Path, stem: str) -> Path:
+    for attempt in range(1, 10_000):
+        folder = parent / (stem if attempt == 1 else f"{stem}-{attempt}")
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        return folder
+    raise OSError(17, "too many runs of this name", str(parent / stem))

@@ -1,0 +1,178 @@
+"""The training loop: iterate, report, save, until the budget is spent or somebody asks to stop."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import Any
+
+from rlcli.errors import DivergedError, Stopped
+from rlcli.rl import checkpoint
+from rlcli.rl.loggers import Logger
+from rlcli.rl.run import Run
+from rlcli.rl.trainer import Report, Trainer
+
+SAVE_EVERY_S = 60.0
+DIVERGED_SHARE = 0.01
+"""Share of an iteration's environment steps that may diverge before the run stops."""
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """How long to train, in total: a resumed run trains what is left."""
+
+    max_iterations: int | None
+    max_steps: int | None
+
+    def spent(self, trainer: Trainer) -> bool:
+        """Whether the trainer has had its iterations or its steps."""
+        return (self.max_iterations is not None and trainer.iteration >= self.max_iterations) or (
+            self.max_steps is not None and trainer.env_steps >= self.max_steps
+        )
+
+    def share(self, trainer: Trainer) -> float:
+        """How much of the budget is spent, 0 to 1; at a boundary within an iteration, by its beginning."""
+        shares = [0.0]
+        if self.max_iterations is not None:
+            shares.append(trainer.iteration / self.max_iterations)
+        if self.max_steps is not None:
+            shares.append(trainer.iteration * trainer.steps_per_iteration / self.max_steps)
+        return min(1.0, max(shares))
+
+    def iterations(self, trainer: Trainer) -> int:
+        """Iterations in all."""
+        limits = []
+        if self.max_iterations is not None:
+            limits.append(self.max_iterations)
+        if self.max_steps is not None:
+            left = max(0, self.max_steps - trainer.env_steps)
+            limits.append(trainer.iteration + -(-left // trainer.steps_per_iteration))
+        return min(limits)
+
+
+@dataclass(slots=True)
+class Progress:
+    """Where training stands, for whoever shows it."""
+
+    iteration: int
+    iterations: int
+    env_steps: int
+    elapsed_s: float
+    remaining_s: float
+    steps_per_s: float
+    seconds: dict[str, float]
+    metrics: dict[str, float]
+
+
+@dataclass(slots=True)
+class StopRequest:
+    """The first SIGINT or SIGTERM asks to stop at the next boundary; the second stops at once."""
+
+    signal: int | None = None
+    _previous: dict[int, Any] = field(default_factory=dict)
+
+    def __enter__(self) -> StopRequest:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._receive)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if self.signal is not None:
+            raise KeyboardInterrupt
+        self.signal = number
+
+
+def fit(
+    trainer: Trainer,
+    run: Run,
+    budget: Budget,
+    *,
+    loggers: Sequence[Logger] = (),
+    save_interval: int | None = None,
+    manifest: dict[str, Any] | None = None,
+    show: Callable[[Progress], None] = lambda _: None,
+    divergences: Callable[[], int] = lambda: 0,
+) -> None:
+    """Train until the budget is spent. Checkpoints are written at iteration boundaries only.
+
+    Raises:
+        Stopped: on SIGINT or SIGTERM, after the checkpoint of the last boundary was written.
+        DivergedError: if the learner or too much of the simulation diverges; the last good checkpoint is kept.
+        MachineError: if the disk refuses.
+    """
+    saved_at = time.monotonic()
+
+    def save() -> None:
+        checkpoint.save(
+            run.checkpoints,
+            trainer.env_steps,
+            trainer.state(),
+            {**(manifest or {}), "iteration": trainer.iteration},
+        )
+
+    if trainer.iteration == 0:
+        save()
+    begin, first_step = time.monotonic(), trainer.env_steps
+    with StopRequest() as stop:
+        while not budget.spent(trainer) and stop.signal is None:
+            diverged = divergences()
+            report = trainer.iterate()
+            _require_stable(divergences() - diverged, trainer)
+            metrics = _with_rates(report, trainer.steps_per_iteration)
+            for logger in loggers:
+                logger.write(trainer.iteration, trainer.env_steps, metrics)
+            show(_progress(trainer, budget, report, metrics, time.monotonic() - begin, first_step))
+            interval_over = save_interval is not None and trainer.iteration % save_interval == 0
+            if interval_over or (save_interval is None and time.monotonic() - saved_at > SAVE_EVERY_S):
+                save()
+                saved_at = time.monotonic()
+    save()
+    if stop.signal is not None and not budget.spent(trainer):
+        code = 130 if stop.signal == signal.SIGINT else 75
+        raise Stopped(
+            f"stopped at iteration {trainer.iteration}, checkpoint written",
+            exit_code=code,
+            hint=f"rlcli train --resume {run.folder}",
+        )
+
+
+def _with_rates(report: Report, steps: int) -> dict[str, float]:
+    seconds = report.seconds
+    total = max(sum(seconds.values()), 1e-9)
+    rates = {
+        "Perf/total_fps": steps / total,
+        "Perf/collection_time": total - seconds.get("update", 0.0),
+        "Perf/learning_time": seconds.get("update", 0.0),
+        **{f"Perf/{name}_share": value / total for name, value in seconds.items()},
+    }
+    return {**report.metrics, **rates}
+
+
+def _progress(
+    trainer: Trainer,
+    budget: Budget,
+    report: Report,
+    metrics: dict[str, float],
+    elapsed: float,
+    first_step: int,
+) -> Progress:
+    iterations = budget.iterations(trainer)
+    rate = (trainer.env_steps - first_step) / max(elapsed, 1e-9)
+    remaining = (iterations - trainer.iteration) * trainer.steps_per_iteration / max(rate, 1e-9)
+    return Progress(trainer.iteration, iterations, trainer.env_steps, elapsed, remaining, rate, report.seconds, metrics)
+
+
+def _require_stable(diverged: int, trainer: Trainer) -> None:
+    share = diverged / trainer.steps_per_iteration
+    if share > DIVERGED_SHARE:
+        raise DivergedError(
+            f"the simulation diverged in {share:.1%} of the environment steps of iteration {trainer.iteration}",
+            hint="lower sim.dt, limit actuator efforts, add joint damping or armature",
+        )

@@ -1,0 +1,79 @@
+"""What a trainer is: the light record that an entry point of `rlcli.trainers` resolves to, and the protocols."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rlcli.rl.policy import Policy
+
+
+@dataclass(frozen=True, slots=True)
+class TrainerSpec:
+    """Importing the module that holds one must be cheap.
+
+    Attributes:
+        summary: one line.
+        algorithms: algorithm name -> `module:Model`, the pydantic model of its settings (an `AgentConfig`).
+        trainer: `module:Class` of a `Trainer`, called as `Class(env, config, seed=, device=, torch_threads=)`.
+    """
+
+    summary: str
+    algorithms: Mapping[str, str]
+    trainer: str
+
+
+@dataclass(slots=True)
+class TrainerState:
+    """Everything a trainer needs to go on exactly: tensors by file, and plain JSON."""
+
+    tensors: dict[str, dict[str, Tensor]] = field(default_factory=dict)
+    values: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class Report:
+    """What one iteration did: losses and rates by metric name, and the seconds it took by part."""
+
+    metrics: dict[str, float]
+    seconds: dict[str, float]
+
+
+class Trainer(Protocol):
+    """Learns in a `VecEnv`, one iteration at a time; between iterations it can be saved and restored exactly."""
+
+    iteration: int
+    steps_per_iteration: int
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps taken, over all environments."""
+        ...
+
+    def start(self) -> None:
+        """Reset the environment; called once, before the first iteration of a run that is not resumed."""
+        ...
+
+    def iterate(self) -> Report:
+        """Collect experience and update once."""
+        ...
+
+    def policy(self) -> Policy:
+        """The policy as it is now, sharing its weights."""
+        ...
+
+    def state(self) -> TrainerState:
+        """A copy of the state at this boundary."""
+        ...
+
+    def load(self, state: TrainerState) -> None:
+        """Go back to a boundary."""
+        ...
+
+    def load_weights(self, policy: Mapping[str, Tensor]) -> None:
+        """Take only the policy's weights (`--init-from`)."""
+        ...

@@ -1,0 +1,1 @@
+"""Simulation: from MJCF files to an engine that steps many copies of one model."""

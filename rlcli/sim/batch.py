@@ -1,0 +1,187 @@
+"""The CPU engine, on `mujoco.batch.Batch`: a C++ thread pool over state rows, bit-identical at any thread count."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
+from torch import Tensor
+
+from rlcli.errors import DivergedError, did_you_mean
+from rlcli.sim.engine import quiet_mujoco
+from rlcli.sim.selection import IdSelection, Selection
+
+_STATE = mujoco.mjtState
+_NOT_DERIVED = frozenset(mujoco.batch._STATE_FIELDS)
+_ACCELERATION = frozenset(
+    [
+        "qacc",
+        "qacc_smooth",
+        "actuator_force",
+        "qfrc_actuator",
+        "qfrc_smooth",
+        "qfrc_constraint",
+        "qfrc_inverse",
+        "act_dot",
+        "cacc",
+        "cfrc_int",
+        "cfrc_ext",
+    ]
+)
+"""Fields of the acceleration stage: read as the last substep left them, so they ask for no stage of their own."""
+
+_W = mujoco.mjtWarning
+_DIVERGED = [int(w) for w in (_W.mjWARN_BADQPOS, _W.mjWARN_BADQVEL, _W.mjWARN_BADQACC, _W.mjWARN_BADCTRL)]
+_NOTED = {
+    "contact_full": int(_W.mjWARN_CONTACTFULL),
+    "constraint_full": int(_W.mjWARN_CNSTRFULL),
+    "inertia": int(_W.mjWARN_INERTIA),
+}
+_NONE, _VEL, _ACC = (
+    int(s) for s in (mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL, mujoco.mjtStage.mjSTAGE_ACC)
+)
+
+
+class BatchEngine:
+    """Many worlds of one model on CPU threads. Physics is float64."""
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int, threads: int) -> None:
+        quiet_mujoco()
+        self.model = model
+        self.num_envs = num_envs
+        self.device = torch.device("cpu")
+        self.threads = threads
+        self.warnings = dict.fromkeys(_NOTED, 0)
+        self._batch = Batch(model, num_envs, threads)
+        self._state = torch.from_numpy(self._batch.state)
+        self._warning_words = self._batch.warning.reshape(-1).view(np.int64)
+        self._default = self._default_row()
+        self._fields: dict[str, Tensor] = {}
+        self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
+        self._step_stage = _NONE
+        self._forward_stage = _NONE
+
+    @property
+    def reads_derived(self) -> bool:
+        """Whether some bound field is computed from the state."""
+        return self._forward_stage != _NONE
+
+    def field(self, name: str) -> Tensor:
+        """A live view of an MjData field; binding a derived one makes the last substep compute its stage."""
+        if name not in self._fields:
+            if name not in DATA_FIELDS:
+                raise ValueError(f"'{name}' is not an MjData field; {did_you_mean(name, DATA_FIELDS) or ''}")
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # torch has no read-only tensors; derived views must only be read
+                self._fields[name] = torch.from_numpy(self._batch.bind(name))
+            if name in _ACCELERATION:
+                self._forward_stage = _ACC
+            elif name not in _NOT_DERIVED:
+                self._step_stage = _VEL
+                self._forward_stage = max(self._forward_stage, _VEL)
+        return self._fields[name]
+
+    def expand(self, name: str) -> Tensor:
+        """A model field with a value for every world."""
+        if name not in MODEL_FIELDS:
+            raise ValueError(f"'{name}' cannot differ between worlds; {did_you_mean(name, MODEL_FIELDS) or ''}")
+        return torch.from_numpy(self._batch.expand(name))
+
+    def step(self, nstep: int) -> None:
+        """Advance every world by `nstep` physics steps."""
+        try:
+            self._batch.step(nstep=nstep, stage=self._step_stage)
+        except SimulationError as error:
+            raise _engine_error(error) from None
+
+    def diverged(self) -> Tensor | None:
+        """Worlds whose warning counters rose in the last step.
+
+        MuJoCo resets a diverging world by itself, to finite values, and clears its counters as it does: so they are
+        read after every step and put back to zero, and the state alone would show nothing.
+        """
+        if not self._warning_words.any():
+            return None
+        counts = self._batch.warning[:, :, 1]
+        for name, kind in _NOTED.items():
+            self.warnings[name] += int((counts[:, kind] > 0).sum())
+        bad = torch.from_numpy((counts[:, _DIVERGED] > 0).any(axis=1))
+        self._batch.warning[:] = 0
+        return bad if bool(bad.any()) else None
+
+    def forward(self, selection: Selection) -> None:
+        """Compute what is bound of the derived fields of the selected worlds."""
+        if self._forward_stage == _NONE:
+            return
+        try:
+            self._batch.forward(_ids(selection).astype(np.int32), stage=self._forward_stage)
+        except SimulationError as error:
+            raise _engine_error(error) from None
+
+    def reset(self, selection: Selection) -> None:
+        """Put the selected worlds into the default state: the whole row, controls and warm start included."""
+        self._batch.state[_ids(selection)] = self._default
+
+    def set_default(self, qpos: Tensor, qvel: Tensor) -> None:
+        """The joint state that `reset` restores."""
+        for name, values in (("qpos", qpos), ("qvel", qvel)):
+            view = self._batch.bind(name)
+            start = (view.ctypes.data - self._batch.state.ctypes.data) // view.itemsize
+            self._default[start : start + len(values)] = values.numpy()
+
+    def select(self, mask: Tensor, seed: int, counters: Tensor) -> IdSelection | None:
+        """The worlds where `mask` holds, as ids; None for none."""
+        ids = mask.numpy().nonzero()[0]
+        return IdSelection(ids, seed, counters.numpy()[ids]) if len(ids) else None
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Copies of the state rows, of the warning counters and of the model fields that differ between worlds."""
+        expanded = {f"model.{name}": torch.from_numpy(np.array(v)) for name, v in self._batch._expanded.items()}
+        warning = torch.from_numpy(np.array(self._batch.warning))
+        return {"state": self._state.clone(), "warning": warning, **expanded}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `state_dict` gave; derived fields are computed anew."""
+        self._state.copy_(state["state"])
+        self._batch.warning[:] = state["warning"].numpy()
+        for name, values in state.items():
+            if name.startswith("model."):
+                self.expand(name.removeprefix("model.")).copy_(values)
+        if self._forward_stage != _NONE:
+            self._batch.forward(stage=self._forward_stage)
+
+    def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """One world as MjModel and MjData, forwarded; asked again for the same world, the same two objects, updated."""
+        if env not in self._worlds:
+            self._worlds[env] = (self._batch.get_model(env), self._batch.get_data(env))
+        model, data = self._worlds[env]
+        if self._batch._expanded:
+            self._batch.get_model(env, model)
+        self._batch.get_data(env, data)
+        mujoco.mj_forward(model, data)
+        return model, data
+
+    def close(self) -> None:
+        """Nothing is held that Python does not free."""
+
+    def _default_row(self) -> np.ndarray:
+        data = mujoco.MjData(self.model)
+        row = np.empty(self._batch.nstate)
+        mujoco.mj_getState(self.model, data, row, int(_STATE.mjSTATE_INTEGRATION))
+        return row
+
+
+def _ids(selection: Selection) -> np.ndarray:
+    assert isinstance(selection, IdSelection)
+    return selection.ids
+
+
+def _engine_error(error: SimulationError) -> DivergedError:
+    return DivergedError(
+        f"the physics engine stopped: {error}",
+        hint="a larger <size memory=...> in the MJCF mends a full contact arena",
+    )

@@ -1,0 +1,336 @@
+"""A robot or object of the scene: its elements by name, its state as float32 tensors, and how to set it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from rlcli.config.schema import EntityConfig
+from rlcli.sim.engine import Engine
+from rlcli.sim.names import match
+from rlcli.sim.rotations import rotate, rotate_inverse
+from rlcli.sim.scene import actuator_kind
+from rlcli.sim.selection import ALL, Columns, Selection
+
+_SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+Value = TypeVar("Value")
+
+
+class SimData:
+    """The engine's joint state as contiguous float32, copied once a step, and derived fields cast when read.
+
+    `qpos` (num_envs, nq) and `qvel` (num_envs, nv) keep their storage for ever, so views of them stay valid.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
+        self.qpos = self._qpos.to(torch.float32, copy=True).contiguous()
+        self.qvel = self._qvel.to(torch.float32, copy=True).contiguous()
+        self.stamp = 0
+        self._derived: dict[str, tuple[int, Tensor]] = {}
+
+    def refresh(self) -> None:
+        """Copy the state of every world."""
+        self.qpos.copy_(self._qpos)
+        self.qvel.copy_(self._qvel)
+        self.stamp += 1
+
+    def refresh_rows(self, selection: Selection) -> None:
+        """Copy the state of the selected worlds, and drop what was computed from it."""
+        selection.write(self.qpos, selection.read(self._qpos))
+        selection.write(self.qvel, selection.read(self._qvel))
+        self.stamp += 1
+
+    def restore_rows(self, selection: Selection) -> None:
+        """Write the last copied state of the selected worlds back to the engine."""
+        selection.write(self._qpos, selection.read(self.qpos))
+        selection.write(self._qvel, selection.read(self.qvel))
+
+    def derived(self, name: str) -> Tensor:
+        """A derived field as float32, cast once a step. (num_envs, ...)"""
+        stamp, value = self._derived.get(name, (-1, None))
+        if stamp != self.stamp or value is None:
+            value = self.engine.field(name).float()
+            self._derived[name] = (self.stamp, value)
+        return value
+
+
+class Entity:
+    """One attached model. Joints are its hinges and slides in the model's order; a free joint is its root."""
+
+    def __init__(self, name: str, config: EntityConfig, engine: Engine, sim: SimData) -> None:
+        self.name = name
+        self.config = config
+        self.engine = engine
+        model = engine.model
+        self.joint_ids = _ids(
+            model, name, mujoco.mjtObj.mjOBJ_JOINT, model.njnt, lambda j: model.jnt_type[j] in _SCALAR
+        )
+        self.body_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_BODY, model.nbody)
+        self.site_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_SITE, model.nsite)
+        self.sensor_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor)
+        self.actuator_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu)
+        self.names: dict[str, list[str]] = {
+            "Joints": _names(model, name, mujoco.mjtObj.mjOBJ_JOINT, self.joint_ids),
+            "Bodies": _names(model, name, mujoco.mjtObj.mjOBJ_BODY, self.body_ids),
+            "Sites": _names(model, name, mujoco.mjtObj.mjOBJ_SITE, self.site_ids),
+            "Sensors": _names(model, name, mujoco.mjtObj.mjOBJ_SENSOR, self.sensor_ids),
+            "Actuators": _names(model, name, mujoco.mjtObj.mjOBJ_ACTUATOR, self.actuator_ids),
+        }
+        self.joint_names = self.names["Joints"]
+        self.qpos_columns = torch.from_numpy(model.jnt_qposadr[self.joint_ids].astype(np.int64))
+        self.dof_columns = torch.from_numpy(model.jnt_dofadr[self.joint_ids].astype(np.int64))
+        self.root_body = self.body_ids[0]
+        self.root_qpos, self.root_dof = self._root(model)
+        self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
+        self._column_cache: dict[tuple, tuple[Columns, Columns]] = {}
+        self.data = EntityData(self, sim)
+
+    @property
+    def is_floating(self) -> bool:
+        """Whether the root is a free joint."""
+        return self.root_qpos is not None
+
+    def select(self, alias: str, patterns: str | Sequence[str]) -> tuple[Columns, list[str]]:
+        """Names or regexes of Joints, Bodies, ... -> an index into this entity's columns, and the names it stands for.
+
+        Raises:
+            NameProblem: for what the model does not have.
+        """
+        names = self.names[alias]
+        singular = {"Bodies": "body"}.get(alias, alias[:-1].lower())
+        positions = match(patterns, names, singular)
+        if alias == "Sensors":
+            return as_index(self._sensor_columns(positions)), [names[p] for p in positions]
+        return as_index(positions), [names[p] for p in positions]
+
+    def actuators_of(self, kind: str) -> list[tuple[int, int]]:
+        """(joint column, actuator id) of every joint that a motor, position or velocity actuator drives."""
+        model = self.engine.model
+        found = []
+        for a in self.actuator_ids.tolist():
+            made = actuator_kind(
+                model.actuator_trntype[a],
+                model.actuator_dyntype[a],
+                model.actuator_gaintype[a],
+                model.actuator_biastype[a],
+                model.actuator_gainprm[a],
+                model.actuator_biasprm[a],
+            )
+            joint = int(model.actuator_trnid[a, 0])
+            if made == kind and joint in self.joint_ids:
+                found.append((self.joint_ids.tolist().index(joint), a))
+        return sorted(found)
+
+    def write_joint_positions(self, selection: Selection, values: Tensor, joints: Columns = ALL) -> None:
+        """Set joint positions of the selected environments. values (rows, k) [m or rad]"""
+        selection.write(self._qpos, values, self._columns(self.qpos_columns, joints))
+
+    def write_joint_velocities(self, selection: Selection, values: Tensor, joints: Columns = ALL) -> None:
+        """Set joint velocities of the selected environments. values (rows, k) [m/s or rad/s]"""
+        selection.write(self._qvel, values, self._columns(self.dof_columns, joints))
+
+    def write_root_pose(self, selection: Selection, position: Tensor, quat: Tensor) -> None:
+        """Set the root's pose in its environment's frame. position (rows, 3) [m], quat (rows, 4) w, x, y, z"""
+        assert self.root_qpos is not None
+        selection.write(self._qpos, torch.cat([position, quat], dim=1), slice(self.root_qpos, self.root_qpos + 7))
+
+    def write_root_velocity(self, selection: Selection, linear_w: Tensor, angular_w: Tensor) -> None:
+        """Set the root's velocity, world frame; set the pose first. linear [m/s] and angular [rad/s], (rows, 3) each"""
+        assert self.root_qpos is not None
+        assert self.root_dof is not None
+        quat = selection.read(self._qpos, slice(self.root_qpos + 3, self.root_qpos + 7)).float()
+        local = rotate_inverse(quat, angular_w)  # a free joint's angular velocity is in the body's frame
+        selection.write(self._qvel, torch.cat([linear_w, local], dim=1), slice(self.root_dof, self.root_dof + 6))
+
+    def _columns(self, of: Tensor, joints: Columns) -> Columns:
+        key = (id(of), joints.start, joints.stop) if isinstance(joints, slice) else (id(of), id(joints), None)
+        if key not in self._column_cache:
+            # the joints stay referenced, so that their id is not given to another tensor
+            self._column_cache[key] = (joints, as_index(of[joints].tolist()))
+        return self._column_cache[key][1]
+
+    def _sensor_columns(self, positions: Sequence[int]) -> list[int]:
+        model = self.engine.model
+        sensors = self.sensor_ids[list(positions)]
+        return [c for s in sensors for c in range(model.sensor_adr[s], model.sensor_adr[s] + model.sensor_dim[s])]
+
+    def _root(self, model: mujoco.MjModel) -> tuple[int | None, int | None]:
+        joint = int(model.body_jntadr[self.root_body])
+        if joint < 0 or model.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_FREE):
+            return None, None
+        return int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+
+
+class EntityData:
+    """The state of an entity in every environment, float32, positions in the environment's frame.
+
+    Read it, do not write it: most attributes are live views. Setters are methods of `Entity`.
+    """
+
+    def __init__(self, entity: Entity, sim: SimData) -> None:
+        self._entity = entity
+        self._sim = sim
+        self._cache: dict[str, tuple[int, Tensor]] = {}
+        model, num_envs = entity.engine.model, entity.engine.num_envs
+        self._qpos_index = as_index(entity.qpos_columns.tolist())
+        self._dof_index = as_index(entity.dof_columns.tolist())
+        ranges = torch.tensor(model.jnt_range[entity.joint_ids], dtype=torch.float32)
+        limited = torch.tensor(model.jnt_limited[entity.joint_ids], dtype=torch.bool)
+        infinite = torch.tensor([-torch.inf, torch.inf])
+        self.joint_pos_limits = torch.where(limited[:, None], ranges, infinite)
+        """Lower and upper limit of each joint, infinite where it has none. (k, 2) [m or rad]"""
+        middle, half = (
+            ranges.mean(dim=1),
+            0.5 * entity.config.soft_joint_pos_limit_factor * (ranges[:, 1] - ranges[:, 0]),
+        )
+        soft = torch.stack([middle - half, middle + half], dim=1)
+        self.soft_joint_pos_limits = torch.where(limited[:, None], soft, infinite)
+        """The limits, drawn in by `soft_joint_pos_limit_factor`. (k, 2) [m or rad]"""
+        position, velocity = default_joint_state(entity)
+        self.default_joint_pos = position.expand(num_envs, -1).clone()
+        """Default joint positions. (num_envs, k) [m or rad]"""
+        self.default_joint_vel = velocity.expand(num_envs, -1).clone()
+        """Default joint velocities. (num_envs, k) [m/s or rad/s]"""
+        self.default_root_state = self._default_root(model).expand(num_envs, -1).clone()
+        """Default root pose and velocity: position, quat (w, x, y, z), linear, angular. (num_envs, 13)"""
+        self._gravity = torch.tensor(model.opt.gravity, dtype=torch.float32)
+        norm = self._gravity.norm()
+        self._down = (self._gravity / norm if norm > 0 else torch.tensor([0.0, 0.0, -1.0])).expand(num_envs, -1)
+
+    @property
+    def joint_pos(self) -> Tensor:
+        """Joint positions. (num_envs, k) [m or rad]"""
+        return self._sim.qpos[:, self._qpos_index]
+
+    @property
+    def joint_vel(self) -> Tensor:
+        """Joint velocities. (num_envs, k) [m/s or rad/s]"""
+        return self._sim.qvel[:, self._dof_index]
+
+    @property
+    def joint_acc(self) -> Tensor:
+        """Joint accelerations over the last substep. (num_envs, k) [m/s^2 or rad/s^2]"""
+        return self._sim.derived("qacc")[:, self._dof_index]
+
+    @property
+    def applied_effort(self) -> Tensor:
+        """Forces of the actuators on the joints, after their limits. (num_envs, k) [N or N m]"""
+        return self._sim.derived("qfrc_actuator")[:, self._dof_index]
+
+    @property
+    def root_pos_w(self) -> Tensor:
+        """Root position. (num_envs, 3) [m]"""
+        q = self._entity.root_qpos
+        return self._sim.qpos[:, q : q + 3] if q is not None else self.default_root_state[:, :3]
+
+    @property
+    def root_quat_w(self) -> Tensor:
+        """Root orientation (w, x, y, z). (num_envs, 4)"""
+        q = self._entity.root_qpos
+        return self._sim.qpos[:, q + 3 : q + 7] if q is not None else self.default_root_state[:, 3:7]
+
+    @property
+    def root_lin_vel_w(self) -> Tensor:
+        """Root linear velocity, world frame. (num_envs, 3) [m/s]"""
+        d = self._entity.root_dof
+        return self._sim.qvel[:, d : d + 3] if d is not None else self.default_root_state[:, 7:10]
+
+    @property
+    def root_ang_vel_b(self) -> Tensor:
+        """Root angular velocity, body frame. (num_envs, 3) [rad/s]"""
+        d = self._entity.root_dof
+        return self._sim.qvel[:, d + 3 : d + 6] if d is not None else self.default_root_state[:, 10:13]
+
+    @property
+    def root_lin_vel_b(self) -> Tensor:
+        """Root linear velocity, body frame. (num_envs, 3) [m/s]"""
+        return self._once("root_lin_vel_b", lambda: rotate_inverse(self.root_quat_w, self.root_lin_vel_w))
+
+    @property
+    def root_ang_vel_w(self) -> Tensor:
+        """Root angular velocity, world frame. (num_envs, 3) [rad/s]"""
+        return self._once("root_ang_vel_w", lambda: rotate(self.root_quat_w, self.root_ang_vel_b))
+
+    @property
+    def projected_gravity_b(self) -> Tensor:
+        """Direction of gravity in the root's frame, length 1. (num_envs, 3)"""
+        return self._once("projected_gravity_b", lambda: rotate_inverse(self.root_quat_w, self._down))
+
+    @property
+    def body_pos_w(self) -> Tensor:
+        """Body positions. (num_envs, bodies, 3) [m]"""
+        return self._sim.derived("xpos")[:, as_index(self._entity.body_ids.tolist())]
+
+    @property
+    def body_quat_w(self) -> Tensor:
+        """Body orientations (w, x, y, z). (num_envs, bodies, 4)"""
+        return self._sim.derived("xquat")[:, as_index(self._entity.body_ids.tolist())]
+
+    @property
+    def sensordata(self) -> Tensor:
+        """All sensor readings of the model, in the units of each sensor. (num_envs, nsensordata)"""
+        return self._sim.derived("sensordata")
+
+    def _once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
+        stamp, value = self._cache.get(name, (-1, None))
+        if stamp != self._sim.stamp or value is None:
+            value = compute()
+            self._cache[name] = (self._sim.stamp, value)
+        return value
+
+    def _default_root(self, model: mujoco.MjModel) -> Tensor:
+        entity = self._entity
+        if entity.root_qpos is not None:
+            pose = model.qpos0[entity.root_qpos : entity.root_qpos + 7]
+        else:
+            body = entity.root_body
+            pose = np.concatenate([model.body_pos[body], model.body_quat[body]])
+        return torch.cat([torch.tensor(pose, dtype=torch.float32), torch.zeros(6)])
+
+
+def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:
+    """Default joint positions and velocities: the MJCF's qpos0, with the entity's `init` over it. (k,), (k,)
+
+    Raises:
+        NameProblem: if `init` names a joint that the model does not have.
+    """
+    position = torch.tensor(entity.engine.model.qpos0[entity.qpos_columns.numpy()], dtype=torch.float32)
+    velocity = torch.zeros_like(position)
+    for values, target in (
+        (entity.config.init.joint_pos, position),
+        (entity.config.init.joint_vel, velocity),
+    ):
+        for pattern, value in values.items():
+            target[match(pattern, entity.joint_names, "joint")] = value
+    return position, velocity
+
+
+def as_index(positions: Sequence[int]) -> Columns:
+    """Column positions as a slice where they are consecutive (a view, not a copy), else as a tensor."""
+    first = positions[0] if len(positions) else 0
+    if list(positions) == list(range(first, first + len(positions))):
+        return slice(first, first + len(positions))
+    return torch.tensor(list(positions), dtype=torch.int64)
+
+
+def _ids(
+    model: mujoco.MjModel,
+    entity: str,
+    kind: mujoco.mjtObj,
+    count: int,
+    keep: Callable[[int], bool] = lambda _: True,
+) -> np.ndarray:
+    prefix = f"{entity}/"
+    ids = [i for i in range(count) if (mujoco.mj_id2name(model, kind, i) or "").startswith(prefix) and keep(i)]
+    return np.array(ids, dtype=np.int64)
+
+
+def _names(model: mujoco.MjModel, entity: str, kind: mujoco.mjtObj, ids: np.ndarray) -> list[str]:
+    return [(mujoco.mj_id2name(model, kind, int(i)) or "").removeprefix(f"{entity}/") for i in ids]

@@ -1,0 +1,47 @@
+"""Names and regular expressions of the YAML -> positions in a list of names, in exactly the order written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from rlcli.errors import did_you_mean, listing
+
+
+class NameProblem(ValueError):
+    """A name or regex that does not fit the model; `hint` names what would."""
+
+    def __init__(self, message: str, hint: str | None = None) -> None:
+        super().__init__(message)
+        self.hint = hint
+
+
+def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> list[int]:
+    """Positions of the names that the patterns match in full.
+
+    The patterns' order is kept; within one regex the order is that of `names`.
+
+    Raises:
+        NameProblem: a pattern matches nothing, is not a regex, or a name is matched twice.
+    """
+    positions: list[int] = []
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        found = [names.index(pattern)] if pattern in names else _search(pattern, names, what)
+        for position in found:
+            if position in positions:
+                raise NameProblem(f"{what} '{names[position]}' is matched twice, the second time by '{pattern}'")
+            positions.append(position)
+    return positions
+
+
+def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
+    try:
+        regex = re.compile(pattern)
+    except re.error as error:
+        raise NameProblem(f"'{pattern}' is neither a {what} nor a regular expression ({error})") from None
+    found = [position for position, name in enumerate(names) if regex.fullmatch(name)]
+    if not found:
+        near = did_you_mean(pattern, names)
+        have = f"{what}s: {listing(names)}"
+        raise NameProblem(f"no {what} matches '{pattern}'", f"{near}; {have}" if near else have)
+    return found

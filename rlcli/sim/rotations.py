@@ -1,0 +1,62 @@
+"""Rotations of vectors by unit quaternions (w, x, y, z), and angles, on (n, ...) tensors.
+
+Every function gives the same bits for a row whatever the number of rows: only arithmetic that torch rounds alike in
+its vectorised and its scalar loops is used (so no atan2 and no pow).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def rotate(quat: Tensor, vector: Tensor) -> Tensor:
+    """Vector in the parent frame of a vector given in the quaternion's frame. (n, 4), (n, 3) -> (n, 3)"""
+    w, axis = quat[:, :1], quat[:, 1:]
+    twice = 2.0 * torch.linalg.cross(axis, vector)
+    return vector + w * twice + torch.linalg.cross(axis, twice)
+
+
+def rotate_inverse(quat: Tensor, vector: Tensor) -> Tensor:
+    """Vector in the quaternion's frame of a vector given in the parent frame. (n, 4), (n, 3) -> (n, 3)"""
+    w, axis = quat[:, :1], quat[:, 1:]
+    twice = 2.0 * torch.linalg.cross(axis, vector)
+    return vector - w * twice + torch.linalg.cross(axis, twice)
+
+
+def multiply(left: Tensor, right: Tensor) -> Tensor:
+    """Hamilton product: first `right`, then `left`. (n, 4), (n, 4) -> (n, 4)"""
+    w1, x1, y1, z1 = left.unbind(-1)
+    w2, x2, y2, z2 = right.unbind(-1)
+    return torch.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ],
+        dim=-1,
+    )
+
+
+def from_euler(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
+    """Quaternion of a rotation about x, then y, then z, all fixed axes [rad]. (n,) each -> (n, 4)"""
+    cr, sr = torch.cos(0.5 * roll), torch.sin(0.5 * roll)
+    cp, sp = torch.cos(0.5 * pitch), torch.sin(0.5 * pitch)
+    cy, sy = torch.cos(0.5 * yaw), torch.sin(0.5 * yaw)
+    return torch.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        dim=-1,
+    )
+
+
+def wrap_to_pi(angle: Tensor) -> Tensor:
+    """The same angle in (-pi, pi] [rad]."""
+    return math.pi - torch.remainder(math.pi - angle, 2.0 * math.pi)

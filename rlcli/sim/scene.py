@@ -1,0 +1,304 @@
+"""From the scene's configuration to a compiled MuJoCo model: named entities, ground, lights, actuators."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from rlcli.config.schema import EntityConfig, JointConfig, LightsConfig, SceneConfig, SimConfig
+from rlcli.errors import ConfigError, Problem
+from rlcli.sim.names import NameProblem, match
+
+_INTEGRATORS = {
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+}
+_OPTIONS = (
+    "integrator", "cone", "jacobian", "solver", "tolerance", "ls_tolerance", "noslip_tolerance", "iterations",
+    "ls_iterations", "noslip_iterations", "ccd_iterations", "ccd_tolerance", "impratio", "density", "viscosity",
+    "wind", "magnetic", "disableflags", "enableflags", "disableactuator",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ActuatorNeed:
+    """An action term needs an actuator of a kind on some joints of an entity."""
+
+    entity: str
+    joints: str | list[str]
+    kind: str
+    path: tuple[str, ...]
+
+
+class SceneProblem(ValueError):
+    """Something in the scene's configuration that the models do not fit; `path` is its key."""
+
+    def __init__(self, path: tuple[str, ...], message: str, hint: str | None = None) -> None:
+        super().__init__(message)
+        self.path = path
+        self.hint = hint
+
+
+class Scene:
+    """A scene under construction; `spec` is open to a direct task's `set_up_scene` until it is compiled."""
+
+    def __init__(self, config: SceneConfig, sim: SimConfig, root: Path) -> None:
+        self.config = config
+        self.sim = sim
+        self.root = root.resolve()
+        self.spec = mujoco.MjSpec()
+        self.spec.copy_during_attach = True
+        self.problems: list[SceneProblem] = []
+        self.views: list[object] = []
+        for name, entity in config.entities.items():
+            self._attach(name, entity)
+        self._options()
+        if config.ground is not None:
+            self._ground()
+        self._lights(config.lights)
+
+    def add(self, view):
+        """Register a view; it is bound to the simulation once the model is compiled."""
+        self.views.append(view)
+        return view
+
+    def add_actuators(self, needs: Iterable[ActuatorNeed]) -> None:
+        """Add the actuators that are asked for and that the MJCF does not have."""
+        for need in needs:
+            if need.entity not in self.config.entities:
+                continue  # the term's own binding says so
+            names = [joint.name.removeprefix(f"{need.entity}/") for joint in self._joints(need.entity)]
+            try:
+                for position in match(need.joints, names, "joint"):
+                    self._actuate(need.entity, names[position], need.kind)
+            except NameProblem:
+                continue  # likewise
+
+    def add_motors(self) -> None:
+        """Give every hinge and slide joint without an actuator a motor: a direct task may set any effort."""
+        driven = {actuator.target for actuator in self.spec.actuators}
+        for entity in self.config.entities:
+            for joint in self._joints(entity):
+                if joint.name not in driven:
+                    self._actuate(entity, joint.name.removeprefix(f"{entity}/"), "motor")
+
+    def compile(self) -> mujoco.MjModel:
+        """Compile to an MjModel.
+
+        Raises:
+            ConfigError: if MuJoCo refuses the model.
+        """
+        try:
+            with warnings.catch_warnings():
+                # attach reports options of the MJCF that the scene's own replace; sim: says which hold
+                warnings.simplefilter("ignore")
+                model = self.spec.compile()
+        except ValueError as error:
+            raise ConfigError([Problem("scene", "", f"MuJoCo cannot compile the model: {_one_line(error)}")]) from None
+        return model
+
+    def _attach(self, name: str, entity: EntityConfig) -> None:
+        path = ("scene", "entities", name)
+        file = (self.root / entity.model).resolve()
+        if not file.is_relative_to(self.root):
+            self.problems.append(
+                SceneProblem((*path, "model"), f"'{entity.model}' lies outside the task's folder {self.root}")
+            )
+            return
+        if not file.is_file():
+            have = sorted(str(p.relative_to(self.root)) for p in self.root.rglob("*.xml"))
+            self.problems.append(
+                SceneProblem(
+                    (*path, "model"),
+                    f"no file '{entity.model}' in {self.root}",
+                    f"MJCF files there: {', '.join(have) or 'none'}",
+                )
+            )
+            return
+        try:
+            child = mujoco.MjSpec.from_file(str(file))
+        except ValueError as error:
+            self.problems.append(
+                SceneProblem((*path, "model"), f"'{entity.model}' is not a valid MJCF: {_one_line(error)}")
+            )
+            return
+        if name == next(iter(self.config.entities)):
+            for option in _OPTIONS:
+                if hasattr(child.option, option):
+                    setattr(self.spec.option, option, getattr(child.option, option))
+        for key in list(child.keys):
+            child.delete(key)  # keyframes of one entity have the wrong size in a scene of several
+        quat = np.asarray(entity.quat) / np.linalg.norm(entity.quat)
+        frame = self.spec.worldbody.add_frame(pos=entity.pos, quat=quat)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.spec.attach(child, prefix=f"{name}/", frame=frame)
+        self._override_joints(name, entity)
+
+    def _override_joints(self, name: str, entity: EntityConfig) -> None:
+        joints = self._joints(name)
+        names = [joint.name.removeprefix(f"{name}/") for joint in joints]
+        for pattern, change in entity.joints.items():
+            try:
+                positions = match(pattern, names, "joint")
+            except NameProblem as problem:
+                self.problems.append(
+                    SceneProblem(("scene", "entities", name, "joints", pattern), str(problem), problem.hint)
+                )
+                continue
+            for position in positions:
+                _override(joints[position], change)
+                self._limit_effort(joints[position].name, change)
+                if change.actuator is not None:
+                    self._actuate(name, names[position], change.actuator)
+
+    def _limit_effort(self, joint: str, change: JointConfig) -> None:
+        if change.effort_limit is None:
+            return
+        for actuator in self.spec.actuators:
+            if actuator.target == joint:
+                _limit(actuator, change.effort_limit)
+
+    def _actuate(self, entity: str, joint: str, kind: str) -> None:
+        target = f"{entity}/{joint}"
+        if any(a.target == target and _spec_kind(a) == kind for a in self.spec.actuators):
+            return
+        settings = joint_settings(self.config.entities[entity], joint)
+        taken = {actuator.name for actuator in self.spec.actuators}
+        name = target if target not in taken else f"{target}_{kind}"
+        actuator = self.spec.add_actuator(name=name, target=target, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        if kind == "motor":
+            actuator.set_to_motor()
+        elif kind == "position":
+            if settings.kp is None:
+                self.problems.append(
+                    SceneProblem(
+                        ("scene", "entities", entity, "joints"),
+                        f"joint '{joint}' needs a position actuator and no gain is given",
+                        f"add joints: {{{joint}: {{kp: ..., kv: ...}}}}",
+                    )
+                )
+                return
+            actuator.set_to_position(kp=settings.kp, kv=settings.kv or 0.0)
+        else:
+            actuator.set_to_velocity(kv=settings.kv if settings.kv is not None else 1.0)
+        if settings.effort_limit is not None:
+            _limit(actuator, settings.effort_limit)
+
+    def _joints(self, entity: str) -> list[mujoco.MjsJoint]:
+        scalar = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        return [j for j in self.spec.joints if j.name.startswith(f"{entity}/") and j.type in scalar]
+
+    def _options(self) -> None:
+        option = self.spec.option
+        option.timestep = self.sim.dt
+        option.gravity = self.sim.gravity
+        if self.sim.integrator is not None:
+            option.integrator = _INTEGRATORS[self.sim.integrator]
+        if self.sim.iterations is not None:
+            option.iterations = self.sim.iterations
+        if self.sim.ls_iterations is not None:
+            option.ls_iterations = self.sim.ls_iterations
+
+    def _ground(self) -> None:
+        ground = self.config.ground
+        assert ground is not None
+        self.spec.add_texture(
+            name="ground", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+            rgb1=[0.32, 0.36, 0.40], rgb2=[0.26, 0.30, 0.34], width=512, height=512,
+        )  # fmt: skip
+        material = self.spec.add_material(name="ground", texrepeat=[1, 1], texuniform=True, reflectance=0.05)
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ground"
+        self.spec.add_texture(
+            name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+            rgb1=[0.62, 0.74, 0.87], rgb2=[0.90, 0.93, 0.96], width=256, height=1536,
+        )  # fmt: skip
+        self.spec.worldbody.add_geom(
+            name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[ground.size / 2, ground.size / 2, 1.0],
+            material="ground", friction=[ground.friction, 0.005, 0.0001],
+        )  # fmt: skip
+
+    def _lights(self, lights: LightsConfig) -> None:
+        headlight = self.spec.visual.headlight
+        if lights.dome is not None:
+            strength = min(1.0, lights.dome.intensity / 1000.0)
+            headlight.ambient = [0.6 * strength * c for c in lights.dome.color]
+            headlight.diffuse = [0.9 * strength * c for c in lights.dome.color]
+            headlight.specular = [0.1 * strength] * 3
+        if lights.distant is not None:
+            strength = min(1.0, lights.distant.intensity / 1000.0)
+            self.spec.worldbody.add_light(
+                name="distant", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, dir=lights.distant.direction,
+                pos=[0, 0, 20], diffuse=[strength * c for c in lights.distant.color], castshadow=True,
+            )  # fmt: skip
+
+
+def joint_settings(entity: EntityConfig, joint: str) -> JointConfig:
+    """What an entity's configuration says of a joint, later matches over earlier ones."""
+    merged: dict[str, object] = {}
+    for pattern, change in entity.joints.items():
+        try:
+            matched = bool(match(pattern, [joint], "joint"))
+        except NameProblem:
+            matched = False
+        if matched:
+            merged.update(change.model_dump(exclude_none=True))
+    return JointConfig.model_validate(merged)
+
+
+def actuator_kind(
+    transmission: int, dynamics: int, gain: int, bias: int, gainprm: np.ndarray, biasprm: np.ndarray
+) -> str:
+    """motor, position, velocity or other, from an actuator's transmission, dynamics, gain and bias."""
+    if transmission != int(mujoco.mjtTrn.mjTRN_JOINT) or gain != int(mujoco.mjtGain.mjGAIN_FIXED):
+        return "other"
+    if dynamics != int(mujoco.mjtDyn.mjDYN_NONE):
+        return "other"
+    if bias == int(mujoco.mjtBias.mjBIAS_NONE):
+        return "motor"
+    if bias == int(mujoco.mjtBias.mjBIAS_AFFINE):
+        if biasprm[1] == -gainprm[0] != 0:
+            return "position"
+        if biasprm[1] == 0 and biasprm[2] == -gainprm[0] != 0:
+            return "velocity"
+    return "other"
+
+
+def _spec_kind(a: mujoco.MjsActuator) -> str:
+    return actuator_kind(int(a.trntype), int(a.dyntype), int(a.gaintype), int(a.biastype), a.gainprm, a.biasprm)
+
+
+def _override(joint: mujoco.MjsJoint, change: JointConfig) -> None:
+    for key, attribute in (
+        ("damping", "damping"),
+        ("stiffness", "stiffness"),
+        ("armature", "armature"),
+        ("friction_loss", "frictionloss"),
+    ):
+        value = getattr(change, key)
+        if value is not None:
+            current = getattr(joint, attribute)
+            if isinstance(current, np.ndarray):  # MuJoCo 4 has polynomial damping and stiffness: the linear term
+                current[:] = 0.0
+                current[0] = value
+            else:
+                setattr(joint, attribute, value)
+    if change.range is not None:
+        joint.range = list(change.range)
+        joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+
+
+def _limit(actuator: mujoco.MjsActuator, effort: float) -> None:
+    actuator.forcerange = [-effort, effort]
+    actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

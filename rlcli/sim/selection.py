@@ -1,0 +1,131 @@
+"""Some of the environments, as resets and events see them: never ids or masks, only what may be done with them.
+
+On the CPU a selection is a short list of ids; an engine inside a CUDA graph can only use a mask over all. Terms
+written against this interface run on both.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rlcli import random
+
+Columns: TypeAlias = slice | Tensor
+ALL = slice(None)
+
+
+class Selection(Protocol):
+    """Rows are the selected environments, in order; `shape` is that of one row's draw."""
+
+    @property
+    def count(self) -> int | Tensor:
+        """How many environments are selected."""
+        ...
+
+    def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
+        """Uniform in [low, high). (rows, *shape)"""
+        ...
+
+    def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
+        """Gaussian. (rows, *shape)"""
+        ...
+
+    def choice(self, options: int, shape: tuple[int, ...] = ()) -> Tensor:
+        """Whole numbers in [0, options), each as likely. (rows, *shape)"""
+        ...
+
+    def read(self, field: Tensor, columns: Columns = ALL) -> Tensor:
+        """The rows of a (num_envs, ...) tensor."""
+        ...
+
+    def write(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
+        """Set the rows of a (num_envs, ...) tensor."""
+        ...
+
+    def add(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
+        """Add to the rows of a (num_envs, ...) tensor."""
+        ...
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Mean of a (num_envs,) tensor over the rows. ()"""
+        ...
+
+    def stream(self, stream: np.uint64) -> Selection:
+        """The same rows drawing from another stream."""
+        ...
+
+
+class IdSelection:
+    """A selection as a sorted list of ids, on the CPU."""
+
+    def __init__(
+        self, ids: NDArray[np.int64], seed: int, counters: NDArray[np.int64], stream: np.uint64 | None = None
+    ) -> None:
+        self.ids = ids
+        self._seed = seed
+        self._counters = counters
+        self._keys: random.Keys | None = None
+        self._stream = np.uint64(0) if stream is None else stream
+        self._drawn = 0
+
+    @property
+    def count(self) -> int:
+        """How many environments are selected."""
+        return len(self.ids)
+
+    def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
+        """Uniform in [low, high). (rows, *shape)"""
+        unit = torch.from_numpy(random.uniform(*self._next(shape))).view(self.count, *shape)
+        return unit.mul_(high - low).add_(low)
+
+    def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
+        """Gaussian. (rows, *shape)"""
+        size = int(np.prod(shape))
+        keys, stream, index, _ = self._next((2 * size,))
+        return torch.from_numpy(random.normal(keys, stream, index, size)).view(self.count, *shape).mul_(std).add_(mean)
+
+    def choice(self, options: int, shape: tuple[int, ...] = ()) -> Tensor:
+        """Whole numbers in [0, options), each as likely. (rows, *shape)"""
+        return torch.from_numpy(random.integers(*self._next(shape), options)).view(self.count, *shape)
+
+    def read(self, field: Tensor, columns: Columns = ALL) -> Tensor:
+        """The rows of a (num_envs, ...) tensor, copied."""
+        return torch.from_numpy(field.numpy()[self._index(columns)])
+
+    def write(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
+        """Set the rows of a (num_envs, ...) tensor."""
+        field.numpy()[self._index(columns)] = values.numpy() if isinstance(values, Tensor) else values
+
+    def add(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
+        """Add to the rows of a (num_envs, ...) tensor."""
+        field.numpy()[self._index(columns)] += values.numpy() if isinstance(values, Tensor) else values
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Mean of a (num_envs,) tensor over the rows. ()"""
+        return self.read(values).float().mean()
+
+    def stream(self, stream: np.uint64) -> IdSelection:
+        """The same rows drawing from another stream."""
+        other = IdSelection(self.ids, self._seed, self._counters, stream)
+        other._keys = self._row_keys()
+        return other
+
+    def _row_keys(self) -> random.Keys:
+        if self._keys is None:
+            self._keys = random.row_keys(self._seed, self.ids, self._counters)
+        return self._keys
+
+    def _next(self, shape: tuple[int, ...]) -> tuple[random.Keys, np.uint64, int, int]:
+        count = int(np.prod(shape)) if shape else 1
+        index, self._drawn = self._drawn, self._drawn + count
+        return self._row_keys(), self._stream, index, count
+
+    def _index(self, columns: Columns) -> tuple[NDArray[np.int64], ...] | tuple[NDArray[np.int64], slice]:
+        if isinstance(columns, slice):
+            return (self.ids,) if columns == ALL else (self.ids, columns)
+        return (self.ids[:, None], columns.numpy())

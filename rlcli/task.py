@@ -1,0 +1,51 @@
+"""What a task plugin exports, and the light type aliases that its terms are written with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+API_VERSION = 1
+"""Version of the plugin interface. A task built for a newer one is refused with both numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSpec:
+    """What an entry point of the group `rlcli.tasks` resolves to. Importing its module must be cheap.
+
+    The task's name is the entry point's name and its owner the distribution: neither is repeated here.
+
+    Attributes:
+        package: the package that the YAML and the models lie in, usually `__name__`.
+        summary: one line for `list-tasks`.
+        config: the YAML file, relative to the package.
+        task: the direct task class as `module:Class`; None for a manager-based task.
+        terms: modules whose functions the YAML may name, searched before `rlcli.mdp`.
+        api: the `API_VERSION` the task was written for.
+    """
+
+    package: str
+    summary: str
+    config: str = "task.yaml"
+    task: str | None = None
+    terms: tuple[str, ...] = ()
+    api: int = API_VERSION
+
+
+# In a YAML file these are names or regular expressions; a term receives what they resolve to in the compiled
+# model. They are Any to a type checker because the default in a signature is the name ("robot") while the
+# function body uses the object.
+Entity: TypeAlias = Any
+"""An entity of the scene. YAML: its name. At run time: `rlcli.sim.entity.Entity`."""
+Joints: TypeAlias = Any
+"""Hinge and slide joints of `entity`, in the order written. At run time: an index into joint columns."""
+Bodies: TypeAlias = Any
+"""Bodies of `entity`. At run time: an index into body columns."""
+Sites: TypeAlias = Any
+"""Sites of `entity`. At run time: an index into site columns."""
+Sensors: TypeAlias = Any
+"""MJCF sensors of `entity`. At run time: an index into sensor-data columns."""
+Actuators: TypeAlias = Any
+"""Actuators of `entity`. At run time: an index into actuator columns."""
+Range: TypeAlias = tuple[float, float]
+"""`[low, high]` with low <= high."""

@@ -1,0 +1,1 @@
+"""Pictures of environments: offscreen video and a native window."""

@@ -1,0 +1,67 @@
+"""Which OpenGL to draw with, chosen when something must be drawn and never before.
+
+With MUJOCO_GL unset: a display's GL if there is a display, else EGL, else OSMesa.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from typing import Any
+
+from rlcli.errors import MachineError
+
+_PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6", "glfw": "a running display server"}
+
+
+def has_display() -> bool:
+    """Whether a window could be opened."""
+    if sys.platform.startswith("linux"):
+        return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    return True
+
+
+def open_context(width: int, height: int) -> tuple[Any, str]:
+    """A current OpenGL context and the name of what made it.
+
+    Raises:
+        MachineError: if nothing works, with what was tried and what to install.
+    """
+    tried = []
+    for backend in _candidates():
+        try:
+            context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+            context.make_current()
+        except Exception as error:  # every backend fails in its own way: missing library, device, display
+            tried.append(f"{backend} ({' '.join(str(error).split())[:100] or type(error).__name__})")
+            _forget_opengl()
+            continue
+        return context, backend
+    packages = " or ".join(_PACKAGES.get(backend, backend) for backend in _candidates())
+    raise MachineError(
+        f"nothing can draw on this machine; tried {', '.join(tried)}",
+        hint=f"install {packages} (Debian, Ubuntu: apt install libegl1 libosmesa6), or set MUJOCO_GL",
+    )
+
+
+def _candidates() -> list[str]:
+    chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if chosen in ("egl", "osmesa", "glfw", "cgl"):
+        return [chosen]
+    if chosen in ("disable", "disabled", "off", "false", "0"):
+        raise MachineError(f"drawing is switched off by MUJOCO_GL={chosen}", hint="unset MUJOCO_GL")
+    if sys.platform == "darwin":
+        return ["cgl", "glfw"]
+    if sys.platform == "win32":
+        return ["glfw"]
+    return ["glfw", "egl", "osmesa"] if has_display() else ["egl", "osmesa"]
+
+
+def _forget_opengl() -> None:
+    """PyOpenGL fixes its platform at import; the next backend needs it fresh."""
+    os.environ.pop("PYOPENGL_PLATFORM", None)
+    for name in [
+        n for n in sys.modules if n.partition(".")[0] == "OpenGL" or n in ("mujoco.egl", "mujoco.osmesa", "mujoco.glfw")
+    ]:
+        del sys.modules[name]

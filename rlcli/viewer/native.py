@@ -1,0 +1,52 @@
+"""A window on one environment, MuJoCo's own passive viewer."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import torch
+
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import MachineError
+from rlcli.rl.rollout import Act
+from rlcli.viewer.gl import has_display
+from rlcli.viewer.video import free_camera
+
+
+def run(env: VecEnv, act: Act, shown: int = 0) -> None:
+    """Step the environment in real time until the window is closed. Space pauses.
+
+    Raises:
+        MachineError: without a display, or on macOS outside mjpython.
+    """
+    if not has_display():
+        raise MachineError(
+            "there is no display for a window",
+            hint="--video FILE.mp4 draws offscreen, --viewer none prints statistics",
+        )
+    import mujoco.viewer
+
+    model, data = env.world(shown)
+
+    def key(code: int) -> None:
+        if code == ord(" "):
+            env.pause(env.is_playing())
+
+    try:
+        handle = mujoco.viewer.launch_passive(model, data, key_callback=key)
+    except RuntimeError as error:
+        hint = "start it as: mjpython -m rlcli play ..." if sys.platform == "darwin" else None
+        raise MachineError(f"the window cannot be opened: {error}", hint=hint) from error
+    with handle as window, torch.no_grad():
+        camera = free_camera(env.config.viewer)
+        window.cam.lookat[:], window.cam.distance = camera.lookat, camera.distance
+        window.cam.azimuth, window.cam.elevation = camera.azimuth, camera.elevation
+        obs = env.reset(seed=env.seed)["policy"]
+        while window.is_running():
+            begin = time.perf_counter()
+            if env.is_playing():
+                obs = env.step(act(obs)).obs["policy"]
+                env.world(shown)
+            window.sync()
+            time.sleep(max(0.0, env.step_dt - (time.perf_counter() - begin)))

@@ -1,0 +1,83 @@
+"""Cartpole in the direct workflow: one class with OmniIsaacGymEnvs' hooks."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from rlcli.config.schema import StrictModel
+from rlcli.envs.articulation import ArticulationView
+from rlcli.envs.direct import DirectTask
+
+
+class CartpoleTask(DirectTask):
+    """Balance a pole on a cart. Observations: cart position [m], velocity [m/s], pole angle [rad], rate [rad/s]."""
+
+    num_observations = 4
+    num_actions = 1
+    observation_names = ("cart_pos", "cart_vel", "pole_pos", "pole_vel")
+
+    class Params(StrictModel):
+        """The task's own settings."""
+
+        reset_dist: float = Field(3.0, gt=0, description="Cart position at which the episode fails [m].")
+        max_effort: float = Field(400.0, gt=0, description="Force at action 1 [N].")
+        cart_vel_weight: float = Field(0.01, ge=0, description="Penalty on |cart velocity| [s/m].")
+        pole_vel_weight: float = Field(0.005, ge=0, description="Penalty on |pole rate| [s/rad].")
+
+    params: Params
+
+    def set_up_scene(self, scene) -> None:
+        """Register the view of the robots."""
+        self.cartpoles = scene.add(ArticulationView("robot", name="cartpole_view"))
+
+    def post_reset(self) -> None:
+        """Look up joints once."""
+        self.cart = self.cartpoles.get_dof_index("slider_to_cart")
+        self.pole = self.cartpoles.get_dof_index("cart_to_pole")
+
+    def reset_idx(self, env_ids: Tensor) -> None:
+        """Cart +-1 m and +-0.5 m/s, pole +-pi/8 and +-pi/4 rad/s."""
+        draws = self.draws(env_ids)
+        span = torch.empty(self.cartpoles.num_dof, device=self.device)
+        span[self.cart], span[self.pole] = 1.0, 0.125 * math.pi
+        position = span * draws.uniform(-1.0, 1.0, (self.cartpoles.num_dof,))
+        span[self.cart], span[self.pole] = 0.5, 0.25 * math.pi
+        velocity = span * draws.uniform(-1.0, 1.0, (self.cartpoles.num_dof,))
+        self.cartpoles.set_joint_positions(position, indices=env_ids)
+        self.cartpoles.set_joint_velocities(velocity, indices=env_ids)
+
+    def pre_physics_step(self, actions: Tensor) -> None:
+        """Push the cart."""
+        efforts = torch.zeros(self.num_envs, self.cartpoles.num_dof, device=self.device)
+        efforts[:, self.cart] = self.params.max_effort * actions[:, 0]
+        self.cartpoles.set_joint_efforts(efforts)
+
+    def get_observations(self) -> dict[str, dict[str, Tensor]]:
+        """Fill obs_buf."""
+        position = self.cartpoles.get_joint_positions(clone=False)
+        velocity = self.cartpoles.get_joint_velocities(clone=False)
+        self.obs_buf[:, 0] = position[:, self.cart]
+        self.obs_buf[:, 1] = velocity[:, self.cart]
+        self.obs_buf[:, 2] = position[:, self.pole]
+        self.obs_buf[:, 3] = velocity[:, self.pole]
+        return {self.cartpoles.name: {"obs_buf": self.obs_buf}}
+
+    def calculate_metrics(self) -> None:
+        """Upright and calm is good, out of bounds costs 2."""
+        _, cart_vel, pole_pos, pole_vel = self.obs_buf.unbind(dim=1)
+        reward = 1.0 - pole_pos.square()
+        reward -= self.params.cart_vel_weight * cart_vel.abs()
+        reward -= self.params.pole_vel_weight * pole_vel.abs()
+        self.rew_buf[:] = torch.where(self._failed(), -2.0, reward)
+
+    def is_done(self) -> None:
+        """Off the rail or fallen; the framework adds the time-out."""
+        self.reset_buf[:] = self._failed()
+
+    def _failed(self) -> Tensor:
+        cart_pos, pole_pos = self.obs_buf[:, 0], self.obs_buf[:, 2]
+        return (cart_pos.abs() > self.params.reset_dist) | (pole_pos.abs() > math.pi / 2)
