@@ -6,6 +6,7 @@ draws. The mixing function is the finaliser of SplitMix64 (Steele, Lea and Flood
 
 from __future__ import annotations
 
+import functools
 import hashlib
 
 import numpy as np
@@ -26,29 +27,34 @@ def stream(name: str) -> np.uint64:
 
 
 def mix(x: Keys) -> Keys:
-    """SplitMix64's finaliser: a bijection of 64-bit words whose output bits all depend on all input bits."""
-    x = (x ^ (x >> _S30)) * _MIX1
-    x = (x ^ (x >> _S27)) * _MIX2
-    return x ^ (x >> _S31)
+    """SplitMix64's finaliser, in place: a bijection whose output bits all depend on all input bits."""
+    x ^= x >> _S30
+    x *= _MIX1
+    x ^= x >> _S27
+    x *= _MIX2
+    x ^= x >> _S31
+    return x
 
 
 def row_keys(seed: int, env_ids: NDArray[np.int64], counters: NDArray[np.int64]) -> Keys:
     """One key a row, from the seed, the environment and a counter (its episode, or its step). (n,)"""
-    with np.errstate(over="ignore"):
-        start = mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64) + _GOLDEN)
-        return mix(mix(start + env_ids.astype(np.uint64) * _GOLDEN) + counters.astype(np.uint64) * _GOLDEN)
+    keys = mix(env_ids.astype(np.uint64) * _GOLDEN + _start(seed))
+    keys += counters.astype(np.uint64) * _GOLDEN
+    return mix(keys)
 
 
 def bits(keys: Keys, stream: np.uint64, index: int, count: int) -> Keys:
     """`count` words a row, those of index `index`, `index + 1`, ... of a stream. (n, count)"""
-    with np.errstate(over="ignore"):
-        offsets = np.arange(index + 1, index + count + 1, dtype=np.uint64) * _GOLDEN + stream
-        return mix(keys[:, None] + offsets)
+    return mix(keys[:, None] + _offsets(int(stream), index, count))
 
 
 def uniform(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
     """Uniform in [0, 1), multiples of 2**-24. (n, count)"""
-    return (bits(keys, stream, index, count) >> _S40).astype(np.float32) * _TO_UNIT
+    words = bits(keys, stream, index, count)
+    words >>= _S40
+    unit = words.astype(np.float32)
+    unit *= _TO_UNIT
+    return unit
 
 
 def normal(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
@@ -65,5 +71,18 @@ def integers(keys: Keys, stream: np.uint64, index: int, count: int, high: int) -
 
 def derive(seed: int, name: str) -> int:
     """A 31-bit seed for a library that wants its own, independent for each name."""
-    with np.errstate(over="ignore"):
-        return int(mix(np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64) ^ stream(name))[0] >> np.uint64(33))
+    return int(mix(_word(seed) ^ stream(name))[0] >> np.uint64(33))
+
+
+@functools.lru_cache
+def _start(seed: int) -> Keys:
+    return mix(_word(seed) + _GOLDEN)
+
+
+@functools.lru_cache(maxsize=4096)
+def _offsets(stream: int, index: int, count: int) -> Keys:
+    return np.arange(index + 1, index + count + 1, dtype=np.uint64) * _GOLDEN + np.uint64(stream)
+
+
+def _word(seed: int) -> Keys:
+    return np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import torch
 from torch import Tensor
 
 from rlcli.config.terms import SELECTORS
@@ -76,8 +75,7 @@ class ManagedEnv(VecEnv):
         return self.observation_manager.compute_final()
 
     def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-        terms = self.reward_manager.episode_sums(ended)
-        returns = torch.stack(list(terms.values())).sum(dim=0)
+        returns, terms = self.reward_manager.episode(ended)
         return returns, terms, self.termination_manager.causes(ended)
 
     def _restart_workflow(self, selection: Selection) -> None:
@@ -87,6 +85,8 @@ class ManagedEnv(VecEnv):
         self.termination_manager.reset(selection)
 
     def _between(self) -> None:
+        if not self.event_manager.has_intervals:
+            return
         steps = self._ids.new_full((self.num_envs,), self.common_step)
         self.event_manager.interval(lambda mask: self.engine.select(mask, self.seed, steps))
 

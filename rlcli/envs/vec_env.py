@@ -21,7 +21,7 @@ from rlcli.config.load import Resolved
 from rlcli.errors import ConfigError, DivergedError
 from rlcli.managers.term import Binder
 from rlcli.sim.engine import open_engine
-from rlcli.sim.entity import Entity, SimData
+from rlcli.sim.entity import Entity, SimData, is_finite
 from rlcli.sim.names import NameProblem
 from rlcli.sim.scene import Scene
 from rlcli.sim.selection import Selection
@@ -191,13 +191,12 @@ class VecEnv(ABC):
 
         final_obs, episodes = None, None
         finished = terminated | truncated
+        self.episode_index += finished  # before the selection: what begins now draws from its own counter
         ended = self._select(finished)
         if ended is not None:
             final_obs = self._final(finished, terminated, truncated)
             episodes = self._episodes(ended, terminated, truncated)
-            self.episode_index += finished
-            # selected again: the new episode draws from its own counter
-            self._restart(self._select(finished))  # type: ignore[arg-type]
+            self._restart(ended)
         self._between()
         obs = self._observe()
         self.seconds["step"] += time.perf_counter() - start
@@ -315,7 +314,7 @@ class VecEnv(ABC):
         if diverged is not None:
             self._put_back(diverged)
         self.sim.refresh()
-        if not _finite(self.sim.qvel):
+        if not self.sim.is_finite():
             diverged = self._mend_silent(diverged)
         return diverged
 
@@ -330,7 +329,7 @@ class VecEnv(ABC):
 
     def _mend_silent(self, diverged: Tensor | None) -> Tensor:
         """Worlds that are not finite without a warning (a NaN time step does that) go to the default state."""
-        silent = ~self.sim.qvel.isfinite().all(dim=1)
+        silent = self.sim.rows_not_finite()
         self.divergences += int(silent.sum())
         selection = self._select(silent)
         assert selection is not None
@@ -377,7 +376,7 @@ class VecEnv(ABC):
         return everyone
 
     def _require_finite(self, values: Tensor, what: str) -> None:
-        if _finite(values):
+        if is_finite(values):
             return
         self._explain(what)
         bad = ~values.isfinite()
@@ -451,11 +450,6 @@ def make_env(resolved: Resolved, *, seed: int = 42, device: str = "cpu") -> VecE
     from rlcli.envs.direct import DirectEnv
 
     return DirectEnv(resolved, seed=seed, device=device)
-
-
-def _finite(values: Tensor) -> bool:
-    # one pass: a sum is finite only if every summand is (an overflow is looked at closely by the caller)
-    return math.isfinite(float(values.sum())) or bool(values.isfinite().all())
 
 
 def _below(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

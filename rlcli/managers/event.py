@@ -37,6 +37,11 @@ class EventManager:
         for term, left in zip(self._interval, self._time_left, strict=True):
             selection.write(left, self._draw(term, selection))
 
+    @property
+    def has_intervals(self) -> bool:
+        """Whether any event fires at intervals."""
+        return bool(self._interval)
+
     def interval(self, select: Select) -> None:
         """Let one step pass and fire what is due; `select` draws from the step's own counter."""
         for term, left in zip(self._interval, self._time_left, strict=True):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rlcli.errors import ConfigError, DivergedError, Problem
 from rlcli.managers.term import BoundTerm, check_shape
+from rlcli.sim.entity import is_finite
 
 
 @dataclass(slots=True)
@@ -70,7 +71,7 @@ class ObservationManager:
         return _Group(terms, sizes, buffers, [_split(buffer, sizes) for buffer in buffers], adjust)
 
     def _require_finite(self, name: str, group: _Group, values: Tensor) -> None:
-        if bool(values.sum().isfinite()) or bool(values.isfinite().all()):
+        if is_finite(values):
             return
         for term, view in zip(group.terms, _split(values, group.sizes), strict=True):
             bad = ~view.isfinite().all(dim=1)

@@ -20,6 +20,7 @@ class RewardManager:
         self._factors = [term.config.weight * dt for term in terms]  # type: ignore[attr-defined]
         self._values = torch.zeros(len(terms), num_envs, device=device)
         self._sums = torch.zeros(len(terms), num_envs, device=device)
+        self._sums_by_env = self._sums.t()
         self._rows = list(self._values.unbind(0))
         self._active = [
             (term.call, row, factor)
@@ -37,10 +38,12 @@ class RewardManager:
         The terms are added one after the other: torch's own sum over rows rounds differently for different numbers of
         environments.
         """
-        self._next = (self._next + 1) % len(self._totals)
-        total = self._totals[self._next].zero_()
         for call, row, factor in self._active:
-            total += torch.mul(call(), factor, out=row)
+            torch.mul(call(), factor, out=row)
+        self._next = (self._next + 1) % len(self._totals)
+        total = self._totals[self._next].copy_(self._rows[0])
+        for row in self._rows[1:]:
+            total += row
         self._sums += self._values
         return total
 
@@ -49,9 +52,11 @@ class RewardManager:
         self._sums -= torch.where(mask, self._values, 0.0)
         total.masked_fill_(mask, reward)
 
-    def episode_sums(self, ended: Selection) -> dict[str, Tensor]:
-        """Term -> sum over the episode of the selected environments. (n,) each"""
-        return {term.name: ended.read(row) for term, row in zip(self.terms, self._sums, strict=True)}
+    def episode(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return of the episode so far, and each term's share of it, where selected. (n,) each"""
+        sums = ended.read(self._sums_by_env)
+        shares = {term.name: column for term, column in zip(self.terms, sums.unbind(1), strict=True)}
+        return sums.sum(dim=1), shares
 
     def explain(self) -> None:
         """Name the term that made a reward that is not finite.
@@ -69,8 +74,7 @@ class RewardManager:
 
     def reset(self, selection: Selection) -> None:
         """Episode sums start at zero."""
-        for row in self._sums:
-            selection.write(row, 0.0)
+        selection.write(self._sums_by_env, 0.0)
         for term in self.terms:
             term.reset(selection)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from torch import Tensor
 
@@ -24,22 +26,23 @@ class TerminationManager:
         """(num_envs,) bool"""
         self.fired: dict[str, Tensor] = {term.name: self._none for term in terms}
         """Term -> where it fired in this step. (num_envs,) bool each"""
+        self._calls = [(term, bool(term.config.time_out)) for term in terms]  # type: ignore[attr-defined]
         for term in terms:
             check_shape(term, term.call(), (num_envs,), "terminations")
 
     def compute(self, diverged: Tensor | None) -> tuple[Tensor, Tensor]:
         """Judge this step. (num_envs,) bool each"""
-        terminated = self._none.clone() if diverged is None else diverged.clone()
-        time_outs = self._none.clone()
         self.fired = {} if diverged is None else {DIVERGED: diverged}
-        for term in self.terms:
+        failed: list[Tensor] = list(self.fired.values())
+        timed_out: list[Tensor] = []
+        for term, is_time_out in self._calls:
             fired = self.fired[term.name] = term.call()
-            if term.config.time_out:  # type: ignore[attr-defined]
-                time_outs |= fired
-            else:
-                terminated |= fired
-        self.terminated, self.time_outs = terminated, time_outs
-        return terminated, time_outs
+            (timed_out if is_time_out else failed).append(fired)
+        self.terminated, self.time_outs = self._any(failed), self._any(timed_out)
+        return self.terminated, self.time_outs
+
+    def _any(self, masks: list[Tensor]) -> Tensor:
+        return functools.reduce(torch.logical_or, masks) if masks else self._none.clone()
 
     def causes(self, ended: Selection) -> dict[str, Tensor]:
         """Term -> whether it fired where episodes ended. (n,) bool each"""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
+from rlcli.sim.entity import as_index
 from rlcli.sim.names import NameProblem
 from rlcli.sim.selection import Columns
 from rlcli.task import Entity, Joints, Range
@@ -42,7 +43,9 @@ class _JointAction:
         self._gear = torch.tensor(entity.engine.model.actuator_gear[actuators, 0], dtype=torch.float32)
         self._geared = self.actuator == "motor" and bool((self._gear != 1.0).any())
         self._ctrl = entity.engine.field("ctrl")
-        self._columns = _index(actuators)
+        self._columns = as_index(actuators)
+        # consecutive controls: a view of the engine's own, made once
+        self._target = self._ctrl[:, self._columns] if isinstance(self._columns, slice) else None
         self.command = torch.zeros(env.num_envs, self.size, device=env.device)
         """What reaches the actuators, before their own limits. (num_envs, size)"""
 
@@ -53,9 +56,11 @@ class _JointAction:
             self.command += self._offset
         if self._clip is not None:
             self.command.clamp_(*self._clip)
-        self._ctrl[:, self._columns] = (self.command / self._gear if self._geared else self.command).to(
-            self._ctrl.dtype
-        )
+        command = self.command / self._gear if self._geared else self.command
+        if self._target is not None:
+            self._target.copy_(command)
+        else:
+            self._ctrl[:, self._columns] = command.to(self._ctrl.dtype)
 
 
 class JointEffort(_JointAction):
@@ -99,9 +104,3 @@ class JointPosition(_JointAction):
     ) -> None:
         default = entity.data.default_joint_pos[:, joints] + offset if use_default_offset else offset
         super().__init__(env, entity, joints, scale, default, clip)
-
-
-def _index(columns: list[int]) -> Columns:
-    from rlcli.sim.entity import as_index
-
-    return as_index(columns)

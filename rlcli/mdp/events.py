@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 import torch
@@ -25,16 +26,9 @@ def reset_joints_by_offset(
     velocity: Range = (0.0, 0.0),
 ) -> None:
     """Default joint state plus uniform offsets [m or rad, m/s or rad/s], positions kept within the soft limits."""
-    data = entity.data
-    default_pos, default_vel = data.default_joint_pos[:, joints], data.default_joint_vel[:, joints]
-    shape = (default_pos.shape[1],)
-    _write_joints(
-        entity,
-        selection,
-        joints,
-        selection.read(default_pos) + selection.uniform(*position, shape),
-        selection.read(default_vel) + selection.uniform(*velocity, shape),
-    )
+    default_pos, default_vel = _defaults(entity, selection, joints)
+    offset = selection.uniform(*_bounds(position, velocity), (2, default_pos.shape[1]))
+    _write_joints(entity, selection, joints, default_pos.add_(offset[:, 0]), default_vel.add_(offset[:, 1]))
 
 
 def reset_joints_by_scale(
@@ -47,16 +41,9 @@ def reset_joints_by_scale(
     velocity: Range = (1.0, 1.0),
 ) -> None:
     """Default joint state times uniform factors, positions kept within the soft limits."""
-    data = entity.data
-    default_pos, default_vel = data.default_joint_pos[:, joints], data.default_joint_vel[:, joints]
-    shape = (default_pos.shape[1],)
-    _write_joints(
-        entity,
-        selection,
-        joints,
-        selection.read(default_pos) * selection.uniform(*position, shape),
-        selection.read(default_vel) * selection.uniform(*velocity, shape),
-    )
+    default_pos, default_vel = _defaults(entity, selection, joints)
+    factor = selection.uniform(*_bounds(position, velocity), (2, default_pos.shape[1]))
+    _write_joints(entity, selection, joints, default_pos.mul_(factor[:, 0]), default_vel.mul_(factor[:, 1]))
 
 
 def reset_root_state_uniform(
@@ -75,9 +62,9 @@ def reset_root_state_uniform(
 ) -> None:
     """Default root state plus uniform offsets: position [m], attitude [rad], velocity [m/s, rad/s], world frame."""
     default = selection.read(entity.data.default_root_state)
-    offset = torch.stack([selection.uniform(*bounds) for bounds in (x, y, z)], dim=1)
-    turn = from_euler(*(selection.uniform(*bounds) for bounds in (roll, pitch, yaw)))
-    velocity = torch.stack([selection.uniform(*bounds) for bounds in (*linear_velocity, *angular_velocity)], dim=1)
+    offset = selection.uniform(*_bounds(x, y, z), (3, 1)).squeeze(2)
+    turn = from_euler(*selection.uniform(*_bounds(roll, pitch, yaw), (3, 1)).squeeze(2).unbind(1))
+    velocity = selection.uniform(*_bounds(*linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
     entity.write_root_pose(selection, default[:, :3] + offset, multiply(default[:, 3:7], turn))
     entity.write_root_velocity(selection, default[:, 7:10] + velocity[:, :3], default[:, 10:] + velocity[:, 3:])
 
@@ -104,7 +91,7 @@ def push_by_setting_velocity(
     angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
 ) -> None:
     """Add a uniform draw to the root's velocity, world frame [m/s, rad/s]."""
-    push = torch.stack([selection.uniform(*bounds) for bounds in (*linear_velocity, *angular_velocity)], dim=1)
+    push = selection.uniform(*_bounds(*linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
     data = entity.data
     entity.write_root_velocity(
         selection,
@@ -131,7 +118,19 @@ def apply_external_force_torque(
     selection.write(wrench, drawn.flatten(1), columns)
 
 
+@functools.lru_cache
+def _bounds(*ranges: Range) -> tuple[Tensor, Tensor]:
+    """Lower and upper ends of several ranges, for draws of shape (rows, ranges, k). (ranges, 1) each"""
+    low, high = torch.tensor(ranges).split(1, dim=1)
+    return low, high
+
+
+def _defaults(entity: Entity, selection: Selection, joints: Joints) -> tuple[Tensor, Tensor]:
+    data = entity.data
+    return selection.read(data.default_joint_pos, joints), selection.read(data.default_joint_vel, joints)
+
+
 def _write_joints(entity: Entity, selection: Selection, joints: Joints, position: Tensor, velocity: Tensor) -> None:
-    low, high = entity.data.soft_joint_pos_limits[joints].unbind(dim=1)
-    entity.write_joint_positions(selection, position.clamp_(low, high), joints)
+    limits = entity.data.soft_joint_pos_limits
+    entity.write_joint_positions(selection, position.clamp_(limits[joints, 0], limits[joints, 1]), joints)
     entity.write_joint_velocities(selection, velocity, joints)

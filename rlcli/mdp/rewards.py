@@ -26,7 +26,7 @@ def is_terminated(env: ManagedEnv) -> Tensor:
 
 
 def joint_pos_target_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", target: float) -> Tensor:
-    """Squared joint deviation from `target` [rad^2], positions wrapped to (-pi, pi]. (num_envs,)"""
+    """Squared joint deviation from `target` [rad^2], positions wrapped to [-pi, pi]. (num_envs,)"""
     deviation = wrap_to_pi(entity.data.joint_pos[:, joints]) - target
     return deviation.square_().sum(dim=1)
 

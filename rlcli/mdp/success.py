@@ -16,5 +16,6 @@ if TYPE_CHECKING:
 def joints_near(
     env: VecEnv, *, entity: Entity = "robot", joints: Joints = ".*", target: float = 0.0, tolerance: float
 ) -> Tensor:
-    """Every joint is within `tolerance` of `target` [m or rad], the difference wrapped to (-pi, pi]. (num_envs,)"""
-    return (wrap_to_pi(entity.data.joint_pos[:, joints] - target).abs_() < tolerance).all(dim=1)
+    """Every joint is within `tolerance` of `target` [m or rad], the difference wrapped to [-pi, pi]. (num_envs,)"""
+    position = entity.data.joint_pos[:, joints]
+    return (wrap_to_pi(position - target if target else position).abs_() < tolerance).all(dim=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
@@ -22,35 +23,48 @@ Value = TypeVar("Value")
 
 
 class SimData:
-    """The engine's joint state as contiguous float32, copied once a step, and derived fields cast when read.
+    """The engine's joint state as float32, copied once a step, and derived fields cast when read.
 
-    `qpos` (num_envs, nq) and `qvel` (num_envs, nv) keep their storage for ever, so views of them stay valid.
+    `qpos` (num_envs, nq) and `qvel` (num_envs, nv) keep their storage for ever, so views of them stay valid. Where the
+    engine keeps the two side by side they are one copy.
     """
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
-        self.qpos = self._qpos.to(torch.float32, copy=True).contiguous()
-        self.qvel = self._qvel.to(torch.float32, copy=True).contiguous()
+        qpos, qvel = engine.field("qpos"), engine.field("qvel")
+        joined = _joined(qpos, qvel)
+        self._sources = [qpos, qvel] if joined is None else [joined]
+        self._copies = [source.to(torch.float32).contiguous() for source in self._sources]
+        self.qpos = self._copies[0][:, : qpos.shape[1]]
+        self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
         self._derived: dict[str, tuple[int, Tensor]] = {}
 
     def refresh(self) -> None:
         """Copy the state of every world."""
-        self.qpos.copy_(self._qpos)
-        self.qvel.copy_(self._qvel)
+        for copy, source in zip(self._copies, self._sources, strict=True):
+            copy.copy_(source)
         self.stamp += 1
 
     def refresh_rows(self, selection: Selection) -> None:
         """Copy the state of the selected worlds, and drop what was computed from it."""
-        selection.write(self.qpos, selection.read(self._qpos))
-        selection.write(self.qvel, selection.read(self._qvel))
+        for copy, source in zip(self._copies, self._sources, strict=True):
+            selection.write(copy, selection.read(source))
         self.stamp += 1
 
     def restore_rows(self, selection: Selection) -> None:
         """Write the last copied state of the selected worlds back to the engine."""
-        selection.write(self._qpos, selection.read(self.qpos))
-        selection.write(self._qvel, selection.read(self.qvel))
+        for copy, source in zip(self._copies, self._sources, strict=True):
+            selection.write(source, selection.read(copy))
+
+    def is_finite(self) -> bool:
+        """Whether the copied state is finite everywhere."""
+        return all(is_finite(copy) for copy in self._copies)
+
+    def rows_not_finite(self) -> Tensor:
+        """Worlds whose copied state is not finite. (num_envs,) bool"""
+        bad = [~copy.isfinite().all(dim=1) for copy in self._copies]
+        return bad[0] if len(bad) == 1 else bad[0] | bad[1]
 
     def derived(self, name: str) -> Tensor:
         """A derived field as float32, cast once a step. (num_envs, ...)"""
@@ -181,6 +195,9 @@ class EntityData:
         model, num_envs = entity.engine.model, entity.engine.num_envs
         self._qpos_index = as_index(entity.qpos_columns.tolist())
         self._dof_index = as_index(entity.dof_columns.tolist())
+        # consecutive columns: a view of the copied state, made once
+        self._joint_pos = sim.qpos[:, self._qpos_index] if isinstance(self._qpos_index, slice) else None
+        self._joint_vel = sim.qvel[:, self._dof_index] if isinstance(self._dof_index, slice) else None
         ranges = torch.tensor(model.jnt_range[entity.joint_ids], dtype=torch.float32)
         limited = torch.tensor(model.jnt_limited[entity.joint_ids], dtype=torch.bool)
         infinite = torch.tensor([-torch.inf, torch.inf])
@@ -207,12 +224,16 @@ class EntityData:
     @property
     def joint_pos(self) -> Tensor:
         """Joint positions. (num_envs, k) [m or rad]"""
-        return self._sim.qpos[:, self._qpos_index]
+        if self._joint_pos is not None:
+            return self._joint_pos
+        return self._once("joint_pos", lambda: self._sim.qpos[:, self._qpos_index])
 
     @property
     def joint_vel(self) -> Tensor:
         """Joint velocities. (num_envs, k) [m/s or rad/s]"""
-        return self._sim.qvel[:, self._dof_index]
+        if self._joint_vel is not None:
+            return self._joint_vel
+        return self._once("joint_vel", lambda: self._sim.qvel[:, self._dof_index])
 
     @property
     def joint_acc(self) -> Tensor:
@@ -318,6 +339,24 @@ def as_index(positions: Sequence[int]) -> Columns:
     if list(positions) == list(range(first, first + len(positions))):
         return slice(first, first + len(positions))
     return torch.tensor(list(positions), dtype=torch.int64)
+
+
+def is_finite(values: Tensor) -> bool:
+    """Whether every value is finite, in one pass where they are: a finite sum has finite summands only."""
+    return math.isfinite(values.sum().item()) or bool(values.isfinite().all())
+
+
+def _joined(left: Tensor, right: Tensor) -> Tensor | None:
+    """Two 2-d views as one, where they are neighbouring columns of the same storage; else None."""
+    neighbours = (
+        left.dtype == right.dtype
+        and left.stride() == right.stride()
+        and left.untyped_storage().data_ptr() == right.untyped_storage().data_ptr()
+        and right.data_ptr() == left.data_ptr() + left.shape[1] * left.element_size()
+    )
+    if not neighbours:
+        return None
+    return left.as_strided((left.shape[0], left.shape[1] + right.shape[1]), left.stride())
 
 
 def _ids(

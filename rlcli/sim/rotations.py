@@ -58,5 +58,6 @@ def from_euler(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
 
 
 def wrap_to_pi(angle: Tensor) -> Tensor:
-    """The same angle in (-pi, pi] [rad]."""
-    return math.pi - torch.remainder(math.pi - angle, 2.0 * math.pi)
+    """The same angle in [-pi, pi] [rad]; one that lies there already is returned bit for bit."""
+    turns = torch.round(angle * (0.5 / math.pi))
+    return torch.sub(angle, turns.mul_(2.0 * math.pi))

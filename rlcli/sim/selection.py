@@ -6,7 +6,8 @@ written against this interface run on both.
 
 from __future__ import annotations
 
-from typing import Protocol, TypeAlias
+import math
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import torch
@@ -80,12 +81,16 @@ class IdSelection:
 
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Uniform in [low, high). (rows, *shape)"""
-        unit = torch.from_numpy(random.uniform(*self._next(shape))).view(self.count, *shape)
-        return unit.mul_(high - low).add_(low)
+        unit = random.uniform(*self._next(shape))
+        if isinstance(low, Tensor) or isinstance(high, Tensor):
+            return torch.from_numpy(unit).view(self.count, *shape).mul_(high - low).add_(low)
+        unit *= high - low  # in numpy: the arrays are short, and its calls cost half of torch's
+        unit += low
+        return torch.from_numpy(unit if len(shape) == 1 else unit.reshape(self.count, *shape))
 
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Gaussian. (rows, *shape)"""
-        size = int(np.prod(shape))
+        size = math.prod(shape)
         keys, stream, index, _ = self._next((2 * size,))
         return torch.from_numpy(random.normal(keys, stream, index, size)).view(self.count, *shape).mul_(std).add_(mean)
 
@@ -121,11 +126,11 @@ class IdSelection:
         return self._keys
 
     def _next(self, shape: tuple[int, ...]) -> tuple[random.Keys, np.uint64, int, int]:
-        count = int(np.prod(shape)) if shape else 1
+        count = math.prod(shape)
         index, self._drawn = self._drawn, self._drawn + count
         return self._row_keys(), self._stream, index, count
 
-    def _index(self, columns: Columns) -> tuple[NDArray[np.int64], ...] | tuple[NDArray[np.int64], slice]:
-        if isinstance(columns, slice):
-            return (self.ids,) if columns == ALL else (self.ids, columns)
-        return (self.ids[:, None], columns.numpy())
+    def _index(self, columns: Columns) -> Any:
+        if columns is ALL:
+            return self.ids
+        return (self.ids, columns) if isinstance(columns, slice) else (self.ids[:, None], columns.numpy())

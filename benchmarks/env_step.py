@@ -1,0 +1,98 @@
+"""The whole environment step against the bare physics of the same model: `python benchmarks/env_step.py`.
+
+Both are timed in turn in one process, block by block; the ratio of each pair of neighbouring blocks is taken, and the
+median of the ratios is the figure. 1.00 would mean that actions, observations, rewards, terminations, resets and
+episode sums cost nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+
+import numpy as np
+import torch
+from machine import describe
+from mujoco.batch import Batch
+
+from rlcli.config.load import resolve
+from rlcli.envs.vec_env import VecEnv, make_env
+from rlcli.registry import find_task
+
+
+def bare_block(batch: Batch, controls: np.ndarray, substeps: int, steps: int) -> float:
+    """Seconds of `steps` bare steps: the controls are written, as the environment's are."""
+    ctrl = batch.bind("ctrl")
+    begin = time.perf_counter()
+    for step in range(steps):
+        ctrl[:] = controls[step % len(controls)]
+        batch.step(nstep=substeps)
+    return time.perf_counter() - begin
+
+
+def env_block(env: VecEnv, actions: torch.Tensor, steps: int) -> float:
+    """Seconds of `steps` environment steps."""
+    begin = time.perf_counter()
+    with torch.inference_mode():
+        for step in range(steps):
+            env.step(actions[step % len(actions)])
+    return time.perf_counter() - begin
+
+
+def measure(task: str, num_envs: int, repeats: int, seconds: float) -> dict[str, float | int | str]:
+    """One row of the table."""
+    env = make_env(resolve(find_task(task), flags={"scene.num_envs": num_envs}), seed=0)
+    env.final_obs_of = "truncated"  # what a trainer asks for
+    env.reset(seed=0)
+    generator = torch.Generator().manual_seed(0)
+    actions = torch.rand(16, num_envs, env.layout.action_size, generator=generator) * 2.0 - 1.0
+    batch = Batch(env.engine.model, num_envs, env.engine.threads)
+    controls = actions.double().numpy() * 100.0
+    substeps = env.config.decimation
+    # until episodes no longer end all at once
+    env_block(env, actions, 2 * env.max_episode_length)
+    steps = max(20, int(seconds / (bare_block(batch, controls, substeps, 20) / 20)))
+    ratios, rates, bares = [], [], []
+    for _ in range(repeats):
+        bare = bare_block(batch, controls, substeps, steps)
+        full = env_block(env, actions, steps)
+        batch.reset()
+        ratios.append(bare / full)
+        rates.append(steps * num_envs / full)
+        bares.append(steps * num_envs / bare)
+    return {
+        "task": task,
+        "num_envs": num_envs,
+        "ratio": statistics.median(ratios),
+        "ratio_min": min(ratios),
+        "ratio_max": max(ratios),
+        "env_steps_per_s": statistics.median(rates),
+        "bare_steps_per_s": statistics.median(bares),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tasks", nargs="+", default=["cartpole", "cartpole-direct"])
+    parser.add_argument("--num-envs", nargs="+", type=int, default=[64, 1024, 4096])
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--seconds", type=float, default=0.5, help="length of a block")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = [measure(t, n, options.repeats, options.seconds) for t in options.tasks for n in options.num_envs]
+    if options.json:
+        print(json.dumps({"machine": describe(), "rows": rows}, indent=2))
+        return
+    print(describe())
+    print(f"{'task':18}{'envs':>6}{'of bare Batch':>15}{'min .. max':>16}{'env steps/s':>14}{'bare':>12}")
+    for row in rows:
+        spread = f"{row['ratio_min']:.3f} .. {row['ratio_max']:.3f}"
+        rates = f"{row['env_steps_per_s']:>14,.0f}{row['bare_steps_per_s']:>12,.0f}"
+        print(f"{row['task']:18}{row['num_envs']:>6}{row['ratio']:>15.3f}{spread:>16}{rates}")
+
+
+if __name__ == "__main__":
+    main()
