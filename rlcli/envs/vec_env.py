@@ -428,7 +428,8 @@ class VecEnv(ABC):
     def _counters(self) -> None:
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         """Steps of the running episode. (num_envs,)"""
-        self.episode_index = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+        # the first reset of a new environment begins episode 0, as a reset with a seed does
+        self.episode_index = torch.full((self.num_envs,), -1, dtype=torch.int64, device=self.device)
         """Episodes begun before the running one; random streams are keyed by it. (num_envs,)"""
         self._ids = torch.arange(self.num_envs, device=self.device)
         self.common_step = 0
