@@ -85,7 +85,7 @@ events:
 rewards:
   alive: {func: is_alive, weight: 1.0}
   fell: {func: is_terminated, weight: -5.0}
-  progress: {func: ProgressReward, weight: 1.0, target: [100.0, 0.0, 0.0]}
+  progress: {func: progress_reward, weight: 1.0, target: [100.0, 0.0, 0.0]}
   heading: {func: move_to_target_bonus, weight: 0.5, threshold: 0.8, target: [100.0, 0.0, 0.0]}
   upright: {func: upright_posture_bonus, weight: 0.1, threshold: 0.93}
   z: {func: lin_vel_z_l2, weight: -2.0}
