@@ -88,7 +88,12 @@ class ManagedEnv(VecEnv):
 
     def _between(self) -> None:
         steps = self._ids.new_full((self.num_envs,), self.common_step)
-        self.event_manager.interval(lambda mask: self.engine.select(mask, self.seed, steps))
+        running = (self.episode_length_buf > 0).long()  # no time has passed for those just reset
+        self.event_manager.interval(lambda mask: self.engine.select(mask, self.seed, steps), running, self._written)
+
+    def _written(self, selection: Selection) -> None:
+        self.engine.forward(selection)
+        self.sim.refresh_rows(selection)
 
     def _observe(self) -> dict[str, Tensor]:
         return self.observation_manager.compute()
