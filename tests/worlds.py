@@ -155,7 +155,13 @@ def edited(task: str, **changes: object) -> str:
     data = yaml.safe_load(task)
     for key, value in changes.items():
         data[key] = {**data[key], **value} if isinstance(value, dict) and isinstance(data.get(key), dict) else value
-    return yaml.safe_dump(data, sort_keys=False)
+    return dump(data)
+
+
+def dump(data: object) -> str:
+    """YAML without anchors."""
+    dumper = type("Dumper", (yaml.SafeDumper,), {"ignore_aliases": lambda *_: True})
+    return yaml.dump(data, Dumper=dumper, sort_keys=False)
 
 
 def build(task: Path | str, num_envs: int | None = None, *overrides: str, seed: int = 42) -> VecEnv:

@@ -186,7 +186,7 @@ class DirectEnv(VecEnv):
         self._observed = True
         return reward, failed, truncated
 
-    def _final(self, finished: Tensor, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor] | None:
+    def _final(self) -> dict[str, Tensor]:
         self._final_obs.copy_(self.task.obs_buf)
         self._final_states.copy_(self.task.states_buf)
         return self._group(self._final_obs, self._final_states)

@@ -70,9 +70,7 @@ class ManagedEnv(VecEnv):
         if what == "the reward":
             self.reward_manager.explain()
 
-    def _final(self, finished: Tensor, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor] | None:
-        if self.final_obs_of == "truncated" and not bool((truncated & ~terminated).any()):
-            return None
+    def _final(self) -> dict[str, Tensor]:
         return self.observation_manager.compute_final()
 
     def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:

@@ -193,7 +193,8 @@ class VecEnv(ABC):
         finished = terminated | truncated
         ended = self._select(finished)
         if ended is not None:
-            final_obs = self._final(finished, terminated, truncated)
+            if self.final_obs_of == "finished" or bool((truncated & ~terminated).any()):
+                final_obs = self._final()
             episodes = self._episodes(ended, terminated, truncated)
             self.episode_index += finished
             # selected again: the new episode draws from its own counter
@@ -273,7 +274,7 @@ class VecEnv(ABC):
         """Reward, terminated, truncated. (num_envs,) each"""
 
     @abstractmethod
-    def _final(self, finished: Tensor, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor] | None:
+    def _final(self) -> dict[str, Tensor]:
         """True last observations, before anything is reset."""
 
     @abstractmethod

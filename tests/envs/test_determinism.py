@@ -1,6 +1,6 @@
 import pytest
 import yaml
-from worlds import CRITTER_TASK, build, critter, edited, life, run, same
+from worlds import CRITTER_TASK, build, critter, dump, edited, life, run, same
 
 TASKS = ["cartpole", "cartpole-direct", "critter"]
 
@@ -77,7 +77,7 @@ def test_a_life_does_not_depend_on_which_other_events_exist(tmp_path):
     }
     data = yaml.safe_load(CRITTER_TASK)
     data["events"] = {**idle, **data["events"]}
-    more = critter(tmp_path / "more", yaml.safe_dump(data, sort_keys=False))
+    more = critter(tmp_path / "more", dump(data))
     reference = run(build(critter(tmp_path), 8), 60)
     results = run(build(more, 8), 60)
     assert same(life(results, 7), life(reference, 7))
