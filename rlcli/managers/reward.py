@@ -28,8 +28,9 @@ class RewardManager:
         ]
         self._totals = [torch.zeros(num_envs, device=device) for _ in range(3)]
         self._next = 0
-        for term in terms:
-            check_shape(term, term.call(), (num_envs,), "rewards")
+        for term, factor in zip(terms, self._factors, strict=True):
+            if factor != 0.0:
+                check_shape(term, term.call(), (num_envs,), "rewards")
 
     def compute(self) -> Tensor:
         """This step's reward. (num_envs,)
