@@ -120,21 +120,16 @@ class ArticulationView:
 
     def set_world_poses(self, positions: Tensor, orientations: Tensor, indices: Tensor | None = None) -> None:
         """Set root poses of a floating robot, in each environment's frame. (n, 3) [m], (n, 4) w, x, y, z"""
-        root = self._floating()[0]
+        root, _ = self._entity.floating()
         self._write(self._qpos, torch.cat([positions, orientations], dim=1), indices, torch.arange(root, root + 7))
 
     def set_velocities(self, velocities: Tensor, indices: Tensor | None = None) -> None:
         """Set root velocities of a floating robot, world frame. (n, 6) [m/s, rad/s]"""
-        qpos, dof = self._floating()
+        qpos, dof = self._entity.floating()
         rows = slice(None) if indices is None else indices.long()
         quat = self._qpos[rows][:, qpos + 3 : qpos + 7].float()
         local = torch.cat([velocities[:, :3], rotate_inverse(quat, velocities[:, 3:])], dim=1)
         self._write(self._qvel, local, indices, torch.arange(dof, dof + 6))
-
-    def _floating(self) -> tuple[int, int]:
-        if self._entity.root_qpos is None or self._entity.root_dof is None:
-            raise TaskError(f"view '{self.name}': '{self.entity_name}' is fixed to the world and cannot be moved")
-        return self._entity.root_qpos, self._entity.root_dof
 
     def _command(self, kind: str, values: Tensor, indices: Tensor | None) -> None:
         joints, controls, gear = self._actuators[kind]

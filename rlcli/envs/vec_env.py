@@ -363,6 +363,7 @@ class VecEnv(ABC):
 
     def _restart(self, selection: Selection) -> None:
         self.engine.reset(selection)
+        self.sim.refresh_rows(selection)  # a reset event or reset_idx reads the default state, not the last episode's
         self._restart_workflow(selection)
         selection.write(self.episode_length_buf, 0)
         selection.write(self._success_hold, 0.0)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from rlcli.config.schema import EntityConfig
+from rlcli.errors import TaskError
 from rlcli.sim.engine import Engine
 from rlcli.sim.names import match
 from rlcli.sim.rotations import rotate, rotate_inverse
@@ -138,16 +139,32 @@ class Entity:
 
     def write_root_pose(self, selection: Selection, position: Tensor, quat: Tensor) -> None:
         """Set the root's pose in its environment's frame. position (rows, 3) [m], quat (rows, 4) w, x, y, z"""
-        assert self.root_qpos is not None
-        selection.write(self._qpos, torch.cat([position, quat], dim=1), slice(self.root_qpos, self.root_qpos + 7))
+        root, _ = self.floating()
+        selection.write(self._qpos, torch.cat([position, quat], dim=1), slice(root, root + 7))
 
     def write_root_velocity(self, selection: Selection, linear_w: Tensor, angular_w: Tensor) -> None:
         """Set the root's velocity, world frame; set the pose first. linear [m/s] and angular [rad/s], (rows, 3) each"""
-        assert self.root_qpos is not None
-        assert self.root_dof is not None
-        quat = selection.read(self._qpos, slice(self.root_qpos + 3, self.root_qpos + 7)).float()
+        root, dof = self.floating()
+        quat = selection.read(self._qpos, slice(root + 3, root + 7)).float()
         local = rotate_inverse(quat, angular_w)  # a free joint's angular velocity is in the body's frame
-        selection.write(self._qvel, torch.cat([linear_w, local], dim=1), slice(self.root_dof, self.root_dof + 6))
+        selection.write(self._qvel, torch.cat([linear_w, local], dim=1), slice(dof, dof + 6))
+
+    def read_root_velocity(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """The root's velocity as it is now, also where it has just been set, world frame. (rows, 3) each"""
+        qpos, dof = self.floating()
+        velocity = selection.read(self._qvel, slice(dof, dof + 6)).float()
+        quat = selection.read(self._qpos, slice(qpos + 3, qpos + 7)).float()
+        return velocity[:, :3], rotate(quat, velocity[:, 3:])
+
+    def floating(self) -> tuple[int, int]:
+        """Where the free joint of the root lies in qpos and in qvel.
+
+        Raises:
+            TaskError: if the root is fixed to the world.
+        """
+        if self.root_qpos is None or self.root_dof is None:
+            raise TaskError(f"entity '{self.name}' is fixed to the world and cannot be moved")
+        return self.root_qpos, self.root_dof
 
     def _columns(self, of: Tensor, joints: Columns) -> Columns:
         key = (id(of), joints.start, joints.stop) if isinstance(joints, slice) else (id(of), id(joints), None)
