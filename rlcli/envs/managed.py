@@ -40,7 +40,7 @@ class ManagedEnv(VecEnv):
         self.event_manager = EventManager(self._events, n, self.step_dt, device)
         self.event_manager.startup(self._everyone())
         reward_dt = self.step_dt if self.config.reward_dt_scaling else 1.0
-        self.reward_manager = RewardManager(self._rewards, n, reward_dt, device)
+        self.reward_manager = RewardManager(self._rewards, n, reward_dt, device, self.config.divergence_reward)
         self.observation_manager = ObservationManager(self._observations, n, device)
 
     def _layout(self) -> Layout:
@@ -62,8 +62,8 @@ class ManagedEnv(VecEnv):
     def _judge(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         terminated, truncated = self.termination_manager.compute(diverged)
         reward = self.reward_manager.compute()
-        if diverged is not None and self.config.divergence_reward is not None:
-            self.reward_manager.replace(diverged, reward, self.config.divergence_reward)
+        if diverged is not None:
+            self.reward_manager.replace_diverged(diverged, reward)
         return reward, terminated, truncated
 
     def _explain(self, what: str) -> None:
@@ -75,7 +75,9 @@ class ManagedEnv(VecEnv):
 
     def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         terms = self.reward_manager.episode_sums(ended)
-        returns = torch.stack(list(terms.values())).sum(dim=0)
+        returns = torch.zeros_like(next(iter(terms.values())))
+        for value in terms.values():  # one after the other: a sum over rows rounds by how many episodes ended
+            returns += value
         return returns, terms, self.termination_manager.causes(ended)
 
     def _restart_workflow(self, selection: Selection) -> None:

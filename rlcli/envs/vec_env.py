@@ -313,11 +313,12 @@ class VecEnv(ABC):
         self.engine.step(self.config.decimation)
         self.seconds["physics"] += time.perf_counter() - start
         diverged = self.engine.diverged()
+        self.sim.refresh()
+        if not _finite(self.sim.qvel):  # a NaN time step gives no warning
+            silent = ~self.sim.qvel.isfinite().all(dim=1)
+            diverged = silent if diverged is None else silent | diverged
         if diverged is not None:
             self._put_back(diverged)
-        self.sim.refresh()
-        if not _finite(self.sim.qvel):
-            diverged = self._mend_silent(diverged)
         return diverged
 
     def _put_back(self, diverged: Tensor) -> None:
@@ -328,17 +329,7 @@ class VecEnv(ABC):
             self.engine.reset(selection)
             self.sim.restore_rows(selection)
             self.engine.forward(selection)
-
-    def _mend_silent(self, diverged: Tensor | None) -> Tensor:
-        """Worlds that are not finite without a warning (a NaN time step does that) go to the default state."""
-        silent = ~self.sim.qvel.isfinite().all(dim=1)
-        self.divergences += int(silent.sum())
-        selection = self._select(silent)
-        assert selection is not None
-        self.engine.reset(selection)
-        self.engine.forward(selection)
-        self.sim.refresh_rows(selection)
-        return silent if diverged is None else silent | diverged
+            self.sim.refresh_rows(selection)
 
     def _hold_success(self) -> None:
         if self._success is not None:

@@ -9,18 +9,31 @@ from torch import Tensor
 
 from rlcli.errors import DivergedError
 from rlcli.managers.term import BoundTerm, check_shape
+from rlcli.managers.termination import DIVERGED
 from rlcli.sim.selection import Selection
 
 
 class RewardManager:
-    """Terms with weight 0 are not called."""
+    """Terms with weight 0 are not called.
 
-    def __init__(self, terms: list[BoundTerm], num_envs: int, dt: float, device: torch.device) -> None:
+    Where a `divergence_reward` is configured, what it paid is kept as a term of its own.
+    """
+
+    def __init__(
+        self,
+        terms: list[BoundTerm],
+        num_envs: int,
+        dt: float,
+        device: torch.device,
+        divergence_reward: float | None = None,
+    ) -> None:
         self.terms = terms
         self._factors = [term.config.weight * dt for term in terms]  # type: ignore[attr-defined]
         self._values = torch.zeros(len(terms), num_envs, device=device)
         self._sums = torch.zeros(len(terms), num_envs, device=device)
         self._rows = list(self._values.unbind(0))
+        self._divergence_reward = divergence_reward
+        self._divergence_sums = torch.zeros(num_envs, device=device)
         self._active = [
             (term.call, row, factor)
             for term, row, factor in zip(terms, self._rows, self._factors, strict=True)
@@ -45,14 +58,20 @@ class RewardManager:
         self._sums += self._values
         return total
 
-    def replace(self, mask: Tensor, total: Tensor, reward: float) -> None:
-        """Give the masked environments another reward for this step; the terms' sums take the difference evenly out."""
-        self._sums -= torch.where(mask, self._values, 0.0)
-        total.masked_fill_(mask, reward)
+    def replace_diverged(self, diverged: Tensor, total: Tensor) -> None:
+        """Pay the `divergence_reward`, if there is one, instead of this step's terms."""
+        if self._divergence_reward is None:
+            return
+        self._sums -= torch.where(diverged, self._values, 0.0)
+        self._divergence_sums += diverged * self._divergence_reward
+        total.masked_fill_(diverged, self._divergence_reward)
 
     def episode_sums(self, ended: Selection) -> dict[str, Tensor]:
         """Term -> sum over the episode of the selected environments. (n,) each"""
-        return {term.name: ended.read(row) for term, row in zip(self.terms, self._sums, strict=True)}
+        sums = {term.name: ended.read(row) for term, row in zip(self.terms, self._sums, strict=True)}
+        if self._divergence_reward is not None:
+            sums[DIVERGED] = ended.read(self._divergence_sums)
+        return sums
 
     def explain(self) -> None:
         """Name the term that made a reward that is not finite.
@@ -72,13 +91,15 @@ class RewardManager:
         """Episode sums start at zero."""
         for row in self._sums:
             selection.write(row, 0.0)
+        selection.write(self._divergence_sums, 0.0)
         for term in self.terms:
             term.reset(selection)
 
     def state_dict(self) -> dict[str, Tensor]:
         """The running sums."""
-        return {"sums": self._sums.clone()}
+        return {"sums": self._sums.clone(), "divergence_sums": self._divergence_sums.clone()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Take back what `state_dict` gave."""
         self._sums.copy_(state["sums"])
+        self._divergence_sums.copy_(state["divergence_sums"])

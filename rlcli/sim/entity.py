@@ -33,11 +33,14 @@ class SimData:
         self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
         self.qpos = self._qpos.to(torch.float32, copy=True).contiguous()
         self.qvel = self._qvel.to(torch.float32, copy=True).contiguous()
+        self._last_qpos, self._last_qvel = self.qpos.clone(), self.qvel.clone()
         self.stamp = 0
         self._derived: dict[str, tuple[int, Tensor]] = {}
 
     def refresh(self) -> None:
-        """Copy the state of every world."""
+        """Copy the state of every world; the state before is kept for `restore_rows`."""
+        self._last_qpos.copy_(self.qpos)
+        self._last_qvel.copy_(self.qvel)
         self.qpos.copy_(self._qpos)
         self.qvel.copy_(self._qvel)
         self.stamp += 1
@@ -49,9 +52,9 @@ class SimData:
         self.stamp += 1
 
     def restore_rows(self, selection: Selection) -> None:
-        """Write the last copied state of the selected worlds back to the engine."""
-        selection.write(self._qpos, selection.read(self.qpos))
-        selection.write(self._qvel, selection.read(self.qvel))
+        """Write the state before the last refresh back to the engine, in the selected worlds."""
+        selection.write(self._qpos, selection.read(self._last_qpos))
+        selection.write(self._qvel, selection.read(self._last_qvel))
 
     def derived(self, name: str) -> Tensor:
         """A derived field as float32, cast once a step. (num_envs, ...)"""
