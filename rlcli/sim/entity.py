@@ -90,7 +90,7 @@ class Entity:
         self.joint_names = self.names["Joints"]
         self.qpos_columns = torch.from_numpy(model.jnt_qposadr[self.joint_ids].astype(np.int64))
         self.dof_columns = torch.from_numpy(model.jnt_dofadr[self.joint_ids].astype(np.int64))
-        self.root_body = self.body_ids[0]
+        self.root_body = int(self.body_ids[0]) if len(self.body_ids) else 0
         self.root_qpos, self.root_dof = self._root(model)
         self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
         self._column_cache: dict[tuple, tuple[Columns, Columns]] = {}
@@ -309,6 +309,8 @@ class EntityData:
         entity = self._entity
         if entity.root_qpos is not None:
             pose = model.qpos0[entity.root_qpos : entity.root_qpos + 7]
+        elif not entity.root_body:  # geoms of the world only
+            pose = np.concatenate([entity.config.pos, entity.config.quat])
         else:
             body = entity.root_body
             pose = np.concatenate([model.body_pos[body], model.body_quat[body]])
