@@ -132,9 +132,9 @@ class ArticulationView:
         self._write(self._qvel, local, indices, torch.arange(dof, dof + 6))
 
     def _command(self, kind: str, values: Tensor, indices: Tensor | None) -> None:
-        joints, controls, gear = self._actuators[kind]
+        joints, controls, factor = self._actuators[kind]
         if len(controls):
-            self._write(self._ctrl, values[:, joints] / gear, indices, controls)
+            self._write(self._ctrl, values[:, joints] * factor, indices, controls)
 
     def _write(self, field: Tensor, values: Tensor, indices: Tensor | None, columns: Tensor) -> None:
         index = as_index(columns.tolist())
@@ -153,17 +153,14 @@ def _rows(values: Tensor, indices: Tensor | None, clone: bool) -> Tensor:
 
 
 def _actuator_columns(entity: Entity, kind: str) -> tuple[Columns, Tensor, Tensor]:
-    """Joint columns that have an actuator of the kind, those actuators' control columns, and their gears."""
+    """Joint columns that have an actuator of the kind, those actuators' control columns, and what turns a joint's
+    force or target into a control: a gear multiplies forces and lengths alike."""
     columns = entity.actuators_of(kind)
     joints = [joint for joint, _ in columns]
     controls = [actuator for _, actuator in columns]
-    gear = (
-        np.array([entity.engine.model.actuator_gear[a, 0] for a in controls])
-        if kind == "motor"
-        else np.ones(len(controls))
-    )
+    gear = np.array([entity.engine.model.actuator_gear[a, 0] for a in controls])
     return (
         as_index(joints),
         torch.tensor(controls, dtype=torch.int64),
-        torch.tensor(gear, dtype=torch.float32),
+        torch.tensor(1.0 / gear if kind == "motor" else gear, dtype=torch.float32),
     )

@@ -39,8 +39,9 @@ class _JointAction:
         actuators = [driven[c] for c in columns]
         self.size = len(columns)
         self._scale, self._offset, self._clip = scale, offset, clip
-        self._gear = torch.tensor(entity.engine.model.actuator_gear[actuators, 0], dtype=torch.float32)
-        self._geared = self.actuator == "motor" and bool((self._gear != 1.0).any())
+        gear = torch.tensor(entity.engine.model.actuator_gear[actuators, 0], dtype=torch.float32)
+        self._factor = 1.0 / gear if self.actuator == "motor" else gear
+        self._geared = bool((gear != 1.0).any())
         self._ctrl = entity.engine.field("ctrl")
         self._columns = _index(actuators)
         self.command = torch.zeros(env.num_envs, self.size, device=env.device)
@@ -53,7 +54,7 @@ class _JointAction:
             self.command += self._offset
         if self._clip is not None:
             self.command.clamp_(*self._clip)
-        self._ctrl[:, self._columns] = (self.command / self._gear if self._geared else self.command).to(
+        self._ctrl[:, self._columns] = (self.command * self._factor if self._geared else self.command).to(
             self._ctrl.dtype
         )
 
