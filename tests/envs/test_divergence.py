@@ -197,7 +197,9 @@ def test_a_reward_term_that_is_not_finite_is_named_with_its_environment(tmp_path
 
 
 def test_an_observation_term_that_is_not_finite_is_named_with_its_environment(tmp_path):
-    env = build(paying(tmp_path, observations={"policy": {"pos": {"func": "joint_pos"}, "odd": {"func": "broken_row"}}}))
+    env = build(
+        paying(tmp_path, observations={"policy": {"pos": {"func": "joint_pos"}, "odd": {"func": "broken_row"}}})
+    )
     env.reset()
     env.engine.field("qpos")[2, 0] = 1.0
     with pytest.raises(DivergedError, match=r"observation 'policy.odd' \(broken_row\) .*environment 2"):

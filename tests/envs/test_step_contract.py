@@ -103,7 +103,10 @@ def test_a_time_out_at_exactly_the_episode_length_is_truncation_with_alive_1(tmp
 def test_the_number_of_steps_of_an_episode_is_rounded_up_without_rounding_errors(
     tmp_path, length, dt, decimation, steps
 ):
-    assert build(world(tmp_path, episode_length_s=length, sim={"dt": dt}, decimation=decimation)).max_episode_length == steps
+    assert (
+        build(world(tmp_path, episode_length_s=length, sim={"dt": dt}, decimation=decimation)).max_episode_length
+        == steps
+    )
 
 
 def test_a_state_may_be_terminated_and_truncated_and_is_then_no_time_out(tmp_path):
