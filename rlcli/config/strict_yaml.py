@@ -119,7 +119,7 @@ class _Reader:
                 if documents > 1:
                     raise YamlError("only one document per file", event.start_mark)
             elif isinstance(event, events.ScalarEvent):
-                self._put(_scalar(event), event.start_mark)
+                self._put(_scalar(event, key=self._awaits_key()), event.start_mark)
             elif isinstance(event, events.MappingStartEvent):
                 self._open({}, event.start_mark)
             elif isinstance(event, events.SequenceStartEvent):
@@ -127,6 +127,9 @@ class _Reader:
             elif isinstance(event, (events.MappingEndEvent, events.SequenceEndEvent)):
                 self.stack.pop()
         return self.root, self.marks
+
+    def _awaits_key(self) -> bool:
+        return bool(self.stack) and isinstance(self.stack[-1].container, dict) and self.stack[-1].key is None
 
     def _refuse(self, event: events.Event) -> None:
         if getattr(event, "anchor", None):
@@ -138,7 +141,7 @@ class _Reader:
     def _open(self, container: dict[str, Any] | list[Any], mark: Any) -> None:
         if len(self.stack) >= MAX_DEPTH:
             raise YamlError(f"nested deeper than {MAX_DEPTH} levels", mark)
-        if self.stack and isinstance(self.stack[-1].container, dict) and self.stack[-1].key is None:
+        if self._awaits_key():
             raise YamlError("keys must be text", mark)
         self.stack.append(_Frame(container, self._put(container, mark)))
 
@@ -176,7 +179,7 @@ class _Reader:
         return path
 
 
-def _scalar(event: events.ScalarEvent) -> Any:
+def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
     text = event.value
     if len(text) > MAX_SCALAR:
         raise YamlError(f"a value longer than {MAX_SCALAR} characters", event.start_mark)
@@ -195,6 +198,6 @@ def _scalar(event: events.ScalarEvent) -> Any:
         return number
     if _NOT_FINITE.match(text):
         raise YamlError(f"{text} is not allowed; write a number, or null for none", event.start_mark)
-    if text.lower() in _WORDS:
+    if text.lower() in _WORDS and not (key and text == "y"):  # x, y and z are names of parameters
         raise YamlError(f"{text} is ambiguous; write true or false, or quote it", event.start_mark)
     return text

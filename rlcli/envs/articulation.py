@@ -45,7 +45,7 @@ class ArticulationView:
         self._env = env
         self._entity: Entity = env.entities[self.entity_name]
         engine = env.engine
-        self._qpos, self._qvel, self._ctrl = engine.field("qpos"), engine.field("qvel"), engine.field("ctrl")
+        self._qpos, self._ctrl = engine.field("qpos"), engine.field("ctrl")
         self._actuators = {kind: _actuator_columns(self._entity, kind) for kind in ("motor", "position", "velocity")}
 
     @property
@@ -98,12 +98,12 @@ class ArticulationView:
 
     def set_joint_positions(self, positions: Tensor, indices: Tensor | None = None) -> None:
         """Set joint positions, and with them the targets of position actuators. (n, num_dof) [m or rad]"""
-        self._write(self._qpos, positions, indices, self._entity.qpos_columns)
+        self._set("qpos", positions, indices, self._entity.qpos_columns)
         self._command("position", positions, indices)
 
     def set_joint_velocities(self, velocities: Tensor, indices: Tensor | None = None) -> None:
         """Set joint velocities, and with them the targets of velocity actuators. (n, num_dof) [m/s or rad/s]"""
-        self._write(self._qvel, velocities, indices, self._entity.dof_columns)
+        self._set("qvel", velocities, indices, self._entity.dof_columns)
         self._command("velocity", velocities, indices)
 
     def set_joint_efforts(self, efforts: Tensor, indices: Tensor | None = None) -> None:
@@ -120,26 +120,26 @@ class ArticulationView:
 
     def set_world_poses(self, positions: Tensor, orientations: Tensor, indices: Tensor | None = None) -> None:
         """Set root poses of a floating robot, in each environment's frame. (n, 3) [m], (n, 4) w, x, y, z"""
-        root = self._floating()[0]
-        self._write(self._qpos, torch.cat([positions, orientations], dim=1), indices, torch.arange(root, root + 7))
+        root, _ = self._entity.floating()
+        self._set("qpos", torch.cat([positions, orientations], dim=1), indices, torch.arange(root, root + 7))
 
     def set_velocities(self, velocities: Tensor, indices: Tensor | None = None) -> None:
         """Set root velocities of a floating robot, world frame. (n, 6) [m/s, rad/s]"""
-        qpos, dof = self._floating()
+        qpos, dof = self._entity.floating()
         rows = slice(None) if indices is None else indices.long()
         quat = self._qpos[rows][:, qpos + 3 : qpos + 7].float()
         local = torch.cat([velocities[:, :3], rotate_inverse(quat, velocities[:, 3:])], dim=1)
-        self._write(self._qvel, local, indices, torch.arange(dof, dof + 6))
-
-    def _floating(self) -> tuple[int, int]:
-        if self._entity.root_qpos is None or self._entity.root_dof is None:
-            raise TaskError(f"view '{self.name}': '{self.entity_name}' is fixed to the world and cannot be moved")
-        return self._entity.root_qpos, self._entity.root_dof
+        self._set("qvel", local, indices, torch.arange(dof, dof + 6))
 
     def _command(self, kind: str, values: Tensor, indices: Tensor | None) -> None:
-        joints, controls, gear = self._actuators[kind]
+        joints, controls, factor = self._actuators[kind]
         if len(controls):
-            self._write(self._ctrl, values[:, joints] / gear, indices, controls)
+            self._write(self._ctrl, values[:, joints] * factor, indices, controls)
+
+    def _set(self, name: str, values: Tensor, indices: Tensor | None, columns: Tensor) -> None:
+        self._write(self._env.engine.field(name), values, indices, columns)
+        self._write(getattr(self._env.sim, name), values, indices, columns)  # what getters read
+        self._env.sim.stamp += 1
 
     def _write(self, field: Tensor, values: Tensor, indices: Tensor | None, columns: Tensor) -> None:
         index = as_index(columns.tolist())
@@ -158,17 +158,15 @@ def _rows(values: Tensor, indices: Tensor | None, clone: bool) -> Tensor:
 
 
 def _actuator_columns(entity: Entity, kind: str) -> tuple[Columns, Tensor, Tensor]:
-    """Joint columns that have an actuator of the kind, those actuators' control columns, and their gears."""
+    """Joint columns that have an actuator of the kind, those actuators' control columns, and what turns a joint's
+    force or target into a control: a gear multiplies forces and lengths alike.
+    """
     columns = entity.actuators_of(kind)
     joints = [joint for joint, _ in columns]
     controls = [actuator for _, actuator in columns]
-    gear = (
-        np.array([entity.engine.model.actuator_gear[a, 0] for a in controls])
-        if kind == "motor"
-        else np.ones(len(controls))
-    )
+    gear = np.array([entity.engine.model.actuator_gear[a, 0] for a in controls])
     return (
         as_index(joints),
         torch.tensor(controls, dtype=torch.int64),
-        torch.tensor(gear, dtype=torch.float32),
+        torch.tensor(1.0 / gear if kind == "motor" else gear, dtype=torch.float32),
     )

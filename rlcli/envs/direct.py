@@ -139,6 +139,7 @@ class DirectEnv(VecEnv):
         self._final_obs = torch.zeros_like(task.obs_buf)
         self._final_states = torch.zeros_like(task.states_buf)
         self._observed = False
+        self._settled = False  # a loaded state holds its second look already
         self._causes: dict[str, Tensor] = {}
         task.post_reset()
 
@@ -186,7 +187,7 @@ class DirectEnv(VecEnv):
         self._observed = True
         return reward, failed, truncated
 
-    def _final(self, finished: Tensor, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor] | None:
+    def _final(self) -> dict[str, Tensor]:
         self._final_obs.copy_(self.task.obs_buf)
         self._final_states.copy_(self.task.states_buf)
         return self._group(self._final_obs, self._final_states)
@@ -213,12 +214,12 @@ class DirectEnv(VecEnv):
             self._fill()
         obs.copy_(task.obs_buf)
         states.copy_(task.states_buf)
-        if self._observed and bool(self._fresh.any()):
+        if self._observed and not self._settled and bool(self._fresh.any()):
             self._fill()
             fresh = self._fresh[:, None]
             task.obs_buf.copy_(torch.where(fresh, task.obs_buf, obs, out=obs))
             task.states_buf.copy_(torch.where(fresh, task.states_buf, states, out=states))
-        self._observed = False
+        self._observed, self._settled = False, False
         self._require_finite(obs, "the observation")
         return self._group(obs, states)
 
@@ -257,6 +258,10 @@ class DirectEnv(VecEnv):
 
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
         for name, value in state.items():
-            target = getattr(self if name in ("_returns", "_fresh") else self.task, name)
-            target.copy_(value)
-        self._observed = True
+            owner: Any = self if name in ("_returns", "_fresh") else self.task
+            target = getattr(owner, name, None)
+            if isinstance(target, Tensor) and target.shape == value.shape:
+                target.copy_(value)  # views of it stay valid
+            else:
+                setattr(owner, name, value.clone())  # the task makes it in a step
+        self._observed, self._settled = True, True

@@ -39,7 +39,7 @@ class ManagedEnv(VecEnv):
         self.event_manager = EventManager(self._events, n, self.step_dt, device)
         self.event_manager.startup(self._everyone())
         reward_dt = self.step_dt if self.config.reward_dt_scaling else 1.0
-        self.reward_manager = RewardManager(self._rewards, n, reward_dt, device)
+        self.reward_manager = RewardManager(self._rewards, n, reward_dt, device, self.config.divergence_reward)
         self.observation_manager = ObservationManager(self._observations, n, device)
 
     def _layout(self) -> Layout:
@@ -61,17 +61,15 @@ class ManagedEnv(VecEnv):
     def _judge(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         terminated, truncated = self.termination_manager.compute(diverged)
         reward = self.reward_manager.compute()
-        if diverged is not None and self.config.divergence_reward is not None:
-            self.reward_manager.replace(diverged, reward, self.config.divergence_reward)
+        if diverged is not None:
+            self.reward_manager.replace_diverged(diverged, reward)
         return reward, terminated, truncated
 
     def _explain(self, what: str) -> None:
         if what == "the reward":
             self.reward_manager.explain()
 
-    def _final(self, finished: Tensor, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor] | None:
-        if self.final_obs_of == "truncated" and not bool((truncated & ~terminated).any()):
-            return None
+    def _final(self) -> dict[str, Tensor]:
         return self.observation_manager.compute_final()
 
     def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
@@ -88,7 +86,12 @@ class ManagedEnv(VecEnv):
         if not self.event_manager.has_intervals:
             return
         steps = self._ids.new_full((self.num_envs,), self.common_step)
-        self.event_manager.interval(lambda mask: self.engine.select(mask, self.seed, steps))
+        running = (self.episode_length_buf > 0).long()  # no time has passed for those just reset
+        self.event_manager.interval(lambda mask: self.engine.select(mask, self.seed, steps), running, self._written)
+
+    def _written(self, selection: Selection) -> None:
+        self.engine.forward(selection)
+        self.sim.refresh_rows(selection)
 
     def _observe(self) -> dict[str, Tensor]:
         return self.observation_manager.compute()

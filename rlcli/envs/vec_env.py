@@ -194,7 +194,8 @@ class VecEnv(ABC):
         self.episode_index += finished  # before the selection: what begins now draws from its own counter
         ended = self._select(finished)
         if ended is not None:
-            final_obs = self._final(finished, terminated, truncated)
+            if self.final_obs_of == "finished" or bool((truncated & ~terminated).any()):
+                final_obs = self._final()
             episodes = self._episodes(ended, terminated, truncated)
             self._restart(ended)
         self._between()
@@ -272,7 +273,7 @@ class VecEnv(ABC):
         """Reward, terminated, truncated. (num_envs,) each"""
 
     @abstractmethod
-    def _final(self, finished: Tensor, terminated: Tensor, truncated: Tensor) -> dict[str, Tensor] | None:
+    def _final(self) -> dict[str, Tensor]:
         """True last observations, before anything is reset."""
 
     @abstractmethod
@@ -311,11 +312,12 @@ class VecEnv(ABC):
         self.engine.step(self.config.decimation)
         self.seconds["physics"] += time.perf_counter() - start
         diverged = self.engine.diverged()
+        self.sim.refresh()
+        if not self.sim.is_finite():  # a NaN time step gives no warning
+            silent = self.sim.rows_not_finite()
+            diverged = silent if diverged is None else silent | diverged
         if diverged is not None:
             self._put_back(diverged)
-        self.sim.refresh()
-        if not self.sim.is_finite():
-            diverged = self._mend_silent(diverged)
         return diverged
 
     def _put_back(self, diverged: Tensor) -> None:
@@ -326,17 +328,7 @@ class VecEnv(ABC):
             self.engine.reset(selection)
             self.sim.restore_rows(selection)
             self.engine.forward(selection)
-
-    def _mend_silent(self, diverged: Tensor | None) -> Tensor:
-        """Worlds that are not finite without a warning (a NaN time step does that) go to the default state."""
-        silent = self.sim.rows_not_finite()
-        self.divergences += int(silent.sum())
-        selection = self._select(silent)
-        assert selection is not None
-        self.engine.reset(selection)
-        self.engine.forward(selection)
-        self.sim.refresh_rows(selection)
-        return silent if diverged is None else silent | diverged
+            self.sim.refresh_rows(selection)
 
     def _hold_success(self) -> None:
         if self._success is not None:
@@ -361,6 +353,7 @@ class VecEnv(ABC):
 
     def _restart(self, selection: Selection) -> None:
         self.engine.reset(selection)
+        self.sim.refresh_rows(selection)  # a reset event or reset_idx reads the default state, not the last episode's
         self._restart_workflow(selection)
         selection.write(self.episode_length_buf, 0)
         selection.write(self._success_hold, 0.0)
@@ -427,7 +420,8 @@ class VecEnv(ABC):
     def _counters(self) -> None:
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         """Steps of the running episode. (num_envs,)"""
-        self.episode_index = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+        # the first reset of a new environment begins episode 0, as a reset with a seed does
+        self.episode_index = torch.full((self.num_envs,), -1, dtype=torch.int64, device=self.device)
         """Episodes begun before the running one; random streams are keyed by it. (num_envs,)"""
         self._ids = torch.arange(self.num_envs, device=self.device)
         self.common_step = 0

@@ -9,19 +9,32 @@ from torch import Tensor
 
 from rlcli.errors import DivergedError
 from rlcli.managers.term import BoundTerm, check_shape
+from rlcli.managers.termination import DIVERGED
 from rlcli.sim.selection import Selection
 
 
 class RewardManager:
-    """Terms with weight 0 are not called."""
+    """Terms with weight 0 are not called.
 
-    def __init__(self, terms: list[BoundTerm], num_envs: int, dt: float, device: torch.device) -> None:
+    Where a `divergence_reward` is configured, what it paid is kept as a term of its own.
+    """
+
+    def __init__(
+        self,
+        terms: list[BoundTerm],
+        num_envs: int,
+        dt: float,
+        device: torch.device,
+        divergence_reward: float | None = None,
+    ) -> None:
         self.terms = terms
         self._factors = [term.config.weight * dt for term in terms]  # type: ignore[attr-defined]
         self._values = torch.zeros(len(terms), num_envs, device=device)
         self._sums = torch.zeros(len(terms), num_envs, device=device)
         self._sums_by_env = self._sums.t()
         self._rows = list(self._values.unbind(0))
+        self._divergence_reward = divergence_reward
+        self._divergence_sums = torch.zeros(num_envs, device=device)
         self._active = [
             (term.call, row, factor)
             for term, row, factor in zip(terms, self._rows, self._factors, strict=True)
@@ -29,8 +42,9 @@ class RewardManager:
         ]
         self._totals = [torch.zeros(num_envs, device=device) for _ in range(3)]
         self._next = 0
-        for term in terms:
-            check_shape(term, term.call(), (num_envs,), "rewards")
+        for term, factor in zip(terms, self._factors, strict=True):
+            if factor != 0.0:
+                check_shape(term, term.call(), (num_envs,), "rewards")
 
     def compute(self) -> Tensor:
         """This step's reward. (num_envs,)
@@ -47,16 +61,23 @@ class RewardManager:
         self._sums += self._values
         return total
 
-    def replace(self, mask: Tensor, total: Tensor, reward: float) -> None:
-        """Give the masked environments another reward for this step; the terms' sums take the difference evenly out."""
-        self._sums -= torch.where(mask, self._values, 0.0)
-        total.masked_fill_(mask, reward)
+    def replace_diverged(self, diverged: Tensor, total: Tensor) -> None:
+        """Pay the `divergence_reward`, if there is one, instead of this step's terms."""
+        if self._divergence_reward is None:
+            return
+        self._sums -= torch.where(diverged, self._values, 0.0)
+        self._divergence_sums += diverged * self._divergence_reward
+        total.masked_fill_(diverged, self._divergence_reward)
 
     def episode(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor]]:
         """Return of the episode so far, and each term's share of it, where selected. (n,) each"""
-        sums = ended.read(self._sums_by_env)
+        sums = ended.read(self._sums_by_env).contiguous()  # a row's sum then rounds alike however many there are
         shares = {term.name: column for term, column in zip(self.terms, sums.unbind(1), strict=True)}
-        return sums.sum(dim=1), shares
+        returns = sums.sum(dim=1)
+        if self._divergence_reward is not None:
+            shares[DIVERGED] = ended.read(self._divergence_sums)
+            returns += shares[DIVERGED]
+        return returns, shares
 
     def explain(self) -> None:
         """Name the term that made a reward that is not finite.
@@ -75,13 +96,15 @@ class RewardManager:
     def reset(self, selection: Selection) -> None:
         """Episode sums start at zero."""
         selection.write(self._sums_by_env, 0.0)
+        selection.write(self._divergence_sums, 0.0)
         for term in self.terms:
             term.reset(selection)
 
     def state_dict(self) -> dict[str, Tensor]:
         """The running sums."""
-        return {"sums": self._sums.clone()}
+        return {"sums": self._sums.clone(), "divergence_sums": self._divergence_sums.clone()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Take back what `state_dict` gave."""
         self._sums.copy_(state["sums"])
+        self._divergence_sums.copy_(state["divergence_sums"])

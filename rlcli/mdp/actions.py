@@ -40,8 +40,9 @@ class _JointAction:
         actuators = [driven[c] for c in columns]
         self.size = len(columns)
         self._scale, self._offset, self._clip = scale, offset, clip
-        self._gear = torch.tensor(entity.engine.model.actuator_gear[actuators, 0], dtype=torch.float32)
-        self._geared = self.actuator == "motor" and bool((self._gear != 1.0).any())
+        gear = torch.tensor(entity.engine.model.actuator_gear[actuators, 0], dtype=torch.float32)
+        self._factor = 1.0 / gear if self.actuator == "motor" else gear
+        self._geared = bool((gear != 1.0).any())
         self._ctrl = entity.engine.field("ctrl")
         self._columns = as_index(actuators)
         # consecutive controls: a view of the engine's own, made once
@@ -56,7 +57,7 @@ class _JointAction:
             self.command += self._offset
         if self._clip is not None:
             self.command.clamp_(*self._clip)
-        command = self.command / self._gear if self._geared else self.command
+        command = self.command * self._factor if self._geared else self.command
         if self._target is not None:
             self._target.copy_(command)
         else:

@@ -92,12 +92,8 @@ def push_by_setting_velocity(
 ) -> None:
     """Add a uniform draw to the root's velocity, world frame [m/s, rad/s]."""
     push = selection.uniform(*_bounds(*linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
-    data = entity.data
-    entity.write_root_velocity(
-        selection,
-        selection.read(data.root_lin_vel_w) + push[:, :3],
-        selection.read(data.root_ang_vel_w) + push[:, 3:],
-    )
+    linear, angular = entity.read_root_velocity(selection)
+    entity.write_root_velocity(selection, linear + push[:, :3], angular + push[:, 3:])
 
 
 def apply_external_force_torque(

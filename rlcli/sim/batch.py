@@ -64,6 +64,7 @@ class BatchEngine:
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         self._step_stage = _NONE
         self._forward_stage = _NONE
+        self._own_constants = False
 
     @property
     def reads_derived(self) -> bool:
@@ -82,7 +83,7 @@ class BatchEngine:
                 self._forward_stage = _ACC
             elif name not in _NOT_DERIVED:
                 self._step_stage = _VEL
-                self._forward_stage = max(self._forward_stage, _VEL)
+                self._forward_stage = max(self._forward_stage, _ACC if self._senses(name) else _VEL)
         return self._fields[name]
 
     def expand(self, name: str) -> Tensor:
@@ -90,6 +91,14 @@ class BatchEngine:
         if name not in MODEL_FIELDS:
             raise ValueError(f"'{name}' cannot differ between worlds; {did_you_mean(name, MODEL_FIELDS) or ''}")
         return torch.from_numpy(self._batch.expand(name))
+
+    def set_constants(self) -> None:
+        """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
+        try:
+            self._batch.set_const()
+        except SimulationError as error:
+            raise _engine_error(error) from None
+        self._own_constants = True
 
     def step(self, nstep: int) -> None:
         """Advance every world by `nstep` physics steps."""
@@ -139,10 +148,15 @@ class BatchEngine:
         return IdSelection(ids, seed, counters.numpy()[ids]) if len(ids) else None
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Copies of the state rows, of the warning counters and of the model fields that differ between worlds."""
+        """Copies of the state rows, of the warning counters and of the model fields that differ between worlds.
+
+        Also of the bound fields of the last substep, which no forward from the state gives back.
+        """
         expanded = {f"model.{name}": torch.from_numpy(np.array(v)) for name, v in self._batch._expanded.items()}
         warning = torch.from_numpy(np.array(self._batch.warning))
-        return {"state": self._state.clone(), "warning": warning, **expanded}
+        substep = {f"substep.{name}": value.clone() for name, value in self._fields.items() if self._of_substep(name)}
+        constants = torch.tensor(self._own_constants)
+        return {"state": self._state.clone(), "warning": warning, "constants": constants, **expanded, **substep}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Take back what `state_dict` gave; derived fields are computed anew."""
@@ -151,8 +165,13 @@ class BatchEngine:
         for name, values in state.items():
             if name.startswith("model."):
                 self.expand(name.removeprefix("model.")).copy_(values)
+        if bool(state["constants"]):
+            self.set_constants()
         if self._forward_stage != _NONE:
             self._batch.forward(stage=self._forward_stage)
+        for name, field in self._fields.items():
+            if f"substep.{name}" in state:
+                field.copy_(state[f"substep.{name}"])
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """One world as MjModel and MjData, forwarded; asked again for the same world, the same two objects, updated."""
@@ -167,6 +186,14 @@ class BatchEngine:
 
     def close(self) -> None:
         """Nothing is held that Python does not free."""
+
+    def _senses(self, name: str) -> bool:
+        """Whether the field holds sensors of the acceleration stage."""
+        stages = self.model.sensor_needstage
+        return name == "sensordata" and bool((stages == int(mujoco.mjtStage.mjSTAGE_ACC)).any())
+
+    def _of_substep(self, name: str) -> bool:
+        return name in _ACCELERATION or self._senses(name)
 
     def _default_row(self) -> np.ndarray:
         data = mujoco.MjData(self.model)

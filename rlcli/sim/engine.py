@@ -39,7 +39,14 @@ class Engine(Protocol):
         ...
 
     def expand(self, name: str) -> Tensor:
-        """A model field with a value for every world, live and writable. (num_envs, ...)"""
+        """A model field with a value for every world, live and writable. (num_envs, ...)
+
+        After writing masses, inertias, positions and the like, call `set_constants`.
+        """
+        ...
+
+    def set_constants(self) -> None:
+        """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
         ...
 
     def step(self, nstep: int) -> None:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rlcli.config.schema import EntityConfig
+from rlcli.errors import TaskError
 from rlcli.sim.engine import Engine
 from rlcli.sim.names import match
 from rlcli.sim.rotations import rotate, rotate_inverse
@@ -35,14 +36,16 @@ class SimData:
         joined = _joined(qpos, qvel)
         self._sources = [qpos, qvel] if joined is None else [joined]
         self._copies = [source.to(torch.float32).contiguous() for source in self._sources]
+        self._before = [copy.clone() for copy in self._copies]
         self.qpos = self._copies[0][:, : qpos.shape[1]]
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
         self._derived: dict[str, tuple[int, Tensor]] = {}
 
     def refresh(self) -> None:
-        """Copy the state of every world."""
-        for copy, source in zip(self._copies, self._sources, strict=True):
+        """Copy the state of every world; the state before is kept for `restore_rows`."""
+        for before, copy, source in zip(self._before, self._copies, self._sources, strict=True):
+            before.copy_(copy)
             copy.copy_(source)
         self.stamp += 1
 
@@ -53,9 +56,9 @@ class SimData:
         self.stamp += 1
 
     def restore_rows(self, selection: Selection) -> None:
-        """Write the last copied state of the selected worlds back to the engine."""
-        for copy, source in zip(self._copies, self._sources, strict=True):
-            selection.write(source, selection.read(copy))
+        """Write the state before the last refresh back to the engine, in the selected worlds."""
+        for before, source in zip(self._before, self._sources, strict=True):
+            selection.write(source, selection.read(before))
 
     def is_finite(self) -> bool:
         """Whether the copied state is finite everywhere."""
@@ -100,7 +103,7 @@ class Entity:
         self.joint_names = self.names["Joints"]
         self.qpos_columns = torch.from_numpy(model.jnt_qposadr[self.joint_ids].astype(np.int64))
         self.dof_columns = torch.from_numpy(model.jnt_dofadr[self.joint_ids].astype(np.int64))
-        self.root_body = self.body_ids[0]
+        self.root_body = int(self.body_ids[0]) if len(self.body_ids) else 0
         self.root_qpos, self.root_dof = self._root(model)
         self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
         self._column_cache: dict[tuple, tuple[Columns, Columns]] = {}
@@ -152,16 +155,32 @@ class Entity:
 
     def write_root_pose(self, selection: Selection, position: Tensor, quat: Tensor) -> None:
         """Set the root's pose in its environment's frame. position (rows, 3) [m], quat (rows, 4) w, x, y, z"""
-        assert self.root_qpos is not None
-        selection.write(self._qpos, torch.cat([position, quat], dim=1), slice(self.root_qpos, self.root_qpos + 7))
+        root, _ = self.floating()
+        selection.write(self._qpos, torch.cat([position, quat], dim=1), slice(root, root + 7))
 
     def write_root_velocity(self, selection: Selection, linear_w: Tensor, angular_w: Tensor) -> None:
         """Set the root's velocity, world frame; set the pose first. linear [m/s] and angular [rad/s], (rows, 3) each"""
-        assert self.root_qpos is not None
-        assert self.root_dof is not None
-        quat = selection.read(self._qpos, slice(self.root_qpos + 3, self.root_qpos + 7)).float()
+        root, dof = self.floating()
+        quat = selection.read(self._qpos, slice(root + 3, root + 7)).float()
         local = rotate_inverse(quat, angular_w)  # a free joint's angular velocity is in the body's frame
-        selection.write(self._qvel, torch.cat([linear_w, local], dim=1), slice(self.root_dof, self.root_dof + 6))
+        selection.write(self._qvel, torch.cat([linear_w, local], dim=1), slice(dof, dof + 6))
+
+    def read_root_velocity(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """The root's velocity as it is now, also where it has just been set, world frame. (rows, 3) each"""
+        qpos, dof = self.floating()
+        velocity = selection.read(self._qvel, slice(dof, dof + 6)).float()
+        quat = selection.read(self._qpos, slice(qpos + 3, qpos + 7)).float()
+        return velocity[:, :3], rotate(quat, velocity[:, 3:])
+
+    def floating(self) -> tuple[int, int]:
+        """Where the free joint of the root lies in qpos and in qvel.
+
+        Raises:
+            TaskError: if the root is fixed to the world.
+        """
+        if self.root_qpos is None or self.root_dof is None:
+            raise TaskError(f"entity '{self.name}' is fixed to the world and cannot be moved")
+        return self.root_qpos, self.root_dof
 
     def _columns(self, of: Tensor, joints: Columns) -> Columns:
         key = (id(of), joints.start, joints.stop) if isinstance(joints, slice) else (id(of), id(joints), None)
@@ -310,6 +329,8 @@ class EntityData:
         entity = self._entity
         if entity.root_qpos is not None:
             pose = model.qpos0[entity.root_qpos : entity.root_qpos + 7]
+        elif not entity.root_body:  # geoms of the world only
+            pose = np.concatenate([entity.config.pos, entity.config.quat])
         else:
             body = entity.root_body
             pose = np.concatenate([model.body_pos[body], model.body_quat[body]])

@@ -135,14 +135,16 @@ class Scene:
                     setattr(self.spec.option, option, getattr(child.option, option))
         for key in list(child.keys):
             child.delete(key)  # keyframes of one entity have the wrong size in a scene of several
+        _name_all(child)
+        self.spec.memory = max(self.spec.memory, child.memory)
         quat = np.asarray(entity.quat) / np.linalg.norm(entity.quat)
         frame = self.spec.worldbody.add_frame(pos=entity.pos, quat=quat)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             self.spec.attach(child, prefix=f"{name}/", frame=frame)
-        self._override_joints(name, entity)
+        self._override_joints(name, entity, degrees=bool(child.compiler.degree))
 
-    def _override_joints(self, name: str, entity: EntityConfig) -> None:
+    def _override_joints(self, name: str, entity: EntityConfig, *, degrees: bool) -> None:
         joints = self._joints(name)
         names = [joint.name.removeprefix(f"{name}/") for joint in joints]
         for pattern, change in entity.joints.items():
@@ -154,17 +156,25 @@ class Scene:
                 )
                 continue
             for position in positions:
-                _override(joints[position], change)
-                self._limit_effort(joints[position].name, change)
+                _override(joints[position], change, degrees=degrees)
+                self._tune(joints[position].name, change)
                 if change.actuator is not None:
                     self._actuate(name, names[position], change.actuator)
 
-    def _limit_effort(self, joint: str, change: JointConfig) -> None:
-        if change.effort_limit is None:
-            return
+    def _tune(self, joint: str, change: JointConfig) -> None:
+        """Gains and limits of the actuators that the joint has."""
         for actuator in self.spec.actuators:
-            if actuator.target == joint:
+            if actuator.target != joint or actuator.trntype != mujoco.mjtTrn.mjTRN_JOINT:
+                continue
+            if change.effort_limit is not None:
                 _limit(actuator, change.effort_limit)
+            kind = _spec_kind(actuator)
+            if kind == "position" and change.kp is not None:
+                actuator.gainprm[0], actuator.biasprm[1] = change.kp, -change.kp
+            if kind == "velocity" and change.kv is not None:
+                actuator.gainprm[0] = change.kv
+            if kind in ("position", "velocity") and change.kv is not None:
+                actuator.biasprm[2] = -change.kv
 
     def _actuate(self, entity: str, joint: str, kind: str) -> None:
         target = f"{entity}/{joint}"
@@ -275,7 +285,26 @@ def _spec_kind(a: mujoco.MjsActuator) -> str:
     return actuator_kind(int(a.trntype), int(a.dyntype), int(a.gaintype), int(a.biastype), a.gainprm, a.biasprm)
 
 
-def _override(joint: mujoco.MjsJoint, change: JointConfig) -> None:
+def _name_all(child: mujoco.MjSpec) -> None:
+    """Give what the MJCF leaves unnamed a name: an entity knows its elements by the prefix of their names."""
+    for kind, elements in (
+        ("body", child.bodies[1:]),
+        ("joint", child.joints),
+        ("site", child.sites),
+        ("sensor", child.sensors),
+        ("actuator", child.actuators),
+    ):
+        taken = {element.name for element in elements}
+        for number, element in enumerate(elements):
+            if not element.name:
+                wanted = element.target if kind == "actuator" and element.target not in taken else f"{kind}_{number}"
+                while wanted in taken:
+                    wanted += "_"
+                element.name = wanted
+                taken.add(wanted)
+
+
+def _override(joint: mujoco.MjsJoint, change: JointConfig, *, degrees: bool) -> None:
     for key, attribute in (
         ("damping", "damping"),
         ("stiffness", "stiffness"),
@@ -291,12 +320,15 @@ def _override(joint: mujoco.MjsJoint, change: JointConfig) -> None:
             else:
                 setattr(joint, attribute, value)
     if change.range is not None:
-        joint.range = list(change.range)
+        # a spec keeps angles in the unit of the MJCF it came from
+        turn = 180.0 / np.pi if degrees and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
+        joint.range = [turn * end for end in change.range]
         joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
 
 
 def _limit(actuator: mujoco.MjsActuator, effort: float) -> None:
-    actuator.forcerange = [-effort, effort]
+    force = effort / (abs(actuator.gear[0]) or 1.0)  # MuJoCo's limit is before the gear, ours is on the joint
+    actuator.forcerange = [-force, force]
     actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
 
 

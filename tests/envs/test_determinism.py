@@ -1,0 +1,89 @@
+import pytest
+import yaml
+from worlds import CRITTER_TASK, build, critter, dump, edited, life, run, same
+
+TASKS = ["cartpole", "cartpole-direct", "critter"]
+
+
+@pytest.fixture
+def place(tmp_path):
+    return lambda name: critter(tmp_path) if name == "critter" else name
+
+
+def steps_of(name):
+    return 90 if name == "critter" else 150
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_first_environment_is_bit_identical_for_any_number_of_environments_and_threads(name, place):
+    task, steps = place(name), steps_of(name)
+    reference = run(build(task, 1, "sim.engine_threads=1", "episode_length_s=0.6"), steps)
+    ended = sum(bool(r.terminated[0] | r.truncated[0]) for r in reference)
+    assert ended >= 2, "the trajectory must cross resets"
+    for num_envs, threads in [(8, 2), (64, 4), (64, 1), (3, 1), (1, 4)]:
+        env = build(task, num_envs, f"sim.engine_threads={threads}", "episode_length_s=0.6")
+        assert same(life(run(env, steps), 0), life(reference, 0)), (num_envs, threads)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_equal_seeds_repeat_and_other_seeds_differ(name, place):
+    task = place(name)
+    first, again, other = (run(build(task, 4, seed=seed), 40) for seed in (5, 5, 6))
+    for env in range(4):
+        assert same(life(first, env), life(again, env))
+        assert not same(life(first, env), life(other, env))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_environments_of_one_run_live_different_lives(name, place):
+    results = run(build(place(name), 4), 5)
+    assert not same(life(results, 0), life(results, 1))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_reset_with_a_seed_starts_over_as_a_new_environment_of_that_seed(name, place):
+    task = place(name)
+    used = build(task, 4, seed=1)
+    run(used, 30)
+    used.reset(seed=9)
+    fresh = build(task, 4, seed=9)
+    assert same(life(run(used, 30, reset=False), 2), life(run(fresh, 30), 2))
+
+
+def test_a_second_reset_without_seed_begins_other_episodes(place):
+    env = build("cartpole", 4)
+    first = env.reset()["policy"].clone()
+    assert not first.equal(env.reset()["policy"])
+
+
+def test_a_life_does_not_depend_on_whether_others_reset(place):
+    task = place("critter")
+    reference = run(build(task, 8), 60)
+    env = build(task, 8)
+    env.reset()
+    env.episode_length_buf[[0, 2, 5, 6]] = 17  # others time out at other moments
+    disturbed = run(env, 60, reset=False)
+    ends = [[bool(r.truncated[i]) for r in results] for results in (reference, disturbed) for i in (0,)]
+    assert ends[0] != ends[1]
+    for i in (1, 3, 4, 7):
+        assert same(life(disturbed, i), life(reference, i))
+
+
+def test_a_life_does_not_depend_on_which_other_events_exist(tmp_path):
+    """An event that draws but changes nothing, before the others, shifts no other draw."""
+    idle = {
+        f"idle_{mode}": {"func": "apply_external_force_torque", "mode": mode, "bodies": ["leg_fl"]}
+        for mode in ("startup", "reset")
+    }
+    data = yaml.safe_load(CRITTER_TASK)
+    data["events"] = {**idle, **data["events"]}
+    more = critter(tmp_path / "more", dump(data))
+    reference = run(build(critter(tmp_path), 8), 60)
+    results = run(build(more, 8), 60)
+    assert same(life(results, 7), life(reference, 7))
+
+
+def test_the_draws_of_an_interval_event_do_not_depend_on_other_environments(tmp_path):
+    task = critter(tmp_path, edited(CRITTER_TASK, episode_length_s=5.0))
+    few, many = run(build(task, 2), 60), run(build(task, 16), 60)
+    assert same(life(few, 1), life(many, 1))

@@ -1,0 +1,347 @@
+"""The step contract of manager-based environments, point by point."""
+
+import pytest
+import torch
+from worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, edited, pendulum, run
+
+TERMS = '''
+import torch
+
+CALLS = []
+
+
+def angle(env, *, entity: Entity = "robot") -> torch.Tensor:
+    """(num_envs,)"""
+    CALLS.append(float(entity.data.joint_pos[0, 0]))
+    return entity.data.joint_pos[:, 0]
+
+
+def beyond(env, *, entity: Entity = "robot", limit: float) -> torch.Tensor:
+    """(num_envs,) bool"""
+    return entity.data.joint_pos[:, 0] > limit
+
+
+def explosive(env) -> torch.Tensor:
+    """(num_envs,)"""
+    raise AssertionError("called")
+
+
+def note(env, selection, *, tag: str) -> None:
+    """Remember who fired when."""
+    env.notes = [*getattr(env, "notes", []), (tag, env.common_step, selection.read(env._ids).tolist())]
+
+
+def angle_row(env, *, entity: Entity = "robot") -> torch.Tensor:
+    """(num_envs, 1)"""
+    return entity.data.joint_pos
+'''
+TERMS = "from rlcli.task import Entity\n" + TERMS
+
+
+def world(tmp_path, **changes):
+    return pendulum(tmp_path, edited(PENDULUM_TASK, **changes), terms_py=TERMS)
+
+
+def idle(env):
+    return torch.zeros(env.num_envs, env.layout.action_size)
+
+
+def set_angle(env, ids, value):
+    env.engine.field("qpos")[ids, 0] = value
+    env.sim.refresh()
+
+
+BEYOND = {"time_out": {"func": "time_out", "time_out": True}, "beyond": {"func": "beyond", "limit": 1.0}}
+
+
+def test_rewards_are_weight_times_value_times_step_dt(tmp_path):
+    env = build(world(tmp_path))
+    env.reset()
+    assert env.step(idle(env)).reward.tolist() == pytest.approx([0.02] * 3)
+
+
+def test_reward_dt_scaling_can_be_switched_off(tmp_path):
+    env = build(world(tmp_path, reward_dt_scaling=False))
+    env.reset()
+    assert env.step(idle(env)).reward.tolist() == [1.0] * 3
+
+
+def test_the_terminating_step_is_paid_from_the_terminal_state_with_alive_0_and_terminating_1(tmp_path):
+    env = build(world(
+        tmp_path,
+        reward_dt_scaling=False,
+        terminations=BEYOND,
+        rewards={"angle": {"func": "angle", "weight": 100.0}},
+    ))  # fmt: skip
+    env.reset()
+    set_angle(env, [1], 2.0)
+    result = env.step(idle(env))
+    terminal = float(result.final_obs["policy"][1, 0])
+    assert terminal > 1.0
+    assert result.terminated.tolist() == [False, True, False]
+    assert not result.truncated.any()
+    assert float(result.reward[1]) == pytest.approx(0.0 - 10.0 + 100.0 * terminal, rel=1e-6)
+    assert float(result.reward[0]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_time_out_at_exactly_the_episode_length_is_truncation_with_alive_1(tmp_path):
+    env = build(world(tmp_path, reward_dt_scaling=False))
+    assert env.max_episode_length == 10
+    results = run(env, 20)
+    for step, result in enumerate(results, 1):
+        assert result.truncated.tolist() == [step in (10, 20)] * 3
+        assert not result.terminated.any()
+        assert result.reward.tolist() == [1.0] * 3
+        assert (result.episodes is None) == (step not in (10, 20))
+    assert results[9].episodes.lengths.tolist() == [10] * 3
+    assert results[9].episodes.truncated.tolist() == [True] * 3
+    assert results[9].episodes.causes["time_out"].tolist() == [True] * 3
+
+
+@pytest.mark.parametrize(("length", "dt", "decimation", "steps"), [(5.0, "1/120", 2, 300), (8.3, 0.0083, 2, 500),
+                                                                    (1.0, 0.01, 3, 34), (0.06, 0.02, 3, 1)])  # fmt: skip
+def test_the_number_of_steps_of_an_episode_is_rounded_up_without_rounding_errors(
+    tmp_path, length, dt, decimation, steps
+):
+    assert (
+        build(world(tmp_path, episode_length_s=length, sim={"dt": dt}, decimation=decimation)).max_episode_length
+        == steps
+    )
+
+
+def test_a_state_may_be_terminated_and_truncated_and_is_then_no_time_out(tmp_path):
+    env = build(world(tmp_path, terminations=BEYOND))
+    env.reset()
+    for _ in range(9):
+        env.step(idle(env))
+    set_angle(env, [0], 2.0)
+    result = env.step(idle(env))
+    assert result.terminated.tolist() == [True, False, False]
+    assert result.truncated.tolist() == [True, True, True]
+    assert result.episodes.truncated.tolist() == [False, True, True]
+    assert result.episodes.causes["beyond"].tolist() == [True, False, False]
+
+
+def test_after_a_same_step_reset_counters_are_zero_and_the_observation_is_the_new_state(tmp_path):
+    env = build(critter(tmp_path), 4)
+    env.reset()
+    before = [env.step(torch.full((4, 4), 0.3)) for _ in range(2)][-1].obs["policy"].clone()
+    env.episode_length_buf[2] = env.max_episode_length - 1
+    result = env.step(torch.full((4, 4), 0.3))
+    assert result.truncated.tolist() == [False, False, True, False]
+    assert env.episode_length_buf.tolist() == [3, 3, 0, 3]
+    final, fresh = result.final_obs["policy"][2], result.obs["policy"][2]
+    assert not torch.equal(final, fresh)
+    qpos = env.engine.field("qpos")[2].float()
+    joints = env.entities["robot"].data.default_joint_pos[2]
+    assert float(fresh[0]) == float(qpos[2])
+    assert torch.allclose(fresh[10:14], qpos[7:11] - joints)
+    assert (fresh[-4:] == 0).all(), "the new episode has no last action"
+    assert (final[-4:] == 0.3).all(), "the old one had"
+    assert torch.allclose(final, before[2], atol=2.0)
+    assert not env.action_manager.action[2].any()
+    assert not env.action_manager.prev_action[2].any()
+    assert env.action_manager.action[1].all()
+
+
+def test_final_obs_is_the_observation_an_endless_episode_would_have_had(tmp_path):
+    """The last observation of a time-out is that of the state, not of the reset, bit for bit."""
+    short = build(critter(tmp_path), 3, "episode_length_s=0.1", "events.push=null", "events.shove=null")
+    long = build(critter(tmp_path), 3, "episode_length_s=9.0", "events.push=null", "events.shove=null")
+    ended, goes_on = run(short, 5)[-1], run(long, 5)[-1]
+    assert ended.truncated.all()
+    for group in ("policy", "critic"):
+        assert torch.equal(ended.final_obs[group], goes_on.obs[group])
+    assert torch.equal(ended.reward, goes_on.reward)
+
+
+@pytest.mark.parametrize("kind", ["pendulum", "cartpole-direct"])
+def test_final_obs_of_truncated_is_none_when_nothing_was_truncated(tmp_path, kind):
+    env = build(world(tmp_path, terminations=BEYOND) if kind == "pendulum" else kind, 3)
+    env.reset()
+    env.final_obs_of = "truncated"
+    set_angle(env, [0], 3.5)
+    result = env.step(idle(env))
+    assert result.terminated.tolist() == [True, False, False]
+    assert result.final_obs is None
+    env.episode_length_buf[1] = env.max_episode_length - 1
+    set_angle(env, [1], 0.25)
+    result = env.step(idle(env))
+    assert result.truncated.tolist() == [False, True, False]
+    assert float(result.final_obs["policy"][1].abs().max()) > 0.2
+
+
+def test_no_final_obs_and_no_episodes_while_all_go_on(tmp_path):
+    env = build(world(tmp_path))
+    env.reset()
+    result = env.step(idle(env))
+    assert result.final_obs is None
+    assert result.episodes is None
+
+
+def test_a_reward_of_weight_0_is_not_called_at_all(tmp_path):
+    env = build(world(tmp_path, rewards={"off": {"func": "explosive", "weight": 0.0}}))
+    results = run(env, 11)
+    assert results[9].episodes.reward_terms["off"].tolist() == [0.0] * 3
+
+
+def test_reward_terms_add_up_to_the_return_and_the_return_to_the_rewards(tmp_path):
+    env = build(critter(tmp_path), 8)
+    paid = torch.zeros(8, dtype=torch.float64)
+    seen = 0
+    for result in run(env, 70):
+        paid += result.reward.double()
+        if result.episodes is not None:
+            ended = result.episodes
+            seen += len(ended.ids)
+            terms = sum(v.double() for v in ended.reward_terms.values())
+            assert torch.allclose(terms, ended.returns.double(), rtol=1e-6, atol=1e-6)
+            assert torch.allclose(paid[ended.ids], ended.returns.double(), rtol=1e-5, atol=1e-5)
+            paid[ended.ids] = 0.0
+    assert seen > 10
+
+
+@pytest.mark.parametrize("name", ["cartpole", "cartpole-direct", "critter"])
+def test_consecutive_observations_and_rewards_share_no_memory(tmp_path, name):
+    env = build(critter(tmp_path) if name == "critter" else name, 4)
+    previous = env.reset()["policy"]
+    kept = previous.clone()
+    reward = None
+    for _ in range(4):
+        result = env.step(torch.rand(4, env.layout.action_size))
+        assert torch.equal(previous, kept), "the observation before was overwritten"
+        if reward is not None:
+            assert torch.equal(reward[0], reward[1])
+        assert result.obs["policy"].data_ptr() != previous.data_ptr()
+        previous, kept = result.obs["policy"], result.obs["policy"].clone()
+        reward = (result.reward, result.reward.clone())
+
+
+@pytest.mark.parametrize("name", ["cartpole", "cartpole-direct", "critter"])
+def test_partial_reset_leaves_other_envs_untouched(tmp_path, name):
+    task = critter(tmp_path) if name == "critter" else name
+    twins = [build(task, 6) for _ in range(2)]
+    for env in twins:
+        run(env, 7)
+    twins[1].episode_length_buf[[1, 4]] = twins[1].max_episode_length - 1
+    action = torch.full((6, twins[0].layout.action_size), 0.1)
+    plain, partly = (env.step(action) for env in twins)
+    assert partly.truncated.tolist() == [False, True, False, False, True, False]
+    rest = [0, 2, 3, 5]
+    for group in plain.obs:
+        assert torch.equal(plain.obs[group][rest], partly.obs[group][rest])
+        assert not torch.equal(plain.obs[group][1], partly.obs[group][1])
+    rows = [env.engine.state_dict()["state"] for env in twins]
+    assert torch.equal(rows[0][rest], rows[1][rest])
+    assert not torch.equal(rows[0][1], rows[1][1])
+
+
+def events(env, tag):
+    return [(step, ids) for t, step, ids in getattr(env, "notes", []) if t == tag]
+
+
+def test_startup_events_fire_once_and_reset_events_at_every_episode(tmp_path):
+    env = build(world(tmp_path, events={
+        "first": {"func": "note", "mode": "startup", "tag": "startup"},
+        "each": {"func": "note", "mode": "reset", "tag": "reset"},
+    }))  # fmt: skip
+    env.reset()
+    env.episode_length_buf[1] = 7
+    for _ in range(3):
+        env.step(idle(env))
+    env.reset(seed=3)
+    assert events(env, "startup") == [(0, [0, 1, 2])]
+    assert events(env, "reset") == [(0, [0, 1, 2]), (3, [1]), (0, [0, 1, 2])]
+
+
+def fired_steps(tmp_path, interval, dt, decimation, steps, length=1000.0):
+    env = build(world(
+        tmp_path,
+        sim={"dt": dt}, decimation=decimation, episode_length_s=length,
+        events={"tick": {"func": "note", "mode": "interval", "interval_range_s": [interval, interval], "tag": "tick"}},
+    ), 1)  # fmt: skip
+    env.reset()
+    for _ in range(steps):
+        env.step(idle(env))
+    return [step for step, _ in events(env, "tick")]
+
+
+@pytest.mark.parametrize(
+    ("interval", "dt", "decimation", "every"),
+    [(0.1, 0.01, 2, 5), (5.0, "1/120", 2, 300), (2.0, 0.01, 1, 200), (0.05, 0.02, 1, 3), (0.001, 0.02, 1, 1)],
+)
+def test_interval_events_keep_their_period_without_drift(tmp_path, interval, dt, decimation, every):
+    steps = 3 * every + every // 2
+    assert fired_steps(tmp_path, interval, dt, decimation, steps) == [every, 2 * every, 3 * every]
+
+
+def test_interval_timers_start_anew_with_an_episode_and_no_time_passes_at_its_reset(tmp_path):
+    # episodes of 8 steps, an event every 5: at 5, then 5 steps into the second episode
+    assert fired_steps(tmp_path, 0.1, 0.01, 2, 24, length=0.16) == [5, 13, 21]
+
+
+def test_interval_times_are_drawn_an_environment_within_their_bounds(tmp_path):
+    env = build(world(tmp_path, episode_length_s=100.0, events={
+        "tick": {"func": "note", "mode": "interval", "interval_range_s": [0.1, 0.2], "tag": "tick"},
+    }), 16)  # fmt: skip
+    env.reset()
+    for _ in range(60):
+        env.step(idle(env))
+    gaps = set()
+    for env_id in range(16):
+        steps = [0, *(step for step, ids in events(env, "tick") if env_id in ids)]
+        gaps |= {b - a for a, b in zip(steps, steps[1:], strict=False)}
+    assert gaps <= set(range(5, 11))
+    assert len(gaps) >= 4
+
+
+def test_the_observation_after_an_interval_event_shows_what_it_did(tmp_path):
+    env = build(critter(tmp_path, edited(CRITTER_TASK, episode_length_s=5.0)), 4)
+    env.reset()
+    for _ in range(30):
+        obs = env.step(torch.zeros(4, 4)).obs["policy"]
+        velocity = env.engine.field("qvel").float()
+        assert torch.equal(env.entities["robot"].data.root_lin_vel_w, velocity[:, :3])
+        assert torch.allclose(obs[:, 4:7], 0.25 * velocity[:, 3:6])
+
+
+def test_two_pushes_in_one_step_add_up_and_a_push_at_reset_starts_from_the_reset_state(tmp_path):
+    push = {"func": "push_by_setting_velocity", "linear_velocity": [[1.0, 1.0], [0.0, 0.0], [0.0, 0.0]]}
+    both = {**push, "mode": "interval", "interval_range_s": [0.02, 0.02]}
+    changes = {"root": None, "joints": None, "shove": None, "push": None}
+    env = build(critter(tmp_path, edited(CRITTER_TASK, sim={"gravity": [0.0, 0.0, 0.0]}, events={
+        **changes, "at_reset": {**push, "mode": "reset"}, "a": both, "b": both,
+    })), 2)  # fmt: skip
+    env.reset()
+    for _ in range(2):
+        assert env.engine.field("qvel")[:, 0].tolist() == pytest.approx([1.0, 1.0], abs=1e-6)
+        env.step(torch.zeros(2, 4))
+        assert env.engine.field("qvel")[:, 0].tolist() == pytest.approx([3.0, 3.0], abs=0.3)
+        env.reset()
+
+
+def test_only_finite_actions_of_the_right_shape_are_taken(tmp_path):
+    env = build(world(tmp_path))
+    env.reset()
+    with pytest.raises(ValueError, match=r"action has shape \(3,\), expected \(3, 1\)"):
+        env.step(torch.zeros(3))
+    env.pause()
+    assert not env.is_playing()
+    with pytest.raises(RuntimeError, match="paused"):
+        env.step(idle(env))
+    env.pause(False)
+    env.step(idle(env))
+
+
+def test_success_needs_the_condition_held_to_a_time_out(tmp_path):
+    task = world(tmp_path, terminations=BEYOND,
+                 success={"func": "joints_near", "target": 0.0, "tolerance": 0.5, "hold_s": 0.1})  # fmt: skip
+    env = build(task, 4)
+    env.reset()
+    for step in range(10):
+        angles = [0.0, 0.9 if step < 5 else 0.0, 0.9 if step < 6 else 0.0, 0.0 if step < 9 else 1.5]
+        env.engine.field("qvel")[:] = 0.0
+        for i, angle in enumerate(angles):
+            env.engine.field("qpos")[i, 0] = angle
+        result = env.step(idle(env))
+    assert result.episodes.success.tolist() == [True, True, False, False]

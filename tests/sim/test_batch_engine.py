@@ -1,0 +1,241 @@
+"""The CPU engine against MuJoCo itself, one world at a time."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from worlds import CRITTER, PENDULUM
+
+from rlcli.errors import DeviceError
+from rlcli.sim.engine import open_engine
+from rlcli.sim.selection import IdSelection
+
+XML = CRITTER.replace("<worldbody>", '<worldbody><geom type="plane" size="5 5 1"/>').replace(
+    "</mujoco>",
+    "<actuator>" + "".join(f'<position joint="hip_{s}" kp="20" kv="0.5"/>' for s in ("fl", "fr", "bl", "br"))
+    + "</actuator></mujoco>",
+)  # fmt: skip
+N = 6
+
+
+def model_of(xml=XML):
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def some(*ids):
+    ids = np.array(ids, dtype=np.int64)
+    return IdSelection(ids, 0, np.zeros_like(ids))
+
+
+def scatter(engine, seed=0):
+    """Different states and controls in every world."""
+    random = np.random.default_rng(seed)
+    qpos = engine.field("qpos")
+    qpos[:, :3] += torch.from_numpy(random.uniform(-0.1, 0.1, (engine.num_envs, 3)))
+    qpos[:, 7:] += torch.from_numpy(random.uniform(-0.3, 0.3, (engine.num_envs, 4)))
+    engine.field("qvel")[:] = torch.from_numpy(random.uniform(-1, 1, (engine.num_envs, 10)))
+    engine.field("ctrl")[:] = torch.from_numpy(random.uniform(-1, 1, (engine.num_envs, 4)))
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_it_steps_like_a_loop_of_mj_step_bit_for_bit(threads):
+    model = model_of()
+    engine = open_engine(model, N, threads=threads)
+    engine.field("xpos")  # with a stage asked for the last substep, too
+    scatter(engine)
+    worlds = []
+    for i in range(N):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = (engine.field(f)[i].numpy() for f in ("qpos", "qvel", "ctrl"))
+        worlds.append(data)
+    for _ in range(40):
+        engine.step(3)
+        for i, data in enumerate(worlds):
+            mujoco.mj_step(model, data, 3)
+            for name in ("qpos", "qvel", "qacc_warmstart"):
+                np.testing.assert_array_equal(engine.field(name)[i].numpy(), getattr(data, name))
+    assert any(data.ncon for data in worlds), "contacts were part of it"
+
+
+def test_fields_are_live_views():
+    engine = open_engine(model_of(), N)
+    qpos, again = engine.field("qpos"), engine.field("qpos")
+    qpos[2, 2] = 5.0
+    assert again.data_ptr() == qpos.data_ptr()
+    before = qpos.clone()
+    engine.step(1)
+    assert not torch.equal(qpos, before)
+    assert float(qpos[2, 2]) == pytest.approx(5.0, abs=0.01)
+
+
+def kinematics(engine, i):
+    data = mujoco.MjData(engine.model)
+    data.qpos[:], data.qvel[:] = engine.field("qpos")[i].numpy(), engine.field("qvel")[i].numpy()
+    data.ctrl[:] = engine.field("ctrl")[i].numpy()
+    mujoco.mj_forward(engine.model, data)
+    return data
+
+
+def test_derived_fields_are_those_of_the_state_after_a_step_and_after_a_partial_reset():
+    engine = open_engine(model_of(), N)
+    fields = {name: engine.field(name) for name in ("xpos", "xquat", "cvel", "site_xpos")}
+    scatter(engine)
+    engine.step(4)
+    for i in range(N):
+        for name, value in fields.items():
+            np.testing.assert_allclose(value[i], getattr(kinematics(engine, i), name), atol=1e-12, rtol=0)
+    kept = {name: value.clone() for name, value in fields.items()}
+    engine.reset(some(1, 4))
+    engine.field("qpos")[4, 0] = 0.7
+    engine.forward(some(1, 4))
+    for i in range(N):
+        for name, value in fields.items():
+            np.testing.assert_allclose(value[i], getattr(kinematics(engine, i), name), atol=1e-12, rtol=0)
+            assert torch.equal(value[i], kept[name][i]) == (i not in (1, 4))
+    assert float(fields["xpos"][4, 1, 0]) == 0.7
+
+
+def test_gyro_and_accelerometer_are_the_new_episodes_after_a_partial_reset():
+    engine = open_engine(model_of(), N)
+    sensors = engine.field("sensordata")
+    scatter(engine)
+    engine.step(4)
+    gyro = sensors[0, 3:6].clone()
+    np.testing.assert_allclose(gyro, kinematics(engine, 0).sensordata[3:6], atol=1e-12)
+    kept = sensors.clone()
+    engine.reset(some(2))
+    engine.field("qpos")[2, 2], engine.field("ctrl")[2] = 0.25, 0.3  # on its feet: the ground pushes
+    engine.forward(some(2))
+    assert abs(kinematics(engine, 2).sensordata[2]) > 5.0
+    np.testing.assert_allclose(sensors[2], kinematics(engine, 2).sensordata, atol=1e-9)
+    assert torch.equal(sensors[[0, 1, 3, 4, 5]], kept[[0, 1, 3, 4, 5]])
+
+
+def test_acceleration_fields_are_those_of_the_last_substep():
+    model = model_of()
+    engine = open_engine(model, 1)
+    qacc, force = engine.field("qacc"), engine.field("actuator_force")
+    scatter(engine)
+    data = kinematics(engine, 0)
+    engine.step(3)
+    data = mujoco.MjData(model)
+    fresh = open_engine(model, 1)
+    scatter(fresh)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = (fresh.field(f)[0].numpy() for f in ("qpos", "qvel", "ctrl"))
+    mujoco.mj_step(model, data, 3)
+    np.testing.assert_array_equal(qacc[0], data.qacc)
+    np.testing.assert_array_equal(force[0], data.actuator_force)
+
+
+def test_reset_restores_the_whole_row_and_only_the_chosen_ones():
+    engine = open_engine(model_of(), N)
+    engine.set_default(torch.arange(11, dtype=torch.float64) / 10, torch.full((10,), 0.5, dtype=torch.float64))
+    engine.reset(some(0))
+    default = engine.state_dict()["state"][0]
+    scatter(engine)
+    engine.field("xfrc_applied")[:] = 3.0
+    engine.step(5)
+    kept = engine.state_dict()["state"]
+    engine.reset(some(0, 3))
+    state = engine.state_dict()["state"]
+    for i in range(N):
+        assert torch.equal(state[i], default if i in (0, 3) else kept[i])
+    assert engine.field("qpos")[3].tolist() == [k / 10 for k in range(11)]
+    assert engine.field("qvel")[3].tolist() == [0.5] * 10
+    assert not engine.field("xfrc_applied")[3].any()
+
+
+def test_gravity_of_each_world_is_seen_by_its_dynamics():
+    engine = open_engine(
+        model_of(PENDULUM.replace("base", "ball").replace('<body name="ball">', '<body name="ball"><freejoint/>')), 3
+    )
+    gravity = torch.tensor([-9.81, -1.62, 0.0], dtype=torch.float64)
+    engine.expand("opt.gravity")[:, 2] = gravity
+    engine.step(10)
+    t = 10 * engine.model.opt.timestep
+    # nothing but gravity acts: the root falls with v = g t
+    assert engine.field("qvel")[:, 2].tolist() == pytest.approx((gravity * t).tolist(), abs=1e-12)
+
+
+def test_mass_of_each_world_is_seen_by_its_dynamics():
+    xml = '<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="s" type="slide" axis="1 0 0"/>'
+    xml += '<geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="s"/></actuator></mujoco>'
+    engine = open_engine(model_of(xml), 3)
+    engine.expand("body_mass")[:, 1] = torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)
+    engine.set_constants()
+    engine.field("ctrl")[:] = 8.0
+    engine.step(5)
+    t = 5 * engine.model.opt.timestep
+    assert engine.field("qvel")[:, 0].tolist() == pytest.approx([8 * t, 4 * t, 2 * t], rel=1e-9)
+
+
+@pytest.mark.parametrize("threads", [1, 4])
+def test_a_restored_engine_goes_on_bit_for_bit_with_any_number_of_threads(threads):
+    model = model_of()
+    engine = open_engine(model, N, threads=2)
+    derived = engine.field("xpos"), engine.field("qacc"), engine.field("sensordata")
+    engine.expand("body_mass")[:, 1] = torch.linspace(2, 4, N, dtype=torch.float64)
+    engine.set_constants()
+    scatter(engine)
+    engine.step(25)
+    saved = engine.state_dict()
+    at_save = [value.clone() for value in derived]
+    engine.step(25)
+    other = open_engine(model, N, threads=threads)
+    restored = other.field("xpos"), other.field("qacc"), other.field("sensordata")
+    other.load_state_dict(saved)
+    for value, expected in zip(restored, at_save, strict=True):
+        assert torch.equal(value, expected), "what a policy would observe now"
+    other.step(25)
+    assert torch.equal(other.state_dict()["state"], engine.state_dict()["state"])
+    assert torch.equal(other.expand("body_mass"), engine.expand("body_mass"))
+
+
+def test_a_state_dict_is_a_copy():
+    engine = open_engine(model_of(), N)
+    saved = engine.state_dict()
+    kept = saved["state"].clone()
+    engine.step(2)
+    assert torch.equal(saved["state"], kept)
+
+
+def test_world_shows_one_world_without_disturbing_it():
+    engine = open_engine(model_of(), N)
+    engine.expand("body_mass")[3, 1] = 9.0
+    scatter(engine)
+    engine.step(5)
+    before = engine.state_dict()["state"]
+    model, data = engine.world(3)
+    np.testing.assert_array_equal(data.qpos, engine.field("qpos")[3])
+    assert model.body_mass[1] == 9.0
+    assert engine.model.body_mass[1] == 3.0
+    np.testing.assert_allclose(data.xpos, kinematics(engine, 3).xpos, atol=1e-12)
+    engine.step(1)
+    again = engine.world(3)
+    assert again[0] is model
+    assert again[1] is data
+    np.testing.assert_array_equal(data.qpos, engine.field("qpos")[3])
+    assert not torch.equal(before, engine.state_dict()["state"])
+
+
+def test_unknown_fields_are_named_with_the_nearest():
+    engine = open_engine(model_of(), 1)
+    with pytest.raises(ValueError, match=r"'qvle' is not an MjData field; did you mean .*'qvel'"):
+        engine.field("qvle")
+    with pytest.raises(ValueError, match=r"'body_masss' cannot differ between worlds; did you mean .*'body_mass'"):
+        engine.expand("body_masss")
+
+
+def test_a_device_without_an_engine_is_refused():
+    with pytest.raises(DeviceError, match="no simulation engine for device 'cuda'"):
+        open_engine(model_of(), 1, device="cuda")
+
+
+def test_dropped_contacts_are_counted_and_are_no_divergence():
+    engine = open_engine(model_of(), 2)
+    engine.step(1)
+    engine._batch.warning[1, int(mujoco.mjtWarning.mjWARN_CONTACTFULL), 1] = 1
+    assert engine.diverged() is None
+    assert engine.warnings["contact_full"] == 1
+    assert engine.diverged() is None
+    assert engine.warnings["contact_full"] == 1
