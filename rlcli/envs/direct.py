@@ -257,6 +257,10 @@ class DirectEnv(VecEnv):
 
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
         for name, value in state.items():
-            target = getattr(self if name in ("_returns", "_fresh") else self.task, name)
-            target.copy_(value)
+            owner: Any = self if name in ("_returns", "_fresh") else self.task
+            current = getattr(owner, name, None)
+            if isinstance(current, Tensor):
+                current.copy_(value)
+            else:  # a buffer that the task makes in its first step
+                setattr(owner, name, value.clone())
         self._observed = True
