@@ -10,7 +10,9 @@ from rlcli.envs.vec_env import make_env
 from rlcli.registry import find_task
 
 MODEL = """
-<mujoco><worldbody><body name="block"><joint name="slide" type="slide"/><geom size="0.1" mass="1"/></body></worldbody></mujoco>
+<mujoco><worldbody><body name="block">
+  <joint name="slide" type="slide"/><geom size="0.1" mass="1"/>
+</body></worldbody></mujoco>
 """
 YAML = """
 summary: Episodes that end on schedule.

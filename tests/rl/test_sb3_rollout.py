@@ -208,8 +208,7 @@ def test_an_adaptive_schedule_stays_in_its_range(make, scheduled):
 def test_a_learner_that_turns_nonfinite_is_a_divergence(make, scheduled, rate):
     trainer = trainer_of(*make(scheduled, f"agent.learning_rate={rate}"))
     with pytest.raises(DivergedError, match="not finite in iteration"):
-        for _ in range(3):
-            trainer.iterate()
+        [trainer.iterate() for _ in range(3)]
 
 
 @pytest.mark.parametrize(
