@@ -1,5 +1,6 @@
 """Pictures and video files, drawn without a display."""
 
+import json
 import os
 import subprocess
 import sys
@@ -17,6 +18,13 @@ from rlcli.viewer.video import Renderer, free_camera
 from rlcli.viewer.writer import VideoWriter, check_video, gif_stride
 
 PICTURES = [np.full((48, 64, 3), value, np.uint8) for value in (0, 80, 160, 240)]
+
+# in a process of its own: imageio's reader leaves pipes open
+READ = """
+import json, sys, imageio.v2 as imageio
+reader = imageio.get_reader(sys.argv[1])
+print(json.dumps([reader.get_meta_data()["fps"], [float(frame.mean()) for frame in reader]]))
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -71,15 +79,13 @@ def test_no_gl_at_all_says_what_was_tried_and_what_to_install():
 
 @pytest.mark.slow
 def test_an_mp4_has_every_picture_at_the_control_rate(tmp_path):
-    import imageio.v2 as imageio
-
     file = tmp_path / "deep" / "er" / "x.mp4"
     with VideoWriter(file, 1 / 60) as writer:
         for picture in PICTURES:
             writer.add(picture)
-    reader = imageio.get_reader(file)
-    assert reader.get_meta_data()["fps"] == 60
-    means = [float(frame.mean()) for frame in reader]
+    read = subprocess.run([sys.executable, "-c", READ, str(file)], capture_output=True, text=True)
+    fps, means = json.loads(read.stdout)
+    assert fps == 60
     assert means == pytest.approx([0, 80, 160, 240], abs=6)
     assert sorted(p.name for p in file.parent.iterdir()) == ["x.mp4"]
 
