@@ -36,8 +36,10 @@ class Sb3VecEnv(Sb3Base):
         self._action = torch.zeros(env.num_envs, env.layout.action_size)
 
     def reset(self) -> np.ndarray:
-        """Start new episodes everywhere. (num_envs, d)"""
-        return self.env.reset(seed=self._seeds[0])["policy"].numpy()
+        """Start new episodes everywhere; a seed given before holds once. (num_envs, d)"""
+        seed = self._seeds[0]
+        self._reset_seeds()
+        return self.env.reset(seed=seed)["policy"].numpy()
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions. (num_envs, a)"""

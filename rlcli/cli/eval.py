@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 import typer
@@ -48,9 +49,15 @@ def command(
 ) -> None:
     """Evaluate a policy."""
     from rlcli.cli.session import open_session
+    from rlcli.errors import UsageError
 
     console.quiet = quiet
     limits = _limits(fail_under or [])
+
+    def check(resolved: Any) -> None:
+        if "success" in limits and resolved.task.success is None:
+            raise UsageError("this task defines no success", hint="add `success:` to its YAML, or use return=X")
+
     session = open_session(
         task,
         overrides or [],
@@ -61,6 +68,7 @@ def command(
         seed=draw_seed(seed),
         config=config,
         runs_dir=runs_dir,
+        check=check,
     )
     from rlcli.rl.rollout import evaluate
 
@@ -92,18 +100,16 @@ def _limits(texts: list[str]) -> dict[str, float]:
             if not equals or key not in ("success", "return", "length"):
                 raise ValueError
             limits[key] = float(value)
+            if not math.isfinite(limits[key]):
+                raise ValueError
         except ValueError:
             raise UsageError(f"--fail-under '{text}' is not success=X, return=X or length=X") from None
     return limits
 
 
 def _verdict(summary: dict[str, Any], limits: dict[str, float]) -> list[str]:
-    from rlcli.errors import UsageError
-
     failures = []
     for key, limit in limits.items():
-        if key == "success" and "success" not in summary:
-            raise UsageError("this task defines no success", hint="add `success:` to its YAML, or use return=X")
         value = summary["success"]["rate"] if key == "success" else summary[key]["mean"]
         if value < limit:
             failures.append(f"{key} is {value:.6g}, below {limit:g}")

@@ -22,7 +22,11 @@ ConfigFile = Annotated[
 ]
 Agent = Annotated[str | None, typer.Option("--agent", help="Which of the task's agents.")]
 NumEnvs = Annotated[int | None, typer.Option("--num-envs", help="Short for scene.num_envs=N.")]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of everything random; -1 draws one and records it.")]
+MAX_SEED = 2**62
+Seed = Annotated[
+    int,
+    typer.Option("--seed", min=-1, max=MAX_SEED, help="Seed of everything random; -1 draws one and records it."),
+]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
 RunsDir = Annotated[Path | None, typer.Option("--runs-dir", help="Runs folder; else RLCLI_RUNS_DIR, else runs/.")]
 CheckpointRef = Annotated[

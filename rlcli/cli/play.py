@@ -53,9 +53,10 @@ def command(
         near = did_you_mean(viewer, ("auto", "native", "none"))
         raise UsageError(f"no viewer '{viewer}'", hint=near or "viewers: auto, native, none")
     if video is not None:
-        from rlcli.viewer.video import check_video
+        from rlcli.viewer.writer import check_video
 
         check_video(video)
+    window = video is None and _window(viewer, headless)
     session = open_session(
         task,
         overrides or [],
@@ -69,7 +70,7 @@ def command(
     )
     if video is not None:
         _video(session, video)
-    elif _window(viewer, headless):
+    elif window:
         from rlcli.viewer.native import run
 
         run(session.env, session.act)
@@ -78,33 +79,40 @@ def command(
 
 
 def _window(viewer: str, headless: bool) -> bool:
+    from rlcli.errors import MachineError
     from rlcli.viewer.gl import has_display
 
+    if viewer == "native" and not has_display():
+        raise MachineError(
+            "there is no display for a window",
+            hint="--video FILE.mp4 draws offscreen, --viewer none prints statistics",
+        )
     return viewer == "native" or (viewer == "auto" and has_display() and not headless)
 
 
 def _video(session: Any, file: Path) -> None:
     from rlcli.rl.rollout import evaluate
-    from rlcli.viewer.video import Renderer, VideoWriter
+    from rlcli.viewer.video import Renderer
+    from rlcli.viewer.writer import VideoWriter
 
     env = session.env
-    renderer = Renderer(env.engine.model, env.config.viewer)
     ended = False
-    with VideoWriter(file, 1.0 / env.step_dt) as writer:
+    with Renderer(env.engine.model, env.config.viewer) as renderer, VideoWriter(file, env.step_dt) as writer:
 
-        def frame(step: Any) -> None:
+        def act(obs: Any) -> Any:
+            if not ended:  # a picture of every state that the policy acts in: the first one too, one a step
+                writer.add(renderer.draw(*env.world(0)))
+            return session.act(obs)
+
+        def note_end(step: Any) -> None:
             nonlocal ended
             ended = ended or bool(step.terminated[0] | step.truncated[0])
-            if not ended:  # the next episode's first state is not this one's last
-                writer.add(renderer.draw(*env.world(0)))
 
-        evaluation = evaluate(env, session.act, env.num_envs, frame)
-        frames = writer.frames
-    renderer.close()
-    summary = evaluation.summary()
-    console.info(f"{frames} frames of environment 0 at {1.0 / env.step_dt:g} a second, drawn with {renderer.backend}")
+        summary = evaluate(env, act, env.num_envs, note_end).summary()
+    frames, fps, backend = writer.frames, writer.fps, renderer.backend
+    console.info(f"{frames} frames of environment 0 at {fps:g} a second, drawn with {backend}")
     console.data(str(file))
-    console.document("play", video=str(file), frames=frames, fps=1.0 / env.step_dt, gl=renderer.backend, **summary)
+    console.document("play", video=str(file), frames=frames, fps=fps, gl=backend, **summary)
 
 
 def _statistics(session: Any) -> None:

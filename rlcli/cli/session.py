@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,8 +35,12 @@ def open_session(
     seed: int,
     config: Path | None,
     runs_dir: Path | None,
+    check: Callable[[Any], None] = lambda resolved: None,
 ) -> Session:
-    """Find, check and build; heavy imports begin only when files and configuration are in order."""
+    """Find, check and build; heavy imports begin only when files and configuration are in order.
+
+    `check` gets the configuration and may raise.
+    """
     from rlcli.config.load import resolve
     from rlcli.errors import UsageError, did_you_mean
     from rlcli.registry import find_task
@@ -60,6 +65,7 @@ def open_session(
     else:
         assert task is not None
         resolved = resolve(find_task(task), play=True, config_file=config, overrides=overrides, flags=values)
+    check(resolved)
     return _build(resolved, run, folder, policy, stochastic, seed)
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rlcli.cli.console import console
 from rlcli.cli.options import (
+    MAX_SEED,
     Agent,
     ConfigFile,
     Debug,
@@ -21,12 +24,16 @@ from rlcli.cli.options import (
     Overrides,
     Quiet,
     RunsDir,
-    Seed,
     Verbose,
     choose_device,
     draw_seed,
     flags,
 )
+
+if TYPE_CHECKING:
+    from rlcli.config.load import Resolved
+    from rlcli.rl.run import Run
+    from rlcli.rl.stop import StopRequest
 
 
 def command(
@@ -35,7 +42,10 @@ def command(
     ] = None,
     overrides: Overrides = None,
     agent: Agent = None,
-    seed: Seed = 42,
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", min=-1, max=MAX_SEED, help="Seed of everything random; -1 draws one; default 42."),
+    ] = None,
     num_envs: NumEnvs = None,
     max_iterations: Annotated[int | None, typer.Option("--max-iterations", help="Iterations to train for.")] = None,
     max_steps: Annotated[int | None, typer.Option("--max-steps", help="Environment steps to train for.")] = None,
@@ -43,7 +53,7 @@ def command(
     logger: Annotated[list[str] | None, typer.Option("--logger", help="tensorboard or none; repeatable.")] = None,
     config: ConfigFile = None,
     resume: Annotated[
-        str | None, typer.Option("--resume", help="Go on with a run: RUN or latest. Needs no TASK.")
+        str | None, typer.Option("--resume", help="Go on with a run: RUN, RUN@step:N or latest. Needs no TASK.")
     ] = None,
     init_from: Annotated[
         str | None, typer.Option("--init-from", help="Start a new run from a checkpoint's weights.")
@@ -57,203 +67,265 @@ def command(
     headless: Headless = True,
 ) -> None:
     """Train a policy."""
+    from rlcli.config.load import resolve
     from rlcli.errors import UsageError
+    from rlcli.registry import find_task
     from rlcli.rl.run import default_runs_dir
+    from rlcli.rl.stop import StopRequest
 
     console.quiet, console.verbose = quiet, verbose
-    chosen = choose_device(device)
-    folder = runs_dir or default_runs_dir()
-    budget = flags(agent__max_iterations=max_iterations, agent__max_steps=max_steps)
-    if resume is not None:
-        given = [word for word in (*([task] if task and "=" in task else []), *(overrides or ()))]
-        if given or config or init_from or agent or num_envs:
-            raise UsageError(
-                "a resumed run keeps its configuration; only --max-iterations and --max-steps may change",
-                hint="--init-from starts a new run from its weights",
+    device, runs = choose_device(device), runs_dir or default_runs_dir()
+    budget = _budget(max_iterations, max_steps)
+    with StopRequest() as stop:
+        if resume is not None:
+            fixed = {
+                "--agent": agent,
+                "--seed": seed,
+                "--num-envs": num_envs,
+                "--config": config,
+                "--init-from": init_from,
+                "--name": name,
+            }
+            _refuse_changes([task, *(overrides or [])], fixed)
+            job = _resumed(resume, runs, find_task(task).name if task else None, budget, logger)
+        elif task is None:
+            raise UsageError("which task?", hint="rlcli train TASK (rlcli list-tasks shows them), or --resume RUN")
+        else:
+            resolved = resolve(
+                find_task(task),
+                agent=agent,
+                device=device,
+                config_file=config,
+                overrides=overrides or [],
+                flags={**flags(scene__num_envs=num_envs), **budget},
             )
-        _resume(resume, folder, task, budget, chosen, logger)
-        return
-    if task is None:
-        raise UsageError("which task?", hint="rlcli train TASK (rlcli list-tasks shows them), or --resume RUN")
-    started = {**flags(scene__num_envs=num_envs), **budget}
-    _start(
-        task,
-        overrides or [],
-        agent,
-        draw_seed(seed),
-        started,
-        chosen,
-        logger,
-        config,
-        init_from,
-        folder,
-        name,
-    )
+            record = {"seed": draw_seed(42 if seed is None else seed), "device": device}
+            job = _created(resolved, runs, name, record, logger, init_from)
+        if job is not None:
+            _train(job, device, stop)
 
 
-def _start(
-    task: str,
-    overrides: list[str],
-    agent: str | None,
-    seed: int,
-    flag_values: Any,
-    device: str,
-    logger: list[str] | None,
-    config: Path | None,
-    init_from: str | None,
-    runs_dir: Path,
+@dataclass(slots=True)
+class _Job:
+    """A locked run with what it trains."""
+
+    run: Run
+    resolved: Resolved
+    loggers: list[str]
+    resume_from: Any = None
+    """The checkpoint to go on from exactly."""
+    init_from: Any = None
+    """The checkpoint folder to take weights from."""
+    begin: float = field(default_factory=time.monotonic)
+
+
+def _budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
+    """A budget on the command line replaces the agent's whole budget."""
+    if max_iterations is None and max_steps is None:
+        return {}
+    return {"agent.max_iterations": max_iterations, "agent.max_steps": max_steps}
+
+
+def _refuse_changes(words: Sequence[str | None], fixed: dict[str, Any]) -> None:
+    from rlcli.errors import UsageError
+
+    changes = [word for word in words if word and "=" in word]
+    changes += [flag for flag, value in fixed.items() if value is not None]
+    if changes:
+        raise UsageError(
+            f"a resumed run keeps its configuration: {', '.join(changes)} cannot be given with --resume"
+            " (--max-iterations and --max-steps can)",
+            hint="--init-from starts a new run from its weights",
+        )
+
+
+def _created(
+    resolved: Resolved,
+    runs: Path,
     name: str | None,
-) -> None:
+    record: dict[str, Any],
+    logger: list[str] | None,
+    init_from: str | None,
+) -> _Job:
+    """A new run, its folder written before anything heavy is imported."""
     from rlcli.config.dump import to_data, to_yaml
-    from rlcli.config.load import resolve
-    from rlcli.errors import RlcliError
-    from rlcli.registry import find_task
+    from rlcli.errors import ConfigError, Problem
     from rlcli.rl.loggers import check_loggers
     from rlcli.rl.run import create_run, environment_record, find_checkpoint
 
-    begin = time.monotonic()
-    resolved = resolve(
-        find_task(task),
-        agent=agent,
-        device=device,
-        config_file=config,
-        overrides=overrides,
-        flags=flag_values,
-    )
+    if resolved.agent is None:
+        raise ConfigError([Problem(resolved.source.label, "agents", "this task has no agent to train")])
     loggers = check_loggers(logger)
-    source, engine_threads, torch_threads = resolved.source, *_threads(resolved)
-    initial = find_checkpoint(init_from, runs_dir) if init_from else None
-    record = {
-        "task": source.record() | {"file": source.config.name},
+    initial = None
+    if init_from is not None:
+        _, initial, why = find_checkpoint(init_from, runs)
+        console.info(f"weights of {initial} ({why})")
+    record |= {
+        "task": resolved.source.record() | {"file": resolved.source.config.name},
         "agent": resolved.agent_name,
-        "seed": seed,
-        "device": device,
         "loggers": loggers,
-        "init_from": str(initial[1]) if initial else None,
-        **environment_record(engine_threads, torch_threads),
+        "init_from": str(initial) if initial else None,
+        **environment_record(*_threads(resolved)),
     }
-    run = create_run(runs_dir, source.name, name, to_yaml(to_data(resolved)), record)
+    run = create_run(runs, resolved.source.name, name, to_yaml(to_data(resolved)), record)
     console.info(f"run {run.folder}")
-    try:
-        trainer, env = _build(resolved, seed, device, torch_threads)
-        if initial is not None:
-            from rlcli.rl.checkpoint import open_checkpoint
-            from rlcli.rl.load import require_fit
-
-            checkpoint = open_checkpoint(initial[1])
-            require_fit(checkpoint, env.layout)
-            trainer.load_weights(checkpoint.tensors("policy"))
-            console.info(f"weights of {initial[1]} ({initial[2]})")
-        trainer.start()
-    except (RlcliError, KeyboardInterrupt):
-        run.discard()
-        raise
-    console.detail(f"built in {time.monotonic() - begin:.1f} s")
-    _fit(run, trainer, env, resolved, loggers, None, begin)
+    return _Job(run, resolved, loggers, init_from=initial)
 
 
-def _resume(
-    reference: str,
-    runs_dir: Path,
-    task: str | None,
-    budget: Mapping[str, Any],
-    device: str,
-    logger: list[str] | None,
-) -> None:
-    from rlcli.errors import CheckpointError
-    from rlcli.rl import checkpoint
-    from rlcli.rl.load import require_fit, resolve_run
+def _resumed(
+    reference: str, runs: Path, task: str | None, budget: dict[str, Any], logger: list[str] | None
+) -> _Job | None:
+    """A run to go on with; None if there is nothing left to do."""
+    from rlcli.config.dump import to_data, to_yaml
+    from rlcli.rl.files import write_atomic
+    from rlcli.rl.load import resolve_run
     from rlcli.rl.loggers import check_loggers
-    from rlcli.rl.run import find_checkpoint, find_run
+    from rlcli.rl.run import find_checkpoint
 
-    begin = time.monotonic()
-    run, why = find_run(reference, runs_dir, task)
-    run.lock()
-    checkpoint.clean(run.checkpoints)
-    _, folder, _ = find_checkpoint(str(run.folder), runs_dir)
-    saved = checkpoint.open_checkpoint(folder)
-    resolved = resolve_run(run, play=False, flags=budget)
-    assert resolved.agent is not None
+    run, folder, why = find_checkpoint(reference, runs, task)
     if run.record.get("state") == "finished" and not budget:
-        console.info(f"{run.folder} ({why}) is finished at step {saved.step}; --max-iterations N trains on")
-        console.document("train", run=str(run.folder), state="finished", step=saved.step)
-        return
-    torch_threads = int(run.record.get("torch_threads") or _threads(resolved)[1])
-    trainer, env = _build(resolved, int(run.record["seed"]), device, torch_threads)
+        console.info(f"{run.folder} ({why}) is finished; --max-iterations N trains on")
+        console.data(str(run.folder))
+        step = int(folder.name)
+        console.document("train", run=str(run.folder), state="finished", checkpoint=str(folder), step=step)
+        return None
+    resolved = resolve_run(run, play=False, flags=budget)
+    loggers = check_loggers(logger) if logger else list(run.record.get("loggers", []))
+    run.lock()
+    try:
+        from rlcli.rl import checkpoint
+
+        checkpoint.clean(run.checkpoints)
+        saved = checkpoint.open_checkpoint(folder)
+        if budget:
+            write_atomic(run.config, to_yaml(to_data(resolved)))
+    except BaseException:
+        run.unlock()
+        raise
+    console.info(f"resuming {folder} ({why})")
+    return _Job(run, resolved, loggers, resume_from=saved)
+
+
+def _train(job: _Job, device: str, stop: StopRequest) -> None:
+    from rlcli.errors import Stopped
+
+    run, new = job.run, job.resume_from is None
+    try:
+        trainer, env = _build(job, device)
+        if stop.signal is not None and new:
+            raise Stopped("stopped before training began; nothing was written", exit_code=stop.exit_code)
+    except BaseException:
+        if new:
+            run.discard()
+        run.unlock()
+        raise
+    console.detail(f"built in {time.monotonic() - job.begin:.1f} s")
+    size, actions = env.layout.size(), env.layout.action_size
+    console.info(
+        f"{job.resolved.source.name}: {env.num_envs} environments, {size} observations, {actions} actions,"
+        f" {env.engine.threads} engine threads, agent {job.resolved.agent_name}, seed {run.record['seed']}"
+    )
+    try:
+        _fit(job, trainer, env, stop)
+    finally:
+        run.unlock()
+        env.close()
+    _warn_physics(env)
+    _report(job, trainer)
+
+
+def _build(job: _Job, device: str) -> Any:
+    """The environment and the trainer, at the boundary where training begins."""
+    from rlcli.envs.vec_env import make_env
+    from rlcli.errors import CheckpointError
+    from rlcli.registry import load_object
+    from rlcli.rl.checkpoint import drop_after, open_checkpoint
+    from rlcli.rl.load import require_fit
+
+    resolved, record = job.resolved, job.run.record
+    assert resolved.trainer is not None
+    env = make_env(resolved, seed=record["seed"], device=device)
+    threads = int(record.get("torch_threads") or _threads(resolved)[1])
+    make = load_object(resolved.trainer.trainer)
+    trainer = make(env, resolved.agent, seed=record["seed"], device=device, torch_threads=threads)
+    saved = job.resume_from
+    if saved is None:
+        if job.init_from is not None:
+            initial = open_checkpoint(job.init_from)
+            require_fit(initial, env.layout)
+            _take(initial, lambda: trainer.load_weights(initial.tensors("policy")), "its weights do not fit the agent")
+        trainer.start()
+        return trainer, env
     require_fit(saved, env.layout)
     state = saved.state()
-    try:
-        trainer.load(state)
-    except (KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{folder} cannot be resumed: {error}") from error
-    console.info(f"resuming {run.folder} ({why}) at iteration {trainer.iteration}")
-    run.update(state="running")
-    names = check_loggers(logger) if logger else list(run.record.get("loggers", []))
-    _fit(run, trainer, env, resolved, names, (trainer.iteration, trainer.env_steps), begin)
-
-
-def _build(resolved: Any, seed: int, device: str, torch_threads: int) -> Any:
-    from rlcli.envs.vec_env import make_env
-    from rlcli.registry import load_object
-
-    assert resolved.trainer is not None
-    env = make_env(resolved, seed=seed, device=device)
-    trainer = load_object(resolved.trainer.trainer)(
-        env, resolved.agent, seed=seed, device=device, torch_threads=torch_threads
-    )
+    _take(saved, lambda: trainer.load(state), "it cannot be resumed")
+    if trainer.env_steps != saved.step:
+        raise CheckpointError(f"{saved.folder} cannot be resumed: its manifest and its state name different steps")
+    dropped = drop_after(job.run.checkpoints, saved.step)
+    if dropped:
+        console.info(f"removed {len(dropped)} later checkpoints: they are not what comes next")
     return trainer, env
 
 
-def _fit(run: Any, trainer: Any, env: Any, resolved: Any, loggers: list[str], resume: Any, begin: float) -> None:
-    from rlcli.cli.live import TrainingView
-    from rlcli.errors import RlcliError
-    from rlcli.rl.checkpoint import steps
-    from rlcli.rl.loggers import open_loggers
-    from rlcli.rl.train import fit
+def _take(saved: Any, load: Any, failure: str) -> None:
+    from rlcli.errors import CheckpointError
 
-    sinks = open_loggers(run, loggers, resume=resume)
-    manifest = {
-        "task": run.record["task"],
-        "agent": run.record["agent"],
-        "seed": run.record["seed"],
-        "layout": env.layout.record(),
-    }
-    size, actions = env.layout.size(), env.layout.action_size
-    console.info(
-        f"{resolved.source.name}: {env.num_envs} environments, {size} observations, {actions} actions,"
-        f" {env.engine.threads} engine threads, agent {resolved.agent_name}, seed {run.record['seed']}"
-    )
-    state = "stopped"
     try:
-        with TrainingView(f"rlcli train {resolved.source.name}") as view:
-            fit(
-                trainer,
-                run,
-                _budget(resolved),
-                loggers=sinks,
-                save_interval=resolved.agent.save_interval,
-                manifest=manifest,
-                show=view.show,
-                divergences=lambda: env.divergences,
-            )
-        state = "finished"
-    except RlcliError as error:
-        state = "stopped" if error.kind == "stopped" else "failed"
-        raise
-    finally:
+        load()
+    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{saved.folder}: {failure}: {' '.join(str(error).split())}") from error
+
+
+def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
+    from rlcli.cli.live import TrainingView
+    from rlcli.errors import RlcliError, Stopped
+    from rlcli.rl.loggers import open_loggers
+    from rlcli.rl.train import Budget, fit
+
+    run, agent = job.run, job.resolved.agent
+    assert agent is not None
+    resume = None if job.resume_from is None else (trainer.iteration, trainer.env_steps)
+    manifest = {**{key: run.record[key] for key in ("task", "agent", "seed")}, "layout": env.layout.record()}
+    sinks: list[Any] = []
+
+    def close(state: str) -> None:
         for sink in sinks:
             sink.close()
         run.update(state=state, step=trainer.env_steps, iteration=trainer.iteration)
-        run.unlock()
-    _warn_physics(env)
+
+    try:
+        run.update(state="running")
+        sinks += open_loggers(run, job.loggers, resume=resume)
+        with TrainingView(f"rlcli train {job.resolved.source.name}") as view:
+            fit(
+                trainer,
+                run,
+                Budget(agent.max_iterations, agent.max_steps),
+                loggers=sinks,
+                save_interval=agent.save_interval,
+                manifest=manifest,
+                show=view.show,
+                divergences=lambda: env.divergences,
+                stop=stop,
+            )
+    except BaseException as error:
+        with contextlib.suppress(OSError, RlcliError):  # the first error is the one to report
+            close("stopped" if isinstance(error, Stopped | KeyboardInterrupt) else "failed")
+        raise
+    close("finished")
+
+
+def _report(job: _Job, trainer: Any) -> None:
+    from rlcli.rl.checkpoint import steps
+
+    run, elapsed = job.run, time.monotonic() - job.begin
     newest = run.checkpoints / f"{steps(run.checkpoints)[-1]:012d}"
-    elapsed = time.monotonic() - begin
     console.info(f"trained {trainer.env_steps:,} steps in {elapsed:.1f} s; next: rlcli play --checkpoint {run.folder}")
     console.data(str(run.folder))
     console.document(
         "train",
         run=str(run.folder),
-        state=state,
+        state="finished",
         checkpoint=str(newest),
         iteration=trainer.iteration,
         step=trainer.env_steps,
@@ -262,15 +334,11 @@ def _fit(run: Any, trainer: Any, env: Any, resolved: Any, loggers: list[str], re
     )
 
 
-def _budget(resolved: Any) -> Any:
-    from rlcli.rl.train import Budget
-
-    return Budget(resolved.agent.max_iterations, resolved.agent.max_steps)
-
-
-def _threads(resolved: Any) -> tuple[int, int]:
+def _threads(resolved: Resolved) -> tuple[int, int]:
+    """Threads of the engine and of torch's update."""
     import os
 
+    assert resolved.agent is not None
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return resolved.task.sim.engine_threads or cores, resolved.agent.torch_threads or min(4, cores)
 

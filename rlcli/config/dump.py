@@ -26,7 +26,10 @@ def _text(dumper: _Dumper, value: str) -> yaml.Node:
 
 
 def _number(dumper: _Dumper, value: float) -> yaml.Node:
-    return dumper.represent_scalar("tag:yaml.org,2002:float", repr(value))
+    text = repr(value)
+    if "." not in text and "e" in text:  # YAML 1.1 takes 1e-05 for a string
+        text = text.replace("e", ".0e")
+    return dumper.represent_scalar("tag:yaml.org,2002:float", text)
 
 
 def _sequence(dumper: _Dumper, value: list[Any]) -> yaml.Node:

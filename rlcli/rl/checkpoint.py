@@ -55,7 +55,14 @@ class Checkpoint:
 
     def state(self) -> TrainerState:
         """Everything a trainer goes on from."""
-        return TrainerState({part: self.tensors(part) for part in PARTS}, self.json("state.json"))
+        tensors = {part: self.tensors(part) for part in PARTS}
+        for part in ("policy", "trainer"):
+            for name, value in tensors[part].items():
+                if value.is_floating_point() and not bool(value.isfinite().all()):
+                    raise CheckpointError(
+                        f"{self.folder / part}.safetensors: '{name}' holds values that are not finite"
+                    )
+        return TrainerState(tensors, self.json("state.json"))
 
     def _data(self, name: str) -> bytes:
         file = self.folder / name
@@ -84,7 +91,7 @@ def save(checkpoints: Path, step: int, state: TrainerState, extra: Mapping[str, 
         extra: further JSON-able entries of the manifest.
 
     Raises:
-        MachineError: if the disk refuses; nothing half-written is left.
+        MachineError: if the disk refuses or the folder is gone; nothing half-written is left.
     """
     target = checkpoints / f"{step:012d}"
     if target.exists():
@@ -99,16 +106,18 @@ def save(checkpoints: Path, step: int, state: TrainerState, extra: Mapping[str, 
     files = {name: {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in contents.items()}
     manifest = {"format": FORMAT, "step": step, **extra, "files": files}
     try:
-        temporary.mkdir(parents=True)
+        temporary.mkdir()
         for name, data in contents.items():
             write_synced(temporary / name, data)
         write_synced(temporary / "manifest.json", to_json(manifest).encode())
         sync_folder(temporary)
         os.rename(temporary, target)
         sync_folder(checkpoints)
-    except OSError as error:
+    except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)
-        raise disk_error(target, error) from error
+        if isinstance(error, OSError):
+            raise disk_error(target, error) from error
+        raise
     write_atomic(checkpoints / "latest", target.name + "\n")
     return target
 
@@ -144,13 +153,24 @@ def steps(checkpoints: Path) -> list[int]:
     """Steps of the complete checkpoints of a run, ascending."""
     if not checkpoints.is_dir():
         return []
-    return sorted(int(p.name) for p in checkpoints.iterdir() if p.name.isdigit() and (p / "manifest.json").is_file())
+    names = [file.parent.name for file in checkpoints.glob("*/manifest.json")]
+    return sorted(int(name) for name in names if name.isdecimal() and name == f"{int(name):012d}")
+
+
+def drop_after(checkpoints: Path, step: int) -> list[int]:
+    """Remove the checkpoints after a step: training goes on from there, and they are no longer its future."""
+    later = [have for have in steps(checkpoints) if have > step]
+    for have in later:
+        shutil.rmtree(checkpoints / f"{have:012d}")
+    return later
 
 
 def clean(checkpoints: Path) -> None:
     """Remove what killed writers left."""
     for leftover in checkpoints.glob(".tmp-*"):
         shutil.rmtree(leftover, ignore_errors=True)
+    for file in [*checkpoints.glob(".*.tmp-*"), *checkpoints.parent.glob(".*.tmp-*")]:
+        file.unlink(missing_ok=True)
 
 
 def _json(data: bytes, file: Path) -> dict[str, Any]:

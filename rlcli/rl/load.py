@@ -62,7 +62,10 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
     Raises:
         CheckpointError: with a table of what differs, then and now.
     """
-    was, now = _fields(checkpoint.manifest.get("layout", {})), _fields(layout.record())
+    try:
+        was, now = _fields(checkpoint.manifest["layout"]), _fields(layout.record())
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise CheckpointError(f"{checkpoint.folder}/manifest.json is corrupt: its layout is malformed") from None
     differs = [name for name in {**was, **now} if was.get(name) != now.get(name)]
     if not differs:
         return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -42,7 +43,8 @@ class JsonLines:
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
         """Append one line."""
         try:
-            self._file.write(json.dumps({"iteration": iteration, "step": step, **metrics}) + "\n")
+            finite = {name: value for name, value in metrics.items() if math.isfinite(value)}
+            self._file.write(json.dumps({"iteration": iteration, "step": step, **finite}) + "\n")
         except OSError as error:
             raise disk_error(self._path, error) from error
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor, nn
 
 from rlcli.errors import CheckpointError
@@ -21,9 +21,9 @@ class PolicySpec(BaseModel):
 
     kind: Literal["gaussian-mlp"] = "gaussian-mlp"
     group: str = "policy"
-    observation_size: int
-    action_size: int
-    hidden: list[int]
+    observation_size: int = Field(ge=1)
+    action_size: int = Field(ge=1)
+    hidden: list[Annotated[int, Field(ge=1)]]
     activation: Literal["elu", "relu", "tanh", "silu"]
     action_bound: float | None
 
@@ -72,7 +72,8 @@ def load_policy(spec: Mapping[str, object], weights: Mapping[str, Tensor]) -> Po
         CheckpointError: if they do not fit each other, or a weight is not finite.
     """
     try:
-        policy = Policy(PolicySpec.model_validate(spec))
+        with torch.device("meta"):  # shapes first: a file must not make this allocate what it does not hold
+            policy = Policy(PolicySpec.model_validate(spec))
     except ValidationError as error:
         raise CheckpointError(f"policy.json does not describe a policy: {' '.join(str(error).split())}") from None
     expected = {name: tuple(value.shape) for name, value in policy.state_dict().items()}
@@ -84,7 +85,9 @@ def load_policy(spec: Mapping[str, object], weights: Mapping[str, Tensor]) -> Po
             + ", ".join(f"{n} is {found.get(n, 'missing')}, expected {expected.get(n, 'nothing')}" for n in differs[:4])
         )
     for name, value in weights.items():
+        if value.dtype != torch.float32:
+            raise CheckpointError(f"policy.safetensors: '{name}' is {value.dtype}, expected torch.float32")
         if not bool(value.isfinite().all()):
             raise CheckpointError(f"policy.safetensors: '{name}' holds values that are not finite")
-    policy.load_state_dict(dict(weights))
+    policy.load_state_dict(dict(weights), assign=True)
     return policy.eval().requires_grad_(False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import shutil
 import sys
 from collections.abc import Mapping
@@ -17,11 +18,12 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 import rlcli
-from rlcli.errors import CheckpointError, MachineError, did_you_mean, listing
+from rlcli.errors import CheckpointError, MachineError, UsageError, did_you_mean, listing
 from rlcli.rl.files import disk_error, to_json, write_atomic
 
 CONFIG = "config.yaml"
 RECORD = "run.json"
+_NAME = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
 
 
 @dataclass(slots=True)
@@ -81,8 +83,11 @@ def create_run(runs_dir: Path, task: str, name: str | None, config: str, record:
     """Make a new run folder with its configuration in it; two that start in the same second get two folders.
 
     Raises:
+        UsageError: for a name that cannot be part of a folder's.
         MachineError: if the folder cannot be made or written.
     """
+    if name is not None and not _NAME.fullmatch(name):
+        raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint="letters, digits, - and _")
     parent = runs_dir / task
     now = datetime.now(UTC)
     stem = now.strftime("%Y-%m-%d_%H-%M-%S") + (f"-{name}" if name else "")
@@ -116,8 +121,11 @@ def open_run(folder: Path) -> Run:
         raise CheckpointError(f"{folder} is not a run: it has no {RECORD}") from None
     except ValueError:
         raise CheckpointError(f"{file} is corrupt: not JSON") from None
-    if not isinstance(record, dict) or not isinstance(record.get("task"), dict):
+    task = record.get("task") if isinstance(record, dict) else None
+    if not isinstance(task, dict) or not isinstance(task.get("name"), str):
         raise CheckpointError(f"{file} is corrupt: it does not name a task")
+    if not (task.get("folder") or task.get("distribution")) or not isinstance(record.get("seed"), int):
+        raise CheckpointError(f"{file} is corrupt: it does not say where the task is from, or has no seed")
     return Run(folder, record)
 
 
@@ -126,26 +134,12 @@ def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[R
 
     Raises:
         CheckpointError: if there is none.
+        UsageError: if it is a run of another task than the one given.
     """
-    if reference == "latest":
-        runs = list_runs(runs_dir, task)
-        if not runs:
-            of = f" of {task}" if task else ""
-            raise CheckpointError(f"there is no run{of} in {runs_dir}", hint=f"rlcli train {task or 'TASK'} makes one")
-        return runs[-1], f"newest run of {task}" if task else f"newest run in {runs_dir}"
-    for candidate in (
-        Path(reference),
-        runs_dir / reference,
-        *([runs_dir / task / reference] if task else []),
-    ):
-        if (candidate / RECORD).is_file():
-            return open_run(candidate), "as named"
-    matches = [run for run in list_runs(runs_dir, None) if run.folder.name == reference]
-    if len(matches) == 1:
-        return matches[0], "as named"
-    names = [run.folder.name for run in list_runs(runs_dir, None)]
-    near = did_you_mean(reference, names)
-    raise CheckpointError(f"no run '{reference}'", hint=near or f"runs in {runs_dir}: {listing(names[-5:])}")
+    run, why = _find_run(reference, runs_dir, task)
+    if task is not None and run.record["task"]["name"] != task:
+        raise UsageError(f"{run.folder} is a run of {run.record['task']['name']}, not of {task}", hint="leave out TASK")
+    return run, why
 
 
 def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
@@ -172,7 +166,7 @@ def find_checkpoint(reference: str, runs_dir: Path, task: str | None = None) -> 
     folder = Path(reference)
     if (folder / "manifest.json").is_file():
         return open_run(folder.resolve().parent.parent), folder, "as named"
-    name, _, which = reference.partition("@")
+    name, _, which = (reference, "", "") if folder.exists() else reference.partition("@")
     run, why = find_run(name, runs_dir, task)
     have = steps(run.checkpoints)
     if not have:
@@ -219,6 +213,28 @@ def environment_record(engine_threads: int, torch_threads: int) -> dict[str, Any
 def default_runs_dir() -> Path:
     """RLCLI_RUNS_DIR, or `runs` in the current folder."""
     return Path(os.environ.get("RLCLI_RUNS_DIR") or "runs")
+
+
+def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, str]:
+    if reference == "latest":
+        runs = list_runs(runs_dir, task)
+        if not runs:
+            of = f" of {task}" if task else ""
+            raise CheckpointError(f"there is no run{of} in {runs_dir}", hint=f"rlcli train {task or 'TASK'} makes one")
+        return runs[-1], f"newest run of {task}" if task else f"newest run in {runs_dir}"
+    for candidate in (
+        Path(reference),
+        runs_dir / reference,
+        *([runs_dir / task / reference] if task else []),
+    ):
+        if (candidate / RECORD).is_file():
+            return open_run(candidate), "as named"
+    matches = [run for run in list_runs(runs_dir, None) if run.folder.name == reference]
+    if len(matches) == 1:
+        return matches[0], "as named"
+    names = [run.folder.name for run in list_runs(runs_dir, None)]
+    near = did_you_mean(reference, names)
+    raise CheckpointError(f"no run '{reference}'", hint=near or f"runs in {runs_dir}: {listing(names[-5:])}")
 
 
 def _fresh_folder(parent: Path, stem: str) -> Path:

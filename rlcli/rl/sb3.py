@@ -20,7 +20,7 @@ from torch import Tensor
 
 from rlcli.adapters.sb3 import Sb3VecEnv
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import DivergedError
+from rlcli.errors import ConfigError, DivergedError
 from rlcli.random import derive
 from rlcli.rl.policy import _ACTIVATIONS, Policy, PolicySpec
 from rlcli.rl.sb3_config import PpoConfig
@@ -42,6 +42,9 @@ _LR_RANGE = (1e-5, 1e-2)
 
 class TorchRolloutBuffer(RolloutBuffer):
     """SB3's rollout buffer with torch storage, gathered by `index_select`. All tensors are (n_steps, n_envs, ...)."""
+
+    num_minibatches: int | None = None
+    """Parts that `get` makes of the rollout, as even as they can be; None makes parts of its `batch_size`."""
 
     def reset(self) -> None:
         """Forget the rollout; the storage is made once."""
@@ -86,7 +89,12 @@ class TorchRolloutBuffer(RolloutBuffer):
         total = self.buffer_size * self.n_envs
         storage = (self.obs, self.action, self.value, self.log_prob, self.advantage, self.target)
         columns = [tensor.view(total, *tensor.shape[2:]) for tensor in storage]
-        for rows in torch.randperm(total).split(batch_size or total):
+        rows_of_parts = (
+            torch.randperm(total).split(batch_size or total)
+            if self.num_minibatches is None
+            else torch.randperm(total).tensor_split(self.num_minibatches)
+        )
+        for rows in rows_of_parts:
             yield RolloutBufferSamples(*(column.index_select(0, rows) for column in columns))
 
 
@@ -165,6 +173,17 @@ class Sb3Trainer:
 
     def iterate(self) -> Report:
         """Collect one rollout, then update."""
+        try:
+            return self._iterate()
+        except ValueError as error:
+            if not str(error).startswith("Expected parameter"):  # how torch refuses a distribution of NaNs
+                raise
+            self._require_finite_weights()
+            raise DivergedError(
+                f"the policy's distribution is not finite in iteration {self.iteration}", hint=_LEARNER_HINT
+            ) from error
+
+    def _iterate(self) -> Report:
         model = self.model
         physics, step = self.env.seconds["physics"], self.env.seconds["step"]
         begin = time.perf_counter()
@@ -173,9 +192,9 @@ class Sb3Trainer:
         collected = time.perf_counter()
         torch.set_num_threads(self.torch_threads)
         self._decay()
+        self.iteration += 1
         model.train()
         updated = time.perf_counter()
-        self.iteration += 1
         metrics = self._losses()
         self._adapt(metrics.get("Loss/kl"))
         physics, step = self.env.seconds["physics"] - physics, self.env.seconds["step"] - step
@@ -190,20 +209,21 @@ class Sb3Trainer:
     def policy(self) -> Policy:
         """The deployable policy, sharing the actor's weights."""
         policy = Policy(policy_spec(self.env, self.config))
-        policy.load_state_dict(_actor(self.model.policy.state_dict()))
+        weights = self.model.policy.state_dict()
+        policy.load_state_dict({name: weights[key] for key, name in _actor_names(weights).items()})
         return policy.eval().requires_grad_(False)
 
     def state(self) -> TrainerState:
         """A copy of everything that the next iteration depends on."""
         weights = self.model.policy.state_dict()
-        actor = _actor(weights)
-        rest = {f"critic.{name}": value.clone() for name, value in weights.items() if _actor_name(name) is None}
+        actor = _actor_names(weights)
+        rest = {f"critic.{name}": value.clone() for name, value in weights.items() if name not in actor}
         optimizer = self.model.policy.optimizer.state_dict()["state"]
         for index, slots in optimizer.items():
             rest.update({f"optimizer.{index}.{slot}": value.clone() for slot, value in slots.items()})
         return TrainerState(
             tensors={
-                "policy": {name: value.clone() for name, value in actor.items()},
+                "policy": {name: weights[key].clone() for key, name in actor.items()},
                 "trainer": rest,
                 "env": {
                     **self.env.state_dict(),
@@ -237,10 +257,10 @@ class Sb3Trainer:
     def load_weights(self, policy: Mapping[str, Tensor], critic: Mapping[str, Tensor] | None = None) -> None:
         """Take a policy's weights, and the critic's where they are given."""
         weights = self.model.policy.state_dict()
+        actor = _actor_names(weights)
         for name in weights:
-            actor = _actor_name(name)
-            if actor is not None:
-                weights[name] = policy[actor]
+            if name in actor:
+                weights[name] = policy[actor[name]]
             elif critic is not None:
                 weights[name] = critic[f"critic.{name}"]
         self.model.policy.load_state_dict(weights)
@@ -251,14 +271,15 @@ class Sb3Trainer:
         metrics["Loss/learning_rate"] = self._learning_rate
         for name in ("Loss/surrogate", "Loss/value", "Policy/mean_std"):
             if not math.isfinite(metrics.get(name, 0.0)):
-                raise DivergedError(f"{name} is not finite after iteration {self.iteration}", hint=_LEARNER_HINT)
+                raise DivergedError(f"{name} is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
+        self._require_finite_weights()
+        recorded.clear()
+        return {name: value for name, value in metrics.items() if math.isfinite(value)}
+
+    def _require_finite_weights(self) -> None:
         for name, parameter in self.model.policy.named_parameters():
             if not bool(parameter.isfinite().all()):
-                raise DivergedError(
-                    f"weight '{name}' is not finite after iteration {self.iteration}", hint=_LEARNER_HINT
-                )
-        recorded.clear()
-        return metrics
+                raise DivergedError(f"weight '{name}' is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
 
     def _decay(self) -> None:
         if self.config.schedule == "linear":
@@ -338,12 +359,13 @@ def load_rng_state(state: Mapping[str, Tensor]) -> None:
 
 def _make_ppo(env: VecEnv, config: PpoConfig, seed: int, device: str) -> FastPPO:
     total = config.n_steps * env.num_envs
+    _require_batch(env, config, total)
     model = FastPPO(
         "MlpPolicy",
         Sb3VecEnv(env, config.action_bound),
         learning_rate=config.learning_rate,
         n_steps=config.n_steps,
-        batch_size=math.ceil(total / config.num_minibatches),
+        batch_size=total,  # the buffer divides it, whatever the number of environments
         n_epochs=config.n_epochs,
         gamma=config.gamma,
         gae_lambda=config.gae_lambda,
@@ -365,27 +387,35 @@ def _make_ppo(env: VecEnv, config: PpoConfig, seed: int, device: str) -> FastPPO
     )
     model.set_logger(Logger(folder=None, output_formats=[]))
     model._current_progress_remaining = 1.0
+    model.rollout_buffer.num_minibatches = config.num_minibatches
     model.source = env
     model.reward_scale = config.reward_scale
     model.clips = config.action_bound is not None
     return model
 
 
-def _actor_name(name: str) -> str | None:
-    """SB3's name of a weight -> the saved policy's, None for the critic's."""
-    if name == "log_std":
-        return name
-    if name.startswith("mlp_extractor.policy_net."):
-        return "actor." + name.removeprefix("mlp_extractor.policy_net.")
-    return None if not name.startswith("action_net.") else name
+def _require_batch(env: VecEnv, config: PpoConfig, total: int) -> None:
+    rollout = f"a rollout holds n_steps x num_envs = {config.n_steps} x {env.num_envs} = {total} samples"
+    if total < config.num_minibatches:
+        key, message = "num_minibatches", f"{config.num_minibatches} minibatches cannot be made: {rollout}"
+    elif total == 1 and config.normalize_advantage:
+        key, message = "n_steps", f"advantages cannot be normalised: {rollout}"
+    else:
+        return
+    path = ("agents", env.resolved.agent_name or "", key)
+    raise ConfigError([env.resolved.problem(path, message, "more environments, more n_steps, or fewer minibatches")])
 
 
-def _actor(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The policy's part of SB3's weights, its output layer numbered after the hidden ones."""
-    actor: dict[str, Tensor] = {}
-    for name, value in weights.items():
-        renamed = _actor_name(name)
-        if renamed is not None:
-            actor[renamed] = value
-    hidden = 2 * sum(1 for name in actor if name.startswith("actor.") and name.endswith(".weight"))
-    return {name.replace("action_net.", f"actor.{hidden}."): value for name, value in actor.items()}
+def _actor_names(weights: Mapping[str, Tensor]) -> dict[str, str]:
+    """SB3's names of the actor's weights -> the saved policy's, its output layer numbered after the hidden ones."""
+    hidden = "mlp_extractor.policy_net."
+    layers = sum(name.startswith(hidden) and name.endswith(".weight") for name in weights)
+    names = {}
+    for name in weights:
+        if name == "log_std":
+            names[name] = name
+        elif name.startswith(hidden):
+            names[name] = f"actor.{name.removeprefix(hidden)}"
+        elif name.startswith("action_net."):
+            names[name] = f"actor.{2 * layers}.{name.removeprefix('action_net.')}"
+    return names

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import signal
+import shlex
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from types import FrameType
+from dataclasses import dataclass
 from typing import Any
 
 from rlcli.errors import DivergedError, Stopped
 from rlcli.rl import checkpoint
 from rlcli.rl.loggers import Logger
 from rlcli.rl.run import Run
+from rlcli.rl.stop import StopRequest
 from rlcli.rl.trainer import Report, Trainer
 
 SAVE_EVERY_S = 60.0
@@ -67,28 +67,6 @@ class Progress:
     metrics: dict[str, float]
 
 
-@dataclass(slots=True)
-class StopRequest:
-    """The first SIGINT or SIGTERM asks to stop at the next boundary; the second stops at once."""
-
-    signal: int | None = None
-    _previous: dict[int, Any] = field(default_factory=dict)
-
-    def __enter__(self) -> StopRequest:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._previous[number] = signal.signal(number, self._receive)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _receive(self, number: int, frame: FrameType | None) -> None:
-        if self.signal is not None:
-            raise KeyboardInterrupt
-        self.signal = number
-
-
 def fit(
     trainer: Trainer,
     run: Run,
@@ -99,11 +77,12 @@ def fit(
     manifest: dict[str, Any] | None = None,
     show: Callable[[Progress], None] = lambda _: None,
     divergences: Callable[[], int] = lambda: 0,
+    stop: StopRequest | None = None,
 ) -> None:
     """Train until the budget is spent. Checkpoints are written at iteration boundaries only.
 
     Raises:
-        Stopped: on SIGINT or SIGTERM, after the checkpoint of the last boundary was written.
+        Stopped: on SIGINT or SIGTERM, after the checkpoint of the last boundary was written; at once on the second.
         DivergedError: if the learner or too much of the simulation diverges; the last good checkpoint is kept.
         MachineError: if the disk refuses.
     """
@@ -117,10 +96,11 @@ def fit(
             {**(manifest or {}), "iteration": trainer.iteration},
         )
 
-    if trainer.iteration == 0:
-        save()
-    begin, first_step = time.monotonic(), trainer.env_steps
-    with StopRequest() as stop:
+    stop = stop or StopRequest()
+    try:
+        if trainer.iteration == 0:
+            save()
+        begin, first_step = time.monotonic(), trainer.env_steps
         while not budget.spent(trainer) and stop.signal is None:
             diverged = divergences()
             report = trainer.iterate()
@@ -133,14 +113,16 @@ def fit(
             if interval_over or (save_interval is None and time.monotonic() - saved_at > SAVE_EVERY_S):
                 save()
                 saved_at = time.monotonic()
-    save()
+        save()
+    except KeyboardInterrupt:
+        raise _stopped("stopped at once; what came after the last checkpoint is lost", run, stop) from None
     if stop.signal is not None and not budget.spent(trainer):
-        code = 130 if stop.signal == signal.SIGINT else 75
-        raise Stopped(
-            f"stopped at iteration {trainer.iteration}, checkpoint written",
-            exit_code=code,
-            hint=f"rlcli train --resume {run.folder}",
-        )
+        raise _stopped(f"stopped at iteration {trainer.iteration}, checkpoint written", run, stop)
+
+
+def _stopped(message: str, run: Run, stop: StopRequest) -> Stopped:
+    hint = f"rlcli train --resume {shlex.quote(str(run.folder))}"
+    return Stopped(message, exit_code=stop.exit_code, hint=hint if checkpoint.steps(run.checkpoints) else None)
 
 
 def _with_rates(report: Report, steps: int) -> dict[str, float]:

@@ -222,13 +222,13 @@ class Scene:
         assert ground is not None
         self.spec.add_texture(
             name="ground", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-            rgb1=[0.32, 0.36, 0.40], rgb2=[0.26, 0.30, 0.34], width=512, height=512,
+            rgb1=[0.86, 0.88, 0.90], rgb2=[0.77, 0.79, 0.82], width=512, height=512,
         )  # fmt: skip
-        material = self.spec.add_material(name="ground", texrepeat=[1, 1], texuniform=True, reflectance=0.05)
+        material = self.spec.add_material(name="ground", texrepeat=[1, 1], texuniform=True)
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ground"
         self.spec.add_texture(
             name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-            rgb1=[0.62, 0.74, 0.87], rgb2=[0.90, 0.93, 0.96], width=256, height=1536,
+            rgb1=[0.45, 0.63, 0.83], rgb2=[0.86, 0.91, 0.95], width=256, height=1536,
         )  # fmt: skip
         self.spec.worldbody.add_geom(
             name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[ground.size / 2, ground.size / 2, 1.0],
@@ -239,8 +239,8 @@ class Scene:
         headlight = self.spec.visual.headlight
         if lights.dome is not None:
             strength = min(1.0, lights.dome.intensity / 1000.0)
-            headlight.ambient = [0.6 * strength * c for c in lights.dome.color]
-            headlight.diffuse = [0.9 * strength * c for c in lights.dome.color]
+            headlight.ambient = [strength * c for c in lights.dome.color]
+            headlight.diffuse = [0.7 * strength * c for c in lights.dome.color]
             headlight.specular = [0.1 * strength] * 3
         if lights.distant is not None:
             strength = min(1.0, lights.distant.intensity / 1000.0)

@@ -1,0 +1,79 @@
+"""Evaluation against episodes whose mix is known, and intervals against published values."""
+
+import pytest
+import torch
+
+from rlcli.rl.rollout import evaluate, proportion, random_policy, zero_policy
+from rlcli.rl.statistics import EpisodeStatistics
+
+
+@pytest.mark.parametrize("episodes", [1, 3, 4, 10])
+def test_exactly_as_many_episodes_as_asked_the_first_of_each_environment(make, scheduled, episodes):
+    env, _ = make(scheduled)
+    result = evaluate(env, zero_policy(env), episodes)
+    assert len(result.returns) == episodes
+    # environments end after 2, 3, 3 and 1 steps, rewards are 11, 12, 13
+    share = [episodes // 4 + (row < episodes % 4) for row in range(4)]
+    wanted = sorted(n for n, count in zip((2, 3, 3, 1), share, strict=True) for _ in range(count))
+    assert sorted(result.lengths) == wanted
+    totals = {1: 11.0, 2: 23.0, 3: 36.0}
+    assert sorted(result.returns) == sorted(totals[n] for n in result.lengths)
+    # ended by time alone: the second environment only, the third was terminated in the same step
+    assert sum(result.truncated) == share[1]
+
+
+def test_causes_are_shares_of_the_episodes(make, scheduled):
+    env, _ = make(scheduled)
+    summary = evaluate(env, zero_policy(env), 8).summary()
+    assert summary["terminations"] == {"time_out": 0.5, "task": 0.75}
+    assert summary["length"]["mean"] == pytest.approx(9 / 4)
+    assert "success" not in summary
+
+
+@pytest.mark.parametrize(
+    ("hits", "count", "low", "high"),
+    [
+        # Newcombe 1998, "Two-sided confidence intervals for the single proportion", table I, method 3
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
+)
+def test_the_interval_of_a_share_is_wilsons(hits, count, low, high):
+    interval = proportion(hits, count)
+    assert interval["rate"] == hits / count
+    assert interval["low"] == pytest.approx(low, abs=5e-5)
+    assert interval["high"] == pytest.approx(high, abs=5e-5)
+
+
+def test_the_interval_of_certainty_ends_at_one():
+    assert proportion(20, 20)["high"] == pytest.approx(1.0)
+    assert proportion(20, 20)["low"] == pytest.approx(1 - 0.1611, abs=5e-5)
+
+
+def test_random_actions_fill_the_bound_and_repeat_with_the_seed(make, scheduled):
+    env, _ = make(scheduled, "scene.num_envs=500")
+    actions = [random_policy(env, 0.5, 7)(torch.zeros(500, 2)) for _ in range(2)]
+    assert torch.equal(*actions)
+    assert 0.45 < float(actions[0].abs().max()) <= 0.5
+    assert float(random_policy(env, None, 7)(torch.zeros(500, 2)).std()) == pytest.approx(1.0, abs=0.15)
+
+
+def test_statistics_name_what_rsl_rl_names(make):
+    env, _ = make("cartpole", "scene.num_envs=3", "episode_length_s=0.1")
+    statistics = EpisodeStatistics(env.config.episode_length_s)
+    env.reset(seed=1)
+    returns = []
+    for _ in range(12):
+        episodes = env.step(torch.zeros(3, 1)).episodes
+        statistics.add(episodes)
+        returns += episodes.returns.tolist() if episodes is not None else []
+    metrics = statistics.flush()
+    assert metrics["Train/mean_reward"] == pytest.approx(sum(returns) / len(returns))
+    assert metrics["Train/mean_episode_length"] == 6
+    # the terms' mean episodic sums over the episode's length in seconds add up to the return's
+    total = sum(value for name, value in metrics.items() if name.startswith("Episode_Reward/"))
+    assert total * 0.1 == pytest.approx(metrics["Train/mean_reward"], rel=1e-4)
+    assert metrics["Episode_Termination/time_out"] == 1.0
+    assert "Episode_Termination/time_out" not in statistics.flush()  # nothing ended since
