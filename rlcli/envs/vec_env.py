@@ -312,12 +312,9 @@ class VecEnv(ABC):
         self.engine.step(self.config.decimation)
         self.seconds["physics"] += time.perf_counter() - start
         diverged = self.engine.diverged()
-        self.sim.refresh()
-        if not self.sim.is_finite():  # a NaN time step gives no warning
-            silent = self.sim.rows_not_finite()
-            diverged = silent if diverged is None else silent | diverged
         if diverged is not None:
             self._put_back(diverged)
+        self.sim.refresh()
         return diverged
 
     def _put_back(self, diverged: Tensor) -> None:
@@ -328,7 +325,6 @@ class VecEnv(ABC):
             self.engine.reset(selection)
             self.sim.restore_rows(selection)
             self.engine.forward(selection)
-            self.sim.refresh_rows(selection)
 
     def _hold_success(self) -> None:
         if self._success is not None:

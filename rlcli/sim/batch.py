@@ -113,14 +113,19 @@ class BatchEngine:
         MuJoCo resets a diverging world by itself, to finite values, and clears its counters as it does: so they are
         read after every step and put back to zero, and the state alone would show nothing.
         """
-        if not self._warning_words.any():
-            return None
+        bad = self._warned() if self._warning_words.any() else None
+        if self._batch._expanded:  # a time step or a mass of its own that is NaN gives no warning at first
+            silent = ~(self.field("qpos").isfinite().all(dim=1) & self.field("qvel").isfinite().all(dim=1))
+            bad = silent if bad is None else bad | silent
+        return bad if bad is not None and bool(bad.any()) else None
+
+    def _warned(self) -> Tensor:
         counts = self._batch.warning[:, :, 1]
         for name, kind in _NOTED.items():
             self.warnings[name] += int((counts[:, kind] > 0).sum())
-        bad = torch.from_numpy((counts[:, _DIVERGED] > 0).any(axis=1))
+        bad = (counts[:, _DIVERGED] > 0).any(axis=1)
         self._batch.warning[:] = 0
-        return bad if bool(bad.any()) else None
+        return torch.from_numpy(bad)
 
     def forward(self, selection: Selection) -> None:
         """Compute what is bound of the derived fields of the selected worlds."""

@@ -36,16 +36,14 @@ class SimData:
         joined = _joined(qpos, qvel)
         self._sources = [qpos, qvel] if joined is None else [joined]
         self._copies = [source.to(torch.float32).contiguous() for source in self._sources]
-        self._before = [copy.clone() for copy in self._copies]
         self.qpos = self._copies[0][:, : qpos.shape[1]]
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
         self._derived: dict[str, tuple[int, Tensor]] = {}
 
     def refresh(self) -> None:
-        """Copy the state of every world; the state before is kept for `restore_rows`."""
-        for before, copy, source in zip(self._before, self._copies, self._sources, strict=True):
-            before.copy_(copy)
+        """Copy the state of every world."""
+        for copy, source in zip(self._copies, self._sources, strict=True):
             copy.copy_(source)
         self.stamp += 1
 
@@ -56,18 +54,9 @@ class SimData:
         self.stamp += 1
 
     def restore_rows(self, selection: Selection) -> None:
-        """Write the state before the last refresh back to the engine, in the selected worlds."""
-        for before, source in zip(self._before, self._sources, strict=True):
-            selection.write(source, selection.read(before))
-
-    def is_finite(self) -> bool:
-        """Whether the copied state is finite everywhere."""
-        return all(is_finite(copy) for copy in self._copies)
-
-    def rows_not_finite(self) -> Tensor:
-        """Worlds whose copied state is not finite. (num_envs,) bool"""
-        bad = [~copy.isfinite().all(dim=1) for copy in self._copies]
-        return bad[0] if len(bad) == 1 else bad[0] | bad[1]
+        """Write the last copied state of the selected worlds back to the engine."""
+        for copy, source in zip(self._copies, self._sources, strict=True):
+            selection.write(source, selection.read(copy))
 
     def derived(self, name: str) -> Tensor:
         """A derived field as float32, cast once a step. (num_envs, ...)"""

@@ -271,7 +271,7 @@ def test_ground_and_lights(tmp_path):
     assert ground.friction[0] == 0.7
     assert model.nlight == 1
     assert model.light("distant").diffuse.tolist() == pytest.approx([0.8] * 3, rel=1e-5)
-    assert model.vis.headlight.ambient.tolist() == pytest.approx([0.3, 0.15, 0.0], rel=1e-5)
+    assert model.vis.headlight.ambient.tolist() == pytest.approx([0.5, 0.25, 0.0], rel=1e-5)
     assert model_of(tmp_path).ngeom == 4  # ground: null
 
 
