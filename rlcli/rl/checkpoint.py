@@ -22,7 +22,8 @@ from rlcli.rl.trainer import TrainerState
 
 FORMAT = 1
 PARTS = ("policy", "trainer", "env", "rng")
-"""Tensor files: the policy alone, critic and optimiser, environment, generators."""
+"""Tensor files of every checkpoint: the policy alone, critics and optimisers, environment, generators. A trainer may
+add parts of its own: the replay buffer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +56,11 @@ class Checkpoint:
 
     def state(self) -> TrainerState:
         """Everything a trainer goes on from."""
-        tensors = {part: self.tensors(part) for part in PARTS}
+        missing = [part for part in PARTS if f"{part}.safetensors" not in self.manifest["files"]]
+        if missing:
+            raise CheckpointError(f"{self.folder} has no {missing[0]}.safetensors")
+        parts = [name.removesuffix(".safetensors") for name in self.manifest["files"] if name.endswith(".safetensors")]
+        tensors = {part: self.tensors(part) for part in parts}
         for part in ("policy", "trainer"):
             for name, value in tensors[part].items():
                 if value.is_floating_point() and not bool(value.isfinite().all()):
@@ -100,7 +105,7 @@ def save(checkpoints: Path, step: int, state: TrainerState, extra: Mapping[str, 
     values = dict(state.values)
     contents: dict[str, bytes] = {"policy.json": to_json(values["policy"]).encode()}
     contents["state.json"] = to_json(values).encode()
-    for part in PARTS:
+    for part in state.tensors:
         tensors = {name: value.detach().contiguous() for name, value in state.tensors[part].items()}
         contents[f"{part}.safetensors"] = safetensors.torch.save(tensors)
     files = {name: {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in contents.items()}

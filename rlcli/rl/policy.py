@@ -3,33 +3,73 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 from torch import Tensor, nn
 
 from rlcli.errors import CheckpointError
 
-_ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
+ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
+_LOG_STD_RANGE = (-20.0, 2.0)
+_CLIP = 10.0
 
 
 class PolicySpec(BaseModel):
-    """What, besides the weights, a policy is made of."""
+    """What, besides the weights, a policy is made of.
+
+    Kinds: `gaussian-mlp`, a mean with a state-independent deviation, clipped to the bound; `squashed-gaussian-mlp`,
+    mean and deviation from the state, tanh times the bound; `deterministic-mlp`, tanh times the bound.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    kind: Literal["gaussian-mlp"] = "gaussian-mlp"
+    kind: Literal["gaussian-mlp", "squashed-gaussian-mlp", "deterministic-mlp"] = "gaussian-mlp"
     group: str = "policy"
-    observation_size: int = Field(ge=1)
-    action_size: int = Field(ge=1)
-    hidden: list[Annotated[int, Field(ge=1)]]
+    observation_size: int
+    action_size: int
+    hidden: list[int]
     activation: Literal["elu", "relu", "tanh", "silu"]
     action_bound: float | None
+    normalize: bool = False
+
+
+class Normalizer(nn.Module):
+    """Running mean and variance of observations, merged batch by batch (Chan, Golub and LeVeque 1979).
+
+    It belongs to the policy: frozen outside training, and part of what is exported.
+    """
+
+    mean: Tensor
+    var: Tensor
+    count: Tensor
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("var", torch.ones(size, dtype=torch.float64))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """(obs - mean) / std, clipped to +-10. (n, d)"""
+        scale = (self.var + 1e-8).rsqrt().float()
+        return ((obs - self.mean.float()) * scale).clamp(-_CLIP, _CLIP)
+
+    def update(self, obs: Tensor) -> None:
+        """Take in a batch. (n, d)"""
+        batch = obs.double()
+        mean, var, count = batch.mean(dim=0), batch.var(dim=0, unbiased=False), float(len(batch))
+        total = self.count + count
+        delta = mean - self.mean
+        spread = self.var * self.count + var * count + delta.square() * self.count * count / total
+        self.mean += delta * count / total
+        self.var.copy_(spread / total)
+        self.count.copy_(total)
 
 
 class Policy(nn.Module):
-    """A multilayer perceptron whose output is the mean of a Gaussian with a state-independent deviation.
+    """A multilayer perceptron, with its observation normaliser and its action bound.
 
     Args:
         spec: its shape.
@@ -38,21 +78,40 @@ class Policy(nn.Module):
     def __init__(self, spec: PolicySpec) -> None:
         super().__init__()
         self.spec = spec
+        self.normalizer = Normalizer(spec.observation_size) if spec.normalize else None
         self.actor = mlp(spec.observation_size, spec.hidden, spec.action_size, spec.activation)
-        self.log_std = nn.Parameter(torch.zeros(spec.action_size))
+        if spec.kind == "gaussian-mlp":
+            self.log_std = nn.Parameter(torch.zeros(spec.action_size))
+        elif spec.kind == "squashed-gaussian-mlp":
+            self.log_std_head = nn.Linear(spec.hidden[-1] if spec.hidden else spec.observation_size, spec.action_size)
 
     def forward(self, obs: Tensor) -> Tensor:
         """The deterministic action. (n, observation_size) -> (n, action_size)"""
-        return self._bounded(self.actor(obs))
+        return self._bounded(self.actor(self._seen(obs)))
 
     def sample(self, obs: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """A stochastic action, as in training. (n, observation_size) -> (n, action_size)"""
-        mean = self.actor(obs)
+        """A stochastic action, as the policy's distribution has it; a deterministic policy has none.
+
+        (n, observation_size) -> (n, action_size)
+        """
+        features = self.actor[:-1](self._seen(obs))
+        mean = self.actor[-1](features)
+        if self.spec.kind == "deterministic-mlp":
+            return self._bounded(mean)
         noise = torch.randn(mean.shape, generator=generator, device=mean.device)
-        return self._bounded(mean + self.log_std.exp() * noise)
+        log_std = (
+            self.log_std if self.spec.kind == "gaussian-mlp" else self.log_std_head(features).clamp(*_LOG_STD_RANGE)
+        )
+        return self._bounded(mean + log_std.exp() * noise)
+
+    def _seen(self, obs: Tensor) -> Tensor:
+        return obs if self.normalizer is None else self.normalizer(obs)
 
     def _bounded(self, action: Tensor) -> Tensor:
         bound = self.spec.action_bound
+        if self.spec.kind != "gaussian-mlp":
+            assert bound is not None
+            return torch.tanh(action) * bound
         return action if bound is None else action.clamp(-bound, bound)
 
 
@@ -60,7 +119,7 @@ def mlp(inputs: int, hidden: list[int], outputs: int, activation: str) -> nn.Seq
     """Linear layers with activations between them."""
     layers: list[nn.Module] = []
     for width in hidden:
-        layers += [nn.Linear(inputs, width), _ACTIVATIONS[activation]()]
+        layers += [nn.Linear(inputs, width), ACTIVATIONS[activation]()]
         inputs = width
     return nn.Sequential(*layers, nn.Linear(inputs, outputs))
 

@@ -1,140 +1,55 @@
-"""The Stable-Baselines3 trainer: SB3's own PPO update, on a rollout that stays in torch from end to end."""
+"""The Stable-Baselines3 trainer: SB3's own updates, one iteration at a time, saved and restored exactly."""
 
 from __future__ import annotations
 
 import math
-import random
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3 import PPO
-from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.type_aliases import RolloutBufferSamples
-from stable_baselines3.common.vec_env import VecEnv as Sb3Base
 from torch import Tensor
 
 from rlcli.adapters.sb3 import Sb3VecEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DivergedError
 from rlcli.random import derive
-from rlcli.rl.policy import _ACTIVATIONS, Policy, PolicySpec
-from rlcli.rl.sb3_config import PpoConfig
+from rlcli.rl.policy import ACTIVATIONS, Normalizer, Policy, PolicySpec
+from rlcli.rl.rng import load_rng_state, rng_state
+from rlcli.rl.sb3_algorithms import FastA2C, FastDDPG, FastPPO, FastSAC, FastTD3
+from rlcli.rl.sb3_buffers import TorchReplayBuffer, TorchRolloutBuffer
+from rlcli.rl.sb3_config import (
+    A2cConfig,
+    DdpgConfig,
+    OffPolicyConfig,
+    OnPolicyConfig,
+    PpoConfig,
+    SacConfig,
+    Sb3Config,
+    Td3Config,
+)
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
 from rlcli.rl.trainer import Report, TrainerState
 
-_LOSSES = {
+_METRICS = {
     "train/policy_gradient_loss": "Loss/surrogate",
+    "train/policy_loss": "Loss/surrogate",
     "train/value_loss": "Loss/value",
     "train/entropy_loss": "Loss/entropy",
     "train/approx_kl": "Loss/kl",
     "train/clip_fraction": "Loss/clip_fraction",
     "train/explained_variance": "Loss/explained_variance",
     "train/std": "Policy/mean_std",
+    "train/actor_loss": "Loss/actor",
+    "train/critic_loss": "Loss/critic",
+    "train/ent_coef": "Loss/entropy_coefficient",
 }
+_MUST_BE_FINITE = ("Loss/surrogate", "Loss/value", "Loss/actor", "Loss/critic", "Policy/mean_std")
 _LR_RANGE = (1e-5, 1e-2)
-
-
-class TorchRolloutBuffer(RolloutBuffer):
-    """SB3's rollout buffer with torch storage, gathered by `index_select`. All tensors are (n_steps, n_envs, ...)."""
-
-    num_minibatches: int | None = None
-    """Parts that `get` makes of the rollout, as even as they can be; None makes parts of its `batch_size`."""
-
-    def reset(self) -> None:
-        """Forget the rollout; the storage is made once."""
-        if not hasattr(self, "obs"):
-            steps, envs = self.buffer_size, self.n_envs
-            self.obs = torch.zeros(steps, envs, *self.obs_shape)
-            self.action = torch.zeros(steps, envs, self.action_dim)
-            self.reward, self.start, self.value, self.log_prob, self.advantage, self.target = (
-                torch.zeros(steps, envs) for _ in range(6)
-            )
-            # SB3's update reads these two, as numpy, for its explained variance
-            self.values, self.returns = self.value.numpy(), self.target.numpy()
-        self.pos, self.full = 0, False
-
-    def put(self, obs: Tensor, action: Tensor, reward: Tensor, start: Tensor, value: Tensor, log_prob: Tensor) -> None:
-        """Store one step of every environment."""
-        for storage, values in (
-            (self.obs, obs),
-            (self.action, action),
-            (self.reward, reward),
-            (self.start, start),
-            (self.value, value),
-            (self.log_prob, log_prob),
-        ):
-            storage[self.pos].copy_(values)
-        self.pos += 1
-        self.full = self.pos == self.buffer_size
-
-    def finish(self, last_value: Tensor, last_done: Tensor) -> None:
-        """Generalised advantage estimation (Schulman et al. 2016), backwards over the rollout."""
-        advantage = torch.zeros_like(last_value)
-        next_value, alive = last_value, 1.0 - last_done.float()
-        for step in reversed(range(self.buffer_size)):
-            delta = self.reward[step] + self.gamma * next_value * alive - self.value[step]
-            advantage = delta + self.gamma * self.gae_lambda * alive * advantage
-            self.advantage[step].copy_(advantage)
-            next_value, alive = self.value[step], 1.0 - self.start[step]
-        torch.add(self.advantage, self.value, out=self.target)
-
-    def get(self, batch_size: int | None = None) -> Iterator[RolloutBufferSamples]:  # type: ignore[override]
-        """Minibatches of a fresh permutation."""
-        total = self.buffer_size * self.n_envs
-        storage = (self.obs, self.action, self.value, self.log_prob, self.advantage, self.target)
-        columns = [tensor.view(total, *tensor.shape[2:]) for tensor in storage]
-        rows_of_parts = (
-            torch.randperm(total).split(batch_size or total)
-            if self.num_minibatches is None
-            else torch.randperm(total).tensor_split(self.num_minibatches)
-        )
-        for rows in rows_of_parts:
-            yield RolloutBufferSamples(*(column.index_select(0, rows) for column in columns))
-
-
-class FastPPO(PPO):
-    """SB3's PPO with a rollout that steps the `VecEnv` directly and bootstraps all time-outs of a step at once."""
-
-    rollout_buffer: TorchRolloutBuffer
-    source: VecEnv
-    statistics: EpisodeStatistics
-    reward_scale: float
-    clips: bool
-
-    def collect_rollouts(
-        self, env: Sb3Base, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
-    ) -> bool:
-        """Fill the buffer with `n_rollout_steps` of every environment."""
-        buffer, source, policy = self.rollout_buffer, self.source, self.policy
-        policy.set_training_mode(False)
-        buffer.reset()
-        obs, start = torch.as_tensor(self._last_obs), torch.as_tensor(self._last_episode_starts)
-        low, high = float(self.action_space.low[0]), float(self.action_space.high[0])
-        done = start
-        with torch.inference_mode():
-            for _ in range(n_rollout_steps):
-                action, value, log_prob = policy(obs)
-                result = source.step(action.clamp(low, high) if self.clips else action)
-                reward = result.reward * self.reward_scale
-                if result.final_obs is not None:
-                    cut = (result.truncated & ~result.terminated).nonzero().squeeze(1)
-                    final_value = policy.predict_values(result.final_obs["policy"].index_select(0, cut)).flatten()
-                    reward.index_add_(0, cut, final_value, alpha=self.gamma)
-                buffer.put(obs, action, reward, start, value.flatten(), log_prob)
-                self.statistics.add(result.episodes)
-                done = result.terminated | result.truncated
-                obs, start = result.obs["policy"], done
-            buffer.finish(policy.predict_values(obs).flatten(), done)
-        self.num_timesteps += n_rollout_steps * source.num_envs
-        self._last_obs = obs.numpy()
-        self._last_episode_starts = start.numpy()
-        return True
+_LEARNER_HINT = "lower learning_rate or max_grad_norm; the last good checkpoint is kept"
 
 
 class Sb3Trainer:
@@ -148,17 +63,30 @@ class Sb3Trainer:
         torch_threads: threads of the update; the rollout runs torch on one, because two thread pools fight.
     """
 
-    def __init__(self, env: VecEnv, config: PpoConfig, *, seed: int, device: str, torch_threads: int) -> None:
+    def __init__(self, env: VecEnv, config: Sb3Config, *, seed: int, device: str, torch_threads: int) -> None:
         self.env = env
         self.config = config
         self.torch_threads = torch_threads
         self.iteration = 0
         env.final_obs_of = "truncated"
         self.statistics = EpisodeStatistics(env.config.episode_length_s)
+        self.spec = policy_spec(env, config)
         torch.set_num_threads(torch_threads)
-        self.model = _make_ppo(env, config, derive(seed, "trainer"), device)
-        self.model.statistics = self.statistics
-        self.steps_per_iteration = config.n_steps * env.num_envs
+        self.model: Any = _make(env, config, derive(seed, "trainer"), device)
+        self.model.set_logger(Logger(folder=None, output_formats=[]))
+        self.model._current_progress_remaining = 1.0
+        self.model.source, self.model.statistics = env, self.statistics
+        self.model.reward_scale, self.model.action_bound = config.reward_scale, config.action_bound
+        self.normalizer = Normalizer(self.spec.observation_size) if config.normalize_observations else None
+        self.model.normalizer = self.normalizer
+        self._actor_names = _actor_names(config.algorithm, self.model.policy.state_dict())
+        if isinstance(config, OffPolicyConfig):
+            self.model.replay_buffer.normalizer = self.normalizer
+            self._horizon = config.train_freq
+        else:
+            assert isinstance(config, OnPolicyConfig)
+            self._horizon = config.n_steps
+        self.steps_per_iteration = self._horizon * env.num_envs
 
     @property
     def env_steps(self) -> int:
@@ -172,7 +100,7 @@ class Sb3Trainer:
         self.model._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
 
     def iterate(self) -> Report:
-        """Collect one rollout, then update."""
+        """Collect experience, then update."""
         try:
             return self._iterate()
         except ValueError as error:
@@ -184,16 +112,15 @@ class Sb3Trainer:
             ) from error
 
     def _iterate(self) -> Report:
-        model = self.model
         physics, step = self.env.seconds["physics"], self.env.seconds["step"]
         begin = time.perf_counter()
         torch.set_num_threads(1)
-        model.collect_rollouts(model.env, self._no_callback, model.rollout_buffer, model.n_steps)  # type: ignore[arg-type]
+        self._collect()
         collected = time.perf_counter()
         torch.set_num_threads(self.torch_threads)
         self._decay()
         self.iteration += 1
-        model.train()
+        self._update()
         updated = time.perf_counter()
         metrics = self._losses()
         self._adapt(metrics.get("Loss/kl"))
@@ -207,45 +134,48 @@ class Sb3Trainer:
         return Report({**self.statistics.flush(), **metrics}, seconds)
 
     def policy(self) -> Policy:
-        """The deployable policy, sharing the actor's weights."""
-        policy = Policy(policy_spec(self.env, self.config))
-        weights = self.model.policy.state_dict()
-        policy.load_state_dict({name: weights[key] for key, name in _actor_names(weights).items()})
+        """The deployable policy as it is now, with weights of its own."""
+        policy = Policy(self.spec)
+        policy.load_state_dict(self._policy_tensors())
         return policy.eval().requires_grad_(False)
 
     def state(self) -> TrainerState:
         """A copy of everything that the next iteration depends on."""
         weights = self.model.policy.state_dict()
-        actor = _actor_names(weights)
-        rest = {f"critic.{name}": value.clone() for name, value in weights.items() if name not in actor}
-        optimizer = self.model.policy.optimizer.state_dict()["state"]
-        for index, slots in optimizer.items():
-            rest.update({f"optimizer.{index}.{slot}": value.clone() for slot, value in slots.items()})
-        return TrainerState(
-            tensors={
-                "policy": {name: weights[key].clone() for key, name in actor.items()},
-                "trainer": rest,
-                "env": {
-                    **self.env.state_dict(),
-                    "episode_starts": torch.as_tensor(self.model._last_episode_starts),
-                },
-                "rng": rng_state(),
-            },
-            values={
-                "policy": policy_spec(self.env, self.config).model_dump(),
-                "iteration": self.iteration,
-                "env_steps": self.env_steps,
-                "learning_rate": self._learning_rate,
-                "updates": self.model._n_updates,
-                "statistics": self.statistics.state(),
-            },
-        )
+        rest = {f"weights.{name}": value.clone() for name, value in weights.items() if name not in self._actor_names}
+        for name, optimizer in self._optimizers().items():
+            for index, slots in optimizer.state_dict()["state"].items():
+                rest.update({f"optimizer.{name}.{index}.{slot}": value.clone() for slot, value in slots.items()})
+        if getattr(self.model, "log_ent_coef", None) is not None:
+            rest["log_ent_coef"] = self.model.log_ent_coef.detach().clone()
+        tensors = {
+            "policy": self._policy_tensors(),
+            "trainer": rest,
+            "env": {**self.env.state_dict(), "episode_starts": torch.as_tensor(self.model._last_episode_starts)},
+            "rng": rng_state(),
+        }
+        if isinstance(self.config, OffPolicyConfig):
+            tensors["replay"] = self.model.replay_buffer.state_dict()
+        values = {
+            "policy": self.spec.model_dump(),
+            "iteration": self.iteration,
+            "env_steps": self.env_steps,
+            "learning_rate": self._learning_rate,
+            "updates": self.model._n_updates,
+            "statistics": self.statistics.state(),
+        }
+        return TrainerState(tensors, values)
 
     def load(self, state: TrainerState) -> None:
         """Go back to a boundary: the next iteration gives the same bits as it did then."""
-        values = state.values
-        self.load_weights(state.tensors["policy"], critic=state.tensors["trainer"])
-        self._load_optimizer(state.tensors["trainer"])
+        values, rest = state.values, state.tensors["trainer"]
+        self._load_weights(state.tensors["policy"], rest)
+        for name, optimizer in self._optimizers().items():
+            _load_optimizer(optimizer, f"optimizer.{name}.", rest)
+        if "log_ent_coef" in rest:
+            self.model.log_ent_coef.data.copy_(rest["log_ent_coef"])
+        if "replay" in state.tensors:
+            self.model.replay_buffer.load_state_dict(state.tensors["replay"])
         self.iteration, self.model.num_timesteps = values["iteration"], values["env_steps"]
         self.model._n_updates = values["updates"]
         self._set_learning_rate(values["learning_rate"])
@@ -254,22 +184,58 @@ class Sb3Trainer:
         self.model._last_obs = self.env.load_state_dict(state.tensors["env"])["policy"].numpy()
         load_rng_state(state.tensors["rng"])
 
-    def load_weights(self, policy: Mapping[str, Tensor], critic: Mapping[str, Tensor] | None = None) -> None:
-        """Take a policy's weights, and the critic's where they are given."""
+    def load_weights(self, policy: Mapping[str, Tensor]) -> None:
+        """Take a policy's weights, with its normaliser; critics stay as they are."""
+        self._load_weights(policy, {})
+
+    def _collect(self) -> None:
+        if isinstance(self.config, OffPolicyConfig):
+            self.model.collect(self._horizon)
+        else:
+            self.model.collect_rollouts(self.model.env, None, self.model.rollout_buffer, self._horizon)
+
+    def _update(self) -> None:
+        if not isinstance(self.config, OffPolicyConfig):
+            self.model.train()
+        elif self.env_steps > self.config.learning_starts:
+            self.model.train(self.config.gradient_steps, self.config.batch_size)
+
+    def _policy_tensors(self) -> dict[str, Tensor]:
         weights = self.model.policy.state_dict()
-        actor = _actor_names(weights)
+        tensors = {name: weights[key].clone() for key, name in self._actor_names.items()}
+        if self.normalizer is not None:
+            tensors.update({f"normalizer.{k}": v.clone() for k, v in self.normalizer.state_dict().items()})
+        return tensors
+
+    def _load_weights(self, policy: Mapping[str, Tensor], rest: Mapping[str, Tensor]) -> None:
+        weights = self.model.policy.state_dict()
         for name in weights:
-            if name in actor:
-                weights[name] = policy[actor[name]]
-            elif critic is not None:
-                weights[name] = critic[f"critic.{name}"]
+            if name in self._actor_names:
+                weights[name] = policy[self._actor_names[name]]
+            elif f"weights.{name}" in rest:
+                weights[name] = rest[f"weights.{name}"]
         self.model.policy.load_state_dict(weights)
+        if not rest and hasattr(self.model, "actor_target"):
+            self.model.actor_target.load_state_dict(self.model.actor.state_dict())
+        if self.normalizer is not None:
+            prefix = "normalizer."
+            self.normalizer.load_state_dict(
+                {k.removeprefix(prefix): v for k, v in policy.items() if k.startswith(prefix)}
+            )
+
+    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        if isinstance(self.config, OnPolicyConfig):
+            return {"policy": self.model.policy.optimizer}
+        optimizers = {"actor": self.model.actor.optimizer, "critic": self.model.critic.optimizer}
+        if getattr(self.model, "ent_coef_optimizer", None) is not None:
+            optimizers["ent_coef"] = self.model.ent_coef_optimizer
+        return optimizers
 
     def _losses(self) -> dict[str, float]:
         recorded = self.model.logger.name_to_value
-        metrics = {name: float(recorded[key]) for key, name in _LOSSES.items() if key in recorded}
+        metrics = {name: float(recorded[key]) for key, name in _METRICS.items() if key in recorded}
         metrics["Loss/learning_rate"] = self._learning_rate
-        for name in ("Loss/surrogate", "Loss/value", "Policy/mean_std"):
+        for name in _MUST_BE_FINITE:
             if not math.isfinite(metrics.get(name, 0.0)):
                 raise DivergedError(f"{name} is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
         self._require_finite_weights()
@@ -282,12 +248,12 @@ class Sb3Trainer:
                 raise DivergedError(f"weight '{name}' is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
 
     def _decay(self) -> None:
-        if self.config.schedule == "linear":
+        if getattr(self.config, "schedule", "constant") == "linear":
             done = Budget(self.config.max_iterations, self.config.max_steps).share(self)
             self._set_learning_rate(self.config.learning_rate * max(0.0, 1.0 - done))
 
     def _adapt(self, kl: float | None) -> None:
-        desired = self.config.desired_kl
+        desired = getattr(self.config, "desired_kl", None)
         if desired is None or kl is None:
             return
         low, high = _LR_RANGE
@@ -303,101 +269,98 @@ class Sb3Trainer:
     def _set_learning_rate(self, value: float) -> None:
         self.model.lr_schedule = lambda _: value
 
-    def _load_optimizer(self, tensors: Mapping[str, Tensor]) -> None:
-        state: dict[int, dict[str, Tensor]] = {}
-        for name, value in tensors.items():
-            if name.startswith("optimizer."):
-                _, index, slot = name.split(".")
-                state.setdefault(int(index), {})[slot] = value.clone()
-        groups = self.model.policy.optimizer.state_dict()["param_groups"]
-        self.model.policy.optimizer.load_state_dict({"state": state, "param_groups": groups})
 
-    @property
-    def _no_callback(self) -> Any:
-        return None
-
-
-_LEARNER_HINT = "lower learning_rate or max_grad_norm; the last good checkpoint is kept"
-
-
-def policy_spec(env: VecEnv, config: PpoConfig) -> PolicySpec:
+def policy_spec(env: VecEnv, config: Sb3Config) -> PolicySpec:
     """What the trained policy is made of."""
+    kind = {"sac": "squashed-gaussian-mlp", "td3": "deterministic-mlp", "ddpg": "deterministic-mlp"}
     return PolicySpec(
+        kind=kind.get(config.algorithm, "gaussian-mlp"),  # type: ignore[arg-type]
         observation_size=env.layout.size("policy"),
         action_size=env.layout.action_size,
         hidden=list(config.policy.hidden),
         activation=config.policy.activation,
         action_bound=config.action_bound,
+        normalize=config.normalize_observations,
     )
 
 
-def rng_state() -> dict[str, Tensor]:
-    """States of the global generators of torch, numpy and Python."""
-    kind, keys, position, has_gauss, gauss = np.random.get_state()
-    assert kind == "MT19937"
-    version, words, next_gauss = random.getstate()
-    return {
-        "torch": torch.get_rng_state(),
-        "numpy.keys": torch.from_numpy(np.asarray(keys).astype(np.int64)),
-        "numpy.position": torch.tensor([int(position), int(has_gauss)]),
-        "numpy.gauss": torch.tensor([float(gauss)], dtype=torch.float64),
-        "python.words": torch.tensor([version, *words], dtype=torch.int64),
-        "python.gauss": torch.tensor([math.nan if next_gauss is None else next_gauss], dtype=torch.float64),
+def _make(env: VecEnv, config: Sb3Config, seed: int, device: str) -> Any:
+    common: dict[str, Any] = {
+        "policy": "MlpPolicy",
+        "env": Sb3VecEnv(env, config.action_bound),
+        "learning_rate": config.learning_rate,
+        "gamma": config.gamma,
+        "seed": seed,
+        "device": device,
     }
-
-
-def load_rng_state(state: Mapping[str, Tensor]) -> None:
-    """Take back what `rng_state` gave."""
-    torch.set_rng_state(state["torch"])
-    position, has_gauss = state["numpy.position"].tolist()
-    keys = state["numpy.keys"].numpy().astype(np.uint32)
-    np.random.set_state(("MT19937", keys, position, has_gauss, float(state["numpy.gauss"])))
-    version, *words = state["python.words"].tolist()
-    gauss = float(state["python.gauss"])
-    random.setstate((version, tuple(words), None if math.isnan(gauss) else gauss))
-
-
-def _make_ppo(env: VecEnv, config: PpoConfig, seed: int, device: str) -> FastPPO:
+    networks: dict[str, Any] = {"activation_fn": ACTIVATIONS[config.policy.activation]}
+    if isinstance(config, OffPolicyConfig):
+        return _make_off_policy(config, common, {**networks, "net_arch": list(config.policy.hidden)})
+    assert isinstance(config, OnPolicyConfig)
+    networks |= {
+        "net_arch": {"pi": list(config.policy.hidden), "vf": list(config.policy.hidden)},
+        "log_std_init": math.log(config.policy.init_std),
+        "ortho_init": config.policy.ortho_init,
+    }
+    common |= {
+        "n_steps": config.n_steps,
+        "gae_lambda": config.gae_lambda,
+        "normalize_advantage": config.normalize_advantage,
+        "ent_coef": config.ent_coef,
+        "vf_coef": config.vf_coef,
+        "max_grad_norm": config.max_grad_norm,
+        "rollout_buffer_class": TorchRolloutBuffer,
+        "policy_kwargs": networks,
+    }
     total = config.n_steps * env.num_envs
     _require_batch(env, config, total)
+    if isinstance(config, A2cConfig):
+        return FastA2C(**common)
+    assert isinstance(config, PpoConfig)
     model = FastPPO(
-        "MlpPolicy",
-        Sb3VecEnv(env, config.action_bound),
-        learning_rate=config.learning_rate,
-        n_steps=config.n_steps,
+        **common,
         batch_size=total,  # the buffer divides it, whatever the number of environments
         n_epochs=config.n_epochs,
-        gamma=config.gamma,
-        gae_lambda=config.gae_lambda,
         clip_range=config.clip_range,
         clip_range_vf=config.clip_range_vf,
-        normalize_advantage=config.normalize_advantage,
-        ent_coef=config.ent_coef,
-        vf_coef=config.vf_coef,
-        max_grad_norm=config.max_grad_norm,
-        rollout_buffer_class=TorchRolloutBuffer,
-        policy_kwargs={
-            "net_arch": {"pi": list(config.policy.hidden), "vf": list(config.policy.hidden)},
-            "activation_fn": _ACTIVATIONS[config.policy.activation],
-            "log_std_init": math.log(config.policy.init_std),
-            "ortho_init": config.policy.ortho_init,
-        },
-        seed=seed,
-        device=device,
     )
-    model.set_logger(Logger(folder=None, output_formats=[]))
-    model._current_progress_remaining = 1.0
     model.rollout_buffer.num_minibatches = config.num_minibatches
-    model.source = env
-    model.reward_scale = config.reward_scale
-    model.clips = config.action_bound is not None
     return model
 
 
-def _require_batch(env: VecEnv, config: PpoConfig, total: int) -> None:
+def _make_off_policy(config: OffPolicyConfig, common: dict[str, Any], networks: dict[str, Any]) -> Any:
+    common = {
+        **common,
+        "policy_kwargs": networks,
+        "buffer_size": config.buffer_size,
+        "batch_size": config.batch_size,
+        "learning_starts": config.learning_starts,
+        "tau": config.tau,
+        "replay_buffer_class": TorchReplayBuffer,
+    }
+    if isinstance(config, SacConfig):
+        model: Any = FastSAC(**common, ent_coef=config.ent_coef)
+        model.exploration_noise = 0.0
+        return model
+    if isinstance(config, Td3Config):
+        model = FastTD3(
+            **common,
+            policy_delay=config.policy_delay,
+            target_policy_noise=config.target_policy_noise,
+            target_noise_clip=config.target_noise_clip,
+        )
+    else:
+        model = FastDDPG(**common)
+    assert isinstance(config, Td3Config | DdpgConfig)
+    model.exploration_noise = config.exploration_noise
+    return model
+
+
+def _require_batch(env: VecEnv, config: OnPolicyConfig, total: int) -> None:
     rollout = f"a rollout holds n_steps x num_envs = {config.n_steps} x {env.num_envs} = {total} samples"
-    if total < config.num_minibatches:
-        key, message = "num_minibatches", f"{config.num_minibatches} minibatches cannot be made: {rollout}"
+    minibatches = config.num_minibatches if isinstance(config, PpoConfig) else 1
+    if total < minibatches:
+        key, message = "num_minibatches", f"{minibatches} minibatches cannot be made: {rollout}"
     elif total == 1 and config.normalize_advantage:
         key, message = "n_steps", f"advantages cannot be normalised: {rollout}"
     else:
@@ -406,9 +369,13 @@ def _require_batch(env: VecEnv, config: PpoConfig, total: int) -> None:
     raise ConfigError([env.resolved.problem(path, message, "more environments, more n_steps, or fewer minibatches")])
 
 
-def _actor_names(weights: Mapping[str, Tensor]) -> dict[str, str]:
+def _actor_names(algorithm: str, weights: Mapping[str, Tensor]) -> dict[str, str]:
     """SB3's names of the actor's weights -> the saved policy's, its output layer numbered after the hidden ones."""
-    hidden = "mlp_extractor.policy_net."
+    hidden, output = {
+        "sac": ("actor.latent_pi.", "actor.mu."),
+        "td3": ("actor.mu.", None),
+        "ddpg": ("actor.mu.", None),
+    }.get(algorithm, ("mlp_extractor.policy_net.", "action_net."))
     layers = sum(name.startswith(hidden) and name.endswith(".weight") for name in weights)
     names = {}
     for name in weights:
@@ -416,6 +383,17 @@ def _actor_names(weights: Mapping[str, Tensor]) -> dict[str, str]:
             names[name] = name
         elif name.startswith(hidden):
             names[name] = f"actor.{name.removeprefix(hidden)}"
-        elif name.startswith("action_net."):
-            names[name] = f"actor.{2 * layers}.{name.removeprefix('action_net.')}"
+        elif output is not None and name.startswith(output):
+            names[name] = f"actor.{2 * layers}.{name.removeprefix(output)}"
+        elif name.startswith("actor.log_std."):
+            names[name] = f"log_std_head.{name.removeprefix('actor.log_std.')}"
     return names
+
+
+def _load_optimizer(optimizer: torch.optim.Optimizer, prefix: str, tensors: Mapping[str, Tensor]) -> None:
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith(prefix):
+            index, slot = name.removeprefix(prefix).split(".")
+            state.setdefault(int(index), {})[slot] = value.clone()
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

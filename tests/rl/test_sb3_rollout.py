@@ -13,7 +13,8 @@ from stable_baselines3.common.logger import Logger
 
 from rlcli.adapters.sb3 import Sb3VecEnv
 from rlcli.errors import ConfigError, DivergedError
-from rlcli.rl.sb3 import Sb3Trainer, TorchRolloutBuffer
+from rlcli.rl.sb3 import Sb3Trainer
+from rlcli.rl.sb3_buffers import TorchRolloutBuffer
 
 
 def trainer_of(env, agent, seed=5):

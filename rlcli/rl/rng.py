@@ -1,0 +1,37 @@
+"""The global random generators of torch, numpy and Python, as tensors of a checkpoint."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def rng_state() -> dict[str, Tensor]:
+    """States of the global generators of torch, numpy and Python."""
+    kind, keys, position, has_gauss, gauss = np.random.get_state()
+    assert kind == "MT19937"
+    version, words, next_gauss = random.getstate()
+    return {
+        "torch": torch.get_rng_state(),
+        "numpy.keys": torch.from_numpy(np.asarray(keys).astype(np.int64)),
+        "numpy.position": torch.tensor([int(position), int(has_gauss)]),
+        "numpy.gauss": torch.tensor([float(gauss)], dtype=torch.float64),
+        "python.words": torch.tensor([version, *words], dtype=torch.int64),
+        "python.gauss": torch.tensor([math.nan if next_gauss is None else next_gauss], dtype=torch.float64),
+    }
+
+
+def load_rng_state(state: Mapping[str, Tensor]) -> None:
+    """Take back what `rng_state` gave."""
+    torch.set_rng_state(state["torch"])
+    position, has_gauss = state["numpy.position"].tolist()
+    keys = state["numpy.keys"].numpy().astype(np.uint32)
+    np.random.set_state(("MT19937", keys, position, has_gauss, float(state["numpy.gauss"])))
+    version, *words = state["python.words"].tolist()
+    gauss = float(state["python.gauss"])
+    random.setstate((version, tuple(words), None if math.isnan(gauss) else gauss))

@@ -1,0 +1,131 @@
+"""Stable-Baselines3's buffers with torch storage: no copy to numpy and back, minibatches by `index_select`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
+from torch import Tensor
+
+from rlcli.rl.policy import Normalizer
+
+
+class TorchRolloutBuffer(RolloutBuffer):
+    """SB3's rollout buffer with torch storage, gathered by `index_select`. All tensors are (n_steps, n_envs, ...)."""
+
+    num_minibatches: int | None = None
+    """Parts that `get` makes of the rollout, as even as they can be; None makes parts of its `batch_size`."""
+
+    def reset(self) -> None:
+        """Forget the rollout; the storage is made once."""
+        if not hasattr(self, "obs"):
+            steps, envs = self.buffer_size, self.n_envs
+            self.obs = torch.zeros(steps, envs, *self.obs_shape)
+            self.action = torch.zeros(steps, envs, self.action_dim)
+            self.reward, self.start, self.value, self.log_prob, self.advantage, self.target = (
+                torch.zeros(steps, envs) for _ in range(6)
+            )
+            # SB3's update reads these two, as numpy, for its explained variance
+            self.values, self.returns = self.value.numpy(), self.target.numpy()
+        self.pos, self.full = 0, False
+
+    def put(self, obs: Tensor, action: Tensor, reward: Tensor, start: Tensor, value: Tensor, log_prob: Tensor) -> None:
+        """Store one step of every environment."""
+        for storage, values in (
+            (self.obs, obs),
+            (self.action, action),
+            (self.reward, reward),
+            (self.start, start),
+            (self.value, value),
+            (self.log_prob, log_prob),
+        ):
+            storage[self.pos].copy_(values)
+        self.pos += 1
+        self.full = self.pos == self.buffer_size
+
+    def finish(self, last_value: Tensor, last_done: Tensor) -> None:
+        """Generalised advantage estimation (Schulman et al. 2016), backwards over the rollout."""
+        advantage = torch.zeros_like(last_value)
+        next_value, alive = last_value, 1.0 - last_done.float()
+        for step in reversed(range(self.buffer_size)):
+            delta = self.reward[step] + self.gamma * next_value * alive - self.value[step]
+            advantage = delta + self.gamma * self.gae_lambda * alive * advantage
+            self.advantage[step].copy_(advantage)
+            next_value, alive = self.value[step], 1.0 - self.start[step]
+        torch.add(self.advantage, self.value, out=self.target)
+
+    def get(self, batch_size: int | None = None) -> Iterator[RolloutBufferSamples]:  # type: ignore[override]
+        """Minibatches of a fresh permutation."""
+        total = self.buffer_size * self.n_envs
+        storage = (self.obs, self.action, self.value, self.log_prob, self.advantage, self.target)
+        columns = [tensor.view(total, *tensor.shape[2:]) for tensor in storage]
+        rows_of_parts = (
+            torch.randperm(total).split(batch_size or total)
+            if self.num_minibatches is None
+            else torch.randperm(total).tensor_split(self.num_minibatches)
+        )
+        for rows in rows_of_parts:
+            yield RolloutBufferSamples(*(column.index_select(0, rows) for column in columns))
+
+
+class TorchReplayBuffer(ReplayBuffer):
+    """A ring of transitions of every environment, kept as they were observed and normalised when sampled.
+
+    A transition that ended by time is stored as not done, with the episode's true last observation as its next one.
+    """
+
+    normalizer: Normalizer | None = None
+
+    def __init__(self, buffer_size: int, *args: Any, **kwargs: Any) -> None:
+        super().__init__(1, *args, **kwargs)  # SB3's own storage is not used
+        self.buffer_size = max(1, buffer_size // self.n_envs)
+        rows, envs = self.buffer_size, self.n_envs
+        self.obs = torch.zeros(rows, envs, *self.obs_shape)
+        self.next_obs = torch.zeros(rows, envs, *self.obs_shape)
+        self.action = torch.zeros(rows, envs, self.action_dim)
+        self.reward = torch.zeros(rows, envs, 1)
+        self.done = torch.zeros(rows, envs, 1)
+
+    def put(self, obs: Tensor, next_obs: Tensor, action: Tensor, reward: Tensor, done: Tensor) -> None:
+        """Store one step of every environment."""
+        for storage, values in (
+            (self.obs, obs),
+            (self.next_obs, next_obs),
+            (self.action, action),
+            (self.reward, reward[:, None]),
+            (self.done, done[:, None]),
+        ):
+            storage[self.pos].copy_(values)
+        self.pos += 1
+        if self.pos == self.buffer_size:
+            self.pos, self.full = 0, True
+
+    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:  # type: ignore[override]
+        """Uniformly drawn transitions."""
+        rows = torch.randint((self.buffer_size if self.full else self.pos) * self.n_envs, (batch_size,))
+        obs, action, next_obs, done, reward = (
+            storage.view(-1, storage.shape[2]).index_select(0, rows)
+            for storage in (self.obs, self.action, self.next_obs, self.done, self.reward)
+        )
+        if self.normalizer is not None:
+            obs, next_obs = self.normalizer(obs), self.normalizer(next_obs)
+        return ReplayBufferSamples(obs, action, next_obs, done, reward)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What has been stored so far, and where the next step goes."""
+        rows = self.buffer_size if self.full else self.pos
+        stored = {name: getattr(self, name)[:rows].clone() for name in _REPLAY}
+        return {**stored, "position": torch.tensor([self.pos, int(self.full)])}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state_dict` gave."""
+        for name in _REPLAY:
+            getattr(self, name)[: len(state[name])].copy_(state[name])
+        self.pos, full = state["position"].tolist()
+        self.full = bool(full)
+
+
+_REPLAY = ("obs", "next_obs", "action", "reward", "done")
