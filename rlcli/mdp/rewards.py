@@ -70,7 +70,8 @@ def joint_pos_limits_penalty_ratio(
     low, high = entity.data.joint_pos_limits[joints].unbind(dim=1)
     scaled = ((2.0 * entity.data.joint_pos[:, joints] - low - high) / (high - low)).abs()
     violation = (scaled - threshold) / (1.0 - threshold)
-    return (violation * gear_ratio * (scaled > threshold)).sum(dim=1)
+    # a joint without limits has no scale (nan), and is never beyond it
+    return torch.where(scaled > threshold, violation * gear_ratio, 0.0).sum(dim=1)
 
 
 def power_consumption(
