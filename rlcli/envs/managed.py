@@ -85,6 +85,7 @@ class ManagedEnv(VecEnv):
         self.action_manager.reset(selection)
         self.reward_manager.reset(selection)
         self.termination_manager.reset(selection)
+        self.observation_manager.reset(selection)
 
     def _between(self) -> None:
         steps = self._ids.new_full((self.num_envs,), self.common_step)

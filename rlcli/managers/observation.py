@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rlcli.errors import ConfigError, DivergedError, Problem
 from rlcli.managers.term import BoundTerm, check_shape
+from rlcli.sim.selection import Selection
 
 
 @dataclass(slots=True)
@@ -47,6 +48,12 @@ class ObservationManager:
             self._fill(group, self._final_views[name])
             self._require_finite(name, group, self._final[name])
         return self._final
+
+    def reset(self, selection: Selection) -> None:
+        """Tell terms with memory."""
+        for group in self.groups.values():
+            for term in group.terms:
+                term.reset(selection)
 
     def sizes(self, group: str) -> list[tuple[BoundTerm, int]]:
         """The terms of a group with their columns."""
