@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import ConfigError, DivergedError, Problem
-from rlcli.managers.term import BoundTerm, check_shape
+from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.sim.selection import Selection
 
 
@@ -68,7 +68,7 @@ class ObservationManager:
     def _group(self, terms: list[BoundTerm], device: torch.device) -> _Group:
         sizes = []
         for term in terms:
-            value = term.call()
+            value = first_value(term)
             width = value.shape[1] if isinstance(value, Tensor) and value.dim() == 2 else 1
             check_shape(term, value, (self.num_envs, width), "observations")
             sizes.append(width)

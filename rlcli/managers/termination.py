@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm, check_shape
+from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.sim.selection import Selection
 
 DIVERGED = "diverged"
@@ -25,7 +25,7 @@ class TerminationManager:
         self.fired: dict[str, Tensor] = {term.name: self._none for term in terms}
         """Term -> where it fired in this step. (num_envs,) bool each"""
         for term in terms:
-            check_shape(term, term.call(), (num_envs,), "terminations")
+            check_shape(term, first_value(term), (num_envs,), "terminations")
 
     def compute(self, diverged: Tensor | None) -> tuple[Tensor, Tensor]:
         """Judge this step. (num_envs,) bool each"""
