@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-import rlcli_tasks.cartpole
 import torch
 from worlds import build, write
+
+import rlcli_tasks.cartpole
 
 TASK = """
 decimation: 2
