@@ -88,6 +88,8 @@ class ManagedEnv(VecEnv):
         self.observation_manager.reset(selection)
 
     def _between(self) -> None:
+        if not self.event_manager.has_intervals:
+            return
         steps = self._ids.new_full((self.num_envs,), self.common_step)
         running = (self.episode_length_buf > 0).long()  # no time has passed for those just reset
         self.event_manager.interval(lambda mask: self.engine.select(mask, self.seed, steps), running, self._written)

@@ -26,6 +26,11 @@ class EventManager:
         # counted in whole steps: subtracting step_dt again and again drifts
         self._steps_left = torch.zeros(len(self._interval), num_envs, dtype=torch.int64, device=device)
 
+    @property
+    def has_intervals(self) -> bool:
+        """Whether there are interval events at all."""
+        return bool(self._interval)
+
     def startup(self, everyone: Selection) -> None:
         """Fire the startup events, once."""
         for term in self._startup:
