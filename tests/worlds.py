@@ -81,7 +81,12 @@ events:
     interval_range_s: [0.1, 0.3]
     linear_velocity: [[-1.0, 1.0], [-1.0, 1.0], [0.0, 0.0]]
     angular_velocity: [[-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0]]
-  shove: {func: apply_external_force_torque, mode: interval, interval_range_s: [0.2, 0.4], bodies: [torso], force: [-5.0, 5.0]}
+  shove:
+    func: apply_external_force_torque
+    mode: interval
+    interval_range_s: [0.2, 0.4]
+    bodies: [torso]
+    force: [-5.0, 5.0]
 rewards:
   alive: {func: is_alive, weight: 1.0}
   fell: {func: is_terminated, weight: -5.0}

@@ -158,8 +158,9 @@ def _rows(values: Tensor, indices: Tensor | None, clone: bool) -> Tensor:
 
 
 def _actuator_columns(entity: Entity, kind: str) -> tuple[Columns, Tensor, Tensor]:
-    """Joint columns that have an actuator of the kind, those actuators' control columns, and what turns a joint's
-    force or target into a control: a gear multiplies forces and lengths alike.
+    """Joint columns that have an actuator of the kind, those actuators' control columns, and what makes controls.
+
+    A gear multiplies forces and lengths alike: so a joint's force is divided by it, a joint's target multiplied.
     """
     columns = entity.actuators_of(kind)
     joints = [joint for joint, _ in columns]

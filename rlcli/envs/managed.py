@@ -81,6 +81,7 @@ class ManagedEnv(VecEnv):
         self.action_manager.reset(selection)
         self.reward_manager.reset(selection)
         self.termination_manager.reset(selection)
+        self.observation_manager.reset(selection)
 
     def _between(self) -> None:
         if not self.event_manager.has_intervals:

@@ -8,6 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from rlcli.errors import ConfigError, Problem
 from rlcli.managers.term import BoundTerm
 from rlcli.sim.selection import Selection
 
@@ -32,6 +33,7 @@ class ActionManager:
 
     def __init__(self, terms: list[BoundTerm], num_envs: int, device: torch.device) -> None:
         self.terms = terms
+        _refuse_shared(terms)
         self.size = sum(term.instance.size for term in terms)
         self.action = torch.zeros(num_envs, self.size, device=device)
         """The policy's action of this step. (num_envs, size)"""
@@ -65,3 +67,18 @@ class ActionManager:
         """Take back what `state_dict` gave."""
         self.action.copy_(state["action"])
         self.prev_action.copy_(state["prev_action"])
+
+
+def _refuse_shared(terms: list[BoundTerm]) -> None:
+    """Of two terms that write one actuator only the later would count.
+
+    Raises:
+        ConfigError: naming both terms and what they share.
+    """
+    owner: dict[int, BoundTerm] = {}
+    for term in terms:
+        for actuator, element in zip(getattr(term.instance, "actuators", ()), term.instance.elements, strict=False):
+            first = owner.setdefault(actuator, term)
+            if first is not term:
+                path = ".".join(map(str, term.path))
+                raise ConfigError([Problem("actions", path, f"'{element}' is driven by '{first.name}' already")])

@@ -26,6 +26,11 @@ class EventManager:
         # counted in whole steps: subtracting step_dt again and again drifts
         self._steps_left = torch.zeros(len(self._interval), num_envs, dtype=torch.int64, device=device)
 
+    @property
+    def has_intervals(self) -> bool:
+        """Whether there are interval events at all."""
+        return bool(self._interval)
+
     def startup(self, everyone: Selection) -> None:
         """Fire the startup events, once."""
         for term in self._startup:
@@ -37,11 +42,6 @@ class EventManager:
             term.call(selection.stream(term.stream))
         for term, left in zip(self._interval, self._steps_left, strict=True):
             selection.write(left, self._draw(term, selection, _FIRST))
-
-    @property
-    def has_intervals(self) -> bool:
-        """Whether any event fires at intervals."""
-        return bool(self._interval)
 
     def interval(self, select: Select, running: Tensor, fired: Callable[[Selection], None]) -> None:
         """Let one step pass where an episode is `running` (1 or 0) and fire what is due, telling `fired` after each.

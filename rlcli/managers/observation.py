@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import ConfigError, DivergedError, Problem
-from rlcli.managers.term import BoundTerm, check_shape
+from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.sim.entity import is_finite
+from rlcli.sim.selection import Selection
 
 
 @dataclass(slots=True)
@@ -49,6 +50,12 @@ class ObservationManager:
             self._require_finite(name, group, self._final[name])
         return self._final
 
+    def reset(self, selection: Selection) -> None:
+        """Tell terms with memory."""
+        for group in self.groups.values():
+            for term in group.terms:
+                term.reset(selection)
+
     def sizes(self, group: str) -> list[tuple[BoundTerm, int]]:
         """The terms of a group with their columns."""
         return list(zip(self.groups[group].terms, self.groups[group].sizes, strict=True))
@@ -62,7 +69,7 @@ class ObservationManager:
     def _group(self, terms: list[BoundTerm], device: torch.device) -> _Group:
         sizes = []
         for term in terms:
-            value = term.call()
+            value = first_value(term)
             width = value.shape[1] if isinstance(value, Tensor) and value.dim() == 2 else 1
             check_shape(term, value, (self.num_envs, width), "observations")
             sizes.append(width)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import DivergedError
-from rlcli.managers.term import BoundTerm, check_shape
+from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.managers.termination import DIVERGED
 from rlcli.sim.selection import Selection
 
@@ -44,7 +44,7 @@ class RewardManager:
         self._next = 0
         for term, factor in zip(terms, self._factors, strict=True):
             if factor != 0.0:
-                check_shape(term, term.call(), (num_envs,), "rewards")
+                check_shape(term, first_value(term), (num_envs,), "rewards")
 
     def compute(self) -> Tensor:
         """This step's reward. (num_envs,)

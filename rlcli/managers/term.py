@@ -153,6 +153,18 @@ class Binder:
         self.problems.append(self.resolved.problem((*path, parameter), message, hint))
 
 
+def first_value(term: BoundTerm) -> Any:
+    """Call a term once, when the environment is built.
+
+    Raises:
+        ConfigError: if it refuses its parameters with a ValueError.
+    """
+    try:
+        return term.call()
+    except ValueError as error:
+        raise ConfigError([Problem(str(term.path[0]), ".".join(map(str, term.path)), str(error))]) from None
+
+
 def check_shape(term: BoundTerm, value: Any, expected: tuple[int, ...], what: str) -> None:
     """A term's first value must be a tensor of the expected shape.
 

@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm, check_shape
+from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.sim.selection import Selection
 
 DIVERGED = "diverged"
@@ -28,7 +28,7 @@ class TerminationManager:
         """Term -> where it fired in this step. (num_envs,) bool each"""
         self._calls = [(term, bool(term.config.time_out)) for term in terms]  # type: ignore[attr-defined]
         for term in terms:
-            check_shape(term, term.call(), (num_envs,), "terminations")
+            check_shape(term, first_value(term), (num_envs,), "terminations")
 
     def compute(self, diverged: Tensor | None) -> tuple[Tensor, Tensor]:
         """Judge this step. (num_envs,) bool each"""

@@ -37,7 +37,7 @@ class _JointAction:
         missing = [name for name, c in zip(self.elements, columns, strict=True) if c not in driven]
         if missing:
             raise NameProblem(f"no {self.actuator} actuator drives {', '.join(missing)}")
-        actuators = [driven[c] for c in columns]
+        self.actuators = actuators = [driven[c] for c in columns]
         self.size = len(columns)
         self._scale, self._offset, self._clip = scale, offset, clip
         gear = torch.tensor(entity.engine.model.actuator_gear[actuators, 0], dtype=torch.float32)

@@ -70,14 +70,21 @@ def joint_pos_limits_penalty_ratio(
     low, high = entity.data.joint_pos_limits[joints].unbind(dim=1)
     scaled = ((2.0 * entity.data.joint_pos[:, joints] - low - high) / (high - low)).abs()
     violation = (scaled - threshold) / (1.0 - threshold)
-    return (violation * gear_ratio * (scaled > threshold)).sum(dim=1)
+    # a joint without limits has no scale (nan), and is never beyond it
+    return torch.where(scaled > threshold, violation * gear_ratio, 0.0).sum(dim=1)
 
 
 def power_consumption(
     env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", gear_ratio: float = 1.0
 ) -> Tensor:
-    """Sum of |raw action x joint velocity x gear ratio| over the driven joints [rad/s]. (num_envs,)"""
-    return (env.action_manager.action * entity.data.joint_vel[:, joints] * gear_ratio).abs().sum(dim=1)
+    """Sum of |raw action x joint velocity x gear ratio|; `joints` are the driven ones, in the action's order [rad/s].
+
+    (num_envs,)
+    """
+    action, velocity = env.action_manager.action, entity.data.joint_vel[:, joints]
+    if action.shape != velocity.shape:
+        raise ValueError(f"selects {velocity.shape[1]} joints, the action has {action.shape[1]} columns")
+    return (action * velocity * gear_ratio).abs().sum(dim=1)
 
 
 def action_rate_l2(env: ManagedEnv) -> Tensor:

@@ -103,7 +103,7 @@ class TorchReplayBuffer(ReplayBuffer):
         if self.pos == self.buffer_size:
             self.pos, self.full = 0, True
 
-    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:  # type: ignore[override]
+    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
         """Uniformly drawn transitions."""
         rows = torch.randint((self.buffer_size if self.full else self.pos) * self.n_envs, (batch_size,))
         obs, action, next_obs, done, reward = (

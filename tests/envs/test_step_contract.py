@@ -1,5 +1,7 @@
 """The step contract of manager-based environments, point by point."""
 
+import itertools
+
 import pytest
 import torch
 from worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, edited, pendulum, run
@@ -98,8 +100,10 @@ def test_a_time_out_at_exactly_the_episode_length_is_truncation_with_alive_1(tmp
     assert results[9].episodes.causes["time_out"].tolist() == [True] * 3
 
 
-@pytest.mark.parametrize(("length", "dt", "decimation", "steps"), [(5.0, "1/120", 2, 300), (8.3, 0.0083, 2, 500),
-                                                                    (1.0, 0.01, 3, 34), (0.06, 0.02, 3, 1)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("length", "dt", "decimation", "steps"),
+    [(5.0, "1/120", 2, 300), (8.3, 0.0083, 2, 500), (1.0, 0.01, 3, 34), (0.06, 0.02, 3, 1)],
+)
 def test_the_number_of_steps_of_an_episode_is_rounded_up_without_rounding_errors(
     tmp_path, length, dt, decimation, steps
 ):
@@ -290,7 +294,7 @@ def test_interval_times_are_drawn_an_environment_within_their_bounds(tmp_path):
     gaps = set()
     for env_id in range(16):
         steps = [0, *(step for step, ids in events(env, "tick") if env_id in ids)]
-        gaps |= {b - a for a, b in zip(steps, steps[1:], strict=False)}
+        gaps |= {b - a for a, b in itertools.pairwise(steps)}
     assert gaps <= set(range(5, 11))
     assert len(gaps) >= 4
 

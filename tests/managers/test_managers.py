@@ -1,0 +1,297 @@
+"""Binding of terms, and what each manager makes of its terms."""
+
+import re
+
+import pytest
+import torch
+from worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, edited, pendulum, run
+
+from rlcli.errors import ConfigError, RlcliError, TaskError
+
+JOINTS = ["hip_fl", "hip_fr", "hip_bl", "hip_br"]
+
+
+def observed(tmp_path, **terms):
+    env = build(critter(tmp_path, edited(CRITTER_TASK, observations={"policy": terms})), 3)
+    env.reset()
+    return env, env.step(torch.rand(3, 4)).obs["policy"]
+
+
+def test_columns_are_in_exactly_the_order_written(tmp_path):
+    order = ["hip_br", "hip_fl", "hip_bl", "hip_fr"]
+    env, obs = observed(tmp_path, pos={"func": "joint_pos", "joints": order}, all={"func": "joint_pos"})
+    assert torch.equal(obs[:, :4], obs[:, 4:][:, [JOINTS.index(name) for name in order]])
+    assert env.layout.observations["policy"][0].elements == tuple(order)
+    assert env.layout.observations["policy"][1].elements == tuple(JOINTS)
+
+
+def test_a_regex_expands_in_the_models_order_and_patterns_in_theirs(tmp_path):
+    env, obs = observed(tmp_path, pos={"func": "joint_pos", "joints": ["hip_b.", "hip_f."]}, all={"func": "joint_pos"})
+    assert env.layout.observations["policy"][0].elements == ("hip_bl", "hip_br", "hip_fl", "hip_fr")
+    assert torch.equal(obs[:, :4], obs[:, 4:][:, [2, 3, 0, 1]])
+
+
+def test_actions_drive_the_joints_in_exactly_the_order_written(tmp_path):
+    env = build(critter(tmp_path), 2)
+    env.reset()
+    env.step(torch.tensor([[1.0, 2.0, 3.0, 4.0]] * 2))
+    assert env.layout.actions[0].elements == ("hip_br", "hip_fl", "hip_bl", "hip_fr")
+    model = env.engine.model
+    driven = [model.joint(int(j)).name.removeprefix("robot/") for j in model.actuator_trnid[:, 0]]
+    target = dict(zip(driven, env.engine.field("ctrl")[0].tolist(), strict=True))
+    # raw x 0.5 about the default pose
+    assert target == pytest.approx({"hip_br": 0.5 - 0.1, "hip_fl": 1.0 + 0.1, "hip_bl": 1.5 + 0.1, "hip_fr": 2.0 - 0.1})
+
+
+def test_an_action_is_scaled_then_offset_then_clipped(tmp_path):
+    term = {"func": "joint_effort", "scale": 3.0, "offset": 1.0, "clip": [-2.0, 5.0]}
+    env = build(pendulum(tmp_path, edited(PENDULUM_TASK, actions={"torque": term})))
+    env.reset()
+    env.step(torch.tensor([[1.0], [2.0], [-3.0]]))
+    assert env.engine.field("ctrl")[:, 0].tolist() == [4.0, 5.0, -2.0]
+    assert env.action_manager.action[:, 0].tolist() == [1.0, 2.0, -3.0]
+
+
+def test_the_default_offset_of_a_position_action_can_be_left_out(tmp_path):
+    legs = {"func": "joint_position", "use_default_offset": False, "offset": 0.25}
+    env = build(critter(tmp_path, edited(CRITTER_TASK, actions={"legs": legs})), 1)
+    env.reset()
+    env.step(torch.zeros(1, 4))
+    assert env.engine.field("ctrl")[0].tolist() == [0.25] * 4
+
+
+def test_several_action_terms_take_their_columns_in_order(tmp_path):
+    split = {"legs": {"func": "joint_position", "joints": ["hip_b."], "use_default_offset": False},
+             "front": {"func": "joint_effort", "joints": ["hip_fr"], "scale": 2.0}}  # fmt: skip
+    env = build(critter(tmp_path, edited(CRITTER_TASK, actions=split, rewards={"power": None})), 1)
+    assert [t.size for t in env.layout.actions] == [2, 1]
+    env.reset()
+    env.step(torch.tensor([[0.1, 0.2, 0.3]]))
+    robot = env.entities["robot"]
+    position, motor = dict(robot.actuators_of("position")), dict(robot.actuators_of("motor"))
+    ctrl = env.engine.field("ctrl")[0]
+    assert [float(ctrl[position[2]]), float(ctrl[position[3]]), float(ctrl[motor[1]])] == pytest.approx([0.1, 0.2, 0.6])
+
+
+def test_previous_and_present_action_of_the_policy_are_kept(tmp_path):
+    env = build(pendulum(tmp_path))
+    env.reset()
+    env.step(torch.full((3, 1), 0.5))
+    env.step(torch.full((3, 1), 0.75))
+    assert env.action_manager.prev_action[:, 0].tolist() == [0.5] * 3
+    assert env.action_manager.action[:, 0].tolist() == [0.75] * 3
+
+
+def test_an_observation_is_clipped_then_scaled(tmp_path):
+    _, obs = observed(
+        tmp_path,
+        raw={"func": "joint_vel"},
+        both={"func": "joint_vel", "clip": [-0.5, 0.25], "scale": 4.0},
+        each={"func": "joint_vel", "scale": [1.0, 2.0, 3.0, -1.0]},
+    )
+    raw, both, each = obs.split(4, dim=1)
+    assert torch.equal(both, raw.clamp(-0.5, 0.25) * 4.0)
+    assert torch.equal(each, raw * torch.tensor([1.0, 2.0, 3.0, -1.0]))
+    assert raw.abs().max() > 0.5
+
+
+def test_groups_are_observed_apart(tmp_path):
+    env = build(critter(tmp_path), 3)
+    obs = env.reset()
+    assert {group: tuple(value.shape) for group, value in obs.items()} == {"policy": (3, 22), "critic": (3, 8)}
+    assert (env.layout.size(), env.layout.size("critic"), env.layout.action_size) == (22, 8, 4)
+
+
+def test_final_observations_do_not_disturb_the_next_ones(tmp_path):
+    env = build(critter(tmp_path), 3)
+    for result in run(env, 35):
+        if result.truncated.any():
+            assert (result.final_obs["policy"][result.truncated] != result.obs["policy"][result.truncated]).any()
+
+
+SHAPES = """
+import torch
+from rlcli.task import Entity
+
+
+def scalar(env):
+    return 1.0
+
+
+def column(env, *, entity: Entity = "robot"):
+    return entity.data.joint_pos
+
+
+def flat(env, *, entity: Entity = "robot"):
+    return entity.data.joint_pos[:, 0]
+
+
+def cube(env, *, entity: Entity = "robot"):
+    return entity.data.joint_pos[:, :, None]
+
+
+class Fussy:
+    def __init__(self, env, *, size: int) -> None:
+        if size > 3:
+            raise ValueError(f"size {size} is more than 3")
+
+    def __call__(self):
+        return torch.zeros(3)
+"""
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"rewards": {"bad": {"func": "scalar", "weight": 1.0}}},
+            "rewards.bad: 'scalar' gave a float, expected {}(3,)",
+        ),
+        (
+            {"rewards": {"bad": {"func": "column", "weight": 1.0}}},
+            "rewards.bad: 'column' gave {}(3, 1), expected {}(3,)",
+        ),
+        ({"terminations": {"bad": {"func": "column"}}}, "terminations.bad: 'column' gave {}(3, 1), expected {}(3,)"),
+        ({"observations": {"policy": {"bad": {"func": "flat"}}}}, "observations.policy.bad: 'flat' gave {}(3,)"),
+        ({"observations": {"policy": {"bad": {"func": "cube"}}}}, "observations.policy.bad: 'cube' gave {}(3, 1, 1)"),
+        (
+            {"observations": {"policy": {"bad": {"func": "joint_pos", "scale": [1.0, 2.0]}}}},
+            "observations.policy.bad.scale: has 2 values for 1 columns",
+        ),
+    ],
+)
+def test_a_term_of_the_wrong_shape_is_named_with_what_was_expected(tmp_path, changes, message):
+    with pytest.raises(ConfigError, match=re.escape(message.replace("{}", "a tensor of shape "))):
+        build(pendulum(tmp_path, edited(PENDULUM_TASK, **changes), terms_py=SHAPES))
+
+
+def test_a_value_that_a_term_refuses_is_reported_at_its_place(tmp_path):
+    task = edited(PENDULUM_TASK, rewards={"bad": {"func": "fussy", "weight": 1.0, "size": 5}})
+    with pytest.raises(ConfigError, match=r"task.yaml:\d+:\d+: rewards.bad: size 5 is more than 3"):
+        build(pendulum(tmp_path, task, terms_py=SHAPES))
+
+
+@pytest.mark.parametrize(
+    ("joints", "message"),
+    [
+        (["hip_fl", "hip_fl"], r"joint 'hip_fl' is matched twice, the second time by 'hip_fl'"),
+        (["hip_f.", "hip_fr"], r"joint 'hip_fr' is matched twice, the second time by 'hip_fr'"),
+        (["hip_f", "hip_fl"], r"no joint matches 'hip_f'; did you mean 'hip_f"),
+        (["knee.*"], r"no joint matches 'knee.\*'.*joints: hip_fl, hip_fr, hip_bl, hip_br"),
+        (["hip_("], r"'hip_\(' is neither a joint nor a regular expression"),
+        (["root"], r"no joint matches 'root'"),
+    ],
+)
+@pytest.mark.parametrize("section", ["observations", "rewards"])
+def test_joints_that_do_not_resolve_are_reported_at_their_place(tmp_path, section, joints, message):
+    term = {"func": "joint_pos", "joints": joints} if section == "observations" else {
+        "func": "joint_vel_l2", "weight": 1.0, "joints": joints}  # fmt: skip
+    changes = {"observations": {"policy": {"x": term}}} if section == "observations" else {"rewards": {"x": term}}
+    with pytest.raises(ConfigError, match=message) as caught:
+        build(critter(tmp_path, edited(CRITTER_TASK, **changes)))
+    assert "task.yaml:" in str(caught.value)
+
+
+def test_all_names_that_do_not_resolve_are_reported_at_once(tmp_path):
+    changes = {
+        "observations": {"policy": {"x": {"func": "joint_pos", "joints": ["a"]}}},
+        "rewards": {"x": {"func": "joint_vel_l2", "weight": 1.0, "joints": ["b"]},
+                    "y": {"func": "lin_vel_z_l2", "weight": 1.0, "entity": "robto"}},
+        "terminations": {"x": {"func": "joint_pos_out_of_limit", "joints": ["c"]}},
+        "events": {"x": {"func": "apply_external_force_torque", "mode": "reset", "bodies": ["d"]}},
+        "actions": {"x": {"func": "joint_effort", "joints": ["e"]}},
+    }  # fmt: skip
+    with pytest.raises(ConfigError) as caught:
+        build(critter(tmp_path, edited(CRITTER_TASK, **changes)))
+    text = str(caught.value)
+    assert len(caught.value.problems) == 6
+    assert all(f"'{name}'" in text for name in "abcde")
+    assert "did you mean 'robot'" in text
+
+
+def test_a_terms_file_that_does_not_import_is_a_broken_task(tmp_path):
+    code = 'import no_such_module\n\n\ndef mine(env):\n    """(num_envs,)"""\n    return env.x\n'
+    task = edited(PENDULUM_TASK, rewards={"x": {"func": "mine", "weight": 1.0}})
+    with pytest.raises(TaskError, match=r"terms.py: cannot be imported: ModuleNotFoundError"):
+        build(pendulum(tmp_path, task, terms_py=code))
+
+
+MEMORY = '''
+import torch
+from rlcli.task import Entity
+
+
+class StepsAlive:
+    """Counts its own calls in each environment's episode."""
+
+    def __init__(self, env, *, entity: Entity = "robot") -> None:
+        self.count = torch.zeros(env.num_envs)
+
+    def __call__(self):
+        self.count += 1
+        return self.count.clone()
+
+    def reset(self, selection):
+        selection.write(self.count, 0.0)
+
+
+class Seen:
+    """How often it was asked, as an observation."""
+
+    def __init__(self, env) -> None:
+        self.count = torch.zeros(env.num_envs, 1)
+
+    def __call__(self):
+        return self.count
+
+    def reset(self, selection):
+        selection.add(self.count, 1.0)
+'''
+
+
+def test_a_reward_term_with_memory_is_reset_with_its_environment(tmp_path):
+    task = edited(PENDULUM_TASK, reward_dt_scaling=False, rewards={
+        "alive": None, "terminating": None, "count": {"func": "steps_alive", "weight": 1.0}})  # fmt: skip
+    env = build(pendulum(tmp_path, task, terms_py=MEMORY))
+    env.reset()
+    env.episode_length_buf[1] = 6
+    paid = [env.step(torch.zeros(3, 1)).reward.tolist() for _ in range(6)]
+    assert [row[0] for row in paid] == [1, 2, 3, 4, 5, 6]
+    assert [row[1] for row in paid] == [1, 2, 3, 4, 1, 2]
+
+
+def test_an_observation_term_with_memory_is_reset_with_its_environment(tmp_path):
+    task = edited(PENDULUM_TASK, observations={"policy": {"seen": {"func": "seen"}}})
+    env = build(pendulum(tmp_path, task, terms_py=MEMORY))
+    assert env.reset()["policy"][:, 0].tolist() == [1, 1, 1]
+    env.episode_length_buf[1] = 9
+    assert env.step(torch.zeros(3, 1)).obs["policy"][:, 0].tolist() == [1, 2, 1]
+
+
+def test_causes_name_every_termination_that_fired(tmp_path):
+    changes = {"terminations": {"also": {"func": "root_height_below_minimum", "minimum_height": 0.2}}}
+    env = build(critter(tmp_path, edited(CRITTER_TASK, **changes)), 2)
+    env.reset()
+    env.engine.field("qpos")[1, 2] = -5.0
+    ended = env.step(torch.zeros(2, 4)).episodes
+    assert ended.ids.tolist() == [1]
+    assert {name for name, fired in ended.causes.items() if fired[0]} >= {"low", "also"}
+    assert not ended.causes["time_out"][0]
+
+
+def test_a_removed_term_is_gone(tmp_path):
+    env = build(critter(tmp_path), 2, "rewards.power=null", "observations.policy.action=null", "events.push=null")
+    assert "power" not in [t.name for t in env.reward_manager.terms]
+    assert env.layout.size() == 18
+
+
+def test_two_actions_that_drive_one_actuator_are_refused(tmp_path):
+    twice = {"legs": {"func": "joint_position"}, "more": {"func": "joint_position", "joints": ["hip_fl"]}}
+    with pytest.raises(RlcliError, match=r"actions.more.*'hip_fl'.*legs"):
+        build(critter(tmp_path, edited(CRITTER_TASK, actions=twice, rewards={"power": None})))
+
+
+def test_power_of_other_joints_than_the_driven_ones_is_refused(tmp_path):
+    with pytest.raises(RlcliError, match=r"rewards.power.*2 joints.*4"):
+        build(critter(tmp_path, edited(CRITTER_TASK, rewards={
+            "power": {"func": "power_consumption", "weight": 1.0, "joints": ["hip_f."]}})))  # fmt: skip

@@ -1,0 +1,364 @@
+"""Every term of the vocabulary against a state whose values are worked out here."""
+
+from math import acos, cos, pi, sin, sqrt
+
+import numpy as np
+import pytest
+import torch
+from worlds import CRITTER_TASK, build, critter, edited
+
+from rlcli.errors import TaskError
+from rlcli.mdp import events, observations, rewards, success, terminations
+from rlcli.sim.selection import IdSelection
+
+PITCH = 0.6
+POS = [0.1, -0.2, 0.3, -1.2]
+VEL = [1.0, -2.0, 3.0, -4.0]
+LIN = [1.0, 0.0, 0.5]  # world frame
+ANG = [0.1, 0.2, 0.3]  # body frame
+ACTION = [0.5, -0.5, 1.0, 0.0]
+PREVIOUS = [0.5, 0.5, 0.0, 0.0]
+LIMIT = pi / 3
+# turned by PITCH about y: x' = cos x - sin z, z' = sin x + cos z takes world to body
+LIN_B = [cos(PITCH) * 1.0 - sin(PITCH) * 0.5, 0.0, sin(PITCH) * 1.0 + cos(PITCH) * 0.5]
+DOWN_B = [sin(PITCH), 0.0, -cos(PITCH)]
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory):
+    env = build(critter(tmp_path_factory.mktemp("terms")), 2)
+    env.reset()
+    qpos, qvel = env.engine.field("qpos"), env.engine.field("qvel")
+    qpos[0] = torch.tensor([1.0, 2.0, 0.5, cos(PITCH / 2), 0.0, sin(PITCH / 2), 0.0, *POS], dtype=torch.float64)
+    qvel[0] = torch.tensor([*LIN, *ANG, *VEL], dtype=torch.float64)
+    env.sim.refresh()
+    env.action_manager.action[0] = torch.tensor(ACTION)
+    env.action_manager.prev_action[0] = torch.tensor(PREVIOUS)
+    return env
+
+
+def kwargs_of(env, kwargs):
+    entity = env.entities["robot"]
+    made = dict(kwargs)
+    if "joints" in made:
+        made["joints"] = entity.select("Joints", made["joints"])[0]
+    if made.pop("entity", True):
+        made["entity"] = entity
+    return made
+
+
+ALL = {"joints": ".*"}
+OBSERVATIONS = [
+    (observations.joint_pos, ALL, POS),
+    (observations.joint_pos, {"joints": ["hip_br", "hip_fl"]}, [-1.2, 0.1]),
+    (observations.joint_vel, {"joints": ["hip_bl", "hip_f."]}, [3.0, 1.0, -2.0]),
+    (observations.joint_pos_rel, ALL, [0.0, -0.1, 0.2, -1.1]),
+    (observations.joint_vel_rel, ALL, VEL),
+    (observations.base_pos_z, {}, [0.5]),
+    (observations.base_lin_vel, {}, LIN_B),
+    (observations.base_ang_vel, {}, ANG),
+    (observations.projected_gravity, {}, DOWN_B),
+    (observations.last_action, {"entity": False}, ACTION),
+]
+
+HEADING = cos(PITCH)  # the horizontal part of the nose's direction, for a target straight ahead
+REWARDS = [
+    (rewards.joint_pos_target_l2, {"joints": ["hip_br", "hip_fl"], "target": 0.5}, 1.7**2 + 0.4**2),
+    (rewards.joint_vel_l1, ALL, 10.0),
+    (rewards.joint_vel_l1, {"joints": ["hip_br", "hip_fl"]}, 5.0),
+    (rewards.joint_vel_l2, ALL, 1 + 4 + 9 + 16),
+    (rewards.joint_pos_limits, ALL, 1.2 - LIMIT),
+    (rewards.joint_pos_limits_penalty_ratio, {**ALL, "threshold": 0.25, "gear_ratio": 2.0},
+     2.0 * ((0.3 / LIMIT - 0.25) / 0.75 + (1.2 / LIMIT - 0.25) / 0.75)),
+    (rewards.power_consumption, {**ALL, "gear_ratio": 2.0}, 2.0 * (0.5 + 1.0 + 3.0 + 0.0)),
+    (rewards.action_rate_l2, {"entity": False}, 0 + 1 + 1 + 0),
+    (rewards.action_l2, {"entity": False}, 0.25 + 0.25 + 1.0),
+    (rewards.lin_vel_z_l2, {}, LIN_B[2] ** 2),
+    (rewards.ang_vel_xy_l2, {}, 0.01 + 0.04),
+    (rewards.flat_orientation_l2, {}, sin(PITCH) ** 2),
+    (rewards.upright_posture_bonus, {"threshold": cos(PITCH) - 0.01}, 1.0),
+    (rewards.upright_posture_bonus, {"threshold": cos(PITCH) + 0.01}, 0.0),
+    (rewards.move_to_target_bonus, {"threshold": 0.9, "target": (11.0, 2.0, 0.0)}, HEADING / 0.9),
+    (rewards.move_to_target_bonus, {"threshold": 0.8, "target": (11.0, 2.0, 7.0)}, 1.0),
+    (rewards.move_to_target_bonus, {"threshold": 0.9, "target": (4.0, 6.0, 0.0)}, HEADING * 0.6 / 0.9),
+    (rewards.move_to_target_bonus, {"threshold": 0.9, "target": (-9.0, 2.0, 0.0)}, -HEADING / 0.9),
+]  # fmt: skip
+
+TERMINATIONS = [
+    (terminations.joint_pos_out_of_manual_limit, {**ALL, "bounds": (-1.3, 0.31)}, False),
+    (terminations.joint_pos_out_of_manual_limit, {**ALL, "bounds": (-1.3, 0.29)}, True),
+    (terminations.joint_pos_out_of_manual_limit, {**ALL, "bounds": (-1.1, 1.0)}, True),
+    (terminations.joint_pos_out_of_manual_limit, {"joints": ["hip_fl"], "bounds": (-1.1, 1.0)}, False),
+    (terminations.joint_pos_out_of_limit, ALL, True),
+    (terminations.joint_pos_out_of_limit, {"joints": ["hip_fl", "hip_bl"]}, False),
+    (terminations.joint_vel_out_of_manual_limit, {**ALL, "max_velocity": 3.9}, True),
+    (terminations.joint_vel_out_of_manual_limit, {**ALL, "max_velocity": 4.1}, False),
+    (terminations.bad_orientation, {"limit_angle": PITCH + 0.01}, False),
+    (terminations.bad_orientation, {"limit_angle": PITCH - 0.01}, True),
+    (terminations.root_height_below_minimum, {"minimum_height": 0.49}, False),
+    (terminations.root_height_below_minimum, {"minimum_height": 0.51}, True),
+    (success.joints_near, {"joints": ["hip_fl", "hip_bl"], "target": 0.2, "tolerance": 0.11}, True),
+    (success.joints_near, {"joints": ["hip_fl", "hip_bl"], "target": 0.2, "tolerance": 0.09}, False),
+    (success.joints_near, {"joints": ["hip_fl"], "target": 0.1 + 2 * pi, "tolerance": 0.01}, True),
+]
+
+
+@pytest.mark.parametrize(("term", "kwargs", "expected"), OBSERVATIONS)
+def test_an_observation_term(env, term, kwargs, expected):
+    value = term(env, **kwargs_of(env, kwargs))
+    assert value.dtype == torch.float32
+    assert value.shape == (2, len(expected))
+    assert value[0].tolist() == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("term", "kwargs", "expected"), REWARDS)
+def test_a_reward_term(env, term, kwargs, expected):
+    value = term(env, **kwargs_of(env, kwargs))
+    assert value.shape == (2,)
+    assert float(value[0]) == pytest.approx(expected, rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.parametrize(("term", "kwargs", "expected"), TERMINATIONS)
+def test_a_termination_or_success_term(env, term, kwargs, expected):
+    value = term(env, **kwargs_of(env, kwargs))
+    assert value.dtype == torch.bool
+    assert value.shape == (2,)
+    assert bool(value[0]) is expected
+
+
+def test_every_term_of_the_vocabulary_has_a_test():
+    import inspect
+
+    tabled = {row[0].__name__ for row in OBSERVATIONS + REWARDS + TERMINATIONS}
+    elsewhere = {"is_alive", "is_terminated", "time_out", "joint_acc_l2", "joint_torques_l2", "ProgressReward"}
+    for module in (observations, rewards, terminations, success):
+        terms = {
+            name for name, value in vars(module).items()
+            if getattr(value, "__module__", None) == module.__name__ and not name.startswith("_")
+            and (inspect.isfunction(value) or inspect.isclass(value))
+        }  # fmt: skip
+        assert terms <= tabled | elsewhere, terms - tabled - elsewhere
+
+
+def test_terms_do_not_write_to_the_state(env):
+    before = env.sim.qpos.clone(), env.sim.qvel.clone(), env.action_manager.action.clone()
+    for term, kwargs, _ in [*OBSERVATIONS, *REWARDS, *TERMINATIONS]:
+        term(env, **kwargs_of(env, kwargs))
+    assert torch.equal(before[0], env.sim.qpos)
+    assert torch.equal(before[1], env.sim.qvel)
+    assert torch.equal(before[2], env.action_manager.action)
+
+
+@pytest.mark.parametrize("turns", [-3, -1, 0, 1, 2])
+@pytest.mark.parametrize("angle", [0.0, 0.4, -0.4, pi])
+def test_a_wrapped_joint_position_counts_the_same_after_whole_turns(env, turns, angle):
+    from rlcli.sim.rotations import wrap_to_pi
+
+    wrapped = float(wrap_to_pi(torch.tensor([angle + 2 * pi * turns]))[0])
+    assert min(abs(wrapped - angle), abs(wrapped + 2 * pi - angle)) < 2e-6
+    assert -pi - 1e-6 < wrapped <= pi + 1e-6
+
+
+def test_bad_orientation_sees_a_robot_on_its_back(env):
+    robot = env.entities["robot"]
+    saved = env.sim.qpos.clone()
+    env.engine.field("qpos")[1, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
+    env.sim.refresh()
+    assert bool(terminations.bad_orientation(env, entity=robot, limit_angle=acos(-0.999))[1])
+    assert robot.data.projected_gravity_b[1].tolist() == pytest.approx([0, 0, 1])
+    env.engine.field("qpos")[:] = saved.double()
+    env.sim.refresh()
+
+
+def test_acceleration_and_torque_are_those_of_the_last_substep(tmp_path):
+    env = build(critter(tmp_path), 2)
+    env.reset()
+    action = torch.tensor([[0.1, 0.2, -0.3, 0.4]] * 2)
+    env.step(action)
+    robot = env.entities["robot"]
+    joints = robot.select("Joints", ["hip_br", "hip_fl"])[0]
+    qacc = env.engine.field("qacc")[:, [9, 6]]
+    effort = env.engine.field("qfrc_actuator")[:, [9, 6]]
+    assert qacc.abs().min() > 0
+    assert effort.abs().min() > 0
+    acc = rewards.joint_acc_l2(env, entity=robot, joints=joints)
+    torque = rewards.joint_torques_l2(env, entity=robot, joints=joints)
+    assert acc.tolist() == pytest.approx(qacc.square().sum(dim=1).tolist(), rel=1e-5)
+    assert torque.tolist() == pytest.approx(effort.square().sum(dim=1).tolist(), rel=1e-5)
+    assert float(env.engine.field("qfrc_actuator")[:, 6:].abs().max()) <= 8.0 + 1e-9, "under its limit"
+
+
+def test_progress_is_the_speed_towards_the_target_and_starts_at_each_episodes_start(tmp_path):
+    start = {
+        "func": "reset_root_state_uniform",
+        "mode": "reset",
+        "x": [-5.0, 5.0],
+        "linear_velocity": [[2.0, 2.0], [0.0, 0.0], [0.0, 0.0]],
+    }
+    task = edited(
+        CRITTER_TASK,
+        sim={"gravity": [0.0, 0.0, 0.0]},
+        scene={"ground": None},
+        events={"joints": None, "push": None, "shove": None, "root": start},
+        terminations={"tilt": None, "low": None},
+    )
+    env = build(critter(tmp_path, task), 3)
+    env.reset()
+    term = next(t for t in env.reward_manager.terms if t.name == "progress")
+    for step in range(65):  # two time-outs on the way
+        start = env.engine.field("qpos")[:, 0].clone()
+        result = env.step(torch.zeros(3, 4))
+        position = env.entities["robot"].data.root_pos_w[:, 0]
+        if result.truncated.any():
+            continue
+        speed = env.reward_manager._values[env.reward_manager.terms.index(term)] / env.step_dt
+        assert speed.tolist() == pytest.approx(((position - start) / env.step_dt).tolist(), rel=0.02), step
+        assert speed.min() > 1.0
+
+
+def some(env, *ids):
+    ids = np.array(ids)
+    return IdSelection(ids, 0, np.zeros_like(ids))
+
+
+@pytest.fixture
+def fresh(tmp_path):
+    env = build(critter(tmp_path), 3)
+    env.reset()
+    return env
+
+
+def joints_of(env, names):
+    return env.entities["robot"].select("Joints", names)[0]
+
+
+def test_reset_joints_by_offset_adds_to_the_default_and_keeps_to_the_limits(fresh):
+    before = fresh.engine.field("qpos").clone()
+    robot, joints = fresh.entities["robot"], joints_of(fresh, ["hip_br", "hip_fl"])
+    events.reset_joints_by_offset(
+        fresh, some(fresh, 1), entity=robot, joints=joints, position=(0.2, 0.2), velocity=(-3.0, -3.0)
+    )
+    qpos, qvel = fresh.engine.field("qpos"), fresh.engine.field("qvel")
+    assert float(qpos[1, 7]) == pytest.approx(0.1 + 0.2)
+    assert float(qpos[1, 10]) == pytest.approx(-0.1 + 0.2)
+    assert torch.equal(qpos[1, 8:10], before[1, 8:10]), "joints not named"
+    assert torch.equal(qpos[[0, 2]], before[[0, 2]]), "environments not selected"
+    assert qvel[1, [6, 9]].tolist() == [-3.0, -3.0]
+    events.reset_joints_by_offset(fresh, some(fresh, 1), entity=robot, joints=joints, position=(9.0, 9.0))
+    assert qpos[1, [7, 10]].tolist() == pytest.approx([LIMIT, LIMIT])
+
+
+def test_reset_joints_by_scale_multiplies_the_default(fresh):
+    robot = fresh.entities["robot"]
+    events.reset_joints_by_scale(
+        fresh, some(fresh, 2), entity=robot, joints=slice(0, 4), position=(2.0, 2.0), velocity=(0.0, 0.0)
+    )
+    assert fresh.engine.field("qpos")[2, 7:].tolist() == pytest.approx([0.2, -0.2, 0.2, -0.2])
+    assert not fresh.engine.field("qvel")[2, 6:].any()
+
+
+def test_reset_root_state_uniform_sets_pose_and_world_frame_velocity(fresh):
+    zero = (0.0, 0.0)
+    events.reset_root_state_uniform(
+        fresh, some(fresh, 1), entity=fresh.entities["robot"],
+        x=(1.0, 1.0), y=(2.0, 2.0), z=(0.1, 0.1), yaw=(pi / 2, pi / 2),
+        linear_velocity=[(1.0, 1.0), zero, zero], angular_velocity=[(0.5, 0.5), zero, zero],
+    )  # fmt: skip
+    half = sqrt(0.5)
+    assert fresh.engine.field("qpos")[1, :7].tolist() == pytest.approx([1, 2, 0.45, half, 0, 0, half], abs=1e-6)
+    # yawed by 90 degrees the world's x is the body's -y; a free joint's rates are the body's
+    assert fresh.engine.field("qvel")[1, :6].tolist() == pytest.approx([1, 0, 0, 0, -0.5, 0], abs=1e-6)
+
+
+@pytest.mark.parametrize(("axis", "turned"), [("roll", [0, sin(0.4), 0, 0]), ("pitch", [0, 0, sin(0.4), 0]),
+                                              ("yaw", [0, 0, 0, sin(0.4)])])  # fmt: skip
+def test_roll_pitch_and_yaw_turn_about_x_y_and_z(fresh, axis, turned):
+    events.reset_root_state_uniform(fresh, some(fresh, 0), entity=fresh.entities["robot"], **{axis: (0.8, 0.8)})
+    expected = [cos(0.4), *turned[1:]]
+    assert fresh.engine.field("qpos")[0, 3:7].tolist() == pytest.approx(expected, abs=1e-6)
+
+
+def test_uniform_resets_fill_their_ranges(tmp_path):
+    env = build(critter(tmp_path), 512)
+    env.reset()
+    qpos = env.engine.field("qpos")
+    assert -0.5 <= float(qpos[:, 0].min()) < -0.47
+    assert 0.47 < float(qpos[:, 0].max()) <= 0.5
+    assert 0.35 <= float(qpos[:, 2].min()) < float(qpos[:, 2].max()) <= 0.4 + 1e-6
+    assert abs(float(np.corrcoef(qpos[:, 0], qpos[:, 1])[0, 1])) < 0.2
+    assert (qpos[:, 3:7].norm(dim=1) - 1).abs().max() < 1e-6
+
+
+def test_push_adds_to_the_velocity_in_the_world_frame(fresh):
+    robot = fresh.entities["robot"]
+    fresh.engine.field("qpos")[0, 3:7] = torch.tensor([sqrt(0.5), 0, 0, sqrt(0.5)], dtype=torch.float64)
+    fresh.engine.field("qvel")[0, :6] = torch.tensor([1.0, 0, 0, 0, -0.5, 0], dtype=torch.float64)
+    zero = (0.0, 0.0)
+    events.push_by_setting_velocity(
+        fresh, some(fresh, 0), entity=robot,
+        linear_velocity=[(0.5, 0.5), (2.0, 2.0), zero], angular_velocity=[(0.25, 0.25), zero, zero],
+    )  # fmt: skip
+    assert fresh.engine.field("qvel")[0, :6].tolist() == pytest.approx([1.5, 2, 0, 0, -0.75, 0], abs=1e-6)
+
+
+def test_an_external_wrench_acts_on_the_named_bodies_until_reset(fresh):
+    robot = fresh.entities["robot"]
+    bodies, names = robot.select("Bodies", ["leg_br", "torso"])
+    assert names == ["leg_br", "torso"]
+    events.apply_external_force_torque(
+        fresh, some(fresh, 2), entity=robot, bodies=bodies, force=(3.0, 3.0), torque=(-1.0, -1.0)
+    )
+    wrench = fresh.engine.field("xfrc_applied")
+    pushed = [robot.body_ids[robot.names["Bodies"].index(n)] for n in names]
+    for body in range(fresh.engine.model.nbody):
+        expected = [3, 3, 3, -1, -1, -1] if body in pushed else [0] * 6
+        assert wrench[2, body].tolist() == expected
+    assert not wrench[:2].any()
+    fresh.engine.reset(some(fresh, 2))
+    assert not wrench.any()
+
+
+def test_reset_scene_to_default_puts_everything_back(fresh):
+    for _ in range(5):
+        fresh.step(torch.rand(3, 4))
+    events.reset_scene_to_default(fresh, some(fresh, 1))
+    expected = [0, 0, 0.35, 1, 0, 0, 0, 0.1, -0.1, 0.1, -0.1]
+    assert fresh.engine.field("qpos")[1].tolist() == pytest.approx(expected, abs=1e-6)
+    assert not fresh.engine.field("qvel")[1].any()
+    assert fresh.engine.field("qvel")[0].any()
+
+
+@pytest.mark.parametrize("event", [
+    {"func": "reset_root_state_uniform", "mode": "reset"},
+    {"func": "push_by_setting_velocity", "mode": "interval", "interval_range_s": [0.01, 0.01]},
+])  # fmt: skip
+def test_moving_the_root_of_a_fixed_robot_is_refused_by_name(tmp_path, event):
+    from worlds import PENDULUM_TASK, pendulum
+
+    env = build(pendulum(tmp_path, edited(PENDULUM_TASK, events={"move": event})))
+    with pytest.raises(TaskError, match="'robot' is fixed to the world"):  # noqa: PT012
+        env.reset()
+        env.step(torch.zeros(3, 1))
+
+
+def test_unlimited_joints_never_violate_their_limits(tmp_path):
+    from worlds import PENDULUM_TASK, pendulum
+
+    terms = {"limits": {"func": "joint_pos_limits", "weight": -1.0},
+             "ratio": {"func": "joint_pos_limits_penalty_ratio", "weight": -1.0}}  # fmt: skip
+    env = build(pendulum(tmp_path, edited(PENDULUM_TASK, rewards=terms)))
+    env.reset()
+    env.engine.field("qpos")[:] = 50.0
+    env.sim.refresh()
+    robot = env.entities["robot"]
+    assert rewards.joint_pos_limits(env, entity=robot, joints=slice(0, 1)).tolist() == [0, 0, 0]
+    assert rewards.joint_pos_limits_penalty_ratio(env, entity=robot, joints=slice(0, 1)).tolist() == [0, 0, 0]
+
+
+def test_soft_limits_are_drawn_in_about_the_middle(tmp_path):
+    robot = {"robot": {"model": "critter.xml", "soft_joint_pos_limit_factor": 0.5,
+                       "joints": {".*": {"kp": 20.0}, "hip_fl": {"range": [-0.2, 1.0]}}}}  # fmt: skip
+    env = build(critter(tmp_path, edited(CRITTER_TASK, scene={"entities": robot})), 2)
+    soft = env.entities["robot"].data.soft_joint_pos_limits
+    assert soft[0].tolist() == pytest.approx([0.1, 0.7])
+    assert soft[1].tolist() == pytest.approx([-LIMIT / 2, LIMIT / 2])
