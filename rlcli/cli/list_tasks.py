@@ -8,7 +8,7 @@ import typer
 
 from rlcli.cli.console import console
 from rlcli.cli.options import Debug, Json
-from rlcli.probe import Details, cached, probe
+from rlcli.probe import TIMEOUT_S, Details, cached, probe
 from rlcli.registry import catalog
 
 
@@ -18,12 +18,15 @@ def command(
         bool,
         typer.Option("--probe", help="Load every task in a process of its own and refresh what is known of it."),
     ] = False,
+    timeout: Annotated[
+        float, typer.Option("--probe-timeout", help="Seconds that --probe gives each task.")
+    ] = TIMEOUT_S,
     json: Json = False,
     debug: Debug = False,
 ) -> None:
     """List installed tasks."""
     entries, broken = catalog()
-    details = probe(entries) if probe_all else cached(entries)
+    details = probe(entries, timeout) if probe_all else cached(entries)
     shared = {e.name for e in entries if sum(other.name == e.name for other in entries) > 1}
     rows = []
     for entry in entries:

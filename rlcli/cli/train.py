@@ -120,6 +120,7 @@ def _start(
         overrides=overrides,
         flags=flag_values,
     )
+    resolved.require_agent()
     loggers = check_loggers(logger)
     source, engine_threads, torch_threads = resolved.source, *_threads(resolved)
     initial = find_checkpoint(init_from, runs_dir) if init_from else None
