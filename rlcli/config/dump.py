@@ -28,6 +28,11 @@ class _Dumper(yaml.SafeDumper):
             return "not a plain scalar"
 
 
+def _text(dumper: _Dumper, value: str) -> yaml.Node:
+    style = '"' if "\n" in value else None  # on one line, with escapes
+    return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
+
+
 def _number(dumper: _Dumper, value: float) -> yaml.Node:
     return dumper.represent_scalar("tag:yaml.org,2002:float", repr(value))
 
@@ -37,6 +42,7 @@ def _sequence(dumper: _Dumper, value: list[Any]) -> yaml.Node:
     return dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=flat)
 
 
+_Dumper.add_representer(str, _text)
 _Dumper.add_representer(float, _number)
 _Dumper.add_representer(list, _sequence)
 

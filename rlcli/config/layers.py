@@ -129,7 +129,8 @@ def read(file: FilePath, name: str | None = None) -> Document:
     except OSError as error:
         raise ConfigError([Problem(name, "", f"cannot be read: {error.strerror or error}")]) from None
     except YamlError as error:
-        raise ConfigError([Problem(f"{name}:{error.line}:{error.column}", "", error.message)]) from None
+        place = f"{name}:{error.line}:{error.column}" if error.line else name
+        raise ConfigError([Problem(place, "", error.message)]) from None
 
 
 def marked(document: Document, name: str, layer: str, at: Path = ()) -> Callable[[Path], Origin]:

@@ -293,10 +293,11 @@ class _Check:
     def agent(self, name: str) -> tuple[TrainerSpec | None, AgentConfig | None]:
         """The agent's trainer and validated settings."""
         at: Path = ("agents", name)
-        data = self.layers.get(at)
-        if not isinstance(data, dict):
-            self.problem(at, f"expected a mapping, found {messages.shown(data)}")
-            return None, None
+        for path in (("agents",), at):
+            data = self.layers.get(path)
+            if not isinstance(data, dict):
+                self.problem(path, f"expected a mapping, found {messages.shown(data)}")
+                return None, None
         spec, model = self._trainer(at, data)
         self.homes = messages.homes({"": TaskConfig, "agent": model})
         config = self._validate(model, data, at)
@@ -422,7 +423,8 @@ class _Check:
             if isinstance(data.get(section, {}), dict) and not any(_mapping(data.get(section)).values()):
                 self.problem((section,), "a manager-based task needs at least one term here")
         groups = data.get("observations", {})
-        if isinstance(groups, dict) and not any(_mapping(groups.get("policy", {})).values()):
+        policy = groups.get("policy", {}) if isinstance(groups, dict) else None
+        if isinstance(policy, dict) and not any(policy.values()):
             self.problem(("observations",), "needs a group 'policy' with at least one term")
 
     def _require_direct(self, data: Mapping[str, Any]) -> None:

@@ -102,6 +102,8 @@ def _said(
     if isinstance(found, str):
         choices = [word.strip("'") for item in items for word in _choices(item)]
         hint = did_you_mean(found, choices) or _unquoted(found, items)
+    elif isinstance(found, dict) and found and all(key.isdecimal() for key in found):
+        hint = "its default has no items to change; give the whole list"
     return f"expected {' or '.join(dict.fromkeys(map(_expected, items)))}, found {shown(found)}", hint, path
 
 

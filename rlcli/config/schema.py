@@ -43,7 +43,7 @@ class _Fraction:
         return core_schema.no_info_before_validator_function(_fraction, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        return {"anyOf": [handler(schema), {"type": "string", "pattern": _FRACTION.pattern.replace(r"\Z", "$")}]}
+        return {"anyOf": [handler(schema), {"type": "string", "pattern": "^" + _FRACTION.pattern.replace(r"\Z", "$")}]}
 
 
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:

@@ -215,6 +215,9 @@ def _tree(file: Path) -> ast.Module:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return ast.parse(file.read_bytes(), filename=str(file))
+    except SyntaxError as error:
+        error.filename = str(file)  # absent where there is a null byte
+        raise
     except (ValueError, RecursionError, MemoryError) as error:
         raise SyntaxError(str(error) or "nested too deeply", (str(file), 1, 1, None)) from None
 
