@@ -6,6 +6,7 @@ Distributions are read one by one, so that a broken one costs its own row and no
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import importlib
 import importlib.util
 import os
@@ -262,7 +263,8 @@ def load_module(name: str) -> Any:
         if not name.endswith(".py"):
             return importlib.import_module(name)
         file = Path(name)
-        alias = f"rlcli_folder_task_{abs(hash(str(file.resolve()))):x}_{file.stem}"
+        digest = hashlib.blake2b(str(file.resolve()).encode(), digest_size=8).hexdigest()
+        alias = f"rlcli_folder_task_{digest}_{file.stem}"
         if alias not in sys.modules:
             spec = importlib.util.spec_from_file_location(alias, file)
             if spec is None or spec.loader is None:

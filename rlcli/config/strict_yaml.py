@@ -40,7 +40,9 @@ class YamlError(ValueError):
     def __init__(self, message: str, mark: Any = None, *, place: Mark = (0, 0)) -> None:
         super().__init__(message)
         self.message = message
-        self.line, self.column = (mark.line + 1, mark.column + 1) if mark else place
+        line, column = (mark.line + 1, mark.column + 1) if mark else place
+        self.line: int = line
+        self.column: int = column
 
 
 @dataclass(slots=True)
@@ -84,7 +86,7 @@ def _decode(text: str | bytes) -> str:
         try:
             text = text.decode("utf-8")
         except UnicodeDecodeError as error:
-            before = text[: error.start].decode("utf-8")
+            before = error.object[: error.start].decode("utf-8")
             raise YamlError(f"not UTF-8: {error.reason}", place=_after(before)) from None
     return text.removeprefix("\ufeff")
 
