@@ -1,6 +1,7 @@
 """Finding tasks and trainers among installed distributions, and what a broken one costs."""
 
 import pytest
+
 from rlcli.errors import TaskError
 from rlcli.registry import TRAINERS, catalog, find_entry, find_task, folder_task, task_of_file
 
@@ -74,6 +75,7 @@ def test_a_foreign_distribution_without_metadata_is_no_concern_of_ours(plugins):
     assert catalog()[1] == []
 
 
+IMPORT = "from rlcli.task import TaskSpec\n"
 BROKEN = {
     "syntax": ("def f(:\n", "SyntaxError"),
     "missing": ("import no_such_module_anywhere\n", "ModuleNotFoundError: No module named 'no_such_module_anywhere'"),
@@ -81,14 +83,17 @@ BROKEN = {
     "raises": ("\n\nraise ValueError('out of cheese')\n", "ValueError: out of cheese"),
     "empty": ("", "AttributeError"),
     "wrong": ("SPEC = {'package': 'x'}\n", "is a dict, not a TaskSpec"),
-    "newer": ("from rlcli.task import TaskSpec\nSPEC = TaskSpec(__name__, 'x', api=99)\n", "needs plugin API 99; this rlcli has 1"),
-    "future": ("from rlcli.task import TaskSpec\nSPEC = TaskSpec(__name__, 'x', wings=2)\n", "TypeError"),
-    "terms": ("from rlcli.task import TaskSpec\nSPEC = TaskSpec(__name__, 'x', terms='a.b')\n", "terms is a tuple"),
-    "nofile": ("from rlcli.task import TaskSpec\nSPEC = TaskSpec(__name__, 'x')\n", "task.yaml does not exist"),
-    "nopackage": ("from rlcli.task import TaskSpec\nSPEC = TaskSpec('no.such', 'x')\n", "No module named 'no'"),
-    "module": ("from rlcli.task import TaskSpec\nSPEC = TaskSpec('json.decoder', 'x')\n", "is not a package"),
-    "noterms": ("from rlcli.task import TaskSpec\nSPEC = TaskSpec(__name__, 'x', config='__init__.py', terms=('noterms.t',))\n", "there is no module 'noterms.t'"),
-}  # fmt: skip
+    "newer": (IMPORT + "SPEC = TaskSpec(__name__, 'x', api=99)\n", "needs plugin API 99; this rlcli has 1"),
+    "future": (IMPORT + "SPEC = TaskSpec(__name__, 'x', wings=2)\n", "TypeError"),
+    "terms": (IMPORT + "SPEC = TaskSpec(__name__, 'x', terms='a.b')\n", "terms is a tuple"),
+    "nofile": (IMPORT + "SPEC = TaskSpec(__name__, 'x')\n", "task.yaml does not exist"),
+    "nopackage": (IMPORT + "SPEC = TaskSpec('no.such', 'x')\n", "No module named 'no'"),
+    "module": (IMPORT + "SPEC = TaskSpec('json.decoder', 'x')\n", "is not a package"),
+    "noterms": (
+        IMPORT + "SPEC = TaskSpec(__name__, 'x', config='__init__.py', terms=('noterms.t',))\n",
+        "there is no module 'noterms.t'",
+    ),
+}
 
 
 @pytest.mark.parametrize("name", BROKEN)
@@ -212,3 +217,34 @@ def test_two_processes_give_a_folder_task_the_same_module_name(tmp_path):
         for seed in ("1", "2")
     }
     assert len(said) == 1
+
+
+TRAINER = """
+from rlcli.trainers import TrainerSpec
+from rlcli.config.schema import AgentConfig
+class Config(AgentConfig):
+    speed: int = 3
+SPEC = TrainerSpec("mine", {"good": "mine:Config", "gone": "mine:Gone", "odd": "mine.odd:Config", "int": "builtins:int"}, "")
+"""
+
+
+def trained_by(algorithm):
+    from rlcli.config.load import resolve
+
+    return resolve(find_task("cartpole"), overrides=[f"agent={{trainer: mine, algorithm: {algorithm}, max_steps: 1}}"])
+
+
+def test_a_trainer_plugin_brings_its_own_settings(plugins):
+    plugins("mine", TRAINER, entry_points="[rlcli.trainers]\nmine = mine:SPEC\n")
+    resolved = trained_by("good")
+    assert resolved.agent.speed == 3
+    assert resolved.trainer.summary == "mine"
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "said"), [("gone", "AttributeError"), ("odd", "No module"), ("int", "AgentConfig")]
+)
+def test_a_broken_trainer_plugin_is_named(plugins, algorithm, said):
+    plugins("mine", TRAINER, entry_points="[rlcli.trainers]\nmine = mine:SPEC\n")
+    with pytest.raises(TaskError, match=f"plugin mine 1.0 is broken: .*{said}"):
+        trained_by(algorithm)
