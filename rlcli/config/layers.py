@@ -33,6 +33,7 @@ class Layers:
 
     def merge(self, patch: Mapping[str, Any], origin: Callable[[Path], Origin], at: Path = ()) -> None:
         """Merge a patch: mappings key by key, everything else replaced. `origin` is asked with paths in the patch."""
+        self.origins.setdefault((), origin(()))
         self._merge(patch, origin, at, ())
 
     def _merge(self, patch: Mapping[str, Any], origin: Callable[[Path], Origin], at: Path, inner: Path) -> None:

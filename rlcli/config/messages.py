@@ -93,11 +93,11 @@ def _said(
         return f"unknown key '{path[-1]}'", _right_key(str(path[-1]), _fields(model, path[:-1]), homes), path
     if kind == "value_error":
         return str(items[0]["ctx"]["error"]), None, path
+    if kind == "missing" and isinstance(items[0]["loc"][-1], str):
+        return f"missing key '{path[-1]}'", None, path[:-1]
     length = _length(model, path)
     if length is not None and kind in ("missing", "too_short", "too_long"):
         return f"expected a list of {length}, found {shown(_at(data, path))}", None, path
-    if kind == "missing":
-        return f"missing key '{path[-1]}'", None, path[:-1]
     hint = None
     if isinstance(found, str):
         choices = [word.strip("'") for item in items for word in _choices(item)]
@@ -109,7 +109,8 @@ def _said(
 
 def _right_key(key: str, fields: Iterable[str], homes: Homes) -> str:
     near = did_you_mean(key, fields)
-    home = f"it belongs {' or '.join(map(_inside, homes[key][:3]))}" if key in homes else None
+    places = homes.get(key, [])
+    home = f"it belongs {' or '.join(map(_inside, places))}" if 0 < len(places) <= 3 else None
     if near or home:
         return "; ".join(filter(None, (near, home)))
     return f"allowed: {listing(sorted(fields), 40)}"

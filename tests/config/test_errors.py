@@ -57,6 +57,7 @@ TYPOS = [
     ("rewards.near.joints=[1]", "rewards.near.joints.0: expected text, found 1", None),
     ("rewards.near.joints=[]", "rewards.near.joints: expected text or at least 1 item, found []", None),
     ("rewards.far={func: joint_pos_target_l2, weight: 1}", "rewards.far: missing key 'target'", None),
+    ("terminations.far={func: joint_pos_out_of_manual_limit}", "terminations.far: missing key 'bounds'", None),
     ("observations.policy=null", "observations.policy: expected a mapping, found null", None),
     ("observations.policy.pos.clip=[1, 0]", "observations.policy.pos.clip: the lower end 1 is above", None),
     ("observations.policy.pos.scale=big", "expected a number or a list", None),

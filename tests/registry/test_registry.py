@@ -224,7 +224,8 @@ from rlcli.trainers import TrainerSpec
 from rlcli.config.schema import AgentConfig
 class Config(AgentConfig):
     speed: int = 3
-SPEC = TrainerSpec("mine", {"good": "mine:Config", "gone": "mine:Gone", "odd": "mine.odd:Config", "int": "builtins:int"}, "")
+MODELS = {"good": "mine:Config", "gone": "mine:Gone", "odd": "mine.odd:Config", "int": "builtins:int"}
+SPEC = TrainerSpec("mine", MODELS, "")
 """
 
 
