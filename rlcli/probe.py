@@ -1,12 +1,13 @@
 """What `list-tasks` knows of a task beyond its name, without importing it: a cache that `--probe` fills.
 
-The built-in tasks come with theirs (`tasks/rlcli_tasks/index.json`); other plugins' lie in the user's cache folder,
-keyed by distribution, version and the state of its files.
+A distribution may ship it as `index.json` in its top-level package, as the built-in tasks do. The others' lies in the
+user's cache folder, keyed by distribution, version and the state of its files.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -15,10 +16,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rlcli.registry import Entry
+from rlcli.registry import Entry, package_folder
 
 TIMEOUT_S = 30.0
-_BUILT_INS = "rlcli"
+_BUILDER = "rlcli.envs.describe"
+"""Run in a process of its own: it stands above this module, and it builds what may hang or crash."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,27 +40,29 @@ class Details:
         return asdict(self)
 
 
+_KINDS: dict[str, Any] = {
+    **dict.fromkeys(("observation_size", "action_size", "num_envs"), int | None),
+    **dict.fromkeys(("workflow", "agent", "broken"), str | None),
+    "summary": str,
+}
+
+
 def cached(entries: Iterable[Entry]) -> dict[str, Details]:
     """What is known already, by qualified name."""
-    shipped = _read(_shipped_file())
-    own = _read(_cache_file())
-    found = {}
-    for entry in entries:
-        row = shipped.get(entry.name) if entry.distribution == _BUILT_INS else own.get(_key(entry))
-        if row is not None:
-            found[entry.qualified] = row
-    return found
+    own = _raw(_cache_file())
+    rows = {entry.qualified: _details(_shipped(entry) or own.get(_key(entry))) for entry in entries}
+    return {name: row for name, row in rows.items() if row is not None}
 
 
-def probe(entries: Iterable[Entry]) -> dict[str, Details]:
+def probe(entries: Iterable[Entry], timeout_s: float = TIMEOUT_S) -> dict[str, Details]:
     """Load every task in a process of its own, and remember what it says. A broken one is a row with its reason."""
     entries = list(entries)
-    found = {entry.qualified: _probe_one(entry) for entry in entries}
-    known = {_key(entry): asdict(found[entry.qualified]) for entry in entries if entry.distribution != _BUILT_INS}
+    found = {entry.qualified: _probe_one(entry, timeout_s) for entry in entries}
+    known = {_key(entry): found[entry.qualified].record() for entry in entries}
     file = _cache_file()
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        temporary = file.with_suffix(".tmp")
+        temporary = file.with_suffix(f".{os.getpid()}.tmp")
         temporary.write_text(json.dumps({**_raw(file), **known}, indent=1), encoding="utf-8")
         temporary.replace(file)
     except OSError:
@@ -66,38 +70,21 @@ def probe(entries: Iterable[Entry]) -> dict[str, Details]:
     return found
 
 
-def describe(name: str) -> Details:
-    """Load a task and build one environment of it; run in a process of its own by `probe`."""
-    from rlcli.config.load import resolve
-    from rlcli.envs.vec_env import make_env
-    from rlcli.registry import find_task
-
-    resolved = resolve(find_task(name))
-    small = resolve(find_task(name), flags={"scene.num_envs": 1})
-    env = make_env(small)
-    return Details(
-        summary=resolved.task.summary,
-        workflow="direct" if resolved.source.task else "managed",
-        observation_size=env.layout.size("policy"),
-        action_size=env.layout.action_size,
-        num_envs=resolved.task.scene.num_envs,
-        agent=resolved.agent_name,
-    )
-
-
-def _probe_one(entry: Entry) -> Details:
-    command = [sys.executable, "-m", "rlcli.probe", entry.qualified]
+def _probe_one(entry: Entry, timeout_s: float) -> Details:
+    command = [sys.executable, "-m", _BUILDER, entry.qualified]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL)
+        done = subprocess.run(command, capture_output=True, timeout=timeout_s, stdin=subprocess.DEVNULL)
     except subprocess.TimeoutExpired:
-        return Details(broken=f"did not load within {TIMEOUT_S:g} s")
+        return Details(broken=f"did not load within {timeout_s:g} s")
     try:
-        row = json.loads(done.stdout.splitlines()[-1])
-        return Details(**row)
-    except (IndexError, ValueError, TypeError):
-        lines = done.stderr.strip().splitlines()
-        reason = f"crashed ({-done.returncode})" if done.returncode < 0 else f"exit {done.returncode}"
-        return Details(broken=lines[-1][:200] if lines else reason)
+        row = _details(json.loads(done.stdout.splitlines()[-1]))
+    except (IndexError, ValueError):
+        row = None
+    if row is not None and done.returncode == 0:
+        return row
+    lines = done.stderr.decode(errors="replace").strip().splitlines()
+    reason = f"crashed (signal {-done.returncode})" if done.returncode < 0 else f"exit {done.returncode}"
+    return Details(broken=f"{reason}: {lines[-1][:200]}" if lines else reason)
 
 
 def _key(entry: Entry) -> str:
@@ -112,12 +99,9 @@ def _fingerprint(distribution: str) -> str:
         return "0"
 
 
-def _shipped_file() -> Path:
-    import importlib.util
-
-    found = importlib.util.find_spec("rlcli_tasks")
-    place = next(iter(found.submodule_search_locations or [""])) if found else ""
-    return Path(place) / "index.json"
+def _shipped(entry: Entry) -> Any:
+    folder = package_folder(entry)
+    return _raw(folder / "index.json").get(entry.name) if folder else None
 
 
 def _cache_file() -> Path:
@@ -134,24 +118,10 @@ def _raw(file: Path) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _read(file: Path) -> dict[str, Details]:
-    names = {f.name for f in fields(Details)}
-    return {
-        key: Details(**{k: v for k, v in row.items() if k in names})
-        for key, row in _raw(file).items()
-        if isinstance(row, dict)
-    }
-
-
-def _main() -> None:
-    from rlcli.errors import RlcliError
-
-    try:
-        details = describe(sys.argv[1])
-    except RlcliError as error:
-        details = Details(broken=" ".join(error.message.split())[:200])
-    sys.stdout.write("\n" + json.dumps(asdict(details)) + "\n")
-
-
-if __name__ == "__main__":
-    _main()
+def _details(row: Any) -> Details | None:
+    """A row of a file that somebody else may have written; None if it is not one."""
+    if not isinstance(row, dict):
+        return None
+    known = {f.name: row[f.name] for f in fields(Details) if f.name in row}
+    good = all(isinstance(value, _KINDS[name]) for name, value in known.items())
+    return Details(**known) if good else None

@@ -6,13 +6,16 @@ Distributions are read one by one, so that a broken one costs its own row and no
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import importlib
 import importlib.util
 import os
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
@@ -82,32 +85,54 @@ class TaskSource:
 def catalog(group: str = TASKS) -> tuple[list[Entry], list[Broken]]:
     """Every entry of a group, sorted by name then distribution, and the distributions that could not be read."""
     entries: dict[tuple[str, str], Entry] = {}
-    broken: list[Broken] = []
+    broken: dict[str, Broken] = {}
     wanted = _wanted()
     for distribution in metadata.distributions():
+        folder = Path(str(getattr(distribution, "_path", "?"))).name
         try:
-            name = distribution.metadata["Name"] or "?"
-            if wanted is not None and name.lower() not in wanted:
+            text = distribution.read_text("entry_points.txt") or ""
+            if group not in text:
+                continue  # most distributions; their metadata is not read
+            name, version = distribution.metadata["Name"], distribution.version
+            if not name or not version:
+                raise ValueError("no Name and Version in its METADATA")
+            if wanted is not None and _normal(name) not in wanted:
                 continue
             for point in distribution.entry_points:
                 if point.group == group:
-                    entry = Entry(point.name, point.value, name, distribution.version)
-                    entries.setdefault((entry.name, name.lower()), entry)
+                    entries.setdefault((point.name, _normal(name)), Entry(point.name, point.value, name, version))
         except Exception as error:
-            place = getattr(distribution, "_path", "?")
-            broken.append(Broken(Path(str(place)).name, f"malformed metadata ({type(error).__name__}: {error})"))
-    return sorted(entries.values(), key=lambda e: (e.name, e.distribution)), broken
+            broken.setdefault(folder, Broken(folder, f"malformed metadata ({type(error).__name__}: {error})"))
+    return sorted(entries.values(), key=lambda e: (e.name, e.distribution)), list(broken.values())
 
 
 def find_task(name: str) -> TaskSource:
     """A task by name, by `distribution:name`, or by the path of a folder with a `task.yaml`.
 
+    A name is looked up among the installed tasks first: a folder of the same name needs a slash, `./cartpole`.
+
     Raises:
         TaskError: unknown, ambiguous, broken, or built for a newer rlcli.
     """
-    if _is_path(name):
+    if name in (".", "..") or any(mark in name for mark in ("/", os.sep)):
         return folder_task(Path(name))
-    entry = find_entry(TASKS, name, what="task")
+    try:
+        entry = find_entry(TASKS, name, what="task")
+    except TaskError:
+        if name and (Path(name) / "task.yaml").is_file() and not _offered(name):
+            return folder_task(Path(name))
+        if "=" in name:
+            raise TaskError(f"no task '{name}'", hint="overrides come after the task: TASK key.path=value") from None
+        raise
+    return installed_task(entry)
+
+
+def installed_task(entry: Entry) -> TaskSource:
+    """The task of an entry point, imported as far as its `TaskSpec`.
+
+    Raises:
+        TaskError: broken, or built for a newer rlcli.
+    """
     spec = load_entry(entry, TaskSpec)
     if spec.api > API_VERSION:
         raise TaskError(
@@ -115,6 +140,30 @@ def find_task(name: str) -> TaskSource:
             hint="pip install --upgrade rlcli",
         )
     return packaged_task(entry, spec)
+
+
+def task_of_file(file: Path) -> TaskSource | None:
+    """The installed task that a YAML file belongs to; only plugins whose package holds the file are imported."""
+    for entry in catalog()[0]:
+        package = package_folder(entry)
+        if package is not None and file.resolve().is_relative_to(package.resolve()):
+            try:
+                source = installed_task(entry)
+            except TaskError:
+                continue
+            if source.config.resolve() == file.resolve():
+                return source
+    return None
+
+
+def package_folder(entry: Entry) -> Path | None:
+    """Where the top-level package of an entry point lies, without importing it."""
+    try:
+        found = importlib.util.find_spec(entry.value.partition(":")[0].partition(".")[0])
+    except (ImportError, ValueError):
+        return None
+    places = list(found.submodule_search_locations or ()) if found else []
+    return Path(places[0]) if places else None
 
 
 def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
@@ -141,6 +190,8 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
     """A folder with a `task.yaml`, and optionally `terms.py` and `task.py` (a class `Task`)."""
     root = folder.resolve()
     config = root / file
+    if root.is_file():
+        raise TaskError(f"'{folder}' is a file, not a task's folder", hint=f"did you mean '{folder.parent}'?")
     if not config.is_file():
         found = listing(sorted(p.name for p in root.iterdir())) if root.is_dir() else "no such folder"
         raise TaskError(f"'{folder}' is not a task: it has no {file} ({found})")
@@ -168,9 +219,9 @@ def find_entry(group: str, name: str, *, what: str) -> Entry:
         owners = " and ".join(f"{e.distribution} {e.version}" for e in matches)
         choices = " or ".join(e.qualified for e in matches)
         raise TaskError(f"{what} '{name}' is offered by {owners}", hint=f"name one: {choices}")
-    names = [e.name for e in entries]
+    names = list(dict.fromkeys(e.name for e in entries))
     installed = listing(sorted({f"{e.distribution} {e.version}" for e in entries}))
-    near = did_you_mean(name, names)
+    near = did_you_mean(name, [*names, *(e.qualified for e in entries)] if ":" in name else names)
     where = f"installed: {listing(names)} (from {installed})"
     raise TaskError(f"no {what} '{name}'", hint=f"{near}; {where}" if near else where)
 
@@ -184,9 +235,10 @@ def load_entry(entry: Entry, kind: type) -> Any:
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
             raise
+        said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise TaskError(
             f"plugin {entry.distribution} {entry.version} is broken: '{entry.name}' = {entry.value}:"
-            f" {type(error).__name__}: {error}{_place(error)}"
+            f" {said}{_place(error)}"
         ) from error
     if not isinstance(value, kind):
         raise TaskError(
@@ -211,7 +263,8 @@ def load_module(name: str) -> Any:
         if not name.endswith(".py"):
             return importlib.import_module(name)
         file = Path(name)
-        alias = f"rlcli_folder_task_{abs(hash(str(file.resolve()))):x}_{file.stem}"
+        digest = hashlib.blake2b(str(file.resolve()).encode(), digest_size=8).hexdigest()
+        alias = f"rlcli_folder_task_{digest}_{file.stem}"
         if alias not in sys.modules:
             spec = importlib.util.spec_from_file_location(alias, file)
             if spec is None or spec.loader is None:
@@ -231,28 +284,42 @@ def _wanted() -> set[str] | None:
     value = os.environ.get("RLCLI_PLUGINS")
     if value is None or not value.strip():
         return None
-    return {"rlcli", *(name.strip().lower() for name in value.split(",") if name.strip().lower() != "none")}
+    return {"rlcli", *(_normal(name.strip()) for name in value.split(",") if name.strip().lower() != "none")}
 
 
-def _is_path(name: str) -> bool:
-    return any(mark in name for mark in ("/", os.sep)) or name in (".", "..") or (Path(name) / "task.yaml").is_file()
+def _normal(distribution: str) -> str:
+    return re.sub(r"[-_.]+", "-", distribution).lower()
+
+
+def _offered(name: str) -> bool:
+    return any(entry.name == name for entry in catalog()[0])
 
 
 def _folder(package: str, entry: Entry) -> Path:
-    found = importlib.util.find_spec(package)
+    found = _find(package, entry)
     if found is None or not found.submodule_search_locations:
         raise TaskError(f"task '{entry.qualified}' is broken: '{package}' is not a package")
     return Path(next(iter(found.submodule_search_locations)))
 
 
 def _module_file(module: str, entry: Entry) -> Path:
-    try:
-        found = importlib.util.find_spec(module)
-    except ImportError as error:
-        raise TaskError(f"task '{entry.qualified}' is broken: {error}") from error
+    found = _find(module, entry)
     if found is None or not found.origin:
         raise TaskError(f"task '{entry.qualified}' is broken: there is no module '{module}'")
     return Path(found.origin)
+
+
+def _find(module: str, entry: Entry) -> ModuleSpec | None:
+    """Where a module lies; its parent packages are imported for that."""
+    try:
+        with _stdout_to_stderr():
+            return importlib.util.find_spec(module)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise TaskError(
+            f"task '{entry.qualified}' is broken: {type(error).__name__}: {error}{_place(error)}"
+        ) from error
 
 
 def _place(error: BaseException) -> str:

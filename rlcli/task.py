@@ -31,6 +31,10 @@ class TaskSpec:
     terms: tuple[str, ...] = ()
     api: int = API_VERSION
 
+    def __post_init__(self) -> None:
+        if isinstance(self.terms, str):
+            raise TypeError(f"terms is a tuple of modules: ({self.terms!r},)")
+
 
 # In a YAML file these are names or regular expressions; a term receives what they resolve to in the compiled
 # model. They are Any to a type checker because the default in a signature is the name ("robot") while the

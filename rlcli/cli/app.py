@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
-import os
 import re
 import sys
 import traceback
 from typing import Any
 
 import typer
-from typer._click.exceptions import ClickException, UsageError
+from typer._click.exceptions import ClickException, NoArgsIsHelpError, UsageError
 
-from rlcli.cli.console import console
+from rlcli.cli.console import console, discard
 from rlcli.errors import ConfigError, RlcliError
 
 COMMANDS = {
@@ -50,6 +50,7 @@ def _root(
         raise typer.Exit
 
 
+@functools.cache
 def build() -> typer.Typer:
     """The app with every command registered; command modules import nothing heavy."""
     for name, module in COMMANDS.items():
@@ -62,6 +63,16 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
+    code = _run(arguments)
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError:
+        discard(sys.stdout)
+    return code
+
+
+def _run(arguments: list[str]) -> int:
     try:
         result = build()(arguments, prog_name="rlcli", standalone_mode=False)
         return result if isinstance(result, int) else 0
@@ -75,19 +86,12 @@ def main(arguments: list[str] | None = None) -> int:
     except (KeyboardInterrupt, typer.Abort):
         console.error("stopped", 130, "interrupted", None, [])
         return 130
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except OSError as error:
         return _machine(error)
     except Exception as error:
-        console.error(
-            "bug",
-            1,
-            f"this is a bug in rlcli: {type(error).__name__}: {error}",
-            "please report it with the lines above",
-            [],
-        ) if console.json else traceback.print_exc()
+        traceback.print_exc()
+        said = f"this is a bug in rlcli: {type(error).__name__}: {error}"
+        console.error("bug", 1, said, "please report it with the lines above", [])
         return 1
 
 
@@ -102,6 +106,9 @@ def _report(error: RlcliError) -> int:
 
 
 def _usage(error: UsageError, arguments: list[str]) -> int:
+    if isinstance(error, NoArgsIsHelpError):
+        console.error("usage", 2, "no command", "rlcli --help", []) if console.json else console.info(error.message)
+        return 2
     hint = "rlcli --help" if error.ctx is None else f"{error.ctx.command_path} --help"
     match = re.match(r"No such option: --([A-Za-z_][\w-]*(?:\.[\w-]+)+)", error.format_message())
     if match:

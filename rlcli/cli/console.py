@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import sys
 from dataclasses import dataclass
 from typing import Any
@@ -50,7 +52,8 @@ class Console:
         """Why the command failed."""
         if self.json:
             error = {"kind": kind, "exit_code": code, "message": message, "hint": hint, "problems": problems}
-            _write(sys.stdout, json.dumps({"schema": SCHEMA_VERSION, "error": error}, indent=2))
+            with contextlib.suppress(OSError):  # stdout may be what failed
+                _write(sys.stdout, json.dumps({"schema": SCHEMA_VERSION, "error": error}, indent=2))
         lines = message.splitlines() or [""]
         _write(sys.stderr, "\n".join(f"error: {line}" for line in lines))
         if hint:
@@ -60,7 +63,7 @@ class Console:
         """A table on stdout; plain columns where stdout is not a terminal."""
         if self.json:
             return
-        if sys.stdout.isatty():
+        if sys.stdout is not None and sys.stdout.isatty():
             from rich.console import Console as Rich
             from rich.table import Table
 
@@ -78,5 +81,18 @@ class Console:
 console = Console()
 
 
+def discard(stream: Any) -> None:
+    """Write nothing more to a stream that cannot be written, at exit either."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
 def _write(stream: Any, text: str) -> None:
-    print(text, file=stream, flush=True)
+    if stream is None:  # closed by whoever started us
+        return
+    try:
+        print(text, file=stream, flush=True)
+    except BrokenPipeError:
+        discard(stream)  # whoever read it is gone; what we do may still matter
+    except UnicodeEncodeError:
+        print(text.encode(stream.encoding, "backslashreplace").decode(stream.encoding), file=stream, flush=True)

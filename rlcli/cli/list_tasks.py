@@ -8,7 +8,7 @@ import typer
 
 from rlcli.cli.console import console
 from rlcli.cli.options import Debug, Json
-from rlcli.probe import Details, cached, probe
+from rlcli.probe import TIMEOUT_S, Details, cached, probe
 from rlcli.registry import catalog
 
 
@@ -16,21 +16,25 @@ def command(
     pattern: Annotated[str | None, typer.Argument(help="Show only names or summaries that contain this.")] = None,
     probe_all: Annotated[
         bool,
-        typer.Option("--probe", help="Load every task in a process of its own and refresh what is known of it."),
+        typer.Option("--probe", help="Load every task shown in a process of its own and refresh what is known of it."),
     ] = False,
+    timeout: Annotated[
+        float, typer.Option("--probe-timeout", help="Seconds that --probe gives each task.")
+    ] = TIMEOUT_S,
     json: Json = False,
     debug: Debug = False,
 ) -> None:
     """List installed tasks."""
     entries, broken = catalog()
-    details = probe(entries) if probe_all else cached(entries)
     shared = {e.name for e in entries if sum(other.name == e.name for other in entries) > 1}
-    rows = []
-    for entry in entries:
-        known = details.get(entry.qualified, Details())
-        if pattern and pattern.lower() not in f"{entry.name} {known.summary}".lower():
-            continue
-        rows.append((entry, known))
+    details = cached(entries)
+    if pattern:
+        entries = [
+            e for e in entries if pattern.lower() in f"{e.name} {details.get(e.qualified, Details()).summary}".lower()
+        ]
+    if probe_all:
+        details.update(probe(entries, timeout))
+    rows = [(entry, details.get(entry.qualified, Details())) for entry in entries]
     console.table(
         ["TASK", "PLUGIN", "WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "SUMMARY"],
         [

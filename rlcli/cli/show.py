@@ -24,14 +24,13 @@ def command(
     debug: Debug = False,
 ) -> None:
     """Print a task's resolved configuration."""
-    from rlcli.config.dump import json_schema, to_data, to_yaml, to_yaml_with_origins
-    from rlcli.config.load import resolve
-    from rlcli.config.terms import Vocabulary
+    from rlcli.config.dump import json_schema, origins, to_data, to_yaml, to_yaml_with_origins
+    from rlcli.config.load import extensions, resolve
     from rlcli.registry import find_task
 
     source = find_task(task)
     if schema:
-        content = json_schema(Vocabulary.of(source.term_files))
+        content = json_schema(*extensions(source))
         console.data(json_module.dumps(content, indent=2))
         console.document("show", schema_document=content)
         return
@@ -45,5 +44,4 @@ def command(
     )
     data = to_data(resolved)
     console.data((to_yaml_with_origins(resolved) if origin else to_yaml(data)).rstrip("\n"))
-    origins = {".".join(map(str, path)): o.where for path, o in resolved.layers.origins.items()}
-    console.document("show", config=data, **({"origins": origins} if origin else {}))
+    console.document("show", config=data, **({"origins": origins(resolved)} if origin else {}))

@@ -149,12 +149,10 @@ def _created(
 ) -> _Job:
     """A new run, its folder written before anything heavy is imported."""
     from rlcli.config.dump import to_data, to_yaml
-    from rlcli.errors import ConfigError, Problem
     from rlcli.rl.loggers import check_loggers
     from rlcli.rl.run import create_run, environment_record, find_checkpoint
 
-    if resolved.agent is None:
-        raise ConfigError([Problem(resolved.source.label, "agents", "this task has no agent to train")])
+    resolved.require_agent()
     loggers = check_loggers(logger)
     initial = None
     if init_from is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,8 @@ import typer
 
 from rlcli.cli.console import console
 from rlcli.cli.options import Agent, ConfigFile, Debug, Json, Overrides
+from rlcli.errors import TaskError
+from rlcli.registry import TaskSource, find_task, folder_task, task_of_file
 
 
 def command(
@@ -21,41 +24,38 @@ def command(
     debug: Debug = False,
 ) -> None:
     """Check a task's configuration."""
-    from rlcli.config.load import resolve
+    from rlcli.config.load import check_all, resolve
 
     source = _source(target)
-    resolved = resolve(source, agent=agent, config_file=config, overrides=overrides or ())
-    # the play: patch must hold as well
-    resolve(source, agent=agent, play=True, config_file=config, overrides=overrides or ())
+    given = overrides or []
+    unchecked = [] if agent else check_all(source, config_file=config, overrides=given)
+    resolved = resolve(source, agent=agent, config_file=config, overrides=given)
+    resolve(source, agent=agent, play=True, config_file=config, overrides=given)
     checked = "files"
     if deep:
         from rlcli.envs.vec_env import make_env
 
-        small = resolve(source, agent=agent, config_file=config, overrides=overrides or (), flags={"scene.num_envs": 2})
+        small = resolve(source, agent=agent, config_file=config, overrides=given, flags={"scene.num_envs": 2})
         make_env(small).reset(seed=0)
         checked = "files and model"
     console.data(f"{source.label}: valid ({checked})")
-    console.document("validate", file=str(source.config), valid=True, deep=deep, agent=resolved.agent_name)
+    if unchecked:
+        console.warn(f"not checked, their trainer is not installed: agents {', '.join(unchecked)}")
+    console.document(
+        "validate",
+        file=str(source.config),
+        valid=True,
+        deep=deep,
+        agent=resolved.agent_name,
+        unchecked_agents=unchecked,
+    )
 
 
-def _source(target: str):
-    from dataclasses import replace
-
-    from rlcli.errors import TaskError
-    from rlcli.registry import catalog, find_task, folder_task, load_entry, packaged_task
-    from rlcli.task import TaskSpec
-
+def _source(target: str) -> TaskSource:
     file = Path(target)
     if file.suffix not in (".yaml", ".yml"):
         return find_task(target)
     if not file.is_file():
         raise TaskError(f"no file '{target}'")
     # a YAML of an installed task keeps that task's terms and class
-    for entry in catalog()[0]:
-        try:
-            source = packaged_task(entry, load_entry(entry, TaskSpec))
-        except TaskError:
-            continue
-        if source.config.resolve() == file.resolve():
-            return source
-    return replace(folder_task(file.parent, file.name), name=file.stem)
+    return task_of_file(file) or replace(folder_task(file.parent, file.name), name=file.stem)

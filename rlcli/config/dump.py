@@ -5,24 +5,32 @@ from __future__ import annotations
 from typing import Any
 
 import yaml
+from pydantic import BaseModel
 
-from rlcli.config import strict_yaml
+from rlcli.config import messages, strict_yaml
+from rlcli.config.layers import Origin
 from rlcli.config.load import Resolved
 from rlcli.config.schema import TaskConfig
 from rlcli.config.strict_yaml import Path
-from rlcli.config.terms import SECTIONS, Vocabulary, params_model
+from rlcli.config.terms import SECTIONS, SignatureError, Vocabulary, params_model
+
+_TAGS = {type(None): "null", bool: "bool", int: "int", float: "float", str: "str"}
 
 
 class _Dumper(yaml.SafeDumper):
-    pass
+    def resolve(self, kind: type[yaml.Node], value: Any, implicit: tuple[bool, bool]) -> str:
+        """The tag that the strict reader gives a plain scalar, so that whatever it reads otherwise is quoted."""
+        if kind is not yaml.ScalarNode or not implicit[0]:
+            return super().resolve(kind, value, implicit)
+        try:
+            return f"tag:yaml.org,2002:{_TAGS[type(strict_yaml.load_value(value))]}"
+        except (strict_yaml.YamlError, KeyError):
+            return "not a plain scalar"
 
 
 def _text(dumper: _Dumper, value: str) -> yaml.Node:
-    try:
-        plain = strict_yaml.load_value(value) == value and "\n" not in value
-    except strict_yaml.YamlError:
-        plain = False
-    return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=None if plain else '"')
+    style = '"' if "\n" in value else None  # on one line, with escapes
+    return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
 
 
 def _number(dumper: _Dumper, value: float) -> yaml.Node:
@@ -66,30 +74,40 @@ def to_yaml_with_origins(resolved: Resolved) -> str:
     return "\n".join(lines) + "\n"
 
 
-def json_schema(vocabulary: Vocabulary) -> dict[str, Any]:
-    """JSON Schema of a task file, for editors: the terms' parameters included."""
+def origins(resolved: Resolved) -> dict[str, str]:
+    """Dotted key of every value -> where it comes from."""
+    return {messages.dotted(path): _origin(resolved, path) for path in _leaves(to_data(resolved))}
+
+
+def json_schema(vocabulary: Vocabulary, params: type[BaseModel] | None = None) -> dict[str, Any]:
+    """JSON Schema of a task file, for editors: the parameters of its terms and of a direct task included."""
     schema = TaskConfig.model_json_schema()
     definitions = schema.setdefault("$defs", {})
+
+    def standing_alone(model: type[BaseModel]) -> dict[str, Any]:
+        part = model.model_json_schema()
+        definitions.update(part.pop("$defs", {}))
+        return part
+
     for section in SECTIONS:
         choices = []
         for name in vocabulary.names(section):
             signature = vocabulary.find(section, name)
-            if signature is None or signature.error:
-                continue
-            entry = params_model(signature, section).model_json_schema(ref_template="#/$defs/{model}")
-            definitions.update(entry.pop("$defs", {}))
+            assert signature is not None
+            try:
+                entry = standing_alone(params_model(signature, section))
+            except SignatureError:
+                continue  # it cannot be used in this section
             entry["properties"]["func"] = {"const": name, "description": signature.summary}
             choices.append(entry)
-        term = {"anyOf": [*choices, {"type": "null"}]}
-        if section == "success":
-            schema["properties"][section] = term
-        else:
-            mapping = {"type": "object", "additionalProperties": term}
-            nested = {"type": "object", "additionalProperties": mapping} if section == "observations" else mapping
-            schema["properties"][section] = {
-                **nested,
-                "description": TaskConfig.model_fields[section].description,
-            }
+        term: dict[str, Any] = {"anyOf": [*choices, {"type": "null"}]}
+        if section == "observations":
+            term = {"type": "object", "additionalProperties": term}
+        if section != "success":
+            term = {"type": "object", "additionalProperties": term}
+        schema["properties"][section] = {**term, "description": TaskConfig.model_fields[section].description}
+    if params is not None:
+        schema["properties"]["params"] = standing_alone(params)
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     return schema
 
@@ -107,8 +125,21 @@ def _annotate(value: Any, path: Path, resolved: Resolved, lines: list[str]) -> N
             lines.append(f"{indent}{text}".ljust(60) + f"  # {_origin(resolved, below)}")
 
 
+def _leaves(value: Any, path: Path = ()) -> list[Path]:
+    if isinstance(value, dict) and value:
+        return [leaf for key, item in value.items() for leaf in _leaves(item, (*path, key))]
+    return [path]
+
+
 def _origin(resolved: Resolved, path: Path) -> str:
-    origin = resolved.layers.origins.get(path)
-    if origin is None:
+    """Where a value was written; of a list, also the overrides of its items."""
+    known = resolved.layers.origins
+    if path not in known:
         return "default"
-    return origin.where if origin.layer in ("task", "override", "flag") else f"{origin.layer}: {origin.where}"
+    items = (o for p, o in known.items() if len(p) > len(path) and p[: len(path)] == path and o.layer == "override")
+    return ", ".join(dict.fromkeys(_place(origin) for origin in (known[path], *items)))
+
+
+def _place(origin: Origin) -> str:
+    where = " ".join(origin.where.split())
+    return where if origin.layer in ("task", "override", "flag") else f"{origin.layer}: {where}"

@@ -13,6 +13,7 @@ from rlcli.config.strict_yaml import Document, Path, YamlError
 from rlcli.errors import ConfigError, Problem
 
 _KEY = re.compile(r'"([^"]+)"|([^.="\s]+)')
+_OVERRIDE = re.compile(rf"\s*((?:{_KEY.pattern})(?:\.(?:{_KEY.pattern}))*)\s*=(.*)", re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +33,7 @@ class Layers:
 
     def merge(self, patch: Mapping[str, Any], origin: Callable[[Path], Origin], at: Path = ()) -> None:
         """Merge a patch: mappings key by key, everything else replaced. `origin` is asked with paths in the patch."""
+        self.origins.setdefault((), origin(()))
         self._merge(patch, origin, at, ())
 
     def _merge(self, patch: Mapping[str, Any], origin: Callable[[Path], Origin], at: Path, inner: Path) -> None:
@@ -41,7 +43,8 @@ class Layers:
             if isinstance(value, dict) and isinstance(target.get(key), dict):
                 self._merge(value, origin, path, source)
                 continue
-            self._forget(path)
+            if key in target:
+                self._forget(path)
             target[key] = _copy(value)
             for below in _paths(value):
                 self.origins[path + below] = origin(source + below)
@@ -127,7 +130,8 @@ def read(file: FilePath, name: str | None = None) -> Document:
     except OSError as error:
         raise ConfigError([Problem(name, "", f"cannot be read: {error.strerror or error}")]) from None
     except YamlError as error:
-        raise ConfigError([Problem(f"{name}:{error.line}:{error.column}", "", error.message)]) from None
+        place = f"{name}:{error.line}:{error.column}" if error.line else name
+        raise ConfigError([Problem(place, "", error.message)]) from None
 
 
 def marked(document: Document, name: str, layer: str, at: Path = ()) -> Callable[[Path], Origin]:
@@ -150,31 +154,18 @@ def parse_override(text: str) -> tuple[Path, Any]:
         ConfigError: if it is not of that form.
     """
     where = f"override '{text}'"
-    key, equals, value = text.partition("=")
-    if not equals:
+    match = _OVERRIDE.fullmatch(text)
+    if match is None:
         raise ConfigError([Problem(where, "", "is not of the form key.path=value")])
-    path: list[str] = []
-    rest = key.strip()
-    while rest:
-        match = _KEY.match(rest)
-        if not match:
-            raise ConfigError([Problem(where, "", f"'{key}' is not a dotted key")])
-        path.append(match[1] or match[2])
-        rest = rest[match.end() :]
-        if rest:
-            if rest[0] != "." or len(rest) == 1:
-                raise ConfigError([Problem(where, "", f"'{key}' is not a dotted key")])
-            rest = rest[1:]
-    if not path:
-        raise ConfigError([Problem(where, "", "has no key before '='")])
+    path = tuple(quoted or plain for quoted, plain in _KEY.findall(match[1]))
     try:
-        return tuple(path), strict_yaml.load_value(value)
+        return path, strict_yaml.load_value(match[match.lastindex or 0])
     except YamlError as error:
         raise ConfigError([Problem(where, ".".join(path), error.message)]) from None
 
 
 def _index(target: list[Any], step: str | int, taken: Path) -> int:
-    if not str(step).isdigit() or int(step) >= len(target):
+    if not str(step).isdecimal() or int(step) >= len(target):
         raise LookupError(f"'{taken[-1]}' is a list of {len(target)}, and '{step}' is not one of its indices")
     return int(step)
 

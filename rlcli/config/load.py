@@ -7,24 +7,28 @@ Precedence: schema default < task < the agent's `task:` patch < the task's `play
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from rlcli.config import messages
 from rlcli.config.layers import Layers, Origin, marked, parse_override, read
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
-from rlcli.config.strict_yaml import Path
+from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.terms import SECTIONS, SignatureError, Vocabulary, params_model, read_params
-from rlcli.errors import ConfigError, DependencyError, Problem, RlcliError, TaskError, did_you_mean, listing
-from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, load_entry, load_object
-from rlcli.rl.trainer import TrainerSpec
+from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing
+from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, load_entry
+from rlcli.trainers import TrainerSpec
 
-KNOWN_TRAINERS = {"ppo": "rlcli", "rsl-rl": "rlcli-rsl-rl", "rl-games": "rlcli-rl-games"}
-"""Trainers that exist outside an installation, with the distribution to install."""
+KNOWN_TRAINERS = {"ppo": "--upgrade rlcli", "rsl-rl": "rlcli-rsl-rl", "rl-games": "rlcli-rl-games"}
+"""Trainers that exist outside an installation, with what to tell pip."""
+
+_APART = ("agents", "play")
+"""Keys of a task file that are not the task itself: they hold patches of it, and are merged before those apply."""
+_DEVICES = ("cpu", "cuda")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +51,20 @@ class Resolved:
         """A problem at a path of this configuration."""
         return Problem(self.place(path), messages.dotted(path), message, hint)
 
+    def require_agent(self) -> None:
+        """Training needs an agent.
+
+        Raises:
+            ConfigError: if the task has none, or several and no default.
+        """
+        if self.agent is None:
+            names = agent_names(self.layers)
+            message = "no default among the agents" if names else "this task has no agent to train"
+            hint = (
+                f"--agent {' or '.join(names)}" if names else "add agents: {default: NAME, NAME: {trainer: sb3, ...}}"
+            )
+            raise ConfigError([self.problem(("agents",), message, hint)])
+
 
 def resolve(
     source: TaskSource,
@@ -65,141 +83,354 @@ def resolve(
         agent: which of its agents; None takes `agents.default`. A task without agents resolves to none.
         device: cpu or cuda, for a default that differs by device.
         play: apply the task's `play:` patch.
-        config_file: a YAML file merged over the task.
+        config_file: a YAML file merged over the task; `agent:` in it addresses the chosen agent.
         overrides: `key.path=value`; `agent.x=...` addresses the chosen agent.
         flags: values of command-line flags by dotted key, applied like overrides.
 
     Raises:
         ConfigError: with every problem found.
+        DependencyError: if that is all, but the agent's trainer is not installed.
+    """
+    check = _Check(source)
+    document = read(source.config, source.label)
+    extra = read(config_file) if config_file else Document({})
+    origin = marked(extra, str(config_file), "config")
+    changes = check.changes(overrides, flags or {})
+
+    check.layers.merge(document.data, marked(document, source.label, "task"))
+    check.layers.merge(_only(extra.data, _APART), origin)
+    name = check.choose_agent(agent, device, changes)
+    if "agent" in extra.data:
+        check.merge_agent(extra.data["agent"], marked(extra, str(config_file), "config", ("agent",)), name)
+    apart = [change for change in changes if change[0][0] in (*_APART, "agent")]
+    check.apply(apart, name)
+    if name is not None:
+        check.patch("agent", ("agents", name, "task"))
+    if play:
+        check.patch("play", ("play",))
+    check.layers.merge({k: v for k, v in extra.data.items() if k not in (*_APART, "agent")}, origin)
+    check.apply([change for change in changes if change not in apart], name)
+
+    trainer, agent_config = check.agent(name) if name is not None else (None, None)
+    task = check.task()
+    if check.problems or task is None:
+        raise ConfigError(check.problems)
+    if check.missing is not None:
+        raise check.missing
+    return Resolved(source, task, agent_config, name, trainer, check.layers, check.vocabulary)
+
+
+def check_all(source: TaskSource, *, config_file: FilePath | None = None, overrides: Sequence[str] = ()) -> list[str]:
+    """Every mistake in a task's files, whichever agent and command would meet it.
+
+    Returns:
+        The agents that could not be checked because their trainer is not installed.
+
+    Raises:
+        ConfigError: with the problems of all agents, in training and in play.
     """
     document = read(source.config, source.label)
-    layers = Layers()
-    layers.merge(document.data, marked(document, source.label, "task"))
-    extra = read(config_file) if config_file else None
+    agents = document.data.get("agents")
+    names = [name for name in agents if name != "default"] if isinstance(agents, dict) else []
     problems: list[Problem] = []
-    name = _agent_name(layers, agent, device, extra.data if extra else {}, problems)
-    if name is not None:
-        _patch(layers, document, source.label, "agent", ("agents", name, "task"), problems)
-    if play:
-        _patch(layers, document, source.label, "play", ("play",), problems)
-    if extra is not None:
-        data = {key: value for key, value in extra.data.items() if key != "agent"}
-        layers.merge(data, marked(extra, str(config_file), "config"))
-        if "agent" in extra.data:
-            _merge_agent(layers, extra, str(config_file), name, problems)
-    for text in overrides:
-        _override(layers, text, name, problems)
-    for key, value in (flags or {}).items():
-        layers.set(
-            _agent_path(tuple(key.split(".")), name),
-            value,
-            Origin("flag", f"--{key.split('.')[-1].replace('_', '-')}"),
-        )
-    vocabulary = _vocabulary(source, problems)
-    task = _task(layers, vocabulary, source, problems)
-    trainer, agent_config = _agent(layers, name, problems) if name is not None else (None, None)
-    if problems or task is None:
+    unchecked: list[str] = []
+    for name in names or [None]:
+        for play in (False, True):
+            try:
+                resolve(source, agent=name, play=play, config_file=config_file, overrides=overrides)
+            except ConfigError as error:
+                problems += error.problems
+            except DependencyError:
+                unchecked += [name] if name and name not in unchecked else []
+    if problems:
         raise ConfigError(problems)
-    return Resolved(source, task, agent_config, name, trainer, layers, vocabulary)
+    return unchecked
 
 
-def _agent_name(
-    layers: Layers, wanted: str | None, device: str, extra: Mapping[str, Any], problems: list[Problem]
-) -> str | None:
-    agents = {**_mapping(layers.get(("agents",))), **_mapping(extra.get("agents"))}
-    default = agents.pop("default", None)
-    if wanted is not None:
-        if wanted not in agents:
-            near = did_you_mean(wanted, agents) or f"agents of this task: {listing(agents)}"
-            raise ConfigError([Problem("--agent", "", f"no agent '{wanted}'", near)])
-        return wanted
-    if isinstance(default, dict):
-        chosen = default.get(device.partition(":")[0])
-        default = chosen if chosen in agents else default.get("cpu")
-    if default is None:
-        return next(iter(agents)) if len(agents) == 1 else None
-    if default not in agents:
-        where = layers.place(("agents", "default"))
-        problems.append(Problem(where, "agents.default", f"no agent '{default}'", f"agents: {listing(agents)}"))
+def extensions(source: TaskSource) -> tuple[Vocabulary, type[BaseModel] | None]:
+    """What a task's source adds to the schema: its terms, and the parameters of a direct task.
+
+    Raises:
+        ConfigError: if that source cannot be read.
+    """
+    check = _Check(source)
+    check.read_terms()
+    params = check.params_model()
+    if check.problems:
+        raise ConfigError(check.problems)
+    return check.vocabulary, params
+
+
+def agent_names(layers: Layers) -> list[str]:
+    """The agents that a configuration describes."""
+    return [name for name in _mapping(layers.get(("agents",))) if name != "default"]
+
+
+class _AnyAgent(AgentConfig):
+    """An agent of a trainer that is not known: what all agents have in common is still checked."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+Change = tuple[Path, Any, Origin]
+
+
+@dataclass(slots=True)
+class _Check:
+    """One pass of phase 1: the layers so far, and every problem found on the way."""
+
+    source: TaskSource
+    layers: Layers = field(default_factory=Layers)
+    vocabulary: Vocabulary = field(default_factory=Vocabulary)
+    problems: list[Problem] = field(default_factory=list)
+    missing: DependencyError | None = None
+    homes: messages.Homes = field(default_factory=dict)
+
+    def problem(self, path: Path, message: str, hint: str | None = None) -> None:
+        """Note a problem at a path."""
+        self.problems.append(Problem(self.layers.place(path), messages.dotted(path), message, hint))
+
+    # --- layers ---
+
+    def changes(self, overrides: Iterable[str], flags: Mapping[str, Any]) -> list[Change]:
+        """What the command line changes, overrides before flags."""
+        found: list[Change] = []
+        for text in overrides:
+            try:
+                found.append((*parse_override(text), Origin("override", f"override '{text}'")))
+            except ConfigError as error:
+                self.problems += error.problems
+        for key, value in flags.items():
+            path = tuple(key.split("."))
+            found.append((path, value, Origin("flag", f"--{path[-1].replace('_', '-')}")))
+        return found
+
+    def choose_agent(self, wanted: str | None, device: str, changes: Iterable[Change]) -> str | None:
+        """The agent's name; None if the task has none, or several and no default."""
+        agents = self.layers.get(("agents",), {})
+        if not isinstance(agents, dict):
+            self.problem(("agents",), f"expected a mapping, found {messages.shown(agents)}")
+            return None
+        names = [name for name in agents if name != "default"]
+        if wanted is not None:
+            if wanted in names:
+                return wanted
+            near = did_you_mean(wanted, names) or f"agents of this task: {listing(names)}"
+            self.problems.append(Problem("--agent", "", f"no agent '{wanted}'", near))
+            return None
+        self.apply([change for change in changes if change[0][:2] == ("agents", "default")], None)
+        at: Path = ("agents", "default")
+        default = self.layers.get(at)
+        if isinstance(default, dict):
+            for kind in default:
+                if kind not in _DEVICES:
+                    self.problem((*at, kind), f"no device '{kind}'", f"devices: {listing(_DEVICES)}")
+            kind = device.partition(":")[0]
+            at = (*at, kind if kind in default else "cpu")
+            default = self.layers.get(at)
+        if default is None:
+            return names[0] if len(names) == 1 else None
+        if default not in names:
+            near = did_you_mean(str(default), names) or f"agents of this task: {listing(names)}"
+            self.problem(at, f"no agent {messages.shown(default)}", near)
+            return None
+        return str(default)
+
+    def merge_agent(self, patch: Any, origin: Any, name: str | None) -> None:
+        """Merge the `agent:` part of a --config file into the chosen agent."""
+        if name is None:
+            self._no_agent(origin(()).where)
+        elif not isinstance(patch, dict):
+            where = origin(()).where
+            self.problems.append(Problem(where, "agent", f"expected a mapping, found {messages.shown(patch)}"))
+        else:
+            self.layers.merge(patch, origin, ("agents", name))
+
+    def _no_agent(self, where: str) -> None:
+        names = agent_names(self.layers)
+        if not names:
+            self.problems.append(Problem(where, "agent", "this task has no agents"))
+        elif not self.problems:  # otherwise the choice itself was wrong, and that has been said
+            hint = f"name one: --agent {' or '.join(names)}"
+            self.problems.append(Problem(where, "agent", "the task has several agents and no default", hint))
+
+    def patch(self, layer: str, at: Path) -> None:
+        """Merge what stands at `at` over the task."""
+        patch = self.layers.get(at)
+        if patch is None:
+            return
+        if not isinstance(patch, dict):
+            self.problem(at, f"expected a mapping, found {messages.shown(patch)}")
+            return
+        for key in _APART:
+            if key in patch:
+                self.problem((*at, key), f"'{key}' cannot be patched here")
+        task = {key: value for key, value in patch.items() if key not in _APART}
+        self.layers.merge(task, lambda path: Origin(layer, self.layers.place(at + path)))
+
+    def apply(self, changes: Iterable[Change], name: str | None) -> None:
+        """Set what the command line changes."""
+        for path, value, origin in changes:
+            if path[0] == "agent":
+                if name is None:
+                    self._no_agent(origin.where)
+                    continue
+                path = ("agents", name, *path[1:])
+            if value is None and path[0] in SECTIONS and not isinstance(self.layers.get(path), dict):
+                near = did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))
+                if near:
+                    self.problems.append(
+                        Problem(origin.where, messages.dotted(path), "there is nothing to remove", near)
+                    )
+                    continue
+            try:
+                self.layers.set(path, value, origin)
+            except LookupError as error:
+                self.problems.append(Problem(origin.where, messages.dotted(path), str(error.args[0])))
+
+    # --- validation ---
+
+    def agent(self, name: str) -> tuple[TrainerSpec | None, AgentConfig | None]:
+        """The agent's trainer and validated settings."""
+        at: Path = ("agents", name)
+        for path in (("agents",), at):
+            data = self.layers.get(path)
+            if not isinstance(data, dict):
+                self.problem(path, f"expected a mapping, found {messages.shown(data)}")
+                return None, None
+        spec, model = self._trainer(at, data)
+        self.homes = messages.homes({"": TaskConfig, "agent": model})
+        config = self._validate(model, data, at)
+        return spec, config if isinstance(config, AgentConfig) else None
+
+    def _trainer(self, at: Path, data: Mapping[str, Any]) -> tuple[TrainerSpec | None, type[AgentConfig]]:
+        """The record of the agent's trainer, and the model of its settings (a common one if that is not known)."""
+        name, algorithm = data.get("trainer"), data.get("algorithm")
+        if not isinstance(name, str):
+            return None, _AnyAgent
+        try:
+            entry = find_entry(TRAINERS, name, what="trainer")
+        except TaskError as error:
+            if name in KNOWN_TRAINERS and name not in {entry.name for entry in catalog(TRAINERS)[0]}:
+                where = f"{self.layers.place((*at, 'trainer'))}: {messages.dotted((*at, 'trainer'))}"
+                hint = f"pip install {KNOWN_TRAINERS[name]}"
+                self.missing = DependencyError(f"{where}: trainer '{name}' is not installed", hint=hint)
+            else:
+                self.problem((*at, "trainer"), error.message, error.hint)
+            return None, _AnyAgent
+        spec = load_entry(entry, TrainerSpec)
+        if not isinstance(algorithm, str):
+            return spec, _AnyAgent
+        if algorithm not in spec.algorithms:
+            near = did_you_mean(algorithm, spec.algorithms) or f"algorithms: {listing(spec.algorithms)}"
+            self.problem((*at, "algorithm"), f"trainer '{name}' has no algorithm '{algorithm}'", near)
+            return spec, _AnyAgent
+        model = load_entry(replace(entry, value=spec.algorithms[algorithm]), type)
+        if not issubclass(model, AgentConfig):
+            raise TaskError(f"plugin {entry.distribution} {entry.version} is broken: {model} is not an AgentConfig")
+        return spec, model
+
+    def task(self) -> TaskConfig | None:
+        """The validated task; None if there are problems."""
+        self.homes = self.homes or messages.homes({"": TaskConfig, "agents.NAME": AgentConfig})
+        self.read_terms()
+        data = {key: value for key, value in self.layers.data.items() if key not in _APART}
+        entries = term_entries(data)
+        terms = {path: self._term(section, path, entry) for section, path, entry in entries}
+        task = self._validate(TaskConfig, _without(data, terms), ())
+        params = self._params(data)
+        if self.source.task is None:
+            self._require_managed(data)
+        else:
+            self._require_direct(data)
+        if self.problems or not isinstance(task, TaskConfig):
+            return None
+        return _filled(task, terms, params)
+
+    def _validate(self, model: type[BaseModel], data: Any, at: Path) -> BaseModel | None:
+        try:
+            return model.model_validate_json(json.dumps(data))
+        except ValidationError as error:
+            self.problems += messages.problems(error, model, data, self.layers.place, at, self.homes)
+            return None
+
+    def read_terms(self) -> None:
+        """Read the signatures of the task's own terms."""
+        try:
+            self.vocabulary = Vocabulary.of(self.source.term_files)
+        except SyntaxError as error:
+            self.problems.append(_not_python(error))
+
+    def _term(self, section: str, path: Path, entry: dict[str, Any]) -> TermConfig | None:
+        """A term with its parameters, all of it checked against the signature of the function that it names."""
+        base = SECTIONS[section]
+        model = base
+        name = entry.get("func")
+        if "func" not in entry and (near := did_you_mean(str(path[-1]), self._siblings(path))):
+            self.problem(path, f"no term '{path[-1]}'", near)  # a slip in an override
+            return None
+        if isinstance(name, str):
+            signature = self.vocabulary.find(section, name)
+            if signature is None:
+                self._unknown_term(section, (*path, "func"), name)
+            else:
+                try:
+                    model = params_model(signature, section)
+                except SignatureError as error:
+                    self.problems.append(Problem(f"{signature.file}:{signature.line}:1", name, str(error)))
+        checked = self._validate(model, entry, path)
+        return base.model_construct(**dict(checked)) if checked is not None else None
+
+    def _siblings(self, path: Path) -> list[str]:
+        terms = _mapping(self.layers.get(path[:-1]))
+        return [name for name, term in terms.items() if isinstance(term, dict) and "func" in term]
+
+    def _unknown_term(self, section: str, path: Path, name: str) -> None:
+        known = self.vocabulary.names(section)
+        hint = did_you_mean(name, known)
+        if hint is None and (other := self.vocabulary.other_section(section, name)):
+            hint = f"'{name}' is a term of {other}"
+        self.problem(path, f"no {section.rstrip('s')} term '{name}'", hint or f"terms: {listing(known, 60)}")
+
+    def _params(self, data: Mapping[str, Any]) -> dict[str, Any] | None:
+        """The parameters of a direct task, checked against the Params in its source."""
+        given, count = data.get("params", {}), len(self.problems)
+        model = self.params_model()
+        if len(self.problems) > count or not isinstance(given, dict):
+            return None  # that has been said
+        if model is None:
+            if given:
+                direct = "this task's class declares no Params" if self.source.task else "only direct tasks have params"
+                self.problem(("params",), direct)
+            return {}
+        checked = self._validate(model, given, ("params",))
+        return checked.model_dump() if checked is not None else None
+
+    def params_model(self) -> type[BaseModel] | None:
+        """The model of a direct task's parameters; None if it has none."""
+        if self.source.task is None or self.source.task_file is None:
+            return None
+        try:
+            return read_params(self.source.task_file, self.source.task.rpartition(":")[2])
+        except SyntaxError as error:
+            self.problems.append(_not_python(error))
+        except SignatureError as error:
+            self.problems.append(Problem(str(self.source.task_file), "Params", str(error)))
         return None
-    return str(default)
 
+    def _require_managed(self, data: Mapping[str, Any]) -> None:
+        for section in ("actions", "rewards"):
+            if isinstance(data.get(section, {}), dict) and not any(_mapping(data.get(section)).values()):
+                self.problem((section,), "a manager-based task needs at least one term here")
+        groups = data.get("observations", {})
+        policy = groups.get("policy", {}) if isinstance(groups, dict) else None
+        if isinstance(policy, dict) and not any(policy.values()):
+            self.problem(("observations",), "needs a group 'policy' with at least one term")
 
-def _patch(layers: Layers, document: Any, label: str, layer: str, at: Path, problems: list[Problem]) -> None:
-    patch = Layers(document.data).get(at)
-    if patch is None:
-        return
-    if not isinstance(patch, dict):
-        problems.append(
-            Problem(layers.place(at), messages.dotted(at), f"expected a mapping, found {messages.shown(patch)}")
-        )
-        return
-    for key in ("agents", "play"):
-        if key in patch:
-            path = (*at, key)
-            problems.append(Problem(layers.place(path), messages.dotted(path), f"'{key}' cannot be patched here"))
-            patch = {k: v for k, v in patch.items() if k != key}
-    layers.merge(patch, marked(document, label, layer, at))
-
-
-def _merge_agent(layers: Layers, document: Any, label: str, name: str | None, problems: list[Problem]) -> None:
-    origin = marked(document, label, "config", ("agent",))
-    patch = document.data["agent"]
-    if name is None or not isinstance(patch, dict):
-        found = "there is no agent to address" if name is None else f"expected a mapping, found {messages.shown(patch)}"
-        problems.append(Problem(origin(()).where, "agent", found))
-        return
-    layers.merge(patch, origin, ("agents", name))
-
-
-def _override(layers: Layers, text: str, name: str | None, problems: list[Problem]) -> None:
-    try:
-        path, value = parse_override(text)
-    except ConfigError as error:
-        problems.extend(error.problems)
-        return
-    where = f"override '{text}'"
-    if path[0] == "agent" and name is None:
-        problems.append(Problem(where, "agent", "this task has no agent to address"))
-        return
-    try:
-        layers.set(_agent_path(path, name), value, Origin("override", where))
-    except LookupError as error:
-        problems.append(Problem(where, messages.dotted(path), str(error.args[0])))
-
-
-def _agent_path(path: Path, name: str | None) -> Path:
-    return ("agents", name, *path[1:]) if path[0] == "agent" and name is not None else path
-
-
-def _vocabulary(source: TaskSource, problems: list[Problem]) -> Vocabulary:
-    try:
-        return Vocabulary.of(source.term_files)
-    except SyntaxError as error:
-        problems.append(
-            Problem(f"{error.filename}:{error.lineno}:{error.offset}", "", f"not valid Python: {error.msg}")
-        )
-        return Vocabulary()
-
-
-def _task(layers: Layers, vocabulary: Vocabulary, source: TaskSource, problems: list[Problem]) -> TaskConfig | None:
-    data = {key: value for key, value in layers.data.items() if key not in ("agents", "play")}
-    task, count = None, len(problems)
-    try:
-        task = TaskConfig.model_validate_json(json.dumps(data))
-    except ValidationError as error:
-        problems.extend(_with_siblings(messages.problems(error, TaskConfig, data, layers.place), layers))
-    params: dict[Path, dict[str, Any]] = {}
-    for section, path, entry in term_entries(data):
-        found = _term(layers, vocabulary, section, path, entry, problems)
-        if found is not None:
-            params[path] = found
-    direct = _params(layers, source, data, problems)
-    if source.task is None:
-        _require_managed(layers, data, problems)
-    if task is None or len(problems) > count:
-        return None
-    return _filled(task, params, direct)
+    def _require_direct(self, data: Mapping[str, Any]) -> None:
+        for section in SECTIONS:
+            if section != "success" and data.get(section):
+                self.problem((section,), f"a direct task has no {section} terms; its class does this")
 
 
 def term_entries(data: Mapping[str, Any]) -> list[tuple[str, Path, dict[str, Any]]]:
@@ -219,199 +450,42 @@ def term_entries(data: Mapping[str, Any]) -> list[tuple[str, Path, dict[str, Any
     return found
 
 
-def _term(
-    layers: Layers,
-    vocabulary: Vocabulary,
-    section: str,
-    path: Path,
-    entry: dict[str, Any],
-    problems: list[Problem],
-) -> dict[str, Any] | None:
-    name = entry.get("func")
-    if not isinstance(name, str):
-        return None  # the schema has said so
-    signature = vocabulary.find(section, name)
-    if signature is None:
-        hint = did_you_mean(name, vocabulary.names(section))
-        other = vocabulary.other_section(section, name)
-        if other and hint is None:
-            hint = f"'{name}' is a term of {other}"
-        kind = section.rstrip("s") if section != "success" else "success"
-        where, key = layers.place((*path, "func")), messages.dotted((*path, "func"))
-        problems.append(
-            Problem(
-                where,
-                key,
-                f"no {kind} term '{name}'",
-                hint or f"terms: {listing(vocabulary.names(section), 60)}",
-            )
-        )
-        return None
-    if signature.error:
-        problems.append(Problem(f"{signature.file}:{signature.line}:1", name, signature.error))
-        return None
-    model = params_model(signature, section)
-    try:
-        checked = model.model_validate_json(json.dumps(entry))
-    except ValidationError as error:
-        base = set(SECTIONS[section].model_fields)
-        found = messages.problems(error, model, entry, layers.place, path)
-        own = [item["loc"] for item in error.errors() if item["loc"] and item["loc"][0] not in base]
-        keys = {messages.dotted((*path, loc[0])) for loc in own} | {messages.dotted(path)}
-        problems.extend(
-            p for p in found if any(p.path == k or p.path.startswith(k + ".") for k in keys) and _is_own(p, base, path)
-        )
-        return None
-    return {parameter.name: getattr(checked, parameter.name) for parameter in signature.parameters}
+def _without(data: Any, paths: Iterable[Path]) -> Any:
+    """A copy in which null stands at these paths; nothing below them is looked at twice."""
+    inner: dict[Any, list[Path]] = {}
+    for path in paths:
+        if path == ():
+            return None
+        inner.setdefault(path[0], []).append(path[1:])
+    return {k: _without(v, inner[k]) if k in inner else v for k, v in data.items()} if inner else data
 
 
-def _is_own(problem: Problem, base: set[str], path: Path) -> bool:
-    """Whether the schema has not reported this already: missing and mistyped base keys are its business."""
-    below = problem.path.removeprefix(messages.dotted(path)).lstrip(".")
-    missing = problem.message.removeprefix("missing key '").rstrip("'") if problem.message.startswith("missing") else ""
-    return below.split(".")[0] not in base and missing not in base and not (below == "" and not missing)
-
-
-def _with_siblings(found: list[Problem], layers: Layers) -> list[Problem]:
-    """A term without `func` is often a mistyped name in an override: name the near ones."""
-    result = []
-    for problem in found:
-        path = tuple(problem.path.split("."))
-        siblings = [
-            key for key, value in _mapping(layers.get(path[:-1])).items() if isinstance(value, dict) and "func" in value
-        ]
-        near = did_you_mean(path[-1], siblings) if problem.message == "missing key 'func'" else None
-        result.append(Problem(problem.where, problem.path, f"no term '{path[-1]}'", near) if near else problem)
-    return result
-
-
-def _params(
-    layers: Layers, source: TaskSource, data: Mapping[str, Any], problems: list[Problem]
-) -> dict[str, Any] | None:
-    given = data.get("params", {})
-    if source.task is None or source.task_file is None:
-        if given:
-            problems.append(Problem(layers.place(("params",)), "params", "only direct tasks have params"))
-        return None
-    try:
-        model = read_params(source.task_file, source.task.rpartition(":")[2])
-    except SyntaxError as error:
-        problems.append(
-            Problem(f"{error.filename}:{error.lineno}:{error.offset}", "", f"not valid Python: {error.msg}")
-        )
-        return None
-    except (SignatureError, ValueError) as error:
-        problems.append(Problem(str(source.task_file), "Params", str(error)))
-        return None
-    if not isinstance(given, dict):
-        return None
-    if model is None:
-        if given:
-            problems.append(Problem(layers.place(("params",)), "params", "this task's class declares no Params"))
-        return {}
-    try:
-        return model.model_validate_json(json.dumps(given)).model_dump()
-    except ValidationError as error:
-        problems.extend(messages.problems(error, model, given, layers.place, ("params",)))
-        return None
-
-
-def _require_managed(layers: Layers, data: Mapping[str, Any], problems: list[Problem]) -> None:
-    problems.extend(
-        Problem(layers.place((section,)), section, "a manager-based task needs at least one term")
-        for section in ("actions", "rewards")
-        if not any(_mapping(data.get(section)).values())
-    )
-    if not any(_mapping(_mapping(data.get("observations")).get("policy")).values()):
-        problems.append(
-            Problem(
-                layers.place(("observations",)),
-                "observations",
-                "needs a group 'policy' with at least one term",
-            )
-        )
-
-
-def _filled(task: TaskConfig, params: Mapping[Path, dict[str, Any]], direct: dict[str, Any] | None) -> TaskConfig:
-    """The task with its terms' parameters as validated, and removed terms gone."""
-    update: dict[str, Any] = {} if direct is None else {"params": direct}
+def _filled(task: TaskConfig, terms: Mapping[Path, TermConfig | None], params: dict[str, Any] | None) -> TaskConfig:
+    """The task with its validated terms in their places; a term that is null in the data is a removed one."""
+    update: dict[str, Any] = {} if params is None else {"params": params}
     for section in SECTIONS:
-        content = getattr(task, section)
         if section == "success":
-            update[section] = content and _with(content, params[(section,)])
+            update[section] = terms.get((section,))
         elif section == "observations":
-            update[section] = {
-                group: {n: _with(t, params[section, group, n]) for n, t in terms.items() if t is not None}
-                for group, terms in content.items()
-            }
+            groups = task.observations
+            update[section] = {g: _kept(terms, (section, g), names) for g, names in groups.items()}
         else:
-            update[section] = {n: _with(t, params[section, n]) for n, t in content.items() if t is not None}
+            update[section] = _kept(terms, (section,), getattr(task, section))
     return task.model_copy(update=update)
 
 
-def _with(term: TermConfig, params: dict[str, Any]) -> TermConfig:
-    return term.model_copy(update=params)
+def _kept(terms: Mapping[Path, TermConfig | None], at: Path, names: Iterable[str]) -> dict[str, TermConfig]:
+    found = {name: terms.get((*at, name)) for name in names}
+    return {name: term for name, term in found.items() if term is not None}
 
 
-def _agent(layers: Layers, name: str, problems: list[Problem]) -> tuple[TrainerSpec | None, AgentConfig | None]:
-    at: Path = ("agents", name)
-    data = layers.get(at)
-    if not isinstance(data, dict):
-        problems.append(
-            Problem(layers.place(at), messages.dotted(at), f"expected a mapping, found {messages.shown(data)}")
-        )
-        return None, None
-    for key in ("trainer", "algorithm"):
-        if not isinstance(data.get(key), str):
-            problems.append(Problem(layers.place(at), messages.dotted(at), f"missing key '{key}'"))
-            return None, None
-    spec = trainer_spec(data["trainer"], layers.place((*at, "trainer")), messages.dotted((*at, "trainer")))
-    reference = spec.algorithms.get(data["algorithm"])
-    if reference is None:
-        near = did_you_mean(data["algorithm"], spec.algorithms) or f"algorithms: {listing(spec.algorithms)}"
-        path = (*at, "algorithm")
-        problems.append(
-            Problem(
-                layers.place(path),
-                messages.dotted(path),
-                f"trainer '{data['trainer']}' has no algorithm '{data['algorithm']}'",
-                near,
-            )
-        )
-        return spec, None
-    model: type[BaseModel] = load_object(reference)
-    try:
-        config = model.model_validate_json(json.dumps(data))
-    except ValidationError as error:
-        problems.extend(messages.problems(error, model, data, layers.place, at))
-        return spec, None
-    assert isinstance(config, AgentConfig)
-    return spec, config
+def _not_python(error: SyntaxError) -> Problem:
+    return Problem(f"{error.filename}:{error.lineno or 1}:{error.offset or 1}", "", f"not valid Python: {error.msg}")
 
 
-def trainer_spec(name: str, where: str, path: str) -> TrainerSpec:
-    """The record of a trainer.
-
-    Raises:
-        DependencyError: a known trainer that is not installed.
-        ConfigError: an unknown one.
-    """
-    try:
-        return load_entry(find_entry(TRAINERS, name, what="trainer"), TrainerSpec)
-    except TaskError as error:
-        installed = {entry.name for entry in catalog(TRAINERS)[0]}
-        if name in installed:
-            raise
-        if name in KNOWN_TRAINERS:
-            raise DependencyError(
-                f"{where}: {path}: trainer '{name}' is not installed",
-                hint=f"pip install {KNOWN_TRAINERS[name]}",
-            ) from None
-        raise ConfigError([Problem(where, path, f"no trainer '{name}'", error.hint)]) from None
+def _only(data: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    return {key: data[key] for key in keys if key in data}
 
 
 def _mapping(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
-
-
-__all__ = ["Resolved", "RlcliError", "resolve", "term_entries", "trainer_spec"]

@@ -10,7 +10,18 @@ import math
 import re
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import CoreSchema, core_schema
 
 _FRACTION = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*/\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*\Z")
 
@@ -25,18 +36,34 @@ def _fraction(value: Any) -> Any:
     return value
 
 
+class _Fraction:
+    """Lets a number be written as a fraction, and says so in the JSON Schema."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(_fraction, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"anyOf": [handler(schema), {"type": "string", "pattern": "^" + _FRACTION.pattern.replace(r"\Z", "$")}]}
+
+
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     if value[0] > value[1]:
         raise ValueError(f"the lower end {value[0]:g} is above the upper end {value[1]:g}")
     return value
 
 
-Number = Annotated[float, BeforeValidator(_fraction)]
-Positive = Annotated[float, BeforeValidator(_fraction), Field(gt=0)]
-NotNegative = Annotated[float, BeforeValidator(_fraction), Field(ge=0)]
+def _rotation(value: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if math.hypot(*value) < 1e-6:
+        raise ValueError("a quaternion must not be zero; no rotation is [1, 0, 0, 0]")
+    return value
+
+
+Number = Annotated[float, _Fraction()]
+Positive = Annotated[float, Field(gt=0), _Fraction()]
+NotNegative = Annotated[float, Field(ge=0), _Fraction()]
 Count = Annotated[int, Field(ge=1)]
 Vec3 = tuple[Number, Number, Number]
-Quaternion = tuple[Number, Number, Number, Number]
+Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_rotation)]
 Range = Annotated[tuple[Number, Number], AfterValidator(_ordered)]
 Names = str | Annotated[list[str], Field(min_length=1)]
 
@@ -117,7 +144,7 @@ class SuccessConfig(TermConfig):
 class SimConfig(StrictModel):
     """The simulation."""
 
-    dt: Annotated[float, BeforeValidator(_fraction), Field(gt=0, le=0.1)]
+    dt: Annotated[float, Field(gt=0, le=0.1), _Fraction()]
     """Physics time step [s]."""
     render_interval: Count = 1
     """Physics steps between two rendered frames."""
@@ -232,14 +259,8 @@ class EntityConfig(StrictModel):
     """Joint name or regex -> what to change; where two match, the later one wins key by key."""
     init: InitialStateConfig = InitialStateConfig()
     """Default joint state; a joint not named starts at the MJCF's qpos0, at rest."""
-    soft_joint_pos_limit_factor: Annotated[float, BeforeValidator(_fraction), Field(gt=0, le=1)] = 1.0
+    soft_joint_pos_limit_factor: Annotated[float, Field(gt=0, le=1), _Fraction()] = 1.0
     """Share of the joint range, about its middle, that counts as inside the soft limits."""
-
-    @model_validator(mode="after")
-    def _unit(self) -> EntityConfig:
-        if math.hypot(*self.quat) < 1e-6:
-            raise ValueError("quat must not be zero")
-        return self
 
 
 class SceneConfig(StrictModel):
@@ -299,14 +320,14 @@ class TaskConfig(StrictModel):
     agents: dict[str, Any] = {}
     """Name -> settings of a trainer; `default` names the one to use, by itself or by device."""
 
-    @model_validator(mode="after")
-    def _times(self) -> TaskConfig:
-        if self.episode_length_s < self.step_dt:
-            raise ValueError(
-                f"episode_length_s ({self.episode_length_s:g} s) is shorter than one step"
-                f" (dt x decimation = {self.step_dt:g} s)"
-            )
-        return self
+    @field_validator("episode_length_s")
+    @classmethod
+    def _at_least_one_step(cls, value: float, info: ValidationInfo) -> float:
+        if "sim" in info.data and "decimation" in info.data:
+            step_dt = info.data["sim"].dt * info.data["decimation"]
+            if value < step_dt:
+                raise ValueError(f"{value:g} s is shorter than one step (dt x decimation = {step_dt:g} s)")
+        return value
 
     @property
     def step_dt(self) -> float:

@@ -26,7 +26,7 @@ _INT = re.compile(r"[-+]?(0|[1-9][0-9]{0,18})\Z")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]{1,4})?\Z")
 _OCTAL = re.compile(r"[-+]?0[0-9]+\Z")
 _NOT_FINITE = re.compile(r"[-+]?\.(inf|nan)\Z", re.IGNORECASE)
-_WORDS = {"yes", "no", "on", "off", "y", "n"}
+_WORDS = {"yes", "no", "on", "off"}
 _CONSTANTS = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
     **dict.fromkeys(("true", "True", "TRUE"), True),
@@ -35,13 +35,14 @@ _CONSTANTS = {
 
 
 class YamlError(ValueError):
-    """A file that is not strict YAML; `line` and `column` count from 1 (0 when unknown)."""
+    """A file that is not strict YAML; `line` and `column` count from 1 (0 when the file as a whole is meant)."""
 
-    def __init__(self, message: str, mark: Any = None) -> None:
+    def __init__(self, message: str, mark: Any = None, *, place: Mark = (0, 0)) -> None:
         super().__init__(message)
         self.message = message
-        self.line = mark.line + 1 if mark else 0
-        self.column = mark.column + 1 if mark else 0
+        line, column = (mark.line + 1, mark.column + 1) if mark else place
+        self.line: int = line
+        self.column: int = column
 
 
 @dataclass(slots=True)
@@ -69,7 +70,7 @@ def load(text: str | bytes) -> Document:
     if value is None:
         value = {}
     if not isinstance(value, dict):
-        raise YamlError("the top level must be a mapping (key: value)")
+        raise YamlError("the top level must be a mapping (key: value)", place=marks[()])
     return Document(value, marks)
 
 
@@ -85,8 +86,14 @@ def _decode(text: str | bytes) -> str:
         try:
             text = text.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise YamlError(f"not UTF-8: {error.reason} at byte {error.start}") from None
+            before = error.object[: error.start].decode("utf-8")
+            raise YamlError(f"not UTF-8: {error.reason}", place=_after(before)) from None
     return text.removeprefix("\ufeff")
+
+
+def _after(before: str) -> Mark:
+    """The position of what follows this text."""
+    return before.count("\n") + 1, len(before) - before.rfind("\n")
 
 
 def _parse(text: str) -> tuple[Any, dict[Path, Mark]]:
@@ -96,8 +103,9 @@ def _parse(text: str) -> tuple[Any, dict[Path, Mark]]:
         raise YamlError(
             error.problem or error.context or "syntax error", error.problem_mark or error.context_mark
         ) from None
-    except yaml.YAMLError as error:
-        raise YamlError(str(error).split("\n")[0]) from None
+    except yaml.reader.ReaderError as error:
+        found = f"the character {chr(error.character)!r} is not allowed"
+        raise YamlError(found, place=_after(text[: error.position])) from None
     except RecursionError:
         raise YamlError("nested too deeply") from None
 

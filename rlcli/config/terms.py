@@ -9,11 +9,12 @@ from __future__ import annotations
 import ast
 import functools
 import re
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Union
 
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import ConfigDict, Field, create_model
 
 from rlcli.config.schema import (
     ActionConfig,
@@ -123,7 +124,7 @@ def read_terms(file: Path) -> dict[str, Signature]:
     Raises:
         SyntaxError: if the file is not Python.
     """
-    tree = ast.parse(file.read_text(encoding="utf-8"), filename=str(file))
+    tree = _tree(file)
     terms: dict[str, Signature] = {}
     for node in tree.body:
         if isinstance(node, ast.FunctionDef) and _takes_env(node.args, 0) and not node.name.startswith("_"):
@@ -137,8 +138,13 @@ def read_terms(file: Path) -> dict[str, Signature]:
 
 
 def read_params(file: Path, class_name: str) -> type[StrictModel] | None:
-    """The `Params` model nested in a direct task's class, rebuilt from its source; None if there is none."""
-    tree = ast.parse(file.read_text(encoding="utf-8"), filename=str(file))
+    """The `Params` model nested in a direct task's class, rebuilt from its source; None if there is none.
+
+    Raises:
+        SyntaxError: if the file is not Python.
+        SignatureError: if a field is not one that YAML can express.
+    """
+    tree = _tree(file)
     task = next((n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == class_name), None)
     params = next((n for n in task.body if isinstance(n, ast.ClassDef) and n.name == "Params"), None) if task else None
     if params is None:
@@ -146,14 +152,25 @@ def read_params(file: Path, class_name: str) -> type[StrictModel] | None:
     fields: dict[str, Any] = {}
     for node in params.body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            fields[node.target.id] = (annotation_type(node.annotation), _field_default(node.value))
-    return create_model("Params", __base__=StrictModel, **fields)
+            try:
+                fields[node.target.id] = (annotation_type(node.annotation), _field_default(node.value))
+            except SignatureError as error:
+                raise SignatureError(f"line {node.lineno}: '{node.target.id}': {error}") from None
+    return _model("Params", StrictModel, fields)
 
 
-def params_model(signature: Signature, section: str) -> type[BaseModel]:
-    """The model of a term's YAML entry: the section's own keys and the function's parameters, nothing else."""
+def params_model(signature: Signature, section: str) -> type[TermConfig]:
+    """The model of a term's YAML entry: the section's own keys and the function's parameters, nothing else.
+
+    Raises:
+        SignatureError: if the function cannot be a term of this section.
+    """
+    if signature.error:
+        raise SignatureError(signature.error)
+    if taken := [p.name for p in signature.parameters if p.name in (*SECTIONS[section].model_fields, "params")]:
+        raise SignatureError(f"parameter '{taken[0]}': every term of {section} has a key of this name already")
     fields: dict[str, Any] = {p.name: (p.type, ... if p.required else p.default) for p in signature.parameters}
-    return create_model(signature.name, __base__=_closed(section), **fields)
+    return _model(signature.name, _closed(section), fields)
 
 
 def snake_case(name: str) -> str:
@@ -170,7 +187,7 @@ def annotation_type(node: ast.expr) -> Any:
     if isinstance(node, ast.Constant) and node.value is None:
         return None
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
-        return annotation_type(ast.parse(node.value, mode="eval").body)
+        return annotation_type(_quoted(node.value))
     name = _last_name(node)
     if name in _TYPES:
         return _TYPES[name]
@@ -180,36 +197,66 @@ def annotation_type(node: ast.expr) -> Any:
         items = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         outer = _last_name(node.value)
         if outer == "Literal":
-            return Literal[tuple(ast.literal_eval(item) for item in items)]
+            return Literal[tuple(_literal(item) for item in items)]
         if outer == "list" and len(items) == 1:
             return list[annotation_type(items[0])]  # type: ignore[misc]
         if outer == "tuple":
             if len(items) == 2 and isinstance(items[1], ast.Constant) and items[1].value is ...:
                 return tuple[annotation_type(items[0]), ...]  # type: ignore[misc]
             return tuple[tuple(annotation_type(item) for item in items)]  # type: ignore[misc]
-    raise SignatureError(f"annotation '{ast.unparse(node)}' is not one that YAML can express")
+    raise SignatureError(
+        f"annotation '{ast.unparse(node)}' is not one that YAML can express; use float, int, bool, str, Literal, tuple,"
+        f" list, X | None, Range, Entity or {' / '.join(SELECTORS)}"
+    )
+
+
+def _tree(file: Path) -> ast.Module:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return ast.parse(file.read_bytes(), filename=str(file))
+    except SyntaxError as error:
+        error.filename = str(file)  # absent where there is a null byte
+        raise
+    except (ValueError, RecursionError, MemoryError) as error:
+        raise SyntaxError(str(error) or "nested too deeply", (str(file), 1, 1, None)) from None
+
+
+def _model(name: str, base: type[StrictModel], fields: dict[str, Any]) -> type[Any]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a parameter may have the name of a pydantic method
+        return create_model(name, __base__=base, **fields)
 
 
 @functools.cache
 def _closed(section: str) -> type[TermConfig]:
     base = SECTIONS[section]
-    return type(base.__name__, (base,), {"model_config": ConfigDict(extra="forbid"), "__module__": __name__})
+    return type(
+        base.__name__,
+        (base,),
+        {"model_config": ConfigDict(extra="forbid", protected_namespaces=()), "__module__": __name__},
+    )
 
 
 def _signature(node: ast.FunctionDef | ast.ClassDef, call: ast.FunctionDef, name: str, file: Path) -> Signature:
     parameters: list[Parameter] = []
-    error = None
+    error = _positional_error(call, isinstance(node, ast.ClassDef))
     for argument, default in zip(call.args.kwonlyargs, call.args.kw_defaults, strict=True):
         try:
             parameters.append(_parameter(argument, default))
-        except (SignatureError, ValueError) as problem:
-            error = f"parameter '{argument.arg}': {problem}"
+        except SignatureError as problem:
+            error = error or f"parameter '{argument.arg}': {problem}"
     if error is None:
         error = _selector_error(parameters)
     summary = (ast.get_docstring(node) or ast.get_docstring(call) or "").split("\n")[0]
     return Signature(
         name, node.name, isinstance(node, ast.ClassDef), file, call.lineno, summary, tuple(parameters), error
     )
+
+
+def _positional_error(call: ast.FunctionDef, is_class: bool) -> str | None:
+    extra = [a.arg for a in call.args.args[2 if is_class else 1 :] if a.arg != "selection"]
+    return f"parameter '{extra[0]}' must be keyword-only: put it after a '*'" if extra else None
 
 
 def _selector_error(parameters: list[Parameter]) -> str | None:
@@ -222,24 +269,51 @@ def _selector_error(parameters: list[Parameter]) -> str | None:
 def _parameter(argument: ast.arg, default: ast.expr | None) -> Parameter:
     if argument.annotation is None:
         raise SignatureError("has no annotation")
-    alias = _last_name(argument.annotation)
+    if argument.arg.startswith("_"):
+        raise SignatureError("starts with an underscore, which no key of a YAML does")
     return Parameter(
         argument.arg,
         annotation_type(argument.annotation),
-        None if default is None else ast.literal_eval(default),
+        None if default is None else _literal(default),
         default is None,
-        alias if alias in SELECTORS or alias == "Entity" else None,
+        _alias(argument.annotation),
     )
+
+
+def _alias(node: ast.expr) -> str | None:
+    """The alias that an annotation is written with, also as `Joints | None` or in quotes."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return _alias(_quoted(node.value))
+    if isinstance(node, ast.BinOp):
+        return _alias(node.left) or _alias(node.right)
+    name = _last_name(node)
+    return name if name in SELECTORS or name == "Entity" else None
+
+
+def _quoted(text: str) -> ast.expr:
+    try:
+        return ast.parse(text, mode="eval").body
+    except (SyntaxError, ValueError):
+        raise SignatureError(f"annotation '{text}' is not valid Python") from None
+
+
+def _literal(node: ast.expr) -> Any:
+    try:
+        return ast.literal_eval(node)
+    except (ValueError, TypeError):
+        raise SignatureError(
+            f"'{ast.unparse(node)}' is not a literal, and files are checked without running them"
+        ) from None
 
 
 def _field_default(node: ast.expr | None) -> Any:
     if node is None:
         return ...
     if isinstance(node, ast.Call) and _last_name(node.func) == "Field":
-        arguments = [ast.literal_eval(argument) for argument in node.args]
-        keywords = {k.arg: ast.literal_eval(k.value) for k in node.keywords if k.arg}
+        arguments = [_literal(argument) for argument in node.args]
+        keywords = {k.arg: _literal(k.value) for k in node.keywords if k.arg}
         return Field(*arguments, **keywords)
-    return ast.literal_eval(node)
+    return _literal(node)
 
 
 def _takes_env(arguments: ast.arguments, position: int) -> bool:

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from rlcli.config.load import Resolved
-from rlcli.errors import ConfigError, DivergedError
+from rlcli.config.schema import InitialStateConfig
+from rlcli.errors import DivergedError
 from rlcli.managers.term import Binder
 from rlcli.sim.engine import open_engine
 from rlcli.sim.entity import Entity, SimData, is_finite
@@ -383,9 +384,9 @@ class VecEnv(ABC):
         scene = Scene(config.scene, config.sim, resolved.source.root)
         self._binder = Binder(self, resolved)
         self._prepare(scene)
-        problems = [resolved.problem(p.path, str(p), p.hint) for p in scene.problems]
-        if problems:
-            raise ConfigError(problems)
+        self._binder.problems += [resolved.problem(p.path, str(p), p.hint) for p in scene.problems]
+        if any(problem.path[-1] == "model" for problem in scene.problems):
+            self._binder.raise_problems()  # there is no model to look other names up in
         scene.spec.visual.global_.offwidth = config.viewer.width
         scene.spec.visual.global_.offheight = config.viewer.height
         self.spec = scene.spec
@@ -397,9 +398,10 @@ class VecEnv(ABC):
             try:
                 self.entities[name] = Entity(name, entity, self.engine, self.sim)
             except NameProblem as problem:
-                problems.append(resolved.problem(("scene", "entities", name, "init"), str(problem), problem.hint))
-        if problems:
-            raise ConfigError(problems)
+                path = ("scene", "entities", name, "init")
+                self._binder.problems.append(resolved.problem(path, str(problem), problem.hint))
+                blank = entity.model_copy(update={"init": InitialStateConfig()})  # to go on to the other problems
+                self.entities[name] = Entity(name, blank, self.engine, self.sim)
         self._set_default(model)
         self.views = scene.views
         self.env_origins = grid(self.num_envs, config.scene.env_spacing).to(self.device)

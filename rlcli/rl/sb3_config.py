@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from rlcli.config.schema import AgentConfig, Count, NotNegative, Positive, StrictModel
-from rlcli.rl.trainer import TrainerSpec
+from rlcli.trainers import TrainerSpec
 
 Discount = Annotated[float, Field(ge=0, le=1)]
 

@@ -1,4 +1,4 @@
-"""What a trainer is: the light record that an entry point of `rlcli.trainers` resolves to, and the protocols."""
+"""What a trainer does: the protocol that the training loop drives, and what passes between them."""
 
 from __future__ import annotations
 
@@ -10,21 +10,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from rlcli.rl.policy import Policy
-
-
-@dataclass(frozen=True, slots=True)
-class TrainerSpec:
-    """Importing the module that holds one must be cheap.
-
-    Attributes:
-        summary: one line.
-        algorithms: algorithm name -> `module:Model`, the pydantic model of its settings (an `AgentConfig`).
-        trainer: `module:Class` of a `Trainer`, called as `Class(env, config, seed=, device=, torch_threads=)`.
-    """
-
-    summary: str
-    algorithms: Mapping[str, str]
-    trainer: str
 
 
 @dataclass(slots=True)

@@ -129,6 +129,10 @@ class Scene:
                 SceneProblem((*path, "model"), f"'{entity.model}' is not a valid MJCF: {_one_line(error)}")
             )
             return
+        if len(child.bodies) < 2:
+            self.problems.append(SceneProblem((*path, "model"), f"'{entity.model}' has no body below its worldbody"))
+            return
+        _name_all(child)
         if name == next(iter(self.config.entities)):
             for option in _OPTIONS:
                 if hasattr(child.option, option):
@@ -248,6 +252,15 @@ class Scene:
                 name="distant", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, dir=lights.distant.direction,
                 pos=[0, 0, 20], diffuse=[strength * c for c in lights.distant.color], castshadow=True,
             )  # fmt: skip
+
+
+def _name_all(spec: mujoco.MjSpec) -> None:
+    """Name what the MJCF leaves unnamed: an entity's elements are found by their names."""
+    for kind, elements in (("body", spec.bodies), ("joint", spec.joints)):
+        taken = {element.name for element in elements}
+        for number, element in enumerate(elements):
+            if not element.name:
+                element.name = next(n for n in (f"{kind}{number}", f"unnamed_{kind}{number}") if n not in taken)
 
 
 def joint_settings(entity: EntityConfig, joint: str) -> JointConfig:

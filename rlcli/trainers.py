@@ -1,0 +1,21 @@
+"""What a trainer plugin exports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class TrainerSpec:
+    """What an entry point of the group `rlcli.trainers` resolves to. Importing its module must be cheap.
+
+    Attributes:
+        summary: one line.
+        algorithms: algorithm name -> `module:Model`, the pydantic model of its settings (an `AgentConfig`).
+        trainer: `module:Class` of a `Trainer`, called as `Class(env, config, seed=, device=, torch_threads=)`.
+    """
+
+    summary: str
+    algorithms: Mapping[str, str]
+    trainer: str

@@ -1,0 +1,178 @@
+"""The command line itself: help, flags, usage errors, the one JSON document, streams that go away."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ["torch", "mujoco", "numpy", "stable_baselines3"]
+
+
+def document(text):
+    """The one JSON document on stdout."""
+    content = json.loads(text)
+    assert content["schema"] == 1
+    return content
+
+
+@pytest.mark.parametrize("flag", ["-h", "--help"])
+@pytest.mark.parametrize("command", [[], ["list-tasks"], ["show"], ["validate"], ["train"], ["play"], ["eval"]])
+def test_help_is_data_and_exits_with_0(in_process, command, flag):
+    code, out, err = in_process(*command, flag)
+    assert (code, err) == (0, "")
+    assert " ".join(["Usage: rlcli", *command]) in out
+
+
+def test_help_loads_nothing_heavy():
+    program = (
+        "import sys; from rlcli.cli.app import main; main(['--help']);"
+        f"print(sorted(set(sys.modules) & {set(HEAVY)!r}), [m for m in sys.modules if m.startswith('rlcli_tasks')])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] == "[] []"
+
+
+def test_the_version_is_printed(in_process):
+    import rlcli
+
+    assert in_process("--version") == (0, f"rlcli {rlcli.__version__}\n", "")
+
+
+def test_no_command_shows_the_help_on_stderr(in_process):
+    code, out, err = in_process()
+    assert (code, out) == (2, "")
+    assert err.startswith("Usage: rlcli")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["tran", "cartpole"], "Did you mean 'train'?"),
+        (["show"], "Missing argument 'task'"),
+        (["list-tasks", "--jso"], "--json"),
+        (["list-tasks", "a", "b"], "unexpected extra argument"),
+        (["train", "cartpole", "--seed", "x"], "'--seed': Input should be a valid integer"),
+        (["train", "cartpole", "--num-envs"], "requires an argument"),
+        (["train"], "which task?"),
+        (["train", "cartpole", "--device", "gpu"], "no device 'gpu'"),
+        (["play", "cartpole", "--policy", "traned"], "did you mean 'trained'"),
+    ],
+)
+def test_usage_errors_exit_with_2(in_process, arguments, said):
+    code, out, err = in_process(*arguments)
+    assert (code, out) == (2, "")
+    assert said in err
+    assert "Traceback" not in err
+    code, out, _ = in_process(*arguments, "--json")
+    if arguments[-1] != "--num-envs":  # it takes what follows as its value
+        error = document(out)["error"]
+        assert (code, error["kind"], error["exit_code"]) == (2, "usage", 2)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--rewards.alive.weight", "2"],
+        ["--rewards.alive.weight=2"],
+        ["--agent.n_steps=2", "rewards.alive.weight=2"],
+        ["--scene.num_envs", "2"],
+    ],
+)
+def test_an_override_with_dashes_is_answered_with_the_right_form(in_process, arguments):
+    code, _, err = in_process("train", "cartpole", *arguments)
+    assert code == 2
+    key = arguments[0].removeprefix("--").partition("=")[0]
+    assert f"overrides have no dashes: {key}=2" in err
+
+
+def test_underscores_are_accepted_for_hyphens(in_process):
+    code, out, _ = in_process("show", "cartpole", "--num_envs", "3", "--json")
+    assert code == 0
+    assert document(out)["config"]["scene"]["num_envs"] == 3
+    assert in_process("list_tasks")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "kind"),
+    [
+        (["show", "nope"], 4, "task"),
+        (["validate", "nope"], 4, "task"),
+        (["validate", "nope.yaml"], 4, "task"),
+        (["train", "nope"], 4, "task"),
+        (["train", "./nope"], 4, "task"),
+        (["train", "sim.dt=1"], 4, "task"),
+        (["show", "cartpole", "x=1"], 3, "config"),
+        (["show", "cartpole", "x"], 3, "config"),
+        (["show", "cartpole", "--agent", "x"], 3, "config"),
+        (["show", "cartpole", "--config", "nope.yaml"], 3, "config"),
+        (["validate", "cartpole", "decimation=0"], 3, "config"),
+        (["train", "cartpole", "decimation=0"], 3, "config"),
+        (["train", "cartpole", "--num-envs", "0"], 3, "config"),
+        (["train", "cartpole", "agent.trainer=rsl-rl"], 7, "dependency"),
+    ],
+)
+def test_errors_are_one_document_and_their_exit_code(in_process, here, arguments, code, kind):
+    found, out, err = in_process(*arguments, "--json")
+    error = document(out)["error"]
+    assert (found, error["exit_code"], error["kind"]) == (code, code, kind)
+    assert set(error) == {"kind", "exit_code", "message", "hint", "problems"}
+    assert error["message"].splitlines()[0] in err
+    assert all(set(problem) == {"where", "path", "message", "hint"} for problem in error["problems"])
+    assert bool(error["problems"]) == (kind == "config")
+    found, out, err = in_process(*arguments)
+    assert (found, out) == (code, "")
+    assert "Traceback" not in err
+    assert list(here.iterdir()) == []  # nothing half-written
+
+
+def test_debug_shows_the_traceback_of_an_error(in_process):
+    code, _, err = in_process("show", "nope", "--debug")
+    assert code == 4
+    assert "Traceback" in err
+
+
+def test_a_missing_trainer_is_answered_with_the_pip_line(in_process):
+    code, _, err = in_process("train", "cartpole", "agent.trainer=rl-games")
+    assert code == 7
+    assert "trainer 'rl-games' is not installed" in err
+    assert "pip install rlcli-rl-games" in err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["list-tasks"], ["show", "cartpole"], ["list-tasks", "--json"], ["show", "nope", "--json"], ["--help"]],
+)
+def test_a_reader_that_goes_away_is_no_error_to_report(rlcli, arguments):
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as stdout:
+        done = rlcli(*arguments, stdout=stdout)
+    assert "Traceback" not in done.stderr
+    assert "Broken" not in done.stderr
+    if arguments[:2] == ["show", "nope"]:
+        assert done.returncode == 4
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is always full")
+@pytest.mark.parametrize("arguments", [["list-tasks"], ["show", "cartpole", "--json"]])
+def test_a_full_disk_is_said_in_one_line(rlcli, arguments):
+    with open("/dev/full", "w") as stdout:
+        done = rlcli(*arguments, stdout=stdout)
+    assert done.returncode == 10
+    assert done.stderr == "error: No space left on device\n"
+
+
+def test_a_closed_stdout_is_no_crash(here):
+    done = subprocess.run(
+        [sys.executable, "-m", "rlcli", "list-tasks"], cwd=here, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: os.close(1),
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_text_that_the_terminal_cannot_show_is_escaped(rlcli, small):
+    done = rlcli("show", small(("a small task", "größer →")), PYTHONIOENCODING="ascii")
+    assert done.returncode == 0
+    assert r"gr\xf6\xdfer \u2192" in done.stdout

@@ -1,0 +1,193 @@
+"""What `show` prints: YAML that reads back as the same configuration, origins, and a JSON Schema."""
+
+import copy
+
+import jsonschema
+import pytest
+import yaml
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from small_task import TASK
+
+from rlcli.config import strict_yaml
+from rlcli.config.dump import json_schema, origins, to_data, to_yaml, to_yaml_with_origins
+from rlcli.config.load import extensions, resolve
+from rlcli.registry import find_task
+
+_TEXT = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=20).filter(
+    lambda text: all(c in "\t\n" or c.isprintable() for c in text)
+)
+_SCALARS = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(10**15), 10**15),
+    st.floats(allow_nan=False, allow_infinity=False),
+    _TEXT,
+    st.sampled_from(
+        [
+            "1e-3",
+            "on",
+            "010",
+            "",
+            "null",
+            "~",
+            "true",
+            "1/2",
+            "a: b",
+            "- a",
+            "#",
+            "a #b",
+            "{",
+            "*a",
+            "&a",
+            "!a",
+            "'",
+            '"',
+            "%",
+            "---",
+            " a ",
+        ]
+    ),
+)
+_DATA = st.dictionaries(
+    st.one_of(_TEXT, st.sampled_from(["on", "1", "", "null", ".*", "a.b", "a: b"])),
+    st.recursive(
+        _SCALARS, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_TEXT, inner, max_size=3), max_leaves=8
+    ),
+    max_size=4,
+)
+
+
+def same(a, b):
+    """Equal, and of equal types all the way down."""
+    if isinstance(a, dict):
+        return type(b) is dict and list(a) == list(b) and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, list):
+        return type(b) is list and len(a) == len(b) and all(map(same, a, b))
+    return type(a) is type(b) and a == b
+
+
+@settings(max_examples=300, deadline=None)
+@given(_DATA)
+@example({"a": 1e-05, "b": 1e22, "c": -0.0, "d": 5e-324, "e": 1.7976931348623157e308, "f": 1.0})
+@example({"on": "on", "010": "010", "x": ["1e-3", "null", ""], "y": {}, "z": []})
+def test_plain_data_reads_back_unchanged(data):
+    assert same(strict_yaml.load(to_yaml(data)).data, data)
+
+
+@pytest.mark.parametrize("name", ["cartpole", "cartpole-direct"])
+@pytest.mark.parametrize("play", [False, True])
+def test_a_built_in_task_reads_back_as_the_same_configuration(name, play, tmp_path):
+    from dataclasses import replace
+
+    source = find_task(name)
+    first = resolve(source, play=play, overrides=["agent.learning_rate=1e-5", "sim.dt=1/300"])
+    file = tmp_path / "task.yaml"
+    for text in (to_yaml(to_data(first)), to_yaml_with_origins(first)):
+        file.write_text(text, encoding="utf-8")
+        again = resolve(replace(source, config=file), play=play)
+        assert again.task.model_dump(exclude={"play"}) == first.task.model_dump(exclude={"play"})
+        assert (again.agent_name, again.trainer) == (first.agent_name, first.trainer)
+        assert again.agent.model_dump(exclude={"task"}) == first.agent.model_dump(exclude={"task"})
+        assert to_data(again) == to_data(first)
+
+
+@settings(max_examples=50, deadline=None)
+@given(summary=_TEXT, weight=st.floats(-1e30, 1e30), joint=_TEXT.filter(bool))
+@example(summary="on", weight=1e-05, joint="1e-3")
+@example(summary="", weight=1e22, joint="null")
+def test_any_values_read_back(tmp_path_factory, summary, weight, joint):
+    from rlcli.registry import folder_task
+
+    folder = tmp_path_factory.mktemp("t")
+    raw = yaml.safe_load(TASK)
+    raw["sim"]["dt"] = 0.01
+    raw["summary"] = summary
+    raw["rewards"]["near"].update(weight=weight, joints=[joint])
+    raw["scene"]["entities"]["robot"]["joints"] = {joint: {"kp": 1.0}}
+    texts = [to_yaml(raw)]
+    resolved = []
+    for _ in range(3):
+        (folder / "task.yaml").write_text(texts[-1], encoding="utf-8")
+        resolved.append(resolve(folder_task(folder)))
+        texts.append(
+            (to_yaml if len(texts) == 1 else lambda _: to_yaml_with_origins(resolved[-1]))(to_data(resolved[-1]))
+        )
+    assert resolved[0].task == resolved[1].task == resolved[2].task
+    assert resolved[0].task.rewards["near"].params["joints"] == [joint]
+
+
+def test_a_removed_term_stays_removed_and_a_null_stays_null(task):
+    data = to_data(resolve(task(), overrides=["rewards.near=null", "scene.ground=null"]))
+    assert list(data["rewards"]) == ["alive"]
+    assert data["scene"]["ground"] is None
+
+
+def test_every_value_has_an_origin(task):
+    overrides = ["sim.gravity=[0, 0, -1]", "sim.gravity.2=-3", "rewards.alive.weight=2", 'summary="two\\nlines"']
+    resolved = resolve(task(), overrides=overrides, flags={"scene.num_envs": 3})
+    label = resolved.source.label
+    found = origins(resolved)
+    assert found["decimation"].startswith(f"agent: {label}:22:")
+    assert found["episode_length_s"] == f"{label}:3:1"
+    assert found["scene.num_envs"] == "--num-envs"
+    assert found["scene.env_spacing"] == "default"
+    assert found["rewards.alive.weight"] == "override 'rewards.alive.weight=2'"
+    assert found["sim.gravity"] == "override 'sim.gravity=[0, 0, -1]', override 'sim.gravity.2=-3'"
+    assert found["agents.one.max_iterations"] == f"{label}:22:39"
+    text = to_yaml_with_origins(resolved)
+    assert all("  # " in line for line in text.splitlines() if not line.rstrip().endswith(":"))
+    assert strict_yaml.load(text).data == to_data(resolved)
+
+
+def validator(source):
+    schema = json_schema(*extensions(source))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
+
+
+@pytest.mark.parametrize("name", ["cartpole", "cartpole-direct"])
+def test_the_schema_accepts_the_built_in_tasks_as_written_and_as_shown(name):
+    source = find_task(name)
+    check = validator(source)
+    written = strict_yaml.load(source.config.read_bytes()).data
+    assert list(check.iter_errors(written)) == []
+    assert list(check.iter_errors(to_data(resolve(source)))) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("decimation",), -2),
+        (("decimatoin",), 2),
+        (("sim", "dt"), "fast"),
+        (("sim", "dt"), -1),
+        (("rewards", "alive", "wieght"), 2.0),
+        (("rewards", "pole_pos", "target"), "far"),
+        (("rewards", "alive", "func"), "is_alife"),
+        (("observations", "policy", "joint_pos_rel", "scale"), "big"),
+        (("success", "tolerance"), None),
+    ],
+)
+def test_the_schema_refuses_what_the_program_refuses(path, value):
+    source = find_task("cartpole")
+    data = copy.deepcopy(strict_yaml.load(source.config.read_bytes()).data)
+    target = data
+    for step in path[:-1]:
+        target = target[step]
+    target[path[-1]] = value
+    assert list(validator(source).iter_errors(data))
+
+
+def test_the_schema_knows_the_terms_and_the_params_of_a_task(task):
+    terms = 'def mine(env, *, x: float = 2.0):\n    """My term."""\ndef odd(env, *, weight: float): ...\n'
+    schema = json_schema(*extensions(task(terms=terms)))
+    rewards = {
+        t["properties"]["func"]["const"]: t
+        for t in schema["properties"]["rewards"]["additionalProperties"]["anyOf"][:-1]
+    }
+    assert rewards["mine"]["properties"]["func"]["description"] == "My term."
+    assert rewards["mine"]["properties"]["x"]["default"] == 2.0
+    assert "odd" not in rewards
+    params = json_schema(*extensions(find_task("cartpole-direct")))["properties"]["params"]
+    assert params["properties"]["reset_dist"]["description"].startswith("Cart position")

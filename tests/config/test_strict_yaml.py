@@ -1,0 +1,157 @@
+"""What strict YAML reads, and what it refuses and where."""
+
+import random
+import time
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rlcli.config.strict_yaml import Document, YamlError, load, load_value
+
+SAMPLE = """\
+# a comment
+summary: "text: with # signs"
+sim: {dt: 1e-3, gravity: [0, 0, -9.81]}
+names:
+- a
+- 'b''s'
+- {x: null, y: ~, z: }
+deep:
+  deeper:
+    - - 1
+      - [2, 3]
+block: |
+  two
+  lines
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-3", 0.001),
+        ("1E5", 1e5),
+        (".5", 0.5),
+        ("-3.", -3.0),
+        ("1e22", 1e22),
+        ("0", 0),
+        ("-12", -12),
+        ("+7", 7),
+        ("true", True),
+        ("False", False),
+        ("null", None),
+        ("~", None),
+        ("", None),
+        ("1:30", "1:30"),
+        ("1/120", "1/120"),
+        ("1_000", "1_000"),
+        ("0x10", "0x10"),
+        ("2024-01-01", "2024-01-01"),
+        ("'010'", "010"),
+        ('"on"', "on"),
+        ("[1, a, {b: c}]", [1, "a", {"b": "c"}]),
+    ],
+)
+def test_scalars_are_read_as_yaml_1_2_reads_them(text, value):
+    found = load_value(text)
+    assert found == value
+    assert type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "column", "said"),
+    [
+        ("a: 1\nb: 2\na: 3\n", 3, 1, "duplicate key 'a' (first on line 1)"),
+        ("a:\n  x: 1\n  x: 2\n", 3, 3, "duplicate key 'x'"),
+        ("a: {b: 1, b: 2}\n", 1, 11, "duplicate key 'b'"),
+        ("a: !!python/object:os.system x\n", 1, 4, "tags are not allowed"),
+        ("a: !!int '3'\n", 1, 4, "tags are not allowed"),
+        ("a: !mine {b: 1}\n", 1, 4, "tags are not allowed"),
+        ("a: &x 1\nb: 2\n", 1, 4, "anchors and aliases"),
+        ("a: 1\nb: *x\n", 2, 4, "anchors and aliases"),
+        ("a: 1\nb:\n  <<: {c: 1}\n", 3, 3, "merge keys"),
+        ("a: 010\n", 1, 4, "drop the leading 0 or quote it"),
+        ("a: [on]\n", 1, 5, "true or false, or quote it"),
+        ("a: No\n", 1, 4, "true or false, or quote it"),
+        ("a: .nan\n", 1, 4, "null for none"),
+        ("a: -.INF\n", 1, 4, "null for none"),
+        ("a: 1e999\n", 1, 4, "out of range"),
+        ("a: 1\n---\nb: 2\n", 2, 1, "only one document"),
+        ("a: 1\n1: 2\n", 2, 1, "keys must be text, found 1; quote it"),
+        ("true: 2\n", 1, 1, "keys must be text"),
+        ("? [a, b]\n: 1\n", 1, 3, "keys must be text"),
+        ("- 1\n- 2\n", 1, 1, "the top level must be a mapping"),
+        ("a: [1, 2\nb: 3\n", 2, 2, "expected"),
+        ("a:\n\t- 1\n", 2, 1, "cannot start any token"),
+        ("a: 1\nb: \x00\n", 2, 4, "not allowed"),
+        (b"a: 1\nb: \xff\n", 2, 4, "not UTF-8"),
+    ],
+)
+def test_what_is_refused_is_refused_where_it_stands(text, line, column, said):
+    with pytest.raises(YamlError) as caught:
+        load(text)
+    assert said in caught.value.message
+    assert (caught.value.line, caught.value.column) == (line, column)
+
+
+def test_positions_point_at_the_key_or_the_item():
+    marks = load(SAMPLE).marks
+    assert marks["sim", "dt"] == (3, 7)
+    assert marks["sim", "gravity", 2] == (3, 33)
+    assert marks["names", 1] == (6, 3)
+    assert marks["names", 2, "y"] == (7, 13)
+    assert marks["deep", "deeper", 0, 1, 1] == (11, 13)
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"a: \xff\xfe\n", "not UTF-8"),
+        (b"a: 1\n" * 60_000, "larger than"),
+        (b"[" * 100_000, "nested deeper than 32"),
+        (b"a: " + b"{a: " * 40 + b"1" + b"}" * 40, "nested deeper than 32"),
+        (b"a: [" + b"1," * 30_000 + b"]", "more than 20000 items"),
+        (b"a: " + b"x" * 20_000, "longer than"),
+    ],
+)
+def test_what_could_exhaust_the_reader_is_refused_quickly(data, said):
+    start = time.perf_counter()
+    with pytest.raises(YamlError, match=said):
+        load(data)
+    assert time.perf_counter() - start < 3.0
+
+
+def test_a_byte_order_mark_and_an_empty_file_are_harmless():
+    assert load("\ufeffa: 1".encode()).data == {"a": 1}
+    assert load(b"").data == {}
+    assert load(b"# nothing\n").data == {}
+
+
+def _only_a_document_or_a_yaml_error(data):
+    try:
+        return isinstance(load(data), Document)
+    except YamlError as error:
+        return bool(error.message)
+
+
+def test_mutated_files_give_a_document_or_a_yaml_error():
+    draw = random.Random(0)
+    for _ in range(2000):
+        data = bytearray(SAMPLE.encode())
+        for _ in range(draw.randint(1, 4)):
+            at = draw.randrange(len(data))
+            kind = draw.randrange(3)
+            if kind == 0:
+                data[at] = draw.randrange(256)
+            elif kind == 1:
+                data[at:at] = draw.choice([b"&a ", b"*a", b"!!x ", b"{", b"[", b"---\n", b": ", b"\t", b"\xc3", b"? "])
+            else:
+                del data[at : at + draw.randint(1, 8)]
+        assert _only_a_document_or_a_yaml_error(bytes(data))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.one_of(st.binary(max_size=200), st.text(max_size=200)))
+def test_any_input_gives_a_document_or_a_yaml_error(data):
+    assert _only_a_document_or_a_yaml_error(data)

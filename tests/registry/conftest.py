@@ -1,0 +1,65 @@
+"""Installed distributions, made of files in a folder on the path."""
+
+import os
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+
+@pytest.fixture
+def plugins(tmp_path, monkeypatch):
+    """plugins(name, module=source, points=..., ...) makes an installed distribution and puts it on the path."""
+    site = tmp_path / "site"
+    site.mkdir()
+    monkeypatch.syspath_prepend(str(site))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), os.environ["PYTHONPATH"]]))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    before = set(sys.modules)
+
+    def make(name, source="", *, task=None, entry_points=None, metadata=None, version="1.0", files=None, package=None):
+        package = package or name.replace("-", "_")
+        folder = site / package
+        folder.mkdir(exist_ok=True)
+        (folder / "__init__.py").write_text(textwrap.dedent(source))
+        for file, text in (files or {}).items():
+            (folder / file).write_text(text)
+        info = site / f"{package}-{version}.dist-info"
+        info.mkdir()
+        if metadata is None:
+            metadata = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
+        if metadata:
+            (info / "METADATA").write_text(metadata)
+        task = task or f"{name}-task"
+        points = f"[rlcli.tasks]\n{task} = {package}:SPEC\n" if entry_points is None else entry_points
+        (info / "entry_points.txt").write_text(points)
+        (info / "RECORD").write_text("")
+        return folder
+
+    yield make
+    for module in set(sys.modules) - before:
+        if not module.startswith(("rlcli", "pydantic")):
+            del sys.modules[module]
+
+
+SPEC = "from rlcli.task import TaskSpec\nSPEC = TaskSpec(package=__name__, summary='A plugin.')\n"
+
+
+@pytest.fixture
+def spec():
+    return SPEC
+
+
+@pytest.fixture
+def cli(tmp_path):
+    """cli(arguments...) -> the finished process of `rlcli`, started in an empty folder."""
+
+    def run(*arguments, **environment):
+        here = tmp_path / "here"
+        here.mkdir(exist_ok=True)
+        command = [sys.executable, "-m", "rlcli", *arguments]
+        env = {**os.environ, **environment}
+        return subprocess.run(command, capture_output=True, text=True, cwd=here, env=env, timeout=120)
+
+    return run

@@ -1,0 +1,177 @@
+"""`list-tasks` and its cache: what is said of installed tasks without importing them."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+HEAVY = ["torch", "mujoco", "numpy", "stable_baselines3"]
+MODEL = "<mujoco><worldbody><body><joint name='j' type='slide'/><geom size='.1' mass='1'/></body></worldbody></mujoco>"
+TASK = """\
+summary: {summary}
+decimation: 1
+episode_length_s: 1.0
+sim: {{dt: 0.01}}
+scene: {{num_envs: 5, entities: {{robot: {{model: model.xml}}}}}}
+actions: {{push: {{func: joint_effort, joints: [j]}}}}
+observations: {{policy: {{pos: {{func: joint_pos_rel}}, vel: {{func: joint_vel_rel}}}}}}
+rewards: {{alive: {{func: is_alive, weight: 1.0}}}}
+"""
+
+
+def rows(done):
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    return {row["name"]: row for row in document["tasks"]}
+
+
+def test_the_index_of_the_built_in_tasks_is_up_to_date():
+    import rlcli_tasks
+
+    file = Path(rlcli_tasks.__file__).with_name("index.json")
+    command = [sys.executable, "-m", "rlcli.envs.describe", "--index", "rlcli"]
+    fresh = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert json.loads(file.read_text()) == json.loads(fresh), f"run: {' '.join(command[1:])} > {file}"
+
+
+def test_built_in_tasks_come_with_their_details(cli):
+    found = rows(cli("list-tasks", "--json"))
+    cartpole = found["cartpole"]
+    assert cartpole["workflow"] == "managed"
+    assert (cartpole["observation_size"], cartpole["action_size"], cartpole["agent"]) == (4, 1, "sb3-ppo")
+    assert "pole" in cartpole["summary"]
+    assert found["cartpole-direct"]["workflow"] == "direct"
+
+
+def test_listing_imports_no_plugin_and_nothing_heavy(plugins, cli):
+    for number in range(20):
+        plugins(f"plug{number}", "raise SystemExit('imported')\n")
+    program = (
+        "import sys; from rlcli.cli.app import main; code = main(['list-tasks']);"
+        f"print(code, sorted(set(sys.modules) & {set(HEAVY)!r}), [m for m in sys.modules if m.startswith('plug')])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    lines = done.stdout.splitlines()
+    assert lines[-1] == "0 [] []"
+    assert sum("plug" in line for line in lines[:-1]) == 20
+    assert "--probe tells more" in done.stdout
+
+
+@pytest.mark.parametrize(("arguments", "bound_s"), [(["list-tasks"], 0.35), (["--help"], 0.25)])
+def test_light_commands_are_fast_with_twenty_plugins(plugins, spec, cli, arguments, bound_s):
+    for number in range(20):
+        plugins(f"plug{number}", spec)
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        assert cli(*arguments).returncode == 0
+        times.append(time.perf_counter() - start)
+    assert min(times) < 3 * bound_s
+
+
+def test_a_pattern_shows_only_names_and_summaries_that_contain_it(cli):
+    assert list(rows(cli("list-tasks", "DIRECT", "--json"))) == ["cartpole-direct"]
+    assert rows(cli("list-tasks", "no such thing", "--json")) == {}
+
+
+def test_shared_names_are_shown_with_their_distribution(plugins, spec, cli):
+    plugins("a", spec, task="walk")
+    plugins("b", spec, task="walk")
+    done = cli("list-tasks")
+    assert "a:walk" in done.stdout
+    assert "b:walk" in done.stdout
+
+
+def test_an_unreadable_distribution_is_a_warning_and_a_row_of_the_document(plugins, cli):
+    plugins("bad", entry_points="[rlcli.tasks]\nnonsense\n")
+    done = cli("list-tasks", "--json")
+    assert "bad-1.0.dist-info" in done.stderr
+    assert json.loads(done.stdout)["broken"][0]["distribution"] == "bad-1.0.dist-info"
+    assert "cartpole" in rows(done)
+
+
+def test_probing_fills_the_cache_and_reports_broken_tasks_as_rows(plugins, spec, cli):
+    plugins("good", "print('hello')\n" + spec, files={"task.yaml": TASK.format(summary="Slide."), "model.xml": MODEL})
+    plugins("exits", "import sys\nsys.exit(3)\n")
+    plugins("crashes", "import os\nos._exit(7)\n")
+    plugins("killed", "import os, signal\nos.kill(os.getpid(), signal.SIGKILL)\n")
+    plugins("raises", "raise ValueError('out of cheese')\n")
+    plugins("invalid", spec, files={"task.yaml": "decimation: -2\n"})
+    assert rows(cli("list-tasks", "--json"))["good-task"]["workflow"] is None
+    found = rows(cli("list-tasks", "task", "--probe", "--json"))
+    good = found["good-task"]
+    assert (good["summary"], good["workflow"], good["num_envs"]) == ("Slide.", "managed", 5)
+    assert (good["observation_size"], good["action_size"], good["agent"], good["broken"]) == (2, 1, None, None)
+    assert "SystemExit: 3" in found["exits-task"]["broken"]
+    assert found["crashes-task"]["broken"] == "exit 7"
+    assert found["killed-task"]["broken"] == "crashed (signal 9)"
+    assert "out of cheese" in found["raises-task"]["broken"]
+    assert "decimation: expected a whole number >= 1" in found["invalid-task"]["broken"]
+    again = rows(cli("list-tasks", "--json"))
+    assert {name: again[name] for name in found} == found
+    assert "broken: exit 7" in cli("list-tasks").stdout
+
+
+def test_a_task_that_hangs_is_given_up(plugins, cli):
+    plugins("hangs", "import time\ntime.sleep(600)\n")
+    found = rows(cli("list-tasks", "hangs", "--probe", "--probe-timeout", "1.5", "--json"))
+    assert found["hangs-task"]["broken"] == "did not load within 1.5 s"
+
+
+def test_a_new_version_of_a_plugin_is_probed_anew(plugins, spec, tmp_path):
+    import os
+
+    from rlcli.probe import _key
+    from rlcli.registry import catalog
+
+    plugins("good", spec)
+    entry = next(e for e in catalog()[0] if e.name == "good-task")
+    before = _key(entry)
+    assert _key(entry) == before
+    os.utime(tmp_path / "site" / "good-1.0.dist-info" / "RECORD", ns=(1, 1))
+    assert _key(entry) != before
+
+
+def test_a_plugin_may_ship_its_details(plugins, spec, cli):
+    index = json.dumps({"good-task": {"summary": "Shipped.", "workflow": "direct", "observation_size": 3}})
+    plugins("good", spec, files={"index.json": index})
+    row = rows(cli("list-tasks", "--json"))["good-task"]
+    assert (row["summary"], row["observation_size"], row["action_size"]) == ("Shipped.", 3, None)
+
+
+@pytest.mark.parametrize(
+    "index",
+    ["", "[]", "{", '{"good-task": 3}', '{"good-task": {"summary": ["x"]}}', '{"good-task": {"num_envs": "x"}}'],
+)
+def test_details_that_are_not_details_are_left_out(plugins, spec, cli, index, tmp_path):
+    plugins("good", spec, files={"index.json": index})
+    (tmp_path / "cache" / "rlcli").mkdir(parents=True)
+    (tmp_path / "cache" / "rlcli" / "tasks.json").write_text(index)
+    done = cli("list-tasks")
+    assert done.returncode == 0
+    assert "good-task" in done.stdout
+
+
+def test_a_plugin_that_prints_does_not_spoil_the_document(plugins, spec, cli):
+    plugins(
+        "loud",
+        "print('hello')\nimport sys; sys.stdout.write('again')\n" + spec,
+        files={"task.yaml": TASK.format(summary="x"), "model.xml": MODEL},
+    )
+    done = cli("show", "loud-task", "--json")
+    assert json.loads(done.stdout)["config"]["summary"] == "x"
+    assert "hello" in done.stderr
+
+
+@pytest.mark.parametrize("source", ["import sys\nsys.exit(0)\n", "def f(:\n", "import no_such_module\n", "SPEC = 3\n"])
+def test_a_broken_plugin_exits_with_4_and_no_traceback(plugins, cli, source):
+    plugins("odd", source)
+    done = cli("show", "odd-task", "--json")
+    error = json.loads(done.stdout)["error"]
+    assert (done.returncode, error["exit_code"], error["kind"]) == (4, 4, "task")
+    assert "plugin odd 1.0 is broken" in error["message"]
+    assert "Traceback" not in done.stderr
+    assert cli("show", "cartpole").returncode == 0
