@@ -43,7 +43,8 @@ def test_a_run_holds_what_the_page_of_names_says(cli, only_run):
 
 
 def test_metrics_have_rsl_rls_names_and_a_line_an_iteration(cli, only_run):
-    cli("train", "cartpole", "scene.num_envs=32", "episode_length_s=0.3", "--max-iterations", 3, "-q")
+    overrides = ("scene.num_envs=32", "episode_length_s=0.3", "agent.torch_threads=1")
+    cli("train", "cartpole", *overrides, "--max-iterations", 3, "-q")
     rows = [json.loads(line) for line in (only_run() / "metrics.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in rows] == [1, 2, 3]
     assert [row["step"] for row in rows] == [512, 1024, 1536]
@@ -215,7 +216,7 @@ def test_a_mistake_leaves_no_run_behind(cli, extra, code):
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
 @pytest.mark.parametrize("envs", [1, 7, pytest.param(4096, marks=pytest.mark.slow)])
 def test_any_number_of_environments_trains(cli, task, envs):
-    done = cli("train", task, f"scene.num_envs={envs}", "--max-iterations", 2, "--json", "-q")
+    done = cli("train", task, *SMALL, f"scene.num_envs={envs}", "--max-iterations", 2, "--json")
     assert done.code == 0, done.err
     assert done.json["step"] == 2 * 16 * envs
 
