@@ -53,7 +53,10 @@ def _root(
 @functools.cache
 def build() -> typer.Typer:
     """The app with every command registered; command modules import nothing heavy."""
+    registered = {command.name for command in app.registered_commands}
     for name, module in COMMANDS.items():
+        if name in registered:
+            continue
         command = importlib.import_module(f"rlcli.cli.{module}").command
         app.command(name, context_settings=_SETTINGS)(command)
     return app

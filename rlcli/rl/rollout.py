@@ -11,8 +11,11 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.vec_env import StepResult, VecEnv
+from rlcli.errors import ConfigError
 
 Act = Callable[[Tensor], Tensor]
+PATIENCE = 10
+"""Episode lengths after which an evaluation gives an episode up."""
 
 
 @dataclass(slots=True)
@@ -48,6 +51,9 @@ def evaluate(
     """Run exactly `episodes` episodes: how many each environment contributes is fixed beforehand.
 
     Counting the first episodes to finish anywhere would favour short ones.
+
+    Raises:
+        ConfigError: if episodes go on and on because the task has no time-out.
     """
     quota = torch.full((env.num_envs,), episodes // env.num_envs)
     quota[: episodes % env.num_envs] += 1
@@ -56,6 +62,7 @@ def evaluate(
     obs = env.reset(seed=env.seed)["policy"]
     with torch.no_grad():
         while bool((quota > 0).any()):
+            _require_end(env)
             step = env.step(act(obs))
             obs = step.obs["policy"]
             on_step(step)
@@ -86,7 +93,16 @@ def proportion(hits: int, count: int) -> dict[str, float]:
     share = hits / count
     middle = (share + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-    return {"rate": share, "low": max(0.0, middle - half), "high": min(1.0, middle + half)}
+    # at the ends the formula gives 0 and 1 but for rounding
+    return {"rate": share, "low": middle - half if hits else 0.0, "high": middle + half if hits < count else 1.0}
+
+
+def _require_end(env: VecEnv) -> None:
+    longest = int(env.episode_length_buf.max())
+    if longest > PATIENCE * env.max_episode_length:
+        message = f"an episode has lasted {longest} steps, {PATIENCE} times episode_length_s, and has not ended"
+        hint = "add a termination with time_out: true"
+        raise ConfigError([env.resolved.problem(("terminations",), message, hint)])
 
 
 def _take(result: Evaluation, step: StepResult, quota: Tensor) -> None:

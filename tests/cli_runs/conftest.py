@@ -14,7 +14,7 @@ from rlcli.cli.app import main
 
 MODEL = """
 <mujoco><worldbody><body name="block">
-  <joint name="slide" type="slide"/><geom type="box" size="0.3 0.3 0.3" mass="1" rgba="0.9 0.2 0.1 1"/>
+  <joint name="slide" type="slide"/><geom type="box" size="0.3 0.3 0.3" mass="1" contype="0" conaffinity="0"/>
 </body></worldbody></mujoco>
 """
 COIN = """

@@ -43,7 +43,8 @@ def test_a_run_holds_what_the_page_of_names_says(cli, only_run):
 
 
 def test_metrics_have_rsl_rls_names_and_a_line_an_iteration(cli, only_run):
-    cli("train", "cartpole", "scene.num_envs=32", "episode_length_s=0.3", "--max-iterations", 3, "-q")
+    overrides = ("scene.num_envs=32", "episode_length_s=0.3", "agent.torch_threads=1")
+    cli("train", "cartpole", *overrides, "--max-iterations", 3, "-q")
     rows = [json.loads(line) for line in (only_run() / "metrics.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in rows] == [1, 2, 3]
     assert [row["step"] for row in rows] == [512, 1024, 1536]
@@ -215,7 +216,7 @@ def test_a_mistake_leaves_no_run_behind(cli, extra, code):
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
 @pytest.mark.parametrize("envs", [1, 7, pytest.param(4096, marks=pytest.mark.slow)])
 def test_any_number_of_environments_trains(cli, task, envs):
-    done = cli("train", task, f"scene.num_envs={envs}", "--max-iterations", 2, "--json", "-q")
+    done = cli("train", task, *SMALL, f"scene.num_envs={envs}", "--max-iterations", 2, "--json")
     assert done.code == 0, done.err
     assert done.json["step"] == 2 * 16 * envs
 
@@ -239,6 +240,39 @@ def test_a_number_in_any_notation_survives_the_run(cli, only_run, rate):
     assert cli("train", "cartpole", *SMALL, "--max-iterations", 1, f"agent.ent_coef={rate}", "--json").code in (0, 6)
     assert cli("eval", "--checkpoint", "latest", "--episodes", 1, "-q").code == 0
     assert cli("train", "--resume", "latest", "-q").code in (0, 6)
+
+
+def test_a_simulation_that_diverges_stops_the_run(cli, only_run):
+    done = cli("train", "cartpole-direct", *SMALL, "params.max_effort=1e30", "--max-iterations", 3)
+    assert done.code == 6, done.err
+    assert "diverged" in done.err
+    assert "hint: " in done.err
+    assert (only_run() / "checkpoints/000000000000/manifest.json").is_file()
+
+
+def test_the_runs_folder_comes_from_the_environment_and_the_flag_wins(cli, monkeypatch):
+    monkeypatch.setenv("RLCLI_RUNS_DIR", "mine")
+    cli("train", "cartpole", *SMALL, "--max-iterations", 1)
+    cli("train", "cartpole", *SMALL, "--max-iterations", 1, "--runs-dir", "given")
+    assert len(list(Path("mine/cartpole").iterdir())) == len(list(Path("given/cartpole").iterdir())) == 1
+    assert not Path("runs").exists()
+    assert cli("eval", "--checkpoint", "latest", "--episodes", 1, "--json").json["checkpoint"].startswith("mine/")
+
+
+def test_a_folder_task_trains_and_resumes(cli, coin, weights):
+    for runs, budget in (("two", 2), ("one", 1)):
+        assert cli("train", coin, *SMALL, "--max-iterations", budget, "--runs-dir", runs).code == 0
+    assert cli("train", coin, "--resume", "latest", "--runs-dir", "one", "--max-iterations", 2, "-q").code == 0
+    assert weights(next(Path("one").glob("*/*"))) == weights(next(Path("two").glob("*/*")))
+
+
+def test_a_task_without_agents_cannot_be_trained(cli, coin):
+    file = Path("coin/task.yaml")
+    file.write_text(file.read_text().partition("agents:")[0])
+    done = cli("train", coin)
+    assert done.code == 3
+    assert "no agent" in done.err
+    assert cli("eval", coin, "--policy", "random", "--episodes", 2, "-q").code == 0
 
 
 def test_a_run_being_written_to_is_left_alone(cli, only_run):

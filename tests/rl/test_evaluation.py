@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from rlcli.errors import ConfigError
 from rlcli.rl.rollout import evaluate, proportion, random_policy, zero_policy
 from rlcli.rl.statistics import EpisodeStatistics
 
@@ -48,8 +49,17 @@ def test_the_interval_of_a_share_is_wilsons(hits, count, low, high):
 
 
 def test_the_interval_of_certainty_ends_at_one():
-    assert proportion(20, 20)["high"] == pytest.approx(1.0)
+    assert proportion(20, 20)["high"] == 1.0
+    assert proportion(0, 20)["low"] == 0.0
     assert proportion(20, 20)["low"] == pytest.approx(1 - 0.1611, abs=5e-5)
+
+
+def test_episodes_that_never_end_are_a_configuration_error(make):
+    env, _ = make("cartpole", "scene.num_envs=2", "episode_length_s=0.1", "terminations.time_out=null",
+                  "terminations.cart_out_of_bounds=null")  # fmt: skip
+    with pytest.raises(ConfigError, match="has not ended") as caught:
+        evaluate(env, zero_policy(env), 2)
+    assert "time_out: true" in str(caught.value)
 
 
 def test_random_actions_fill_the_bound_and_repeat_with_the_seed(make, scheduled):
