@@ -139,7 +139,6 @@ class Scene:
                     setattr(self.spec.option, option, getattr(child.option, option))
         for key in list(child.keys):
             child.delete(key)  # keyframes of one entity have the wrong size in a scene of several
-        _name_all(child)
         self.spec.memory = max(self.spec.memory, child.memory)
         quat = np.asarray(entity.quat) / np.linalg.norm(entity.quat)
         frame = self.spec.worldbody.add_frame(pos=entity.pos, quat=quat)
@@ -252,15 +251,6 @@ class Scene:
                 name="distant", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, dir=lights.distant.direction,
                 pos=[0, 0, 20], diffuse=[strength * c for c in lights.distant.color], castshadow=True,
             )  # fmt: skip
-
-
-def _name_all(spec: mujoco.MjSpec) -> None:
-    """Name what the MJCF leaves unnamed: an entity's elements are found by their names."""
-    for kind, elements in (("body", spec.bodies), ("joint", spec.joints)):
-        taken = {element.name for element in elements}
-        for number, element in enumerate(elements):
-            if not element.name:
-                element.name = next(n for n in (f"{kind}{number}", f"unnamed_{kind}{number}") if n not in taken)
 
 
 def joint_settings(entity: EntityConfig, joint: str) -> JointConfig:
