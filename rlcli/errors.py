@@ -51,7 +51,7 @@ class ConfigError(RlcliError):
     kind = "config"
 
     def __init__(self, problems: Iterable[Problem]) -> None:
-        self.problems = sorted(set(problems), key=_by_place)
+        self.problems = sorted(dict.fromkeys(problems), key=_by_place)
         super().__init__("\n".join(str(problem) for problem in self.problems))
 
 

@@ -29,7 +29,7 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _text(dumper: _Dumper, value: str) -> yaml.Node:
-    style = '"' if "\n" in value else None  # on one line, with escapes
+    style = '"' if len(value.splitlines()) > 1 or value[-1:].isspace() else None  # on one line, with escapes
     return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
 
 
@@ -116,13 +116,18 @@ def _annotate(value: Any, path: Path, resolved: Resolved, lines: list[str]) -> N
     indent = "  " * len(path)
     for key, item in value.items():
         below = (*path, key)
-        name = to_yaml({key: 0}).rpartition(":")[0]
         if isinstance(item, dict) and item:
-            lines.append(f"{indent}{name}:")
+            lines.append(f"{indent}{_inline(key)}:")
             _annotate(item, below, resolved, lines)
         else:
-            text = yaml.dump({key: item}, Dumper=_Dumper, default_flow_style=True, width=10**6).strip()[1:-1]
-            lines.append(f"{indent}{text}".ljust(60) + f"  # {_origin(resolved, below)}")
+            text = f"{indent}{_inline(key)}: {_inline(item)}"
+            lines.append(f"{text.ljust(60)}  # {_origin(resolved, below)}")
+
+
+def _inline(value: Any) -> str:
+    """A value on one line, to stand anywhere in YAML."""
+    text = yaml.dump((value,), Dumper=_Dumper, default_flow_style=True, width=10**6, allow_unicode=True)
+    return text.strip()[1:-1]
 
 
 def _leaves(value: Any, path: Path = ()) -> list[Path]:

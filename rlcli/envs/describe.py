@@ -44,7 +44,8 @@ def main(arguments: list[str]) -> None:
     try:
         details = describe(arguments[0])
     except RlcliError as error:
-        details = Details(broken=" ".join(error.message.split())[:200])
+        first, *more = error.message.splitlines()
+        details = Details(broken=f"{first[:200]} (and {len(more)} more)" if more else first[:200])
     sys.stdout.write("\n" + json.dumps(details.record()) + "\n")
 
 

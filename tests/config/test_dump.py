@@ -92,10 +92,12 @@ def test_a_built_in_task_reads_back_as_the_same_configuration(name, play, tmp_pa
         assert to_data(again) == to_data(first)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(summary=_TEXT, weight=st.floats(-1e30, 1e30), joint=_TEXT.filter(bool))
 @example(summary="on", weight=1e-05, joint="1e-3")
 @example(summary="", weight=1e22, joint="null")
+@example(summary="two\nlines", weight=1.0, joint="a\nb: c")
+@example(summary="?", weight=1.0, joint="a joint with a long name " * 8)
 def test_any_values_read_back(tmp_path_factory, summary, weight, joint):
     from rlcli.registry import folder_task
 

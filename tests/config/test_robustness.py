@@ -75,14 +75,14 @@ def test_mutated_tasks_give_a_configuration_or_problems(name, tmp_path):
         (tmp_path / "task.py").write_text(source.task_file.read_text().replace("CartpoleTask", "Task"))
     folder = folder_task(tmp_path)
     accepted = 0
-    for _ in range(250):
+    for _ in range(100):
         data = copy.deepcopy(original)
         mutate(data, draw)
         folder.config.write_text(to_yaml(data), encoding="utf-8")
         problems = problems_of(folder, play=draw.random() < 0.5)
         assert all(str(folder.config) in problem.where for problem in problems or []), problems
         accepted += problems is None
-    assert 0 < accepted < 250
+    assert 0 < accepted < 100
 
 
 def test_any_override_gives_a_configuration_or_problems():
@@ -91,9 +91,9 @@ def test_any_override_gives_a_configuration_or_problems():
     original = strict_yaml.load(source.config.read_bytes()).data
     paths = [p for p in nodes(original) if p]
     refused = 0
-    for _ in range(150):
+    for _ in range(80):
         path = draw.choice(paths)
         path = (*path[: draw.randint(1, len(path))], *draw.choices(["x", 0, "func"], k=draw.randint(0, 1)))
         value = to_yaml({"v": draw.choice(VALUES)}).strip().removeprefix("v:").strip()
         refused += problems_of(source, overrides=[f"{'.'.join(map(str, path))}={value}"]) is not None
-    assert 0 < refused < 150
+    assert 0 < refused < 80
