@@ -215,7 +215,7 @@ def test_validate_deep_says_what_is_wrong_with_a_model(in_process, small, model,
 
 def test_validate_deep_finds_elements_that_the_model_leaves_unnamed(in_process, small):
     bare = "<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body></worldbody></mujoco>"
-    assert in_process("validate", small(("[slider]", "[joint0]"), model=bare), "--deep")[0] == 0
+    assert in_process("validate", small(("[slider]", "[joint_0]"), model=bare), "--deep")[0] == 0
 
 
 def test_validate_deep_of_terms_that_do_not_import_is_a_broken_task(in_process, small):
