@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, PositiveFloat, PositiveInt, ValidationError, model_validator
 from torch import Tensor, nn
 
 from rlcli.errors import CheckpointError
@@ -27,12 +27,18 @@ class PolicySpec(BaseModel):
 
     kind: Literal["gaussian-mlp", "squashed-gaussian-mlp", "deterministic-mlp"] = "gaussian-mlp"
     group: str = "policy"
-    observation_size: int
-    action_size: int
-    hidden: list[int]
+    observation_size: PositiveInt
+    action_size: PositiveInt
+    hidden: list[PositiveInt]
     activation: Literal["elu", "relu", "tanh", "silu"]
-    action_bound: float | None
+    action_bound: PositiveFloat | None
     normalize: bool = False
+
+    @model_validator(mode="after")
+    def _bounded(self) -> PolicySpec:
+        if self.kind != "gaussian-mlp" and self.action_bound is None:
+            raise ValueError(f"a {self.kind} needs an action_bound")
+        return self
 
 
 class Normalizer(nn.Module):
@@ -143,9 +149,10 @@ def load_policy(spec: Mapping[str, object], weights: Mapping[str, Tensor]) -> Po
             "policy.safetensors does not fit policy.json: "
             + ", ".join(f"{n} is {found.get(n, 'missing')}, expected {expected.get(n, 'nothing')}" for n in differs[:4])
         )
+    kinds = {name: value.dtype for name, value in policy.state_dict().items()}
     for name, value in weights.items():
-        if value.dtype != torch.float32:
-            raise CheckpointError(f"policy.safetensors: '{name}' is {value.dtype}, expected torch.float32")
+        if value.dtype != kinds[name]:
+            raise CheckpointError(f"policy.safetensors: '{name}' is {value.dtype}, expected {kinds[name]}")
         if not bool(value.isfinite().all()):
             raise CheckpointError(f"policy.safetensors: '{name}' holds values that are not finite")
     policy.load_state_dict(dict(weights), assign=True)

@@ -129,9 +129,6 @@ class Scene:
                 SceneProblem((*path, "model"), f"'{entity.model}' is not a valid MJCF: {_one_line(error)}")
             )
             return
-        if len(child.bodies) < 2:
-            self.problems.append(SceneProblem((*path, "model"), f"'{entity.model}' has no body below its worldbody"))
-            return
         _name_all(child)
         if name == next(iter(self.config.entities)):
             for option in _OPTIONS:
