@@ -13,6 +13,7 @@ import typer
 from typer._click.exceptions import ClickException, NoArgsIsHelpError, UsageError
 
 from rlcli.cli.console import console, discard
+from rlcli.cli.options import CHOOSE
 from rlcli.errors import ConfigError, RlcliError
 
 COMMANDS = {
@@ -66,13 +67,23 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
-    code = _run(arguments)
+    code = _run(_with_values(arguments))
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
     except OSError:
         discard(sys.stdout)
     return code
+
+
+def _with_values(arguments: list[str]) -> list[str]:
+    """`--video` may stand without its FILE: the parser knows no optional values, so the word for "choose" is put in."""
+    filled = []
+    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        filled.append(word)
+        if word == "--video" and (not following or following.startswith("-") or "=" in following):
+            filled.append(CHOOSE)
+    return filled
 
 
 def _run(arguments: list[str]) -> int:

@@ -8,6 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
+CHOOSE = "auto"
+"""Stands for a value that an option may leave out (`--video`)."""
+
 Overrides = Annotated[
     list[str] | None,
     typer.Argument(metavar="[KEY.PATH=VALUE]...", help="Overrides; agent.x=... addresses the chosen agent."),

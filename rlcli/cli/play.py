@@ -9,6 +9,7 @@ import typer
 
 from rlcli.cli.console import console
 from rlcli.cli.options import (
+    CHOOSE,
     CheckpointRef,
     ConfigFile,
     Debug,
@@ -22,6 +23,8 @@ from rlcli.cli.options import (
     draw_seed,
 )
 
+_FALLBACK_VIDEO = Path("play.mp4")
+
 
 def command(
     task: Annotated[
@@ -31,7 +34,10 @@ def command(
     checkpoint: CheckpointRef = None,
     policy: Annotated[str, typer.Option("--policy", help="trained, zero or random.")] = "trained",
     video: Annotated[
-        Path | None, typer.Option("--video", help="Write one episode to FILE.mp4 or FILE.gif, offscreen.")
+        Path | None,
+        typer.Option(
+            "--video", help="Write one episode to FILE.mp4 or FILE.gif, offscreen; without FILE into the run."
+        ),
     ] = None,
     viewer: Annotated[str, typer.Option("--viewer", help="auto, native or none.")] = "auto",
     stochastic: Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")] = False,
@@ -55,7 +61,7 @@ def command(
     if video is not None:
         from rlcli.viewer.writer import check_video
 
-        check_video(video)
+        check_video(_FALLBACK_VIDEO if str(video) == CHOOSE else video)
     window = video is None and _window(viewer, headless)
     session = open_session(
         task,
@@ -69,13 +75,20 @@ def command(
         runs_dir=runs_dir,
     )
     if video is not None:
-        _video(session, video)
+        _video(session, _default_video(session) if str(video) == CHOOSE else video)
     elif window:
         from rlcli.viewer.native import run
 
         run(session.env, session.act)
     else:
         _statistics(session)
+
+
+def _default_video(session: Any) -> Path:
+    """`videos/STEP.mp4` in the run; for a policy without a run, a file in the current folder."""
+    if session.run is None or session.checkpoint is None:
+        return _FALLBACK_VIDEO
+    return session.run.folder / "videos" / f"{session.checkpoint.name}.mp4"
 
 
 def _window(viewer: str, headless: bool) -> bool:

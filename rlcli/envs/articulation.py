@@ -46,6 +46,8 @@ class ArticulationView:
         self._entity: Entity = env.entities[self.entity_name]
         engine = env.engine
         self._qpos, self._ctrl = engine.field("qpos"), engine.field("ctrl")
+        driven = {joint for joint, _ in self._entity.actuators_of("motor")}
+        self._without_motor = [j for j in range(len(self._entity.joint_names)) if j not in driven]
         self._actuators = {kind: _actuator_columns(self._entity, kind) for kind in ("motor", "position", "velocity")}
 
     @property
@@ -107,7 +109,15 @@ class ArticulationView:
         self._command("velocity", velocities, indices)
 
     def set_joint_efforts(self, efforts: Tensor, indices: Tensor | None = None) -> None:
-        """Forces of the joints' motors until set again, under each motor's limit. (n, num_dof) [N or N m]"""
+        """Forces of the joints' motors until set again, under each motor's limit. (n, num_dof) [N or N m]
+
+        Raises:
+            TaskError: for an effort on a joint that only has an actuator of another kind.
+        """
+        if len(self._without_motor) and bool(efforts[:, self._without_motor].any()):
+            names = listing(self._entity.joint_names[j] for j in self._without_motor)
+            hint = "give them `actuator: motor` in scene.entities, or set targets"
+            raise TaskError(f"view '{self.name}': no motor drives {names}", hint=hint)
         self._command("motor", efforts, indices)
 
     def set_joint_position_targets(self, positions: Tensor, indices: Tensor | None = None) -> None:

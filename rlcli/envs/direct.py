@@ -60,7 +60,7 @@ class DirectTask:
         self.progress_buf = torch.zeros(n, dtype=torch.int64, device=self.device)
         """Steps of the running episode. (num_envs,) int64"""
         self.extras: dict[str, Any] = {}
-        """Numbers and (num_envs,) tensors to log, by name."""
+        """Numbers and tensors to log, by name: `Task/<name>` in the metrics is their mean at the end of an iteration."""
 
     def set_up_scene(self, scene: Scene) -> None:
         """Register views with `scene.add`; `scene.spec` is the MjSpec, still open."""
@@ -158,6 +158,16 @@ class DirectEnv(VecEnv):
             self.physics_dt,
             self.config.decimation,
         )
+
+    def extras(self) -> dict[str, float]:
+        """The task's `extras`: numbers, and means of tensors."""
+        found = {}
+        for name, value in self.task.extras.items():
+            if isinstance(value, Tensor) and value.numel():
+                found[name] = float(value.float().mean())
+            elif isinstance(value, int | float):
+                found[name] = float(value)
+        return found
 
     def _start_over(self) -> None:
         self._observed = False

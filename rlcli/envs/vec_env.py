@@ -212,6 +212,10 @@ class VecEnv(ABC):
         """Pause or go on."""
         self._playing = not paused
 
+    def extras(self) -> dict[str, float]:
+        """Further numbers that the task wants logged, by name; as of the last step."""
+        return {}
+
     def close(self) -> None:
         """Let go of the engine."""
         self.engine.close()

@@ -131,7 +131,8 @@ class Sb3Trainer:
             "policy": collected - begin - step,
             "update": updated - collected,
         }
-        return Report({**self.statistics.flush(), **metrics}, seconds)
+        task = {f"Task/{name}": value for name, value in self.env.extras().items() if math.isfinite(value)}
+        return Report({**self.statistics.flush(), **task, **metrics}, seconds)
 
     def policy(self) -> Policy:
         """The deployable policy as it is now, with weights of its own."""
@@ -248,7 +249,7 @@ class Sb3Trainer:
                 raise DivergedError(f"weight '{name}' is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
 
     def _decay(self) -> None:
-        if getattr(self.config, "schedule", "constant") == "linear":
+        if self.config.schedule == "linear":
             done = Budget(self.config.max_iterations, self.config.max_steps).share(self)
             self._set_learning_rate(self.config.learning_rate * max(0.0, 1.0 - done))
 

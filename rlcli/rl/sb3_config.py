@@ -30,6 +30,8 @@ class Sb3Config(AgentConfig):
 
     learning_rate: Positive = 3e-4
     """Step size of the optimiser."""
+    schedule: Literal["constant", "linear", "adaptive"] = "constant"
+    """How the learning rate moves: linear goes to 0 over the budget; adaptive (PPO only) follows desired_kl."""
     gamma: Discount = 0.99
     """Discount."""
     reward_scale: Positive = 1.0
@@ -45,8 +47,6 @@ class OnPolicyConfig(Sb3Config):
 
     n_steps: Count = 16
     """Steps an environment and iteration."""
-    schedule: Literal["constant", "linear", "adaptive"] = "constant"
-    """How the learning rate moves: linear goes to 0 over the budget; adaptive (PPO) follows desired_kl."""
     gae_lambda: Discount = 0.95
     """Lambda of generalised advantage estimation."""
     normalize_advantage: bool = True
@@ -102,6 +102,8 @@ class A2cConfig(OnPolicyConfig):
 class OffPolicyConfig(Sb3Config):
     """SAC, TD3 and DDPG. An iteration is `train_freq` steps of every environment, then `gradient_steps` updates."""
 
+    schedule: Literal["constant", "linear"] = "constant"
+    """How the learning rate moves: linear goes to 0 over the budget."""
     action_bound: Positive = 1.0
     """Actions are tanh times this; an off-policy algorithm needs a bound."""
     train_freq: Count = 16
