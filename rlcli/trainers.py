@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,8 +14,10 @@ class TrainerSpec:
         summary: one line.
         algorithms: algorithm name -> `module:Model`, the pydantic model of its settings (an `AgentConfig`).
         trainer: `module:Class` of a `Trainer`, called as `Class(env, config, seed=, device=, torch_threads=)`.
+        refused: algorithms that the library has and this trainer cannot run -> why.
     """
 
     summary: str
     algorithms: Mapping[str, str]
     trainer: str
+    refused: Mapping[str, str] = field(default_factory=dict)

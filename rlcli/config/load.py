@@ -322,6 +322,10 @@ class _Check:
         if not isinstance(algorithm, str):
             return spec, _AnyAgent
         if algorithm not in spec.algorithms:
+            if algorithm in spec.refused:
+                reason = f"trainer '{name}' cannot run '{algorithm}': {spec.refused[algorithm]}"
+                self.problem((*at, "algorithm"), reason, f"algorithms: {listing(spec.algorithms)}")
+                return spec, _AnyAgent
             near = did_you_mean(algorithm, spec.algorithms) or f"algorithms: {listing(spec.algorithms)}"
             self.problem((*at, "algorithm"), f"trainer '{name}' has no algorithm '{algorithm}'", near)
             return spec, _AnyAgent

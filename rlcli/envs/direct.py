@@ -60,7 +60,7 @@ class DirectTask:
         self.progress_buf = torch.zeros(n, dtype=torch.int64, device=self.device)
         """Steps of the running episode. (num_envs,) int64"""
         self.extras: dict[str, Any] = {}
-        """Numbers and tensors to log, by name: `Task/<name>` in the metrics is their mean at the end of an iteration."""
+        """Numbers and tensors to log, by name: `Task/<name>` in the metrics is their mean, once an iteration."""
 
     def set_up_scene(self, scene: Scene) -> None:
         """Register views with `scene.add`; `scene.spec` is the MjSpec, still open."""

@@ -171,4 +171,8 @@ SPEC = TrainerSpec(
         "ddpg": "rlcli.rl.sb3_config:DdpgConfig",
     },
     trainer="rlcli.rl.sb3:Sb3Trainer",
+    refused={
+        "dqn": "it needs discrete actions, and tasks have continuous ones",
+        "her": "it needs goals as observations, and tasks have vectors",
+    },
 )
