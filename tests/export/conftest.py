@@ -56,7 +56,14 @@ agents:
     {trainer: sb3, algorithm: ppo, max_iterations: 1, n_steps: 4, num_minibatches: 1, action_bound: 0.8,
      torch_threads: 1, policy: {hidden: [8], activation: tanh}}
 """
-SHORT = ("--num-envs", "8", "--max-iterations", "2", "--logger", "none", "-q")
+SAC = """
+agents:
+  sac:
+    {trainer: sb3, algorithm: sac, max_iterations: 4, train_freq: 4, learning_starts: 64, gradient_steps: 2,
+     batch_size: 32, buffer_size: 1000, normalize_observations: NORMALIZE, torch_threads: 1,
+     policy: {hidden: [16, 16], activation: relu}}
+"""
+SHORT = ("--num-envs", "32", "--max-iterations", "4", "--logger", "none", "-q")
 
 
 @pytest.fixture(autouse=True)
@@ -69,18 +76,30 @@ def _one_torch_thread():
 
 @pytest.fixture(scope="session")
 def runs(tmp_path_factory) -> Path:
-    """A runs folder with a short run of each built-in cartpole and of the arm."""
+    """A runs folder with short runs: PPO and SAC of each built-in cartpole, one SAC normalised, and the arm."""
     folder = tmp_path_factory.mktemp("trained")
     arm = folder / "arm"
     arm.mkdir()
     (arm / "task.yaml").write_text(YAML)
     (arm / "arm.xml").write_text(ARM)
-    for task in ("cartpole", "cartpole-direct", str(arm)):
-        assert main(["train", task, *SHORT, "--runs-dir", str(folder / "runs")]) == 0
+    to = ("--runs-dir", str(folder / "runs"))
+    for task, normalize in (("cartpole", "true"), ("cartpole-direct", "false")):
+        config = folder / f"{task}.yaml"
+        config.write_text(SAC.replace("NORMALIZE", normalize))
+        chosen = ("--config", str(config), "--agent", "sac", "--name", "sac")
+        assert main(["train", task, *chosen, *SHORT, *to]) == 0
+        assert main(["train", task, *SHORT, *to]) == 0
+    assert main(["train", str(arm), *SHORT, *to]) == 0
     return folder / "runs"
 
 
 @pytest.fixture
 def newest(runs):
-    """Task -> the folder of the newest checkpoint of its run."""
-    return lambda task: find_checkpoint("latest", runs, task)[1]
+    """A task, or a task and `sac`, -> the folder of the newest checkpoint of its run."""
+
+    def find(label):
+        task, _, name = label.partition(" ")
+        run = max(folder for folder in (runs / task).iterdir() if folder.name.endswith("-sac") == (name == "sac"))
+        return find_checkpoint(str(run), runs)[1]
+
+    return find

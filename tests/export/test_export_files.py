@@ -18,9 +18,10 @@ from rlcli.rl import export as module
 from rlcli.rl.checkpoint import open_checkpoint
 from rlcli.rl.export import export
 from rlcli.rl.load import policy_of, resolve_run
-from rlcli.rl.run import find_run
+from rlcli.rl.run import find_run, open_run
 
-BOTH = ["cartpole", "cartpole-direct"]
+TASKS = ["cartpole", "cartpole-direct"]
+POLICIES = [*TASKS, "cartpole sac", "cartpole-direct sac"]
 
 
 @pytest.fixture
@@ -58,7 +59,7 @@ def thousand(newest, task):
 
 @pytest.mark.parametrize("batch", [1, 7])
 @pytest.mark.parametrize("format_", ["onnx", "torch"])
-@pytest.mark.parametrize("task", BOTH)
+@pytest.mark.parametrize("task", POLICIES)
 def test_export_equals_the_policy_on_1000_observations(exported, newest, task, format_, batch):
     policy, run, metadata, _ = exported(task, format_)
     observations = thousand(newest, task)
@@ -150,17 +151,17 @@ def require_shape(value, schema, path="metadata"):
 
 
 @pytest.mark.parametrize("format_", ["onnx", "torch"])
-@pytest.mark.parametrize("task", [*BOTH, "arm"])
+@pytest.mark.parametrize("task", [*POLICIES, "arm"])
 def test_metadata_is_complete_and_fits_the_run(exported, runs, task, format_):
     _, _, metadata, _ = exported(task, format_)
     require_shape(metadata, SCHEMA)
-    run, _ = find_run("latest", runs, task)
-    assert metadata["task"]["name"] == task
-    assert metadata["run"] == run.folder.name
+    run = open_run(runs / task.split()[0] / metadata["run"])
+    assert metadata["task"]["name"] == task.split()[0]
+    assert metadata["agent"] == run.record["agent"]
     assert metadata["seed"] == run.record["seed"]
     assert metadata["step"] == run.record["step"]
     assert metadata["quaternions"] == "wxyz"
-    assert metadata["normalizer"] is False
+    assert metadata["normalizer"] is (task == "cartpole sac")
     assert metadata["versions"]["mujoco"] == run.record["versions"]["mujoco"]
     for terms, width in (
         (metadata["observations"], metadata["input"]["shape"][1]),
@@ -282,8 +283,19 @@ def test_a_failed_export_leaves_the_file_of_the_last_one(newest, tmp_path, monke
     assert [entry.name for entry in tmp_path.iterdir()] == ["policy.onnx"]
 
 
-def test_checkpoint_keeps_observations_of_the_last_rollout(newest):
-    observations = open_checkpoint(newest("cartpole")).tensors("trainer")["observations"]
-    assert observations.shape == (128, 4)  # 16 steps x 8 environments, of which it keeps up to 256
+@pytest.mark.parametrize("task", POLICIES)
+def test_checkpoint_keeps_recent_observations_as_the_environment_gave_them(newest, task):
+    checkpoint = open_checkpoint(newest(task))
+    observations = checkpoint.tensors("trainer")["observations"]
+    assert observations.shape == (160, 4)  # of the reset and of 4 iterations, 32 environments each
     assert observations.dtype == torch.float32
-    assert len(observations.unique(dim=0)) > 100
+    assert len(observations.unique(dim=0)) > 150
+    assert float(observations[-32:, 0].abs().max()) > 0.5  # start positions in metres, not normalised
+
+
+def test_checkpoint_without_recorded_observations_is_checked_on_random_ones(newest, tmp_path, monkeypatch):
+    checkpoint = open_checkpoint(newest("cartpole"))
+    tensors = type(checkpoint).tensors
+    older = lambda self, part: {k: v for k, v in tensors(self, part).items() if k != "observations"}  # noqa: E731
+    monkeypatch.setattr(type(checkpoint), "tensors", older)
+    assert export(checkpoint, tmp_path / "policy.onnx").observations == 512
