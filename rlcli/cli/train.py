@@ -286,7 +286,6 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
     manifest = {
         **{key: run.record[key] for key in ("task", "agent", "seed")},
         "layout": env.layout.record(),
-        "run": run.folder.name,
         "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
     }
     sinks: list[Any] = []

@@ -29,6 +29,7 @@ from rlcli.rl.checkpoint import Checkpoint
 from rlcli.rl.files import sync_folder, write_synced
 from rlcli.rl.load import policy_of
 from rlcli.rl.policy import Policy
+from rlcli.rl.run import RECORD
 
 FORMATS = {"onnx": ".onnx", "torch": ".pt2"}
 """Format -> how its files end."""
@@ -171,7 +172,7 @@ def export(checkpoint: Checkpoint, file: Path, format_: str = "onnx") -> Exporte
 def describe(checkpoint: Checkpoint, policy: Policy, layout: LayoutRecord) -> dict[str, Any]:
     """The metadata: everything that whoever runs the file must know."""
     manifest, spec = checkpoint.manifest, policy.spec
-    task = manifest.get("task") or {}
+    task, run = manifest.get("task") or {}, checkpoint.folder.resolve().parent.parent
     normalized = getattr(policy, "normalizer", None) is not None
     terms = layout.observations[spec.group]
     return {
@@ -223,7 +224,7 @@ def describe(checkpoint: Checkpoint, policy: Policy, layout: LayoutRecord) -> di
         "policy": spec.kind,
         "task": {key: task.get(key) for key in ("name", "distribution", "version")},
         "agent": manifest.get("agent"),
-        "run": manifest.get("run"),
+        "run": run.name if (run / RECORD).is_file() else None,
         "step": checkpoint.step,
         "seed": manifest.get("seed"),
         "versions": {key: (manifest.get("versions") or {}).get(key) for key in ("rlcli", "torch", "mujoco")},

@@ -118,7 +118,9 @@ class Policy(nn.Module):
             return self._bounded(mean)
         noise = torch.randn(mean.shape, generator=generator, device=mean.device)
         log_std = (
-            self.log_std if self.spec.kind == "gaussian-mlp" else self.log_std_head(features).float().clamp(*_LOG_STD_RANGE)
+            self.log_std
+            if self.spec.kind == "gaussian-mlp"
+            else self.log_std_head(features).float().clamp(*_LOG_STD_RANGE)
         )
         return self._bounded(mean + log_std.exp() * noise)
 
