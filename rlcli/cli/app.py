@@ -23,6 +23,7 @@ COMMANDS = {
     "train": "train",
     "play": "play",
     "eval": "eval",
+    "export": "export",
 }
 """Command -> module of `rlcli.cli` that registers it."""
 

@@ -286,7 +286,11 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
     run, agent = job.run, job.resolved.agent
     assert agent is not None
     resume = None if job.resume_from is None else (trainer.iteration, trainer.env_steps)
-    manifest = {**{key: run.record[key] for key in ("task", "agent", "seed")}, "layout": env.layout.record()}
+    manifest = {
+        **{key: run.record[key] for key in ("task", "agent", "seed")},
+        "layout": env.layout.record(),
+        "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
+    }
     sinks: list[Any] = []
 
     def close(state: str) -> None:

@@ -37,6 +37,10 @@ class DirectTask:
     """Columns of states_buf, the critic's view; 0 for none."""
     observation_names: ClassVar[tuple[str, ...]] = ()
     """Names of the columns of obs_buf, for messages and exports."""
+    observation_units: ClassVar[tuple[str, ...]] = ()
+    """Their units."""
+    action_names: ClassVar[tuple[str, ...]] = ()
+    """What the columns of the action drive, for messages and exports."""
     Params: type[StrictModel] = StrictModel
     """Model of the YAML's `params:`."""
 
@@ -145,15 +149,18 @@ class DirectEnv(VecEnv):
 
     def _layout(self) -> Layout:
         task = self.task
-        names = task.observation_names
-        size = task.num_observations
-        terms = tuple(TermLayout(name, 1) for name in names) if len(names) == size else (TermLayout("obs_buf", size),)
+        names, size = task.observation_names, task.num_observations
+        units = task.observation_units if len(task.observation_units) == size else ("",) * size
+        clip, action_clip = _around_zero(self.config.clip_observations), _around_zero(self.config.clip_actions)
+        terms: tuple[TermLayout, ...] = (TermLayout("obs_buf", size, clip=clip),)
+        if len(names) == size:
+            terms = tuple(TermLayout(name, 1, unit=unit, clip=clip) for name, unit in zip(names, units, strict=True))
         groups = {"policy": terms}
         if task.num_states:
-            groups["critic"] = (TermLayout("states_buf", task.num_states),)
+            groups["critic"] = (TermLayout("states_buf", task.num_states, clip=clip),)
         return Layout(
             groups,
-            (TermLayout("actions", task.num_actions),),
+            (TermLayout("actions", task.num_actions, task.action_names, clip=action_clip),),
             self.step_dt,
             self.physics_dt,
             self.config.decimation,
@@ -275,3 +282,7 @@ class DirectEnv(VecEnv):
             else:
                 setattr(owner, name, value.clone())  # the task makes it in a step
         self._observed, self._settled = True, True
+
+
+def _around_zero(bound: float | None) -> tuple[float, float] | None:
+    return None if bound is None else (-bound, bound)

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from dataclasses import replace
 
 from torch import Tensor
 
 from rlcli.config.terms import SELECTORS
 from rlcli.envs.vec_env import Layout, TermLayout, VecEnv
-from rlcli.managers.action import ActionManager
+from rlcli.managers.action import ActionManager, CommandMap
 from rlcli.managers.event import EventManager
 from rlcli.managers.observation import ObservationManager
 from rlcli.managers.reward import RewardManager
+from rlcli.managers.term import BoundTerm
 from rlcli.managers.termination import TerminationManager
 from rlcli.sim.scene import ActuatorNeed, Scene
 from rlcli.sim.selection import Selection
+
+_UNIT = re.compile(r"\[([^\]]+)\]")
+"""The unit in the first line of a term's docstring."""
 
 
 class ManagedEnv(VecEnv):
@@ -44,16 +50,24 @@ class ManagedEnv(VecEnv):
 
     def _layout(self) -> Layout:
         observations = {
-            group: tuple(
-                TermLayout(term.name, size, tuple(next(iter(term.elements.values()), [])))
-                for term, size in self.observation_manager.sizes(group)
-            )
+            group: tuple(self._observation_layout(term, size) for term, size in self.observation_manager.sizes(group))
             for group in self.config.observations
         }
-        actions = tuple(
-            TermLayout(t.name, t.instance.size, t.instance.elements, t.instance.unit) for t in self.action_manager.terms
-        )
+        actions = tuple(_action_layout(term) for term in self.action_manager.terms)
         return Layout(observations, actions, self.step_dt, self.physics_dt, self.config.decimation)
+
+    def _observation_layout(self, term: BoundTerm, size: int) -> TermLayout:
+        signature = self.resolved.vocabulary.find("observations", term.config.func)
+        unit = _UNIT.search(signature.summary) if signature is not None else None
+        scale = term.config.scale  # type: ignore[attr-defined]
+        return TermLayout(
+            term.name,
+            size,
+            tuple(next(iter(term.elements.values()), [])),
+            unit[1] if unit else "",
+            scale=None if scale is None else tuple(scale) if isinstance(scale, list) else (scale,) * size,
+            clip=term.config.clip,  # type: ignore[attr-defined]
+        )
 
     def _act(self, action: Tensor) -> None:
         self.action_manager.process(action)
@@ -135,3 +149,12 @@ class ManagedEnv(VecEnv):
                     ActuatorNeed(config.params["entity"], config.params[joints], kind, ("actions", name, joints))
                 )
         return needs
+
+
+def _action_layout(term: BoundTerm) -> TermLayout:
+    action = term.instance
+    layout = TermLayout(term.name, action.size, action.elements, action.unit)
+    if not hasattr(action, "command_map"):
+        return layout
+    command: CommandMap = action.command_map()
+    return replace(layout, scale=command.scale, clip=command.clip, offset=command.offset, limits=command.limits)

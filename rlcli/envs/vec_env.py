@@ -75,6 +75,14 @@ class TermLayout:
     size: int
     elements: tuple[str, ...] = ()
     unit: str = ""
+    scale: tuple[float, ...] | None = None
+    """Factor of each column; None: not scaled, or (an action) in the task's own way."""
+    clip: tuple[float, float] | None = None
+    """Limits: of an observation before it is scaled, of an action after scale and offset."""
+    offset: tuple[float, ...] | None = None
+    """What is added to each column of an action after scaling."""
+    limits: tuple[tuple[float, float], ...] | None = None
+    """What the actuator of each column of an action can take, infinite where it has no limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,12 +107,23 @@ class Layout:
     def record(self) -> dict[str, Any]:
         """As plain JSON."""
 
-        def terms(items: tuple[TermLayout, ...]) -> list[dict[str, Any]]:
-            return [{"name": t.name, "size": t.size, "elements": list(t.elements), "unit": t.unit} for t in items]
+        def term(t: TermLayout) -> dict[str, Any]:
+            return {
+                "name": t.name,
+                "size": t.size,
+                "elements": list(t.elements),
+                "unit": t.unit,
+                "scale": None if t.scale is None else list(t.scale),
+                "clip": None if t.clip is None else list(t.clip),
+            }
+
+        def action(t: TermLayout) -> dict[str, Any]:
+            limits = [[x if math.isfinite(x) else None for x in pair] for pair in t.limits or ()]
+            return {**term(t), "offset": None if t.offset is None else list(t.offset), "limits": limits or None}
 
         return {
-            "observations": {group: terms(items) for group, items in self.observations.items()},
-            "actions": terms(self.actions),
+            "observations": {group: [term(t) for t in items] for group, items in self.observations.items()},
+            "actions": [action(t) for t in self.actions],
             "step_dt": self.step_dt,
             "dt": self.dt,
             "decimation": self.decimation,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -13,8 +14,26 @@ from rlcli.managers.term import BoundTerm
 from rlcli.sim.selection import Selection
 
 
+@dataclass(frozen=True, slots=True)
+class CommandMap:
+    """How a term turns its columns into commands: raw x scale + offset, then clip, then the actuators' own limits."""
+
+    scale: tuple[float, ...]
+    """One a column."""
+    offset: tuple[float, ...]
+    """One a column, in the command's unit."""
+    clip: tuple[float, float] | None
+    """The term's own limits, in the command's unit."""
+    limits: tuple[tuple[float, float], ...]
+    """What each column's actuator can take, in the command's unit; infinite where it has no limit."""
+
+
 class ActionTerm(Protocol):
-    """An action term is a class `Name(env, *, ...)`."""
+    """An action term is a class `Name(env, *, ...)`.
+
+    A term whose command is a scaled and clipped action says so in a method `command_map() -> CommandMap`; exported
+    policies then contain it.
+    """
 
     size: int
     """Columns of the policy's vector that it takes."""

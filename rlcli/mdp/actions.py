@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
+import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
+from rlcli.managers.action import CommandMap
 from rlcli.sim.entity import as_index
 from rlcli.sim.names import NameProblem
 from rlcli.sim.selection import Columns
@@ -43,12 +48,18 @@ class _JointAction:
         gear = torch.tensor(entity.engine.model.actuator_gear[actuators, 0], dtype=torch.float32)
         self._factor = 1.0 / gear if self.actuator == "motor" else gear
         self._geared = bool((gear != 1.0).any())
+        self._limits = _command_limits(entity.engine.model, actuators, self.actuator)
         self._ctrl = entity.engine.field("ctrl")
         self._columns = as_index(actuators)
         # consecutive controls: a view of the engine's own, made once
         self._target = self._ctrl[:, self._columns] if isinstance(self._columns, slice) else None
         self.command = torch.zeros(env.num_envs, self.size, device=env.device)
         """What reaches the actuators, before their own limits. (num_envs, size)"""
+
+    def command_map(self) -> CommandMap:
+        """What `process` computes, and the limits of the actuators behind it."""
+        offset = self._offset[0].tolist() if isinstance(self._offset, Tensor) else [self._offset] * self.size
+        return CommandMap((self._scale,) * self.size, tuple(offset), self._clip, self._limits)
 
     def process(self, action: Tensor) -> None:
         """Write the controls of this step. (num_envs, size)"""
@@ -105,3 +116,28 @@ class JointPosition(_JointAction):
     ) -> None:
         default = entity.data.default_joint_pos[:, joints] + offset if use_default_offset else offset
         super().__init__(env, entity, joints, scale, default, clip)
+
+
+def _command_limits(model: mujoco.MjModel, actuators: list[int], kind: str) -> tuple[tuple[float, float], ...]:
+    """Commands beyond which each actuator gives no more: its control range, and what bounds a motor's force."""
+    limits = []
+    for a in actuators:
+        gain, gear, joint = model.actuator_gainprm[a, 0], model.actuator_gear[a, 0], model.actuator_trnid[a, 0]
+        low, high = model.actuator_ctrlrange[a] if model.actuator_ctrllimited[a] else (-math.inf, math.inf)
+        if not gain or not gear:
+            low, high = -math.inf, math.inf  # it moves nothing
+        elif kind != "motor":
+            low, high = sorted((low / gear, high / gear))
+        else:
+            if model.actuator_forcelimited[a]:
+                low, high = _overlap((low, high), sorted(model.actuator_forcerange[a] / gain))
+            low, high = sorted((low * gear, high * gear))
+            alone = np.count_nonzero(model.actuator_trnid[:, 0] == joint) == 1
+            if model.jnt_actfrclimited[joint] and alone:
+                low, high = _overlap((low, high), sorted(model.jnt_actfrcrange[joint] / gain))
+        limits.append((float(low), float(high)))
+    return tuple(limits)
+
+
+def _overlap(a: Sequence[float], b: Sequence[float]) -> tuple[float, float]:
+    return max(a[0], b[0]), min(a[1], b[1])

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rlcli.config.load import Resolved, resolve
-from rlcli.envs.vec_env import Layout
 from rlcli.errors import CheckpointError, TaskError
 from rlcli.registry import TaskSource, find_task, folder_task
 from rlcli.rl.checkpoint import Checkpoint
 from rlcli.rl.policy import Policy, load_policy
 from rlcli.rl.run import Run
+
+if TYPE_CHECKING:
+    from rlcli.envs.vec_env import Layout
 
 
 def source_of(run: Run) -> TaskSource:
@@ -63,13 +65,12 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
         CheckpointError: with a table of what differs, then and now.
     """
     try:
-        was, now = _fields(checkpoint.manifest["layout"]), _fields(layout.record())
+        differing = _differing(checkpoint.manifest["layout"], layout.record())
     except (AttributeError, KeyError, TypeError, ValueError):
         raise CheckpointError(f"{checkpoint.folder}/manifest.json is corrupt: its layout is malformed") from None
-    differs = [name for name in {**was, **now} if was.get(name) != now.get(name)]
-    if not differs:
+    if not differing:
         return
-    rows = [("field", "in the checkpoint", "now"), *((n, was.get(n, "-"), now.get(n, "-")) for n in differs)]
+    rows = [("field", "in the checkpoint", "now"), *differing]
     widths = [max(len(row[column]) for row in rows) for column in range(2)]
     table = "\n".join(f"  {a.ljust(widths[0])}  {b.ljust(widths[1])}  {c}" for a, b, c in rows)
     raise CheckpointError(
@@ -78,18 +79,50 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
     )
 
 
-def _fields(record: Mapping[str, Any]) -> dict[str, str]:
-    fields: dict[str, str] = {}
+def _differing(record: Mapping[str, Any], current: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """The rows of the table."""
+    was, now = _fields(record), _fields(current)
+    names = [name for name in {**was, **now} if _differ(was.get(name), now.get(name))]
+    return [(name, _text(was.get(name)), _text(now.get(name))) for name in names]
+
+
+def _fields(record: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """What must be equal, by the name it has in the table."""
+    fields: dict[str, Mapping[str, Any]] = {}
     for group, terms in record.get("observations", {}).items():
         for position, term in enumerate(terms):
-            fields[f"observations.{group}[{position}]"] = _term(term)
+            fields[f"observations.{group}[{position}]"] = term
     for position, term in enumerate(record.get("actions", [])):
-        fields[f"actions[{position}]"] = _term(term)
+        fields[f"actions[{position}]"] = term
     if "step_dt" in record:
-        fields["step_dt"] = f"{record['step_dt']:.9g} s"
+        fields["step_dt"] = {"name": f"{record['step_dt']:.9g} s"}
     return fields
 
 
-def _term(term: Mapping[str, Any]) -> str:
+_CONTRACT = ("name", "size", "elements", "scale", "offset", "clip")
+"""Of a term: what a policy was trained with. Units are words, and limits belong to the machine that is driven."""
+
+
+def _differ(was: Mapping[str, Any] | None, now: Mapping[str, Any] | None) -> bool:
+    """Whether something differs that both sides know; older checkpoints do not know everything."""
+    if was is None or now is None:
+        return True
+    known = [key for key in _CONTRACT if key in was and key in now]
+    return any(_rounded(was[key]) != _rounded(now[key]) for key in known if key != "elements" or was[key])
+
+
+def _text(term: Mapping[str, Any] | None) -> str:
+    if term is None:
+        return "-"
+    if "size" not in term:
+        return str(term["name"])
     elements = ", ".join(term.get("elements", []))
-    return f"{term['name']} ({term['size']}{': ' + elements if elements else ''})"
+    factors = [f"{key} {_rounded(term[key])}" for key in ("scale", "offset", "clip") if term.get(key)]
+    return ", ".join([f"{term['name']} ({term['size']}{': ' + elements if elements else ''})", *factors])
+
+
+def _rounded(value: Any) -> Any:
+    """Numbers as six digits: the last bits of a model's values depend on the machine that compiled it."""
+    if isinstance(value, list):
+        return "[" + ", ".join(str(_rounded(item)) for item in value) + "]"
+    return f"{value:.6g}" if isinstance(value, float) else value

@@ -74,6 +74,18 @@ class Normalizer(nn.Module):
         self.count.copy_(total)
 
 
+class WideLinear(nn.Linear):
+    """A linear layer with float32 weights that computes in float64.
+
+    The order in which a runtime adds up then does not show in a float32 action, however far an observation lies from
+    those of training: batches of any size and exported graphs agree.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, in) -> (n, out) float64"""
+        return nn.functional.linear(x.double(), self.weight.double(), self.bias.double())
+
+
 class Policy(nn.Module):
     """A multilayer perceptron, with its observation normaliser and its action bound.
 
@@ -89,11 +101,11 @@ class Policy(nn.Module):
         if spec.kind == "gaussian-mlp":
             self.log_std = nn.Parameter(torch.zeros(spec.action_size))
         elif spec.kind == "squashed-gaussian-mlp":
-            self.log_std_head = nn.Linear(spec.hidden[-1] if spec.hidden else spec.observation_size, spec.action_size)
+            self.log_std_head = WideLinear(spec.hidden[-1] if spec.hidden else spec.observation_size, spec.action_size)
 
     def forward(self, obs: Tensor) -> Tensor:
         """The deterministic action. (n, observation_size) -> (n, action_size)"""
-        return self._bounded(self.actor(self._seen(obs)))
+        return self._bounded(self.actor(self._seen(obs)).float())
 
     def sample(self, obs: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """A stochastic action, as the policy's distribution has it; a deterministic policy has none.
@@ -101,12 +113,14 @@ class Policy(nn.Module):
         (n, observation_size) -> (n, action_size)
         """
         features = self.actor[:-1](self._seen(obs))
-        mean = self.actor[-1](features)
+        mean = self.actor[-1](features).float()
         if self.spec.kind == "deterministic-mlp":
             return self._bounded(mean)
         noise = torch.randn(mean.shape, generator=generator, device=mean.device)
         log_std = (
-            self.log_std if self.spec.kind == "gaussian-mlp" else self.log_std_head(features).clamp(*_LOG_STD_RANGE)
+            self.log_std
+            if self.spec.kind == "gaussian-mlp"
+            else self.log_std_head(features).float().clamp(*_LOG_STD_RANGE)
         )
         return self._bounded(mean + log_std.exp() * noise)
 
@@ -122,12 +136,12 @@ class Policy(nn.Module):
 
 
 def mlp(inputs: int, hidden: list[int], outputs: int, activation: str) -> nn.Sequential:
-    """Linear layers with activations between them."""
+    """Linear layers with activations between them, in float64."""
     layers: list[nn.Module] = []
     for width in hidden:
-        layers += [nn.Linear(inputs, width), ACTIVATIONS[activation]()]
+        layers += [WideLinear(inputs, width), ACTIVATIONS[activation]()]
         inputs = width
-    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
+    return nn.Sequential(*layers, WideLinear(inputs, outputs))
 
 
 def load_policy(spec: Mapping[str, object], weights: Mapping[str, Tensor]) -> Policy:

@@ -49,6 +49,8 @@ _METRICS = {
 }
 _MUST_BE_FINITE = ("Loss/surrogate", "Loss/value", "Loss/actor", "Loss/critic", "Policy/mean_std")
 _LR_RANGE = (1e-5, 1e-2)
+_RECORDED = 256
+"""Recent observations that a checkpoint keeps, for checking what is made of the policy later."""
 _LEARNER_HINT = "lower learning_rate or max_grad_norm; the last good checkpoint is kept"
 
 
@@ -87,6 +89,7 @@ class Sb3Trainer:
             assert isinstance(config, OnPolicyConfig)
             self._horizon = config.n_steps
         self.steps_per_iteration = self._horizon * env.num_envs
+        self._recorded = torch.zeros(0, self.spec.observation_size)
 
     @property
     def env_steps(self) -> int:
@@ -98,6 +101,7 @@ class Sb3Trainer:
         obs = self.env.reset(seed=self.env.seed)["policy"]
         self.model._last_obs = obs.numpy()
         self.model._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
+        self._record()
 
     def iterate(self) -> Report:
         """Collect experience, then update."""
@@ -116,6 +120,7 @@ class Sb3Trainer:
         begin = time.perf_counter()
         torch.set_num_threads(1)
         self._collect()
+        self._record()
         collected = time.perf_counter()
         torch.set_num_threads(self.torch_threads)
         self._decay()
@@ -144,6 +149,7 @@ class Sb3Trainer:
         """A copy of everything that the next iteration depends on."""
         weights = self.model.policy.state_dict()
         rest = {f"weights.{name}": value.clone() for name, value in weights.items() if name not in self._actor_names}
+        rest["observations"] = self._recorded.clone()
         for name, optimizer in self._optimizers().items():
             for index, slots in optimizer.state_dict()["state"].items():
                 rest.update({f"optimizer.{name}.{index}.{slot}": value.clone() for slot, value in slots.items()})
@@ -175,6 +181,7 @@ class Sb3Trainer:
             _load_optimizer(optimizer, f"optimizer.{name}.", rest)
         if "log_ent_coef" in rest:
             self.model.log_ent_coef.data.copy_(rest["log_ent_coef"])
+        self._recorded = rest.get("observations", self._recorded)
         if "replay" in state.tensors:
             self.model.replay_buffer.load_state_dict(state.tensors["replay"])
         self.iteration, self.model.num_timesteps = values["iteration"], values["env_steps"]
@@ -194,6 +201,10 @@ class Sb3Trainer:
             self.model.collect(self._horizon)
         else:
             self.model.collect_rollouts(self.model.env, None, self.model.rollout_buffer, self._horizon)
+
+    def _record(self) -> None:
+        newest = torch.as_tensor(self.model._last_obs)[:_RECORDED]
+        self._recorded = torch.cat([newest, self._recorded])[:_RECORDED]
 
     def _update(self) -> None:
         if not isinstance(self.config, OffPolicyConfig):

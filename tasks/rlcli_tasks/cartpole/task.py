@@ -19,6 +19,8 @@ class CartpoleTask(DirectTask):
     num_observations = 4
     num_actions = 1
     observation_names = ("cart_pos", "cart_vel", "pole_pos", "pole_vel")
+    observation_units = ("m", "m/s", "rad", "rad/s")
+    action_names = ("slider_to_cart",)
 
     class Params(StrictModel):
         """The task's own settings."""
