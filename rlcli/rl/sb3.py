@@ -305,7 +305,12 @@ def _make(env: VecEnv, config: Sb3Config, seed: int, device: str) -> Any:
         "seed": seed,
         "device": device,
     }
-    networks: dict[str, Any] = {"activation_fn": ACTIVATIONS[config.policy.activation]}
+    # SB3's own Adam, its step in one kernel; A2C keeps its RMSprop
+    adam = {"fused": True} if isinstance(config, OffPolicyConfig) else {"fused": True, "eps": 1e-5}
+    networks: dict[str, Any] = {
+        "activation_fn": ACTIVATIONS[config.policy.activation],
+        "optimizer_kwargs": None if isinstance(config, A2cConfig) else adam,
+    }
     if isinstance(config, OffPolicyConfig):
         return _make_off_policy(config, common, {**networks, "net_arch": list(config.policy.hidden)})
     assert isinstance(config, OnPolicyConfig)
