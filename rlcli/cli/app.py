@@ -22,6 +22,7 @@ COMMANDS = {
     "train": "train",
     "play": "play",
     "eval": "eval",
+    "check": "check",
 }
 """Command -> module of `rlcli.cli` that registers it."""
 
