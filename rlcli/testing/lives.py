@@ -272,23 +272,22 @@ def _declared(subject: Subject, cause: str) -> bool:
 
 def repeated_observation(subject: Subject) -> Iterator[Finding]:
     """Observing the same state a second time gives the same."""
-    env = _twins(subject).kept
     hint = "compute it from the state alone; advance histories and counters when actions are applied"
-    for what, (before, after) in _second_look(env).items():
+    for what, (before, after) in _second_look(_twins(subject)).items():
         if not same(before, after):
             message = "changes when it is computed a second time in the same state"
             yield Finding("repeated-observation", "error", what, message, hint)
 
 
-def _second_look(env: VecEnv) -> dict[str, tuple[Tensor, Tensor]]:
+def _second_look(twins: _Twins) -> dict[str, tuple[Tensor, Tensor]]:
+    env, obs = twins.kept, {group: values.clone() for group, values in twins.step()[0].obs.items()}
     if isinstance(env, ManagedEnv):
-        first = {group: values.clone() for group, values in env.observation_manager.compute().items()}
-        second = env.observation_manager.compute()
-        return {f"observations.{group}": (first[group], second[group]) for group in first}
+        again = env.observation_manager.compute()
+        return {f"observations.{group}": (values, again[group]) for group, values in obs.items()}
     task = task_of(env)
     first = {"obs_buf": task.obs_buf.clone(), "states_buf": task.states_buf.clone()}
     env._fill()  # type: ignore[attr-defined]
-    return {name: (first[name], getattr(task, name)) for name in first}
+    return {name: (values, getattr(task, name)) for name, values in first.items()}
 
 
 def observation_after_reset(subject: Subject) -> Iterator[Finding]:

@@ -124,53 +124,60 @@ def shapes(subject: Subject) -> Iterator[Finding]:
     """Everything has the shape that the layout and the number of environments promise."""
     recording = subject.recording()
     env = recording.env
-    expected = {f"observation '{g}'": (NUM_ENVS, env.layout.size(g)) for g in env.layout.observations}
+    own = [
+        finding
+        for what, value, columns in _raw(env)
+        for finding in _shape(what, value, (NUM_ENVS,) if columns is None else (NUM_ENVS, columns))
+    ]
+    yield from own
+    if own:
+        return  # what the framework makes of it follows from that
+    expected = {f"observation '{group}'": (NUM_ENVS, env.layout.size(group)) for group in env.layout.observations}
     for step in recording.steps[-1:]:
         for what, value in flat(step).items():
-            yield from _shape(what, value, expected.get(what, (NUM_ENVS,)), "the framework's own")
-    for what, value, columns in _raw(env):
-        yield from _shape(what, value, (NUM_ENVS,) if columns is None else (NUM_ENVS, columns), "fill it in place: [:]")
+            yield from _shape(what, value, expected.get(what, (NUM_ENVS,)))
 
 
-def _shape(what: str, value: Tensor, expected: tuple[int, ...], hint: str) -> Iterator[Finding]:
+def _shape(what: str, value: Tensor, expected: tuple[int, ...]) -> Iterator[Finding]:
     found = tuple(value.shape)
     if found != expected:
         message = f"has shape {found}, expected {expected} for {NUM_ENVS} environments"
+        hint = "return one row an environment, and fill buffers in place: buf[:] = ..."
         yield Finding("shapes", "error", what, message, hint)
 
 
 def dtypes(subject: Subject) -> Iterator[Finding]:
     """Observations and rewards are float32, terminated and truncated are bool."""
     recording = subject.recording()
+    own = [finding for what, value, _ in _raw(recording.env) for finding in _dtype(what, value, _allowed(what))]
+    yield from own
+    if own:
+        return
     for step in recording.steps[-1:]:
         for what, value in flat(step).items():
-            wanted = torch.bool if what in ("terminated", "truncated") else torch.float32
-            if value.dtype != wanted:
-                message = f"is {_name(value)}, expected {_name(wanted)}"
-                hint = "return bool from terminations (a comparison), float32 from everything else"
-                yield Finding("dtypes", "error", what, message, hint)
-    for what, value, _ in _raw(recording.env):
-        allowed: tuple[torch.dtype, ...]
-        if what == "reset_buf":
-            allowed = (torch.bool, torch.int64, torch.int32, torch.uint8)
-        elif what.startswith("terminations."):
-            allowed = (torch.bool,)
-        elif what.startswith("rewards."):
-            allowed = (torch.float32, torch.bool)
-        else:
-            allowed = (torch.float32,)
-        if value.dtype not in allowed:
-            message = f"is {_name(value)}, expected {_name(allowed[0])}"
-            hint = (
-                "end the term with .float() or a comparison"
-                if "." in what
-                else "fill the buffer in place: buf[:] = ..."
-            )
-            yield Finding("dtypes", "error", what, message, hint)
+            yield from _dtype(what, value, _FLAG if what in ("terminated", "truncated") else (torch.float32,))
 
 
-def _name(value: Tensor | torch.dtype) -> str:
-    return str(value.dtype if isinstance(value, Tensor) else value).removeprefix("torch.")
+_FLAG = (torch.bool,)
+
+
+def _allowed(what: str) -> tuple[torch.dtype, ...]:
+    if what == "reset_buf":
+        return (torch.bool, torch.int64, torch.int32, torch.uint8)
+    if what.startswith("terminations."):
+        return _FLAG
+    return (torch.float32, torch.bool) if what.startswith("rewards.") else (torch.float32,)
+
+
+def _dtype(what: str, value: Tensor, allowed: tuple[torch.dtype, ...]) -> Iterator[Finding]:
+    if value.dtype not in allowed:
+        message = f"is {_name(value.dtype)}, expected {' or '.join(map(_name, allowed))}"
+        hint = "end a term with .float() or a comparison; fill buffers in place: buf[:] = ..."
+        yield Finding("dtypes", "error", what, message, hint)
+
+
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
 
 
 def _raw(env: VecEnv) -> Iterator[tuple[str, Tensor, int | None]]:
