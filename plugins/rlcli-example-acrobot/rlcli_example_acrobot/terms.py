@@ -39,9 +39,3 @@ def tip_above(
 ) -> Tensor:
     """The tip is higher than `height`, a share of the arm's length. (num_envs,) bool"""
     return tip_height(env, entity=entity, joints=joints, lengths=lengths) > height
-
-
-def joint_cos_sin(env, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Cosine and sine of joint angles, which do not jump at half a turn. (num_envs, 2 k)"""
-    angle = entity.data.joint_pos[:, joints]
-    return torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)
