@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-
 from rlcli_example_acrobot.terms import tip_above, tip_below, tip_height
 
 
