@@ -282,6 +282,11 @@ def test_clock_of_its_own_is_a_warning(direct):
     assert "exactly 40 steps" in finding.message
 
 
+def test_reset_buf_that_is_replaced_by_a_comparison_is_in_order(direct):
+    direct.replace("self.reset_buf[:] = self.obs_buf", "self.reset_buf = self.obs_buf")
+    assert check(direct) == []
+
+
 # --- looking twice ---
 
 

@@ -67,5 +67,5 @@ def run_commands(found, folder, *, site=None):
 
 
 def success_rate(output):
-    """The last success rate that `eval` printed."""
-    return float(re.findall(r"^success rate +(\S+)", output, re.MULTILINE)[-1])
+    """The first success rate that was printed: that of the trained policy."""
+    return float(re.findall(r"^success rate +(\S+)", output, re.MULTILINE)[0])
