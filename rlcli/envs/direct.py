@@ -191,7 +191,7 @@ class DirectEnv(VecEnv):
         self._fill()
         task.calculate_metrics()
         task.is_done()
-        failed = task.reset_buf.bool()
+        failed = task.reset_buf != 0  # a copy, even of a bool buffer: the flags are raised for time-outs too
         truncated = self.episode_length_buf >= self.max_episode_length
         self._causes = {"time_out": truncated, "task": failed}
         reward = next(self._rewards).copy_(task.rew_buf)

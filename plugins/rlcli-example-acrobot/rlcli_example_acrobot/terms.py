@@ -1,0 +1,41 @@
+"""The terms that rlcli does not have: how high the tip of the arm is, and whether it is high enough."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from rlcli.task import Entity, Joints
+
+
+def tip_height(
+    env, *, entity: Entity = "robot", joints: Joints = ("shoulder", "elbow"), lengths: tuple[float, float]
+) -> Tensor:
+    """Height of the tip over the shoulder, as a share of the arm's length: -1 hanging, 1 upright. (num_envs,)"""
+    shoulder, elbow = entity.data.joint_pos[:, joints].unbind(dim=1)
+    upper, lower = lengths
+    return (upper * torch.cos(shoulder) + lower * torch.cos(shoulder + elbow)) / (upper + lower)
+
+
+def tip_below(
+    env,
+    *,
+    entity: Entity = "robot",
+    joints: Joints = ("shoulder", "elbow"),
+    lengths: tuple[float, float],
+    height: float,
+) -> Tensor:
+    """The tip is lower than `height`, a share of the arm's length. (num_envs,) bool"""
+    return tip_height(env, entity=entity, joints=joints, lengths=lengths) < height
+
+
+def tip_above(
+    env,
+    *,
+    entity: Entity = "robot",
+    joints: Joints = ("shoulder", "elbow"),
+    lengths: tuple[float, float],
+    height: float,
+) -> Tensor:
+    """The tip is higher than `height`, a share of the arm's length. (num_envs,) bool"""
+    return tip_height(env, entity=entity, joints=joints, lengths=lengths) > height

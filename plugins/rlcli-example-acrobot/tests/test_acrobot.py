@@ -1,0 +1,33 @@
+"""The task keeps rlcli's contract, and its own terms compute what they say."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+from rlcli_example_acrobot.terms import tip_above, tip_below, tip_height
+
+
+def arm(*angles):
+    """An entity whose joints stand at these (shoulder, elbow) angles, one pair an environment."""
+    return SimpleNamespace(data=SimpleNamespace(joint_pos=torch.tensor(angles)))
+
+
+def test_the_contract(rlcli_check):
+    assert rlcli_check("acrobot") == []
+
+
+@pytest.mark.parametrize(
+    ("shoulder", "elbow", "expected"),
+    [(0.0, 0.0, 1.0), (math.pi, 0.0, -1.0), (0.0, math.pi, 0.0), (math.pi / 2, -math.pi / 2, 0.5)],
+)
+def test_tip_height_is_a_share_of_the_arms_length(shoulder, elbow, expected):
+    height = tip_height(None, entity=arm((shoulder, elbow)), joints=slice(0, 2), lengths=(0.5, 0.5))
+    assert height.tolist() == pytest.approx([expected], abs=1e-6)
+
+
+def test_above_and_below_part_the_environments():
+    entity = arm((0.0, 0.0), (math.pi / 2, 0.0))
+    parameters = {"entity": entity, "joints": slice(0, 2), "lengths": (0.5, 0.5), "height": 0.5}
+    assert tip_above(None, **parameters).tolist() == [True, False]
+    assert tip_below(None, **parameters).tolist() == [False, True]

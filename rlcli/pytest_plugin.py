@@ -1,0 +1,40 @@
+"""For task authors: the pytest fixture `rlcli_check`. It comes with rlcli and costs nothing where it is not used.
+
+```python
+def test_the_contract(rlcli_check):
+    rlcli_check("acrobot")
+```
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from rlcli.testing import Finding
+
+
+@pytest.fixture
+def rlcli_check() -> Callable[..., list[Finding]]:
+    """A function that fails the test with everything a task does not keep, and returns the warnings.
+
+    Its arguments are those of `rlcli.testing.check_task`: a task's name or folder, `agent`, `overrides`, `only`.
+    """
+
+    def check(
+        task: str | Path, *, agent: str | None = None, overrides: Sequence[str] = (), only: Sequence[str] = ()
+    ) -> list[Finding]:
+        __tracebackhide__ = True
+        from rlcli.testing import check_task
+
+        findings = check_task(task, agent=agent, overrides=overrides, only=only)
+        errors = [str(finding) for finding in findings if finding.severity == "error"]
+        if errors:
+            pytest.fail("\n".join([f"task '{task}' breaks its contract:", *errors]), pytrace=False)
+        return findings
+
+    return check

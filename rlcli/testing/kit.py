@@ -1,0 +1,128 @@
+"""Runs the checks one after the other; one that raises is a finding of its own, and the others still run."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+
+import torch
+
+from rlcli.errors import ConfigError, DependencyError, DeviceError, RlcliError, TaskError, UsageError, did_you_mean
+from rlcli.registry import find_task
+from rlcli.testing import lives, values
+from rlcli.testing.subject import Finding, Subject
+
+Check = Callable[[Subject], Iterable[Finding]]
+OnCheck = Callable[[str, "list[Finding] | None"], None]
+
+CHECKS: dict[str, Check] = {
+    "names": values.names,
+    "yaml-round-trip": values.yaml_round_trip,
+    "finite": values.finite,
+    "shapes": values.shapes,
+    "dtypes": values.dtypes,
+    "random-actions": values.random_actions_stay_stable,
+    "extreme-actions": values.extreme_actions_stay_stable,
+    "same-seed": lives.same_seed,
+    "start-states": lives.start_states,
+    "constant-columns": values.constant_columns,
+    "aliasing": values.aliasing,
+    "partial-reset": lives.partial_reset,
+    "final-observations": lives.final_observations,
+    "truncation": lives.truncation,
+    "termination": lives.termination,
+    "repeated-observation": lives.repeated_observation,
+    "observation-after-reset": lives.observation_after_reset,
+}
+"""Name -> check, in the order in which they run. The first line of a check's docstring says what it demands."""
+
+_DIRECT_ONLY = ("observation-after-reset",)
+
+
+def check_task(
+    task: str | Path,
+    *,
+    agent: str | None = None,
+    overrides: Sequence[str] = (),
+    only: Sequence[str] = (),
+    on_check: OnCheck = lambda name, findings: None,
+) -> list[Finding]:
+    """Check a task against the contract, in a few seconds.
+
+    Args:
+        task: a name from `list-tasks`, or a folder with a `task.yaml`.
+        agent: whose patch of the task and action bound hold; None takes the default agent.
+        overrides: `key.path=value`, as on the command line.
+        only: names of checks to run; all if empty.
+        on_check: called after each check with its name and findings; with None for a check that could not be run.
+
+    Returns:
+        What the task does not keep; empty for a task that is in order.
+
+    Raises:
+        UsageError: for a check that does not exist.
+        ConfigError: if the files are not valid; `rlcli validate` says the same.
+        TaskError: if there is no such task, or it cannot be imported.
+    """
+    for name in only:
+        if name not in CHECKS:
+            raise UsageError(f"no check '{name}'", hint=did_you_mean(name, CHECKS) or f"checks: {', '.join(CHECKS)}")
+    path = Path(task)
+    subject = Subject(find_task(str(path.resolve()) if isinstance(task, Path) else task), agent, overrides)
+    chosen = [name for name in CHECKS if (not only or name in only) and (subject.is_direct or name not in _DIRECT_ONLY)]
+    found: list[Finding] = []
+    with torch.random.fork_rng(devices=[]):
+        broken = list(_build(subject))
+        if broken:
+            found += broken
+            for name in dict.fromkeys((*(f.check for f in broken), *chosen)):
+                mine = [f for f in broken if f.check == name]
+                on_check(name, mine or None)
+            return found
+        for name in chosen:
+            findings = list(_run(name, subject, found))
+            found += findings
+            on_check(name, findings)
+    return found
+
+
+def _build(subject: Subject) -> Iterator[Finding]:
+    """Nothing can be checked of a task that cannot be built."""
+    try:
+        subject.env()
+    except ConfigError as error:
+        for problem in error.problems:
+            # a term's first value is looked at when the environment is built
+            check = "shapes" if problem.where in ("observations", "rewards", "terminations") else "names"
+            where = f"{problem.where}: {problem.path}" if problem.path else problem.where
+            yield Finding(
+                check, "error", where, problem.message, problem.hint or "mend it; `rlcli validate --deep` agrees"
+            )
+    except (TaskError, DependencyError, DeviceError):
+        raise
+    except Exception as error:
+        yield _stopped("names", subject, error, [])
+
+
+def _run(name: str, subject: Subject, before: list[Finding]) -> Iterator[Finding]:
+    try:
+        yield from CHECKS[name](subject)
+    except Exception as error:
+        yield _stopped(name, subject, error, before)
+
+
+def _stopped(name: str, subject: Subject, error: Exception, before: list[Finding]) -> Finding:
+    message = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"
+    message = f"the check was stopped by {' '.join(message.split())}"
+    earlier = next((f.check for f in before if f.message == message), None)
+    hint = "mend what raises it, then check again"
+    if earlier is not None:
+        hint = f"see {earlier}"
+    return Finding(name, "error", _place(subject, error), message, hint)
+
+
+def _place(subject: Subject, error: Exception) -> str:
+    """The innermost line of the task's own files, or the task."""
+    own = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).is_relative_to(subject.source.root)]
+    return f"{own[-1].filename}:{own[-1].lineno}" if own else subject.source.label

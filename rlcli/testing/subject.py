@@ -1,0 +1,189 @@
+"""The task under test: small seeded environments of it, lives lived in them, and one recording that checks share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from rlcli.config.load import Resolved, resolve
+from rlcli.envs.direct import DirectEnv, DirectTask
+from rlcli.envs.vec_env import StepResult, VecEnv, make_env
+from rlcli.registry import TaskSource
+
+NUM_ENVS = 8
+STEPS = 200
+"""Steps of a recording."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that a task does not keep: which check saw it, where, what was found, and what to do."""
+
+    check: str
+    severity: Literal["error", "warning"]
+    where: str
+    message: str
+    hint: str
+
+    def __str__(self) -> str:
+        """One line."""
+        return f"{self.severity}: {self.check}: {self.where}: {self.message}; {self.hint}"
+
+
+@dataclass(slots=True)
+class Recording:
+    """What an environment gave, step by step: copies, and the tensors themselves to see whether they change."""
+
+    env: VecEnv
+    steps: list[StepResult] = field(default_factory=list)
+    """As given; their tensors may have been written to since."""
+    obs: list[dict[str, Tensor]] = field(default_factory=list)
+    """Copies, the start's first. [group -> (num_envs, d)]"""
+    late_writes: dict[str, int] = field(default_factory=dict)
+    """What changed after it was given, although it may not yet -> the first step that it was given in."""
+    shared: dict[str, int] = field(default_factory=dict)
+    """What shares memory with its predecessor -> the first step."""
+    error: Exception | None = None
+
+
+class Subject:
+    """A task, as training sees it but with few environments and one engine thread."""
+
+    def __init__(self, source: TaskSource, agent: str | None = None, overrides: Sequence[str] = ()) -> None:
+        self.source = source
+        self._agent, self._overrides = agent, tuple(overrides)
+        # the files must hold as the user wrote them, and for playing
+        resolve(source, agent=agent, overrides=overrides)
+        resolve(source, agent=agent, overrides=overrides, play=True)
+        self.resolved = self._resolve({})
+        self._recording: Recording | None = None
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether the task is written in the direct workflow."""
+        return self.source.task is not None
+
+    @property
+    def bound(self) -> float:
+        """Largest action tried: the agent's bound, or 1 where it has none."""
+        return (self.resolved.agent and self.resolved.agent.action_bound) or 1.0
+
+    def env(self, *, episode_steps: int | None = None, seed: int = 0) -> VecEnv:
+        """A new environment of the task; with `episode_steps`, with episodes of that many steps."""
+        step_dt = self.resolved.task.step_dt
+        flags = {} if episode_steps is None else {"episode_length_s": episode_steps * step_dt}
+        return make_env(self._resolve(flags), seed=seed)
+
+    def recording(self) -> Recording:
+        """200 steps of random actions. The first to ask gets the error that ended them, if one did."""
+        if self._recording is None:
+            env = self.env()
+            self._recording = record(env, random_actions(env, self.bound))
+            if self._recording.error is not None:
+                raise self._recording.error
+        return self._recording
+
+    def _resolve(self, flags: dict[str, Any]) -> Resolved:
+        small = {"scene.num_envs": NUM_ENVS, "sim.engine_threads": 1}
+        return resolve(self.source, agent=self._agent, overrides=self._overrides, flags={**small, **flags})
+
+
+def random_actions(env: VecEnv, bound: float, steps: int = STEPS) -> Iterator[Tensor]:
+    """Uniform actions within the bound, the same ones every time."""
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(steps):
+        yield (torch.rand(env.num_envs, env.layout.action_size, generator=generator) * 2.0 - 1.0) * bound
+
+
+def extreme_actions(env: VecEnv, bound: float, steps: int = STEPS) -> Iterator[Tensor]:
+    """The bound with alternating sign, every 8th one held twice; half of the environments against the other half."""
+    sign = torch.ones(env.num_envs, 1)
+    sign[1::2] = -1.0
+    for step in range(steps):
+        pushed = sign * (-1.0) ** (step + step // 8) * bound
+        yield pushed.expand(-1, env.layout.action_size).clone()
+
+
+def record(env: VecEnv, actions: Iterator[Tensor]) -> Recording:
+    """Live until the actions end or something is raised."""
+    recording = Recording(env)
+    try:
+        given = env.reset(seed=0)
+        recording.obs.append(_copy(given))
+        previous = {f"observation '{group}'": value for group, value in given.items()}
+        copies = _copy(previous)
+        for number, action in enumerate(actions):
+            before = action.clone()
+            result = env.step(action)
+            recording.steps.append(result)
+            recording.obs.append(_copy(result.obs))
+            for what, value in previous.items():
+                if not same(value, copies[what]):
+                    recording.late_writes.setdefault(what, number)
+            if not same(action, before):
+                recording.late_writes.setdefault("the action", number)
+            given_now = flat(result)
+            for what, value in given_now.items():
+                if what in previous and value.numel() and value.data_ptr() == previous[what].data_ptr():
+                    recording.shared.setdefault(what, number)
+            previous, copies = given_now, _copy(given_now)
+    except Exception as error:
+        recording.error = error
+    return recording
+
+
+def live(env: VecEnv, actions: Iterator[Tensor], seed: int = 0) -> list[dict[str, Tensor]]:
+    """A life from `reset(seed)`: what the environment gave, copied, the start first."""
+    life = [{f"observation '{group}'": value.clone() for group, value in env.reset(seed=seed).items()}]
+    life += [_copy(flat(env.step(action))) for action in actions]
+    return life
+
+
+def flat(result: StepResult) -> dict[str, Tensor]:
+    """Everything that a step gives for all environments, by name."""
+    return {
+        **{f"observation '{group}'": value for group, value in result.obs.items()},
+        "reward": result.reward,
+        "terminated": result.terminated,
+        "truncated": result.truncated,
+    }
+
+
+def end_soon(env: VecEnv, rows: list[int]) -> None:
+    """Put the clock of some environments one step before the end of their episodes."""
+    env.episode_length_buf[rows] = env.max_episode_length - 1
+    if isinstance(env, DirectEnv):
+        env.task.progress_buf[rows] = env.max_episode_length - 1
+
+
+def task_of(env: VecEnv) -> DirectTask:
+    """The direct task inside an environment."""
+    assert isinstance(env, DirectEnv)
+    return env.task
+
+
+def worlds(env: VecEnv) -> dict[str, Tensor]:
+    """The engine's state, one row an environment."""
+    return {name: value for name, value in env.engine.state_dict().items() if len(value) == env.num_envs}
+
+
+def column_names(env: VecEnv, group: str) -> list[str]:
+    """What the columns of an observation group are called in messages."""
+    names = []
+    for term in env.layout.observations[group]:
+        several = term.elements if len(term.elements) == term.size else tuple(str(i) for i in range(term.size))
+        names += [term.name if term.size == 1 and not term.elements else f"{term.name}[{e}]" for e in several]
+    return names
+
+
+def same(left: Tensor, right: Tensor) -> bool:
+    """Whether two tensors are equal bit for bit, NaN included."""
+    return left.shape == right.shape and bool(((left == right) | ((left != left) & (right != right))).all())
+
+
+def _copy(values: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in values.items()}

@@ -1,0 +1,263 @@
+"""What must hold of a task's names, its files, and what each step gives: one function a clause of the contract."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import torch
+from torch import Tensor
+
+from rlcli.config.dump import to_data, to_yaml
+from rlcli.config.load import resolve
+from rlcli.envs.managed import ManagedEnv
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import ConfigError, DivergedError
+from rlcli.testing.subject import (
+    NUM_ENVS,
+    STEPS,
+    Finding,
+    Subject,
+    column_names,
+    extreme_actions,
+    flat,
+    record,
+    task_of,
+)
+
+
+def names(subject: Subject) -> Iterator[Finding]:
+    """Every name in the YAML resolves; joints, actuators and bodies of the model have names."""
+    model = subject.env().engine.model
+    kinds = (
+        (mujoco.mjtObj.mjOBJ_JOINT, model.njnt, "joint", "error", "no term can observe or reset it"),
+        (mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu, "actuator", "error", "no action term can drive it"),
+        (mujoco.mjtObj.mjOBJ_BODY, model.nbody, "body", "warning", "no term can name it"),
+    )
+    for kind, count, word, severity, why in kinds:
+        for item in range(count):
+            if mujoco.mj_id2name(model, kind, item):
+                continue
+            if word == "joint" and model.jnt_type[item] == mujoco.mjtJoint.mjJNT_FREE:
+                continue  # the root is found without its name
+            yield Finding(
+                "names",
+                severity,  # type: ignore[arg-type]
+                f"{word} {item}{_owner(model, kind, item)}",
+                f"has no name, so {why}",
+                f'give it one in the MJCF: <{word} name="..."/>',
+            )
+
+
+def _owner(model: mujoco.MjModel, kind: mujoco.mjtObj, item: int) -> str:
+    if kind == mujoco.mjtObj.mjOBJ_JOINT:
+        body = int(model.jnt_bodyid[item])
+    elif kind == mujoco.mjtObj.mjOBJ_BODY:
+        body = int(model.body_parentid[item])
+    else:
+        return ""
+    return f" of body '{mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or body}'"
+
+
+def yaml_round_trip(subject: Subject) -> Iterator[Finding]:
+    """The resolved configuration, written as YAML and read again, is the same configuration."""
+    data = to_data(subject.resolved)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "config.yaml"
+        file.write_text(to_yaml(data), encoding="utf-8")
+        try:
+            again = to_data(resolve(replace(subject.source, config=file)))
+        except ConfigError as error:
+            for problem in error.problems:
+                yield Finding(
+                    "yaml-round-trip",
+                    "error",
+                    problem.path or subject.source.label,
+                    f"does not read back from YAML: {problem.message}",
+                    problem.hint or "use a value that YAML has (finite numbers, text, lists)",
+                )
+            return
+    for path, was, now in _differences(data, again):
+        yield Finding(
+            "yaml-round-trip",
+            "error",
+            path,
+            f"is {was!r}, and {now!r} after writing and reading the configuration",
+            "a run keeps its configuration as YAML: use a value that YAML can hold",
+        )
+
+
+def _differences(was: object, now: object, path: str = "") -> Iterator[tuple[str, object, object]]:
+    if isinstance(was, dict) and isinstance(now, dict):
+        for key in {**was, **now}:
+            yield from _differences(was.get(key), now.get(key), f"{path}.{key}" if path else str(key))
+    elif was != now and not (isinstance(was, list | tuple) and list(was) == now):
+        yield path, was, now
+
+
+# --- what a step gives ---
+
+
+def finite(subject: Subject) -> Iterator[Finding]:
+    """Observations, final observations and rewards are finite numbers."""
+    where = subject.source.label
+    hint = "look for divisions, square roots and logarithms of what can be 0, and for buffers that are never filled"
+    try:
+        recording = subject.recording()
+    except DivergedError as error:
+        yield Finding("finite", "error", where, f"{error.message}; allowed are finite numbers", hint)
+        return
+    final = [v for step in recording.steps for v in (step.final_obs or {}).values()]
+    for number, step in enumerate(recording.steps):
+        rows = step.terminated | step.truncated
+        for group, values in (step.final_obs or {}).items():
+            if final and not bool(values[rows].isfinite().all()):
+                message = f"the final observation is not finite at step {number}; allowed are finite numbers"
+                yield Finding("finite", "error", f"observations.{group}", message, hint)
+                return
+
+
+def shapes(subject: Subject) -> Iterator[Finding]:
+    """Everything has the shape that the layout and the number of environments promise."""
+    recording = subject.recording()
+    env = recording.env
+    own = [
+        finding
+        for what, value, columns in _raw(env)
+        for finding in _shape(what, value, (NUM_ENVS,) if columns is None else (NUM_ENVS, columns))
+    ]
+    yield from own
+    if own:
+        return  # what the framework makes of it follows from that
+    expected = {f"observation '{group}'": (NUM_ENVS, env.layout.size(group)) for group in env.layout.observations}
+    for step in recording.steps[-1:]:
+        for what, value in flat(step).items():
+            yield from _shape(what, value, expected.get(what, (NUM_ENVS,)))
+
+
+def _shape(what: str, value: Tensor, expected: tuple[int, ...]) -> Iterator[Finding]:
+    found = tuple(value.shape)
+    if found != expected:
+        message = f"has shape {found}, expected {expected} for {NUM_ENVS} environments"
+        hint = "return one row an environment, and fill buffers in place: buf[:] = ..."
+        yield Finding("shapes", "error", what, message, hint)
+
+
+def dtypes(subject: Subject) -> Iterator[Finding]:
+    """Observations and rewards are float32, terminated and truncated are bool."""
+    recording = subject.recording()
+    own = [finding for what, value, _ in _raw(recording.env) for finding in _dtype(what, value, _allowed(what))]
+    yield from own
+    if own:
+        return
+    for step in recording.steps[-1:]:
+        for what, value in flat(step).items():
+            yield from _dtype(what, value, _FLAG if what in ("terminated", "truncated") else (torch.float32,))
+
+
+_FLAG = (torch.bool,)
+
+
+def _allowed(what: str) -> tuple[torch.dtype, ...]:
+    if what == "reset_buf":
+        return (torch.bool, torch.int64, torch.int32, torch.uint8)
+    if what.startswith("terminations."):
+        return _FLAG
+    return (torch.float32, torch.bool) if what.startswith("rewards.") else (torch.float32,)
+
+
+def _dtype(what: str, value: Tensor, allowed: tuple[torch.dtype, ...]) -> Iterator[Finding]:
+    if value.dtype not in allowed:
+        message = f"is {_name(value.dtype)}, expected {' or '.join(map(_name, allowed))}"
+        hint = "end a term with .float() or a comparison; fill buffers in place: buf[:] = ..."
+        yield Finding("dtypes", "error", what, message, hint)
+
+
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
+def _raw(env: VecEnv) -> Iterator[tuple[str, Tensor, int | None]]:
+    """What the task itself gives, before the framework casts it: (name, value, columns or None)."""
+    if not isinstance(env, ManagedEnv):
+        task = task_of(env)
+        yield "obs_buf", task.obs_buf, task.num_observations
+        yield "states_buf", task.states_buf, task.num_states
+        yield "rew_buf", task.rew_buf, None
+        yield "reset_buf", task.reset_buf, None
+        return
+    manager = env.observation_manager
+    for group in manager.groups:
+        for term, size in manager.sizes(group):
+            yield f"observations.{group}.{term.name}", term.call(), size
+    for section, terms in (("rewards", env.reward_manager.terms), ("terminations", env.termination_manager.terms)):
+        for term in terms:
+            yield f"{section}.{term.name}", term.call(), None
+
+
+def random_actions_stay_stable(subject: Subject) -> Iterator[Finding]:
+    """200 steps of random actions within the action bound, and no simulation diverges."""
+    recording = subject.recording()
+    yield from _stable("random-actions", subject, recording.env, len(recording.steps))
+
+
+def extreme_actions_stay_stable(subject: Subject) -> Iterator[Finding]:
+    """200 steps of actions at the bound, signs alternating, and no simulation diverges."""
+    env = subject.env()
+    recording = record(env, extreme_actions(env, subject.bound))
+    yield from _stable("extreme-actions", subject, env, len(recording.steps))
+    if recording.error is not None:
+        raise recording.error
+
+
+def _stable(check: str, subject: Subject, env: VecEnv, steps: int) -> Iterator[Finding]:
+    if env.divergences:
+        yield Finding(
+            check,
+            "error",
+            f"sim.dt = {env.physics_dt:g} s, {steps} of {STEPS} steps",
+            f"the simulation diverged {env.divergences} times with actions within +-{subject.bound:g}; it must never",
+            "take a smaller sim.dt, more damping or armature, lower gains, or an effort_limit",
+        )
+
+
+def constant_columns(subject: Subject) -> Iterator[Finding]:
+    """No observation column keeps one value in all environments and steps."""
+    recording = subject.recording()
+    for group in recording.env.layout.observations:
+        seen = torch.stack([obs[group] for obs in recording.obs])
+        for column, name in enumerate(column_names(recording.env, group)):
+            values = seen[:, :, column]
+            if bool((values == values[0, 0]).all()):
+                yield Finding(
+                    "constant-columns",
+                    "error",
+                    f"observations.{group}, column {column} ({name})",
+                    f"is {float(values[0, 0]):g} in {NUM_ENVS} environments and {len(seen)} observations",
+                    "a policy cannot learn from it: compute it from the state, or leave it out",
+                )
+
+
+def aliasing(subject: Subject) -> Iterator[Finding]:
+    """What a step gave keeps its values while the next step runs, and actions are not written to."""
+    recording = subject.recording()
+    for what, step in recording.late_writes.items():
+        yield Finding(
+            "aliasing",
+            "error",
+            what,
+            f"was changed in place at step {step}; a trainer keeps it",
+            "write into a tensor of your own, or clone() first",
+        )
+    for what, step in recording.shared.items():
+        if what not in recording.late_writes:
+            yield Finding(
+                "aliasing",
+                "error",
+                what,
+                f"shares its memory with the one before, at step {step}",
+                "return a new tensor instead of a buffer that the term keeps",
+            )

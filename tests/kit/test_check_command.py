@@ -1,0 +1,169 @@
+"""`rlcli check` and the pytest fixture, as their users meet them: in processes of their own."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from rlcli.cli.app import main
+
+
+def check(capsys, *arguments):
+    """(exit code, stdout, stderr) of `rlcli check`."""
+    code = main(["check", *map(str, arguments)])
+    return code, *capsys.readouterr()
+
+
+def test_task_in_order_ends_with_0_and_a_table(managed, capsys):
+    code, out, err = check(capsys, managed.write())
+    assert code == 0
+    assert out.splitlines()[0].split() == ["CHECK", "RESULT"]
+    assert "partial-reset         ok" in out
+    assert out.splitlines()[-1].endswith("0 errors, 0 warnings")
+    assert err == ""
+
+
+def test_findings_end_with_9_and_say_what_to_do(managed, capsys):
+    managed.config["terminations"] = {}
+    code, out, _ = check(capsys, managed.write())
+    assert code == 9
+    assert "truncation            error" in out
+    assert "error: truncation: episode_length_s of 6 steps: episodes run on after step 6" in out
+    assert "time_out: true" in out
+
+
+def test_warnings_alone_end_with_0(direct, capsys):
+    direct.replace("self.obs_buf[:, 0].abs() > 3.0", "self.progress_buf >= 40")
+    code, out, _ = check(capsys, direct.write())
+    assert code == 0
+    assert "termination              warning" in out
+    assert out.splitlines()[-1].endswith("0 errors, 1 warning")
+
+
+def test_json_is_one_document_with_every_check_and_finding(managed, capsys):
+    managed.config["events"]["start"]["position"] = [0.0, 0.0]
+    code, out, _ = check(capsys, managed.write(), "--json")
+    document = json.loads(out)
+    assert code == 9
+    assert document["passed"] is False
+    assert {c["name"]: c["result"] for c in document["checks"]}["start-states"] == "error"
+    assert {f["where"] for f in document["findings"]} == {"between environments", "between episodes"}
+    assert set(document["findings"][0]) == {"check", "severity", "where", "message", "hint"}
+
+
+def test_task_that_cannot_be_built_names_the_checks_that_were_not_run(managed, capsys):
+    managed.config["events"]["start"]["joints"] = ["elbow"]
+    code, out, _ = check(capsys, managed.write())
+    assert code == 9
+    assert "names                 error" in out
+    assert "same-seed             not run" in out
+
+
+def test_only_runs_what_it_names_and_knows_the_names(managed, capsys):
+    managed.config["terminations"] = {}
+    assert check(capsys, managed.write(), "--only", "start-states", "--only", "names")[0] == 0
+    code, _, err = check(capsys, managed.write(), "--only", "truncate")
+    assert code == 2
+    assert "did you mean 'truncation'?" in err
+
+
+def test_overrides_are_checked_too(managed, capsys):
+    code, out, _ = check(capsys, managed.write(), "events.start.position=[0.2,0.2]")
+    assert code == 9
+    assert "start-states" in out
+
+
+def test_invalid_files_end_with_3_and_every_mistake(managed, capsys):
+    managed.config["decimation"] = -2
+    managed.config["rewards"]["upright"]["wieght"] = 1.0
+    code, out, err = check(capsys, managed.write())
+    assert code == 3
+    assert "decimation" in err
+    assert "did you mean 'weight'?" in err
+    assert out == ""
+
+
+def test_unknown_task_ends_with_4(capsys):
+    code, _, err = check(capsys, "cartpoel")
+    assert code == 4
+    assert "did you mean 'cartpole'" in err
+
+
+def test_task_whose_class_does_not_import_ends_with_4(direct, capsys):
+    direct.task = "import no_such_module\n" + direct.task.replace("from __future__ import annotations\n", "")
+    code, _, err = check(capsys, direct.write())
+    assert code == 4
+    assert "no_such_module" in err
+
+
+@pytest.fixture
+def plugin_of_the_future(tmp_path):
+    """An installed package whose task was written for a newer rlcli."""
+    site = tmp_path / "site"
+    (site / "future_task").mkdir(parents=True)
+    (site / "future_task" / "__init__.py").write_text(
+        "from rlcli.task import TaskSpec\nTASK = TaskSpec(package=__name__, summary='Later.', api=99)\n"
+    )
+    (site / "future_task" / "task.yaml").write_text("this: is not looked at\n")
+    info = site / "future_task-3.1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: future-task\nVersion: 3.1\n")
+    (info / "entry_points.txt").write_text("[rlcli.tasks]\nfuture = future_task:TASK\n")
+    return site
+
+
+def in_process(*arguments, path, cwd):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(path), os.environ.get("PYTHONPATH", "")])}
+    return subprocess.run([sys.executable, *arguments], cwd=cwd, env=environment, capture_output=True, text=True)
+
+
+def test_plugin_for_a_newer_api_is_refused_with_both_numbers(plugin_of_the_future, tmp_path):
+    done = in_process("-m", "rlcli", "check", "future", path=plugin_of_the_future, cwd=tmp_path)
+    assert done.returncode == 4
+    assert "future-task:future" in done.stderr
+    assert "needs plugin API 99; this rlcli has 1" in done.stderr
+    assert "pip install --upgrade rlcli" in done.stderr
+
+
+# --- the pytest plugin ---
+
+
+def run_pytest(folder, test, *options):
+    (folder / "test_contract.py").write_text(test)
+    environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "rlcli.pytest_plugin", "-p", "no:cacheprovider", *options]
+    done = subprocess.run([*command, "test_contract.py"], cwd=folder, env=environment, capture_output=True, text=True)
+    return done.returncode, done.stdout + done.stderr
+
+
+THREE_LINES = "def test_the_contract(rlcli_check):\n    rlcli_check('./pendulum')\n"
+
+
+def test_fixture_passes_a_task_in_order(managed, tmp_path):
+    managed.write()
+    code, output = run_pytest(tmp_path, THREE_LINES)
+    assert code == 0, output
+    assert "1 passed" in output
+
+
+def test_fixture_fails_with_every_error_and_no_traceback(managed, tmp_path):
+    managed.config["terminations"] = {}
+    managed.config["events"]["start"]["position"] = [0.2, 0.2]
+    managed.write()
+    code, output = run_pytest(tmp_path, THREE_LINES)
+    assert code == 1
+    assert "task './pendulum' breaks its contract:" in output
+    assert "error: truncation:" in output
+    assert "error: start-states: between episodes" in output
+    assert "pytest_plugin.py" not in output
+
+
+def test_plugin_is_cheap_where_it_is_not_used(tmp_path):
+    test = (
+        "import sys\n\ndef test_nothing_heavy_is_loaded():\n"
+        "    assert {'torch', 'mujoco', 'numpy', 'pydantic', 'rlcli.testing'}.isdisjoint(sys.modules)\n"
+    )
+    code, output = run_pytest(tmp_path, test, "-W", "error")
+    assert code == 0, output

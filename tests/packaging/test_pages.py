@@ -1,0 +1,80 @@
+"""What the documentation tells to do works as it stands there."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+from fenced import REPOSITORY, blocks, run_commands, success_rate, write_files
+
+import rlcli.errors
+from rlcli.testing import CHECKS
+
+DOCS = REPOSITORY / "docs"
+README = REPOSITORY / "README.md"
+
+
+@pytest.mark.slow
+def test_quickstart_works_as_written(tmp_path):
+    output = run_commands(blocks(DOCS / "quickstart.md"), tmp_path)
+    assert success_rate(output) >= 0.99
+    assert (tmp_path / "cartpole.mp4").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "folder"), [("write-a-task.md", "my_task"), ("write-a-direct-task.md", "my_arm")])
+def test_the_task_of_a_page_checks_trains_and_learns(page, folder, tmp_path):
+    found = blocks(DOCS / page)
+    write_files(found, tmp_path)
+    output = run_commands(found, tmp_path)
+    assert f"./{folder}: 0 errors, 0 warnings" in output
+    assert success_rate(output) > 0.9
+
+
+@pytest.mark.slow
+def test_the_readmes_task_of_your_own_works_as_written(tmp_path):
+    found = blocks(README, "## A task of your own", "## Licence")
+    write_files(found, tmp_path)
+    assert "./my_task: 0 errors, 0 warnings" in run_commands(found, tmp_path)
+
+
+@pytest.mark.slow
+def test_each_example_of_the_exit_codes_ends_with_its_code(tmp_path):
+    (block,) = [b for b in blocks(DOCS / "exit-codes.md") if b.language == "sh"]
+    examples = re.findall(r"^rlcli (.*?)\s+# (\d+)$", block.text, re.MULTILINE)
+    assert len(examples) == len(block.text.splitlines())
+    for arguments, code in examples:
+        done = subprocess.run(
+            [sys.executable, "-m", "rlcli", *arguments.split()], cwd=tmp_path, capture_output=True, text=True
+        )
+        assert done.returncode == int(code), f"{arguments}: {done.returncode}\n{done.stderr}"
+        assert "Traceback" not in done.stderr
+
+
+def test_the_page_of_exit_codes_has_every_code_and_kind_that_errors_have():
+    text = (DOCS / "exit-codes.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| (\d+) \| `(\w+)` \|", text, re.MULTILINE))
+    errors = [e for e in vars(rlcli.errors).values() if isinstance(e, type) and issubclass(e, rlcli.errors.RlcliError)]
+    for error in errors:
+        if error.kind not in ("error", "stopped"):
+            assert rows[str(error.exit_code)] == error.kind
+    assert set(rows) == {*map(str, range(1, 11)), "75", "130"}
+
+
+def test_the_page_on_plugins_lists_every_check():
+    text = (DOCS / "write-a-plugin.md").read_text(encoding="utf-8")
+    listed = [
+        name for cell in re.findall(r"^\| (`.*?`) \|", text, re.MULTILINE) for name in re.findall(r"`(.+?)`", cell)
+    ]
+    assert set(CHECKS) <= set(listed)
+
+
+def test_links_between_pages_lead_somewhere():
+    for page in [*DOCS.glob("*.md"), README]:
+        for target in re.findall(r"\]\(([^)#:]+\.md)\)", page.read_text(encoding="utf-8")):
+            assert (page.parent / target).is_file(), f"{page.name}: {target}"
+
+
+def test_the_index_names_every_page():
+    text = (DOCS / "index.md").read_text(encoding="utf-8")
+    assert {p.name for p in DOCS.glob("*.md")} - {"index.md"} <= set(re.findall(r"\(([\w-]+\.md)\)", text))

@@ -1,0 +1,139 @@
+"""rlcli's wheel and a stranger's, built and installed together, used from another folder."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from email.parser import Parser
+
+import pytest
+from fenced import REPOSITORY, blocks, run_commands, success_rate, write_files
+
+ACROBOT = REPOSITORY / "plugins" / "rlcli-example-acrobot"
+pytestmark = pytest.mark.slow
+
+
+def build(source, folder):
+    """Build a wheel from a copy, so that nothing is left in the sources."""
+    copy = folder / "source" / source.name
+    ignored = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", "tests", ".*_cache", ".hypothesis")
+    shutil.copytree(source, copy, ignore=ignored)
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(copy)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done
+
+
+def install(wheels, site):
+    options = ["-q", "--disable-pip-version-check", "--no-deps", "--no-index", "--target", str(site)]
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, *map(str, wheels)], check=True)
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheels")
+    build(REPOSITORY, folder)
+    build(ACROBOT, folder)
+    ours, theirs = sorted(folder.glob("rlcli-*.whl")), sorted(folder.glob("rlcli_example_acrobot-*.whl"))
+    assert (len(ours), len(theirs)) == (1, 1)
+    return ours[0], theirs[0]
+
+
+@pytest.fixture(scope="module")
+def site(wheels, tmp_path_factory):
+    """A folder with the two wheels and nothing else; what they depend on comes from this environment."""
+    folder = tmp_path_factory.mktemp("site")
+    install(wheels, folder)
+    return folder
+
+
+@pytest.fixture
+def elsewhere(site, tmp_path):
+    """Run a command in a folder that is not the repository, with only the installed rlcli."""
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(site),
+        "PYTHONSAFEPATH": "1",
+        "HOME": str(tmp_path),
+        "XDG_CACHE_HOME": str(tmp_path / "cache"),
+    }
+
+    def run(*arguments, code=0):
+        done = subprocess.run(
+            [sys.executable, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=280
+        )
+        assert done.returncode == code, f"{arguments}: exit {done.returncode}\n{done.stdout}\n{done.stderr}"
+        return done
+
+    return run
+
+
+def test_our_wheel_is_pure_small_and_pins_nothing(wheels):
+    ours = wheels[0]
+    assert ours.name.endswith("-py3-none-any.whl")
+    assert ours.stat().st_size < 1_000_000
+    with zipfile.ZipFile(ours) as archive:
+        (name,) = [n for n in archive.namelist() if n.endswith(".dist-info/METADATA")]
+        metadata = Parser().parsestr(archive.read(name).decode())
+    requirements = metadata.get_all("Requires-Dist")
+    assert len(requirements) > 10
+    assert [r for r in requirements if "==" in r.partition(";")[0]] == []
+
+
+def test_our_wheel_holds_every_file_of_the_tasks_and_nothing_of_the_tests(wheels):
+    with zipfile.ZipFile(wheels[0]) as archive:
+        inside = set(archive.namelist())
+    for root, package in ((REPOSITORY / "tasks", "rlcli_tasks"), (REPOSITORY, "rlcli")):
+        files = {f.relative_to(root).as_posix() for f in (root / package).rglob("*") if f.is_file()}
+        assert {f for f in files if "__pycache__" not in f} <= inside
+    assert {"rlcli_tasks/index.json", "rlcli_tasks/cartpole/task.yaml", "rlcli_tasks/cartpole/cartpole.xml"} <= inside
+    assert {name.split("/")[0] for name in inside} == {"rlcli", "rlcli_tasks", "rlcli-0.1.0.dist-info"}
+
+
+def test_plugin_wheel_holds_its_task_and_asks_for_rlcli(wheels):
+    with zipfile.ZipFile(wheels[1]) as archive:
+        inside = archive.namelist()
+        metadata = archive.read(next(n for n in inside if n.endswith("METADATA"))).decode()
+    assert {f"rlcli_example_acrobot/{n}" for n in ("task.yaml", "acrobot.xml", "terms.py")} <= set(inside)
+    assert "Requires-Dist: rlcli>=0.1" in metadata
+
+
+def test_the_installed_pair_lists_checks_trains_and_plays(elsewhere, site):
+    place = elsewhere("-c", "import rlcli, rlcli_tasks; print(rlcli.__file__); print(rlcli_tasks.__file__)").stdout
+    assert [line.startswith(str(site)) for line in place.splitlines()] == [True, True]
+    rows = json.loads(elsewhere("-m", "rlcli", "list-tasks", "--json").stdout)["tasks"]
+    assert [(r["name"], r["distribution"]) for r in rows if r["name"] == "acrobot"] == [
+        ("acrobot", "rlcli-example-acrobot")
+    ]
+    for name in ("acrobot", "cartpole", "cartpole-direct"):
+        assert json.loads(elsewhere("-m", "rlcli", "check", name, "--json").stdout)["passed"] is True
+    elsewhere("-m", "rlcli", "train", "acrobot", "--max-iterations", "2", "--num-envs", "16")
+    elsewhere("-m", "rlcli", "play", "acrobot", "--video", "acrobot.gif")
+    elsewhere("-m", "rlcli", "eval", "acrobot", "--episodes", "8", "--fail-under", "success=0.99", code=9)
+
+
+def test_every_command_of_the_plugins_readme_runs(site, tmp_path):
+    folder = tmp_path / "rlcli-example-acrobot"
+    shutil.copytree(ACROBOT, folder, ignore=shutil.ignore_patterns("__pycache__"))
+    own = tmp_path / "site"
+    shutil.copytree(site, own)
+    for left in own.glob("rlcli_example_acrobot*"):
+        shutil.rmtree(left)  # the README installs it
+    output = run_commands(blocks(folder / "README.md"), folder, site=own)
+    assert success_rate(output) >= 0.99
+    assert "acrobot: 0 errors, 0 warnings" in output
+    assert "6 passed" in output
+    assert (folder / "acrobot.gif").stat().st_size > 10_000
+
+
+def test_the_plugin_of_the_page_works_as_written(site, tmp_path):
+    own = tmp_path / "site"
+    shutil.copytree(site, own)
+    found = blocks(REPOSITORY / "docs" / "write-a-plugin.md")
+    write_files(found, tmp_path)
+    output = run_commands(found, tmp_path, site=own)
+    assert "my-arm: 0 errors, 0 warnings" in output
+    assert "1 passed" in output
+    assert success_rate(output) > 0.9
