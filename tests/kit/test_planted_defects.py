@@ -50,7 +50,7 @@ def test_every_check_has_a_docstring_that_says_what_it_demands():
 
 JOINT = '<joint type="hinge" axis="1 0 0" damping="0.05"/><geom name="arm"'
 BODY = '<body pos="0 0 0.5"><geom size="0.02" mass="0.1" contype="0" conaffinity="0"/></body></body>'
-ACTUATOR = '<actuator><motor joint="hinge"/></actuator></mujoco>'
+ACTUATOR = '<actuator><position joint="hinge" kp="0.1"/></actuator></mujoco>'
 
 
 @pytest.mark.parametrize(
