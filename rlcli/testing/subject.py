@@ -168,7 +168,8 @@ def task_of(env: VecEnv) -> DirectTask:
 
 def worlds(env: VecEnv) -> dict[str, Tensor]:
     """The engine's state, one row an environment."""
-    return {name: value for name, value in env.engine.state_dict().items() if len(value) == env.num_envs}
+    state = env.engine.state_dict()
+    return {name: value for name, value in state.items() if value.dim() and len(value) == env.num_envs}
 
 
 def column_names(env: VecEnv, group: str) -> list[str]:

@@ -15,7 +15,7 @@ from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import resolve
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import ConfigError, DivergedError
+from rlcli.errors import ConfigError, DivergedError, listing
 from rlcli.testing.subject import (
     NUM_ENVS,
     STEPS,
@@ -30,36 +30,21 @@ from rlcli.testing.subject import (
 
 
 def names(subject: Subject) -> Iterator[Finding]:
-    """Every name in the YAML resolves; joints, actuators and bodies of the model have names."""
-    model = subject.env().engine.model
-    kinds = (
-        (mujoco.mjtObj.mjOBJ_JOINT, model.njnt, "joint", "error", "no term can observe or reset it"),
-        (mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu, "actuator", "error", "no action term can drive it"),
-        (mujoco.mjtObj.mjOBJ_BODY, model.nbody, "body", "warning", "no term can name it"),
-    )
-    for kind, count, word, severity, why in kinds:
-        for item in range(count):
-            if mujoco.mj_id2name(model, kind, item):
-                continue
-            if word == "joint" and model.jnt_type[item] == mujoco.mjtJoint.mjJNT_FREE:
-                continue  # the root is found without its name
-            yield Finding(
-                "names",
-                severity,  # type: ignore[arg-type]
-                f"{word} {item}{_owner(model, kind, item)}",
-                f"has no name, so {why}",
-                f'give it one in the MJCF: <{word} name="..."/>',
-            )
-
-
-def _owner(model: mujoco.MjModel, kind: mujoco.mjtObj, item: int) -> str:
-    if kind == mujoco.mjtObj.mjOBJ_JOINT:
-        body = int(model.jnt_bodyid[item])
-    elif kind == mujoco.mjtObj.mjOBJ_BODY:
-        body = int(model.body_parentid[item])
-    else:
-        return ""
-    return f" of body '{mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or body}'"
+    """Every name in the YAML resolves; joints, actuators and bodies of the models have names."""
+    for entity, config in subject.resolved.task.scene.entities.items():
+        spec = mujoco.MjSpec.from_file(str(subject.source.root / config.model))
+        scalar = [joint for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]  # a root needs no name
+        for word, elements in (("joint", scalar), ("actuator", list(spec.actuators)), ("body", spec.bodies[1:])):
+            unnamed = [element for element in elements if not element.name]
+            if unnamed:
+                places = [f"on '{e.target}'" if word == "actuator" else f"in '{e.parent.name}'" for e in unnamed]
+                yield Finding(
+                    "names",
+                    "warning",
+                    f"scene.entities.{entity}: {config.model}",
+                    f"{word} without a name: {listing(places)}; a term can reach it only by its place in the file",
+                    f'name it in the MJCF: <{word} name="..."/>',
+                )
 
 
 def yaml_round_trip(subject: Subject) -> Iterator[Finding]:

@@ -48,27 +48,33 @@ def test_every_check_has_a_docstring_that_says_what_it_demands():
 # --- names ---
 
 
-def test_unnamed_joint_is_found(managed):
-    managed.xml = managed.xml.replace(
-        '<geom name="arm"', '<joint type="hinge" axis="1 0 0" damping="0.05"/><geom name="arm"'
-    )
-    finding = errors(managed)["names"]
-    assert "joint" in finding.where
-    assert "robot/arm" in finding.where
-    assert "<joint name=" in finding.hint
+JOINT = '<joint type="hinge" axis="1 0 0" damping="0.05"/><geom name="arm"'
+BODY = '<body pos="0 0 0.5"><geom size="0.02" mass="0.1" contype="0" conaffinity="0"/></body></body>'
+ACTUATOR = '<actuator><position joint="hinge" kp="0.1"/></actuator></mujoco>'
 
 
-def test_unnamed_actuator_is_found(managed):
-    managed.xml = managed.xml.replace("</mujoco>", '<actuator><motor joint="hinge"/></actuator></mujoco>')
-    assert "actuator" in errors(managed)["names"].where
+@pytest.mark.parametrize(
+    ("word", "place", "old", "new"),
+    [
+        ("joint", "in 'arm'", '<geom name="arm"', JOINT),
+        ("body", "in 'arm'", "</body>", BODY),
+        ("actuator", "on 'hinge'", "</mujoco>", ACTUATOR),
+    ],
+)
+def test_what_the_model_leaves_unnamed_is_found(word, place, old, new, managed):
+    managed.xml = managed.xml.replace(old, new)
+    (finding,) = [f for f in check_task(managed.write(), only=["names"]) if f.check == "names"]
+    assert f"{word} without a name: {place}" in finding.message
+    assert "pendulum.xml" in finding.where
+    assert f"<{word} name=" in finding.hint
 
 
-def test_unnamed_body_is_a_warning(managed):
-    managed.xml = managed.xml.replace(
-        "</body>", '<body pos="0 0 0.5"><geom size="0.02" mass="0.1" contype="0" conaffinity="0"/></body></body>'
-    )
-    (finding,) = check(managed)
-    assert (finding.check, finding.severity) == ("names", "warning")
+def test_free_joint_needs_no_name(managed):
+    managed.xml = managed.xml.replace("</worldbody>", FREE + "</worldbody>")
+    assert check_task(managed.write(), only=["names"]) == []
+
+
+FREE = '<body name="ball"><freejoint/><geom size="0.02" mass="0.1" contype="0" conaffinity="0"/></body>'
 
 
 def test_every_joint_that_the_model_lacks_is_a_finding(managed):
