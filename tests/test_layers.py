@@ -16,7 +16,7 @@ LAYERS = [
     {"config", "registry", "probe"},
     {"sim"},
     {"managers", "mdp", "envs"},
-    {"rl", "viewer", "adapters"},
+    {"rl", "viewer", "adapters", "testing", "pytest_plugin"},
     {"cli"},
 ]
 ANYWHERE = {"rlcli", "rlcli.__main__"}
