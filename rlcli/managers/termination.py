@@ -42,7 +42,9 @@ class TerminationManager:
         return self.terminated, self.time_outs
 
     def _any(self, masks: list[Tensor]) -> Tensor:
-        return functools.reduce(torch.logical_or, masks) if masks else self._none.clone()
+        if len(masks) < 2:  # a copy: a term may keep its own tensor from step to step
+            return masks[0].clone() if masks else self._none.clone()
+        return functools.reduce(torch.logical_or, masks)
 
     def causes(self, ended: Selection) -> dict[str, Tensor]:
         """Term -> whether it fired where episodes ended. (n,) bool each"""
