@@ -81,8 +81,9 @@ def main(arguments: list[str] | None = None) -> int:
 def _with_values(arguments: list[str]) -> list[str]:
     """`--video` may stand without its FILE: the parser knows no optional values, so the word for "choose" is put in."""
     filled = []
-    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
+    for position, word in enumerate(arguments):
         filled.append(word)
+        following = arguments[position + 1] if position + 1 < len(arguments) else ""
         if word == "--video" and (not following or following.startswith("-") or "=" in following):
             filled.append(CHOOSE)
     return filled

@@ -195,7 +195,7 @@ def test_validate_deep_reports_all_problems_of_the_model_at_once(in_process, sma
         (None, "", "no file 'model.xml'"),
         ("<mujoco>", "", "'model.xml' is not a valid MJCF"),
         ("not xml", "", "'model.xml' is not a valid MJCF"),
-        ("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>", "", "has no body"),
+        ("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>", "", "no joint matches"),
         (
             "<mujoco><worldbody><body><joint type='slide'/></body></worldbody></mujoco>",
             "actions.push.joints=.*",
