@@ -27,7 +27,7 @@ MODULES = {"mujoco", "gymnasium", "stable_baselines3", "rlcli_tasks"}
 
 def python(code, *arguments, cwd, blocked=frozenset()):
     return subprocess.run(
-        [sys.executable, "-c", WITHOUT.format(blocked=set(blocked)) + code, *map(str, arguments)],
+        [sys.executable, "-B", "-c", WITHOUT.format(blocked=set(blocked)) + code, *map(str, arguments)],
         cwd=cwd,
         capture_output=True,
         text=True,

@@ -295,7 +295,8 @@ except MachineError as error:
 def test_a_file_size_limit_is_a_machine_error_and_leaves_nothing(tmp_path):
     folder = tmp_path / "checkpoints"
     folder.mkdir()
-    command = [sys.executable, "-c", LIMITED, str(folder), str(Path(__file__).parent)]
+    # -B: under the limit Python would leave modules half-compiled for everybody
+    command = [sys.executable, "-B", "-c", LIMITED, str(folder), str(Path(__file__).parent)]
     said = subprocess.run(command, capture_output=True, text=True)
     assert "File too large" in said.stdout, said.stderr
     assert list(folder.iterdir()) == []
