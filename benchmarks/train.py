@@ -23,9 +23,9 @@ from stable_baselines3.common.logger import Logger
 from rlcli.adapters.sb3 import Sb3VecEnv
 from rlcli.config.load import resolve
 from rlcli.envs.vec_env import make_env
+from rlcli.machine import available_cores
 from rlcli.registry import find_task
 from rlcli.rl.sb3 import Sb3Trainer
-from rlcli.sim.engine import available_cores
 
 SIZES = ["agent.n_steps=16", "agent.n_epochs=5", "agent.num_minibatches=4"]
 

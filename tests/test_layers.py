@@ -12,7 +12,7 @@ import rlcli
 PACKAGE = Path(rlcli.__file__).parent
 REPOSITORY = PACKAGE.parent
 LAYERS = [
-    {"errors", "task", "trainers", "random"},
+    {"errors", "task", "trainers", "random", "machine"},
     {"config", "registry", "probe"},
     {"sim"},
     {"managers", "mdp", "envs"},

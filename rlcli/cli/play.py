@@ -109,11 +109,13 @@ def _video(session: Any, file: Path) -> None:
     from rlcli.viewer.writer import VideoWriter
 
     env = session.env
+    stride = max(1, env.config.sim.render_interval // env.config.decimation)
     ended = False
-    with Renderer(env.engine.model, env.config.viewer) as renderer, VideoWriter(file, env.step_dt) as writer:
+    with Renderer(env.engine.model, env.config.viewer) as renderer, VideoWriter(file, stride * env.step_dt) as writer:
 
         def act(obs: Any) -> Any:
-            if not ended:  # a picture of every state that the policy acts in: the first one too, one a step
+            # a picture of the states that the policy acts in, the first one too
+            if not ended and int(env.episode_length_buf[0]) % stride == 0:
                 writer.add(renderer.draw(*env.world(0)))
             return session.act(obs)
 

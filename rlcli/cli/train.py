@@ -341,10 +341,10 @@ def _report(job: _Job, trainer: Any) -> None:
 
 def _threads(resolved: Resolved) -> tuple[int, int]:
     """Threads of the engine and of torch's update."""
-    import os
+    from rlcli.machine import available_cores
 
     assert resolved.agent is not None
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = available_cores()
     return resolved.task.sim.engine_threads or cores, resolved.agent.torch_threads or min(4, cores)
 
 

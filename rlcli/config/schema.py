@@ -147,7 +147,7 @@ class SimConfig(StrictModel):
     dt: Annotated[float, Field(gt=0, le=0.1), _Fraction()]
     """Physics time step [s]."""
     render_interval: Count = 1
-    """Physics steps between two rendered frames."""
+    """Physics steps between two frames of a video; never less than one environment step."""
     gravity: Vec3 = (0.0, 0.0, -9.81)
     """Gravity in the world frame [m/s^2]."""
     integrator: Literal["euler", "rk4", "implicit", "implicitfast"] | None = None

@@ -66,11 +66,6 @@ class BatchEngine:
         self._forward_stage = _NONE
         self._own_constants = False
 
-    @property
-    def reads_derived(self) -> bool:
-        """Whether some bound field is computed from the state."""
-        return self._forward_stage != _NONE
-
     def field(self, name: str) -> Tensor:
         """A live view of an MjData field; binding a derived one makes the last substep compute its stage."""
         if name not in self._fields:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, Protocol
 
 import mujoco
@@ -10,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import DeviceError
+from rlcli.machine import available_cores
 from rlcli.sim.selection import Selection
 
 if TYPE_CHECKING:
@@ -24,11 +24,6 @@ class Engine(Protocol):
     model: mujoco.MjModel
     threads: int
     warnings: dict[str, int]
-
-    @property
-    def reads_derived(self) -> bool:
-        """Whether some bound field is computed from the state, so that `forward` is needed after writing it."""
-        ...
 
     def field(self, name: str) -> Tensor:
         """A live view of an MjData field: state fields are writable, derived ones (xpos, ...) must only be read.
@@ -101,11 +96,6 @@ def open_engine(model: mujoco.MjModel, num_envs: int, *, device: str = "cpu", th
     from rlcli.sim.batch import BatchEngine
 
     return BatchEngine(model, num_envs, threads or available_cores())
-
-
-def available_cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def quiet_mujoco() -> None:
