@@ -26,7 +26,8 @@ class DirectTask:
     """Base of a direct task. The framework owns the buffers; the hooks fill them.
 
     Order of a step: `pre_physics_step`, physics, `progress_buf += 1`, `get_observations`, `get_states`,
-    `calculate_metrics`, `is_done`; then `reset_idx` for the environments that ended, and their observations again.
+    `calculate_metrics`, `is_done`; then `reset` (or `reset_idx`) for the environments that ended, and their observations
+    again.
     """
 
     num_observations: ClassVar[int]
@@ -72,8 +73,15 @@ class DirectTask:
     def post_reset(self) -> None:
         """Called once, when the simulation runs: look up indices."""
 
+    def reset(self, selection: Selection) -> None:
+        """Write start states; the environments are in their default state.
+
+        Draw from the selection, write through it: `entity.write_joint_positions(selection, ...)`, `selection.write(...)`.
+        A GPU runs this form as part of the captured step. A task defines this hook or `reset_idx`, not both.
+        """
+
     def reset_idx(self, env_ids: Tensor) -> None:
-        """Write start states; the environments are in their default state. env_ids (n,) int64, sorted"""
+        """The same with ids, as OmniIsaacGymEnvs has it. env_ids (n,) int64, sorted"""
 
     def pre_physics_step(self, actions: Tensor) -> None:
         """Apply the actions. (num_envs, num_actions)"""
@@ -134,6 +142,7 @@ class DirectEnv(VecEnv):
         task = self.task
         self._returns = torch.zeros(self.num_envs, device=self.device)
         self._fresh = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self._resets_by_id = type(task).reset_idx is not DirectTask.reset_idx
         self._reset_hook = task.reset_idx
         task.reset_idx = self._reset_stale  # type: ignore[method-assign]
         # three buffers in turn: consecutive observations share no memory
@@ -217,11 +226,13 @@ class DirectEnv(VecEnv):
         )
 
     def _restart_workflow(self, selection: Selection) -> None:
-        ids = selection.read(self._ids)
-        self._reset_hook(ids)
-        self.task.progress_buf[ids] = 0
-        self.task.reset_buf[ids] = 1
-        self._fresh[ids] = True
+        task = self.task
+        task.reset(selection.stream(_RESET))
+        if self._resets_by_id:
+            self._reset_hook(selection.read(self._ids))
+        selection.write(task.progress_buf, 0)
+        selection.write(task.reset_buf, 1)
+        selection.write(self._fresh, True)
         selection.write(self._returns, 0.0)
 
     def _observe(self) -> dict[str, Tensor]:
