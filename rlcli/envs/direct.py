@@ -108,7 +108,8 @@ class DirectTask:
         They depend on the seed, the environment, its episode and `name`, and on nothing else.
         """
         ids = env_ids.numpy()
-        return IdSelection(ids, self.env.seed, self.env.episode_index.numpy()[ids], stream(f"direct.{name}"))
+        first, episodes = self.env.engine.first_env, self.env.episode_index.numpy()[ids]
+        return IdSelection(ids, self.env.seed, episodes, first, stream(f"direct.{name}"))
 
 
 class DirectEnv(VecEnv):

@@ -49,12 +49,16 @@ _NONE, _VEL, _ACC = (
 class BatchEngine:
     """Many worlds of one model on CPU threads. Physics is float64."""
 
+    asynchronous = False
+
     def __init__(self, model: mujoco.MjModel, num_envs: int, threads: int) -> None:
         quiet_mujoco()
         self.model = model
         self.num_envs = num_envs
         self.device = torch.device("cpu")
         self.threads = threads
+        self.first_env = 0
+        self.divergences = 0
         self.warnings = dict.fromkeys(_NOTED, 0)
         self._batch = Batch(model, num_envs, threads)
         self._state = torch.from_numpy(self._batch.state)
@@ -65,6 +69,9 @@ class BatchEngine:
         self._step_stage = _NONE
         self._forward_stage = _NONE
         self._own_constants = False
+
+    def attach(self) -> None:
+        """Nothing to do: calls return when their work is done."""
 
     def field(self, name: str) -> Tensor:
         """A live view of an MjData field; binding a derived one makes the last substep compute its stage."""
@@ -112,7 +119,10 @@ class BatchEngine:
         if self._batch._expanded:  # a time step or a mass of its own that is NaN gives no warning at first
             silent = ~(self.field("qpos").isfinite().all(dim=1) & self.field("qvel").isfinite().all(dim=1))
             bad = silent if bad is None else bad | silent
-        return bad if bad is not None and bool(bad.any()) else None
+        if bad is None or not bool(bad.any()):
+            return None
+        self.divergences += int(bad.sum())
+        return bad
 
     def _warned(self) -> Tensor:
         counts = self._batch.warning[:, :, 1]
@@ -145,7 +155,14 @@ class BatchEngine:
     def select(self, mask: Tensor, seed: int, counters: Tensor) -> IdSelection | None:
         """The worlds where `mask` holds, as ids; None for none."""
         ids = mask.numpy().nonzero()[0]
-        return IdSelection(ids, seed, counters.numpy()[ids]) if len(ids) else None
+        return IdSelection(ids, seed, counters.numpy()[ids], self.first_env) if len(ids) else None
+
+    def watch(self, values: Tensor, what: str) -> None:
+        """Never needed: values are checked where they are made."""
+
+    def noted(self) -> list[str]:
+        """Nothing."""
+        return []
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copies of the state rows, of the warning counters and of the model fields that differ between worlds.
