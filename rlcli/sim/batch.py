@@ -74,11 +74,11 @@ class BatchEngine:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # torch has no read-only tensors; derived views must only be read
                 self._fields[name] = torch.from_numpy(self._batch.bind(name))
-            if name in _ACCELERATION:
+            if self._of_substep(name):
                 self._forward_stage = _ACC
-            elif name not in _NOT_DERIVED:
+            if name not in _NOT_DERIVED and name not in _ACCELERATION and not self._senses_forces_alone(name):
                 self._step_stage = _VEL
-                self._forward_stage = max(self._forward_stage, _ACC if self._senses(name) else _VEL)
+                self._forward_stage = max(self._forward_stage, _VEL)
         return self._fields[name]
 
     def expand(self, name: str) -> Tensor:
@@ -191,6 +191,11 @@ class BatchEngine:
         """Whether the field holds sensors of the acceleration stage."""
         stages = self.model.sensor_needstage
         return name == "sensordata" and bool((stages == int(mujoco.mjtStage.mjSTAGE_ACC)).any())
+
+    def _senses_forces_alone(self, name: str) -> bool:
+        """Whether the field holds sensors of the acceleration stage and no others: no other stage writes it."""
+        stages = self.model.sensor_needstage
+        return name == "sensordata" and bool((stages == int(mujoco.mjtStage.mjSTAGE_ACC)).all())
 
     def _of_substep(self, name: str) -> bool:
         return name in _ACCELERATION or self._senses(name)
