@@ -86,6 +86,8 @@ class AntTask(DirectTask):
         self.start_distance = torch.linalg.vector_norm(self.target - data.default_root_state[:, :2], dim=1)
         self.distance = self.start_distance.clone()
         self.distance_before = self.start_distance.clone()
+        self.speed = torch.zeros(n, device=self.device)
+        self.extras["speed"] = self.speed  # towards the target [m/s]
         self.actions = torch.zeros(n, self.num_actions, device=self.device)
         # the velocity of the torso and the three axes of the world, all to be seen from the torso
         self.seen = torch.cat([torch.zeros(1, 3), torch.eye(3)]).to(self.device).repeat(n, 1, 1)
@@ -146,7 +148,8 @@ class AntTask(DirectTask):
         cost.add_(obs[:, JOINT_POS].abs() > 0.99, alpha=params.limit_cost)
         reward = (obs[:, HEADING] / 0.8).clamp_(max=1.0).mul_(params.heading_weight)
         reward.add_(obs[:, UP] > 0.93, alpha=params.up_weight)
-        reward.add_(self.distance_before - self.distance, alpha=params.progress_weight / self.step_dt)
+        torch.sub(self.distance_before, self.distance, out=self.speed).div_(self.step_dt)
+        reward.add_(self.speed, alpha=params.progress_weight)
         reward.add_(params.alive_weight).sub_(cost.sum(dim=1))
         self.rew_buf.copy_(reward.masked_fill_(self._fallen(), params.death_reward))
         self.distance_before.copy_(self.distance)
