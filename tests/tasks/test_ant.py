@@ -1,6 +1,9 @@
 """The task `ant-direct`: its model, what it observes, what it pays, where it ends, how it starts."""
 
+import json
 import math
+import subprocess
+import sys
 from itertools import pairwise
 
 import mujoco
@@ -357,3 +360,12 @@ def test_an_episode_that_ends_at_speed_is_a_success(speed, succeeds):
         result = env.step(torch.zeros(2, 8))
     assert result.truncated.all()
     assert result.episodes.success.tolist() == [succeeds] * 2
+
+
+@pytest.mark.slow
+def test_a_hundred_iterations_teach_it_to_walk(tmp_path):
+    command = ["-m", "rlcli", "train", "ant-direct", "--max-iterations", "100", "--runs-dir", str(tmp_path), "--quiet"]
+    subprocess.run([sys.executable, *command], check=True)
+    (metrics,) = tmp_path.glob("ant-direct/*/metrics.jsonl")
+    last = json.loads(metrics.read_text().splitlines()[-1])
+    assert last["Task/speed"] > 1.0
