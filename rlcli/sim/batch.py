@@ -80,12 +80,15 @@ class BatchEngine:
                 raise ValueError(f"'{name}' is not an MjData field; {did_you_mean(name, DATA_FIELDS) or ''}")
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # torch has no read-only tensors; derived views must only be read
-                self._fields[name] = torch.from_numpy(self._batch.bind(name))
-            if name in _ACCELERATION:
+                bound = torch.from_numpy(self._batch.bind(name))
+            if self._of_substep(name):
                 self._forward_stage = _ACC
-            elif name not in _NOT_DERIVED:
+            if name not in _NOT_DERIVED and name not in _ACCELERATION and not self._senses_forces_alone(name):
                 self._step_stage = _VEL
-                self._forward_stage = max(self._forward_stage, _ACC if self._senses(name) else _VEL)
+                self._forward_stage = max(self._forward_stage, _VEL)
+            if name not in _NOT_DERIVED:
+                self._forward_all()  # a field asked for late holds zeros until then
+            self._fields[name] = bound
         return self._fields[name]
 
     def expand(self, name: str) -> Tensor:
@@ -184,11 +187,13 @@ class BatchEngine:
                 self.expand(name.removeprefix("model.")).copy_(values)
         if bool(state["constants"]):
             self.set_constants()
+        substep = {n.removeprefix("substep."): values for n, values in state.items() if n.startswith("substep.")}
+        for name in substep:
+            self.field(name)  # whoever saved had asked for it; here that may come later
         if self._forward_stage != _NONE:
             self._batch.forward(stage=self._forward_stage)
-        for name, field in self._fields.items():
-            if f"substep.{name}" in state:
-                field.copy_(state[f"substep.{name}"])
+        for name, values in substep.items():
+            self._fields[name].copy_(values)
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """One world as MjModel and MjData, forwarded; asked again for the same world, the same two objects, updated."""
@@ -204,10 +209,25 @@ class BatchEngine:
     def close(self) -> None:
         """Nothing is held that Python does not free."""
 
+    def _forward_all(self) -> None:
+        """Compute what is bound from the state of every world; fields of the last substep keep their values."""
+        kept = {name: value.clone() for name, value in self._fields.items() if self._of_substep(name)}
+        try:
+            self._batch.forward(stage=self._forward_stage)
+        except SimulationError as error:
+            raise _engine_error(error) from None
+        for name, value in kept.items():
+            self._fields[name].copy_(value)
+
     def _senses(self, name: str) -> bool:
         """Whether the field holds sensors of the acceleration stage."""
         stages = self.model.sensor_needstage
         return name == "sensordata" and bool((stages == int(mujoco.mjtStage.mjSTAGE_ACC)).any())
+
+    def _senses_forces_alone(self, name: str) -> bool:
+        """Whether the field holds sensors of the acceleration stage and no others: no other stage writes it."""
+        stages = self.model.sensor_needstage
+        return name == "sensordata" and bool((stages == int(mujoco.mjtStage.mjSTAGE_ACC)).all())
 
     def _of_substep(self, name: str) -> bool:
         return name in _ACCELERATION or self._senses(name)
