@@ -127,9 +127,14 @@ def adam(vector: nn.Parameter, learning_rate: Tensor, eps: float) -> torch.optim
 def _mlp(inputs: int, config: NetworkConfig, outputs: int, init: str, gain: float) -> nn.Sequential:
     layers: list[nn.Module] = []
     for width in config.hidden:
-        layers += [_linear(inputs, width, init, math.sqrt(2.0)), ACTIVATIONS[config.activation]()]
+        layers += [_linear(inputs, width, init, math.sqrt(2.0)), _activation(config.activation)]
         inputs = width
     return nn.Sequential(*layers, _linear(inputs, outputs, init, gain))
+
+
+def _activation(name: str) -> nn.Module:
+    """In place where the gradient can be had from the result: nothing reads a linear layer's output otherwise."""
+    return ACTIVATIONS[name](inplace=True) if name in ("elu", "relu") else ACTIVATIONS[name]()
 
 
 def _linear(inputs: int, outputs: int, init: str, gain: float) -> nn.Linear:

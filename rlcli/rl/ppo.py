@@ -218,10 +218,8 @@ class PpoTrainer:
             self._kl.zero_()
             for number, minibatch in enumerate(rollout.minibatches):
                 self._descend(minibatch, self._old_std[number])
-            if config.kl_grain == "epoch":
-                self._adapt(self._kl / len(rollout.minibatches))
-        if config.kl_grain == "iteration":
-            self._adapt(self._kl / len(rollout.minibatches))
+            self._adapt(self._kl / len(rollout.minibatches), "epoch")
+        self._adapt(self._kl / len(rollout.minibatches), "iteration")
         self._conclude()
 
     def _order(self) -> Tensor:
@@ -244,24 +242,28 @@ class PpoTrainer:
         value_loss = self._value_loss(value, batch)
         entropy = (std.log() + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
         loss = surrogate + config.value_coef * value_loss - config.entropy_coef * entropy
-        bounds = (mean.abs() - config.bounds_margin).clamp(min=0.0).square().sum(dim=-1).mean()
         if config.bounds_coef:
+            bounds = (mean.abs() - config.bounds_margin).clamp(min=0.0).square().sum(dim=-1).mean()
             loss = loss + config.bounds_coef * bounds
+        else:
+            bounds = torch.zeros_like(loss)
 
         with torch.no_grad():
-            kl = self._divergence(batch, old_std, mean, std)
-            self._kl += kl
+            old = config.kl_from == "rollout"
+            kl = _divergence(batch.mean, old_std, mean, std) if old else _divergence(mean, std, batch.mean, old_std)
             clip_fraction = ((ratio - 1.0).abs() > config.clip_range).float().mean()
+            self._kl += kl
             self._sums += torch.stack((surrogate, value_loss, entropy, kl, clip_fraction, bounds))
-        every_minibatch = config.kl_grain == "minibatch"
-        if every_minibatch and config.kl_from == "rollout":
-            self._adapt(kl)
+        if old:
+            self._adapt(kl, "minibatch")
         self._gradient.zero_()
         loss.backward()
         self._clip_gradient()
         self._optimizer.step()
-        if every_minibatch and config.kl_from == "last_pass":
-            self._adapt(kl)
+        if not old:
+            self._adapt(kl, "minibatch")
+            batch.mean.copy_(mean.detach())
+            old_std.copy_(std.detach())
 
     def _value_loss(self, value: Tensor, batch: Samples) -> Tensor:
         config = self.config
@@ -273,19 +275,10 @@ class PpoTrainer:
             error = torch.max(error, clipped_error) if config.clip_value == "larger" else clipped_error
         return error.mean()
 
-    def _divergence(self, batch: Samples, old_std: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-        """Mean divergence between the old policy and this one; of two passes, the other way round."""
-        if self.config.kl_from == "rollout":
-            return _divergence(batch.mean, old_std, mean, std)
-        kl = _divergence(mean, std, batch.mean, old_std)
-        batch.mean.copy_(mean)
-        old_std.copy_(std)
-        return kl
-
-    def _adapt(self, kl: Tensor) -> None:
-        """Move the learning rate to where the divergence is as desired."""
+    def _adapt(self, kl: Tensor, grain: str) -> None:
+        """Move the learning rate to where the divergence is as desired, if that is the grain to do it at."""
         desired = self.config.desired_kl
-        if desired is None:
+        if desired is None or grain != self.config.kl_grain:
             return
         low, high = self.config.learning_rate_range
         rate = self.learning_rate
