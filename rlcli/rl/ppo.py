@@ -179,10 +179,9 @@ class PpoTrainer:
         torch.add(samples.advantage, value, out=samples.target)
         self._explain(value)
         if self.value_normalizer is not None:
-            self.value_normalizer.update(samples.value)
-            self.value_normalizer.update(samples.target)
-            samples.value.copy_(self.value_normalizer(samples.value))
-            samples.target.copy_(self.value_normalizer(samples.target))
+            for column in (samples.value, samples.target):
+                self.value_normalizer.update(column)
+                column.copy_(self.value_normalizer(column))
         if config.normalize_advantage == "batch":
             samples.advantage.copy_(_standardized(samples.advantage))
 
@@ -249,18 +248,19 @@ class PpoTrainer:
             bounds = torch.zeros_like(loss)
 
         with torch.no_grad():
-            old = config.kl_from == "rollout"
-            kl = _divergence(batch.mean, old_std, mean, std) if old else _divergence(mean, std, batch.mean, old_std)
+            acted = config.kl_from == "rollout"
+            old, new = (batch.mean, old_std), (mean, std)
+            kl = _divergence(*old, *new) if acted else _divergence(*new, *old, eps=1e-5)
             clip_fraction = ((ratio - 1.0).abs() > config.clip_range).float().mean()
             self._kl += kl
             self._sums += torch.stack((surrogate, value_loss, entropy, kl, clip_fraction, bounds))
-        if old:
+        if acted:
             self._adapt(kl, "minibatch")
         self._gradient.zero_()
         loss.backward()
         self._clip_gradient()
         self._optimizer.step()
-        if not old:
+        if not acted:
             self._adapt(kl, "minibatch")
             batch.mean.copy_(mean.detach())
             old_std.copy_(std.detach())
@@ -426,10 +426,10 @@ def _log_prob(noise: Tensor, std: Tensor) -> Tensor:
     return -(0.5 * noise.square() + std.log() + 0.5 * math.log(2.0 * math.pi)).sum(dim=-1)
 
 
-def _divergence(mean: Tensor, std: Tensor, other_mean: Tensor, other_std: Tensor) -> Tensor:
+def _divergence(mean: Tensor, std: Tensor, other_mean: Tensor, other_std: Tensor, eps: float = 0.0) -> Tensor:
     """Mean of KL(N(mean, std) || N(other_mean, other_std)). (n, a), (a,), (n, a), (a,) -> ()"""
-    variances = (std.square() + (mean - other_mean).square()) / (2.0 * other_std.square())
-    return ((other_std / std).log() + variances - 0.5).sum(dim=-1).mean()
+    variances = (std.square() + (mean - other_mean).square()) / (2.0 * (other_std.square() + eps))
+    return ((other_std / std + eps).log() + variances - 0.5).sum(dim=-1).mean()
 
 
 def _standardized(values: Tensor) -> Tensor:

@@ -490,8 +490,8 @@ def test_initial_weights_are_as_asked(own, init, check):
     if init == "orthogonal":
         weight = networks.actor[0].weight.detach()
         torch.testing.assert_close(weight.T @ weight, 2.0 * torch.eye(2), rtol=0, atol=1e-5)
-        assert float(networks.actor[-1].weight.norm()) == pytest.approx(0.01, rel=1e-4)
-        assert float(networks.critic[-1].weight.norm()) == pytest.approx(1.0, rel=1e-4)
+        assert networks.actor[-1].weight.norm().item() == pytest.approx(0.01, rel=1e-4)
+        assert networks.critic[-1].weight.norm().item() == pytest.approx(1.0, rel=1e-4)
 
 
 def test_a_dialect_gives_defaults_that_given_keys_replace(own):
