@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from rlcli.rl.policy import ACTIVATIONS
+from rlcli.rl.policy import ACTIVATIONS, Normalizer
 from rlcli.rl.ppo_config import NetworkConfig, PpoConfig
 
 _MIN_STD = 1e-6
@@ -61,18 +61,12 @@ class ActorCritic(nn.Module):
                 self.raw_std.copy_(policy["log_std"].exp())
 
 
-class ValueNormalizer(nn.Module):
-    """Running mean and variance of returns; both begin as if one return had been seen, 0 with a variance of 1."""
-
-    mean: Tensor
-    var: Tensor
-    count: Tensor
+class ValueNormalizer(Normalizer):
+    """Running mean and variance of returns; they begin as if one return had been seen, 0 with a variance of 1."""
 
     def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("mean", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("var", torch.ones((), dtype=torch.float64))
-        self.register_buffer("count", torch.ones((), dtype=torch.float64))
+        super().__init__(())
+        self.count.fill_(1.0)
 
     def forward(self, value: Tensor) -> Tensor:
         """To what the critic learns."""
@@ -82,30 +76,21 @@ class ValueNormalizer(nn.Module):
         """From what the critic gives."""
         return value.clamp(-_VALUE_CLIP, _VALUE_CLIP) * self._std + self.mean.float()
 
-    def update(self, value: Tensor) -> None:
-        """Take in a batch."""
-        mean, var, count = value.mean(), value.var(unbiased=False), float(value.numel())
-        total = self.count + count
-        delta = mean - self.mean
-        spread = self.var * self.count + var * count + delta.square() * self.count * count / total
-        self.mean += delta * count / total
-        self.var.copy_(spread / total)
-        self.count.copy_(total)
-
     @property
     def _std(self) -> Tensor:
         return (self.var.float() + _VALUE_EPS).sqrt()
 
 
 def flatten(module: nn.Module) -> tuple[nn.Parameter, Tensor, dict[str, slice]]:
-    """Make a module's parameters views of one vector, and their gradients views of that vector's.
+    """Make a module's parameters views of one vector, and their gradients views of another.
 
     Returns:
-        The vector, its gradient, and where in it each parameter lies.
+        The vector, its gradient with room for one more number behind it, and where each parameter lies.
     """
     parameters = dict(module.named_parameters())
     vector = nn.Parameter(torch.cat([value.detach().flatten() for value in parameters.values()]))
-    vector.grad = gradient = torch.zeros_like(vector)
+    gradient = torch.zeros(len(vector) + 1, device=vector.device)
+    vector.grad = gradient[:-1]
     places, start = {}, 0
     for name, parameter in parameters.items():
         place = slice(start, start + parameter.numel())

@@ -51,7 +51,7 @@ class Normalizer(nn.Module):
     var: Tensor
     count: Tensor
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int | tuple[()]) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
@@ -65,7 +65,10 @@ class Normalizer(nn.Module):
     def update(self, obs: Tensor) -> None:
         """Take in a batch. (n, d)"""
         batch = obs.double()
-        mean, var, count = batch.mean(dim=0), batch.var(dim=0, unbiased=False), float(len(batch))
+        self.merge(batch.mean(dim=0), batch.var(dim=0, unbiased=False), float(len(batch)))
+
+    def merge(self, mean: Tensor, var: Tensor, count: float) -> None:
+        """Take in the mean and the variance of `count` samples. (d,)"""
         total = self.count + count
         delta = mean - self.mean
         spread = self.var * self.count + var * count + delta.square() * self.count * count / total

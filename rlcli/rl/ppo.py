@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from torch import Tensor
 from rlcli.envs.vec_env import StepResult, VecEnv
 from rlcli.errors import ConfigError, DivergedError
 from rlcli.random import derive
+from rlcli.rl import distributed
 from rlcli.rl.capture import captured
 from rlcli.rl.networks import ActorCritic, ValueNormalizer, adam, flatten
 from rlcli.rl.policy import Normalizer, Policy, PolicySpec
@@ -48,8 +50,10 @@ class PpoTrainer:
     def __init__(self, env: VecEnv, config: PpoConfig, *, seed: int, device: str, torch_threads: int) -> None:
         self.env, self.config, self.torch_threads = env, config, torch_threads
         self.device = torch.device(device)
+        self.peers = distributed.current()
         self.iteration, self.env_steps = 0, 0
-        self.steps_per_iteration = config.num_steps * env.num_envs
+        self._own_steps = config.num_steps * env.num_envs
+        self.steps_per_iteration = self._own_steps * self.peers.size
         env.final_obs_of = "truncated"
         self.statistics = EpisodeStatistics(env.config.episode_length_s)
         self._groups = _critic_groups(env, config)
@@ -60,9 +64,13 @@ class PpoTrainer:
         torch.set_num_threads(torch_threads)
         torch.manual_seed(derive(seed, "trainer"))
         self.networks = ActorCritic(obs_size, critic_size, self.spec.action_size, config).to(self.device)
-        self._vector, self._gradient, places = flatten(self.networks)
+        self._vector, self._shared, places = flatten(self.networks)
+        self._gradient, self._shared_kl = self._shared[:-1], self._shared[-1]
+        self.peers.lead_(self._vector.data)
         self._actor_end = min(place.start for name, place in places.items() if name.startswith("critic."))
         self.learning_rate = torch.tensor(config.learning_rate, device=self.device)
+        torch.manual_seed(self.peers.seed(derive(seed, "exploration"), "exploration"))
+        self._ceiling = torch.tensor(config.learning_rate_range[1], device=self.device)
         self._optimizer = adam(self._vector, self.learning_rate, config.adam_eps)
         normalize = config.normalize_observations
         self.normalizer = Normalizer(obs_size).to(self.device) if normalize else None
@@ -70,7 +78,7 @@ class PpoTrainer:
         self.value_normalizer = ValueNormalizer().to(self.device) if config.normalize_value else None
 
         sizes = (obs_size, 0 if shared else critic_size, self.spec.action_size)
-        minibatches = _minibatches(env, config, self.steps_per_iteration)
+        minibatches = _minibatches(env, config, self._own_steps)
         self._rollout = Rollout(config.num_steps, env.num_envs, sizes, minibatches, self.device)
         self._obs = {g: torch.zeros(env.num_envs, env.layout.size(g), device=self.device) for g in self._read()}
         self._raw = {g: torch.zeros(config.num_steps, *obs.shape, device=self.device) for g, obs in self._obs.items()}
@@ -180,10 +188,10 @@ class PpoTrainer:
         self._explain(value)
         if self.value_normalizer is not None:
             for column in (samples.value, samples.target):
-                self.value_normalizer.update(column)
+                self._learn_moments(self.value_normalizer, column.flatten())
                 column.copy_(self.value_normalizer(column))
         if config.normalize_advantage == "batch":
-            samples.advantage.copy_(_standardized(samples.advantage))
+            samples.advantage.copy_(self._standardized(samples.advantage))
 
     def _value(self, critic_obs: Tensor) -> Tensor:
         value = self.networks.value(critic_obs)
@@ -196,6 +204,12 @@ class PpoTrainer:
             value[mask] = self._value(critic_obs[mask])
             return value
         return torch.where(mask, self._value(critic_obs), 0.0)
+
+    def _standardized(self, values: Tensor) -> Tensor:
+        deviation = values - self.peers.average_(values.mean())
+        count = values.numel() * self.peers.size
+        variance = self.peers.average_(deviation.square().mean()) * (count / (count - 1))
+        return deviation / (variance.sqrt() + 1e-8)
 
     def _explain(self, value: Tensor) -> None:
         """The share of the returns' variance that the critic knew beforehand."""
@@ -224,7 +238,7 @@ class PpoTrainer:
     def _order(self) -> Tensor:
         if self.config.shuffle == "none":
             return self._rollout.by_environment
-        return torch.randperm(self.steps_per_iteration, device=self.device)
+        return torch.randperm(self._own_steps, device=self.device)
 
     def _descend(self, batch: Samples, old_std: Tensor) -> None:
         """One step of Adam down the clipped surrogate objective."""
@@ -232,7 +246,7 @@ class PpoTrainer:
         std, mean, value = networks.std, networks.actor(batch.obs), networks.value(batch.critic_obs)
         advantage = batch.advantage
         if config.normalize_advantage == "minibatch":
-            advantage = _standardized(advantage)
+            advantage = self._standardized(advantage)
 
         log_ratio = _log_prob((batch.action - mean) / std, std) - batch.log_prob
         ratio = log_ratio.exp()
@@ -252,16 +266,18 @@ class PpoTrainer:
             old, new = (batch.mean, old_std), (mean, std)
             kl = _divergence(*old, *new) if acted else _divergence(*new, *old, eps=1e-5)
             clip_fraction = ((ratio - 1.0).abs() > config.clip_range).float().mean()
-            self._kl += kl
             self._sums += torch.stack((surrogate, value_loss, entropy, kl, clip_fraction, bounds))
-        if acted:
-            self._adapt(kl, "minibatch")
         self._gradient.zero_()
         loss.backward()
+        self._shared_kl.copy_(kl)
+        self.peers.average_(self._shared)
+        self._kl += self._shared_kl
+        if acted:
+            self._adapt(self._shared_kl, "minibatch")
         self._clip_gradient()
         self._optimizer.step()
         if not acted:
-            self._adapt(kl, "minibatch")
+            self._adapt(self._shared_kl, "minibatch")
             batch.mean.copy_(mean.detach())
             old_std.copy_(std.detach())
 
@@ -280,9 +296,8 @@ class PpoTrainer:
         desired = self.config.desired_kl
         if desired is None or grain != self.config.kl_grain:
             return
-        low, high = self.config.learning_rate_range
-        rate = self.learning_rate
-        slower, faster = (rate / 1.5).clamp(min=low), (rate * 1.5).clamp(max=high)
+        rate, low = self.learning_rate, self.config.learning_rate_range[0]
+        slower, faster = (rate / 1.5).clamp(min=low), (rate * 1.5).minimum(self._ceiling)
         # a divergence from the rollout is 0 before the first step; one from the last pass is 0 all through the first
         too_small = (kl < 0.5 * desired) & (kl > (0.0 if self.config.kl_from == "rollout" else -1.0))
         rate.copy_(torch.where(kl > 2.0 * desired, slower, torch.where(too_small, faster, rate)))
@@ -302,6 +317,7 @@ class PpoTrainer:
         last = torch.stack((self.networks.std.mean(), self.learning_rate, self._vector.isfinite().all().float()))
         self._metrics[: len(_METRICS)].copy_(self._sums / updates)
         self._metrics[len(_METRICS) : -1].copy_(last)
+        self.peers.average_(self._metrics)
 
     # --- between rollout and update ---
 
@@ -312,7 +328,7 @@ class PpoTrainer:
         for name in ("Loss/surrogate", "Loss/value", "Policy/mean_std"):
             if not math.isfinite(metrics[name]):
                 raise DivergedError(f"{name} is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
-        if not finite:
+        if finite < 1.0:
             name = next(n for n, p in self.networks.named_parameters() if not bool(p.isfinite().all()))
             raise DivergedError(f"weight '{name}' is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
         if not self.config.bounds_coef:
@@ -320,9 +336,15 @@ class PpoTrainer:
         return {name: value for name, value in metrics.items() if math.isfinite(value)}
 
     def _decay(self) -> None:
-        if self.config.schedule == "linear":
-            done = Budget(self.config.max_iterations, self.config.max_steps).share(self)
-            self.learning_rate.fill_(self.config.learning_rate * max(0.0, 1.0 - done))
+        config = self.config
+        if not config.schedule.endswith("linear"):
+            return
+        left = max(0.0, 1.0 - Budget(config.max_iterations, config.max_steps).share(self))
+        if config.schedule == "linear":
+            self.learning_rate.fill_(config.learning_rate * left)
+        else:
+            self._ceiling.fill_(config.learning_rate_range[1] * left)
+            self.learning_rate.clamp_(max=self._ceiling)
 
     def _record(self) -> None:
         self._recorded = torch.cat([self._obs["policy"][:_RECORDED], self._recorded])[:_RECORDED]
@@ -348,9 +370,18 @@ class PpoTrainer:
 
     def _update_normalizers(self, obs: Mapping[str, Tensor]) -> None:
         if self.normalizer is not None:
-            self.normalizer.update(obs["policy"].flatten(0, -2))
+            self._learn_moments(self.normalizer, obs["policy"].flatten(0, -2))
         if self.critic_normalizer is not None:
-            self.critic_normalizer.update(_joined(obs, self._groups).flatten(0, -2))
+            self._learn_moments(self.critic_normalizer, _joined(obs, self._groups).flatten(0, -2))
+
+    def _learn_moments(self, normalizer: Normalizer, values: Tensor) -> None:
+        """Take in a batch of every process. (n, ...)"""
+        batch = values.double()
+        mean, var = batch.mean(dim=0), batch.var(dim=0, unbiased=False)
+        if self.peers.size > 1:
+            mean, square = self.peers.average_(torch.stack((mean, var + mean.square())))
+            var = square - mean.square()
+        normalizer.merge(mean, var, float(len(batch) * self.peers.size))
 
     # --- saving and restoring ---
 
@@ -365,22 +396,32 @@ class PpoTrainer:
         tensors = {
             "policy": self._policy_tensors(),
             "trainer": {name: _copy(value) for name, value in self._learner().items()},
-            "env": {name: value.cpu() for name, value in self.env.state_dict().items()},
-            "rng": rng_state(),
         }
         tensors["trainer"]["observations"] = _copy(self._recorded)
-        if self.device.type == "cuda":
-            tensors["rng"]["cuda"] = torch.cuda.get_rng_state(self.device)
         values = {
             "policy": self.spec.model_dump(),
             "iteration": self.iteration,
             "env_steps": self.env_steps,
-            "statistics": self.statistics.state(),
+            "processes": self.peers.size,
         }
+        for rank, (env, rng, statistics) in enumerate(self.peers.gather(self._own_state())):
+            suffix = f".{rank}" if rank else ""
+            tensors[f"env{suffix}"], tensors[f"rng{suffix}"] = env, rng
+            values[f"statistics{suffix}"] = statistics
         return TrainerState(tensors, values)
 
+    def _own_state(self) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
+        """What each process has for itself: environments, generators, statistics."""
+        rng = rng_state()
+        if self.device.type == "cuda":
+            rng["cuda"] = torch.cuda.get_rng_state(self.device)
+        return {n: value.cpu() for n, value in self.env.state_dict().items()}, rng, self.statistics.state()
+
     def load(self, state: TrainerState) -> None:
-        """Go back to a boundary: on a CPU the next iteration gives the same bits as it did then."""
+        """Go back to a boundary: on a CPU the next iteration gives the same bits as it did then.
+
+        With another number of processes than then, everything that is learned goes on, in new episodes.
+        """
         values, saved = state.values, state.tensors["trainer"]
         self.load_weights(state.tensors["policy"])
         with torch.no_grad():
@@ -388,11 +429,18 @@ class PpoTrainer:
                 value.copy_(saved[name])
         self._recorded = saved["observations"].to(self.device)
         self.iteration, self.env_steps = values["iteration"], values["env_steps"]
-        self.statistics.load(values["statistics"])
-        self._take_in(self.env.load_state_dict(state.tensors["env"]))
-        load_rng_state(state.tensors["rng"])
-        if self.device.type == "cuda" and "cuda" in state.tensors["rng"]:
-            torch.cuda.set_rng_state(state.tensors["rng"]["cuda"], self.device)
+        if values["processes"] != self.peers.size:
+            self.statistics.load(values["statistics"])
+            torch.manual_seed(derive(torch.initial_seed(), f"after {self.env_steps} steps"))
+            self._take_in(self.env.reset(seed=derive(self.env.seed, f"after {self.env_steps} steps")))
+            return
+        suffix = f".{self.peers.rank}" if self.peers.rank else ""
+        self.statistics.load(values[f"statistics{suffix}"])
+        self._take_in(self.env.load_state_dict(state.tensors[f"env{suffix}"]))
+        rng = state.tensors[f"rng{suffix}"]
+        load_rng_state(rng)
+        if self.device.type == "cuda" and "cuda" in rng:
+            torch.cuda.set_rng_state(rng["cuda"], self.device)
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
         """Take a policy's weights, with its normaliser; the critic stays as it is."""
@@ -430,10 +478,6 @@ def _divergence(mean: Tensor, std: Tensor, other_mean: Tensor, other_std: Tensor
     """Mean of KL(N(mean, std) || N(other_mean, other_std)). (n, a), (a,), (n, a), (a,) -> ()"""
     variances = (std.square() + (mean - other_mean).square()) / (2.0 * (other_std.square() + eps))
     return ((other_std / std + eps).log() + variances - 0.5).sum(dim=-1).mean()
-
-
-def _standardized(values: Tensor) -> Tensor:
-    return (values - values.mean()) / (values.std() + 1e-8)
 
 
 def _joined(obs: Mapping[str, Tensor], groups: tuple[str, ...]) -> Tensor:

@@ -77,18 +77,19 @@ class PpoConfig(AgentConfig):
     """Step size of Adam."""
     adam_eps: Positive = 1e-8
     """Adam's epsilon."""
-    schedule: Literal["constant", "linear", "adaptive"] = "constant"
+    schedule: Literal["constant", "linear", "adaptive", "adaptive_linear"] = "constant"
     """How the learning rate moves: linear goes to 0 over the budget; adaptive follows desired_kl: / 1.5 above twice
-    that divergence, x 1.5 below half of it."""
+    that divergence, x 1.5 below half of it; adaptive_linear does so under a ceiling that goes from the upper end of
+    learning_rate_range to 0 over the budget, so that the last iterations settle."""
     desired_kl: Positive | None = None
-    """Divergence between the policies before and after an update that schedule adaptive aims at."""
+    """Divergence between the policies before and after an update that an adaptive schedule aims at."""
     kl_grain: Literal["minibatch", "epoch", "iteration"] = "minibatch"
-    """How often schedule adaptive looks at the divergence; of an epoch its mean, of an iteration that of the last."""
+    """How often an adaptive schedule looks at the divergence; of an epoch its mean, of an iteration that of the last."""
     kl_from: Literal["rollout", "last_pass"] = "rollout"
     """The old policy: the one that acted, looked at before a minibatch's update; or, as rl_games has it, the one that
     the epoch before found for the same sample, looked at after the update."""
     learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)
-    """Where schedule adaptive stays."""
+    """Where an adaptive schedule stays."""
 
     normalize_observations: bool = False
     """Normalise observations by their running mean and deviation; the statistics are part of the policy."""
@@ -122,8 +123,8 @@ class PpoConfig(AgentConfig):
 
     @model_validator(mode="after")
     def _relations(self) -> PpoConfig:
-        if (self.schedule == "adaptive") != (self.desired_kl is not None):
-            raise ValueError("desired_kl belongs to schedule adaptive, and schedule adaptive needs it")
+        if self.schedule.startswith("adaptive") != (self.desired_kl is not None):
+            raise ValueError("desired_kl belongs to an adaptive schedule, and an adaptive schedule needs it")
         if self.kl_from == "last_pass" and self.shuffle == "epoch":
             raise ValueError("kl_from last_pass needs the same minibatches in every epoch: shuffle update or none")
         low, high = self.learning_rate_range
@@ -188,6 +189,7 @@ SPEC = TrainerSpec(
     summary="Built-in PPO in torch alone; on a GPU all of it is captured",
     algorithms={"ppo": "rlcli.rl.ppo_config:PpoConfig"},
     trainer="rlcli.rl.ppo:PpoTrainer",
+    parallel=True,
 )
 
 
