@@ -320,6 +320,14 @@ def test_an_adaptive_schedule_stays_in_its_range(own, desired, limit):
     assert learning_rates(trainer, 3)[-1] == pytest.approx(limit)
 
 
+def test_an_adaptive_schedule_that_settles_stays_under_a_ceiling_that_falls_to_zero(own):
+    trainer = trainer_of(
+        own, "agent.schedule=adaptive_linear", "agent.desired_kl=1e9", "agent.learning_rate=1e-3",
+        "agent.learning_rate_range=[1e-5, 2e-3]", "agent.max_iterations=4",
+    )  # fmt: skip
+    assert learning_rates(trainer, 4) == pytest.approx([2e-3, 1.5e-3, 1e-3, 0.5e-3])
+
+
 @pytest.mark.parametrize("rate", ["1e10", "1e30"])
 def test_a_learner_that_turns_nonfinite_is_a_divergence(own, rate):
     trainer = trainer_of(own, f"agent.learning_rate={rate}")
