@@ -34,6 +34,7 @@ LIGHT = [
     "rl/trainer.py",
     "rl/sb3_config.py",
     "rl/ppo_config.py",
+    "rl/distributed.py",
 ]
 """What is imported before a configuration is known to be good."""
 

@@ -15,7 +15,6 @@ from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import MachineError
-from rlcli.random import derive
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -39,7 +38,11 @@ class Peers:
 
     def seed(self, seed: int, what: str) -> int:
         """The seed of a process's own draws: the leader's is the one given."""
-        return seed if self.leads else derive(seed, f"{what} of process {self.rank}")
+        if self.leads:
+            return seed
+        from rlcli.random import derive
+
+        return derive(seed, f"{what} of process {self.rank}")
 
     def average_(self, values: Tensor) -> Tensor:
         """Put the mean over all processes in place."""

@@ -8,9 +8,10 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from rlcli.rl.policy import ACTIVATIONS, Normalizer
+from rlcli.rl.policy import ACTIVATIONS, Lstm, Normalizer
 from rlcli.rl.ppo_config import NetworkConfig, PpoConfig
 
+_POLICY = ("memory.", "actor.")
 _MIN_STD = 1e-6
 _VALUE_CLIP = 5.0
 _VALUE_EPS = 1e-5
@@ -28,12 +29,15 @@ class ActorCritic(nn.Module):
 
     def __init__(self, obs_size: int, critic_obs_size: int, action_size: int, config: PpoConfig) -> None:
         super().__init__()
-        self.actor = _mlp(obs_size, config.actor, action_size, config.init, gain=0.01)
+        cells = [config.rnn.hidden] * config.rnn.layers if config.rnn else []
+        self.memory = Lstm(obs_size, cells) if cells else None
+        self.actor = _mlp(cells[-1] if cells else obs_size, config.actor, action_size, config.init, gain=0.01)
         if config.std == "log":
             self.log_std = nn.Parameter(torch.full((action_size,), math.log(config.init_std)))
         else:
             self.raw_std = nn.Parameter(torch.full((action_size,), config.init_std))
-        self.critic = _mlp(critic_obs_size, config.critic, 1, config.init, gain=1.0)
+        self.critic_memory = Lstm(critic_obs_size, cells) if cells else None
+        self.critic = _mlp(cells[-1] if cells else critic_obs_size, config.critic, 1, config.init, gain=1.0)
 
     @property
     def std(self) -> Tensor:
@@ -46,19 +50,35 @@ class ActorCritic(nn.Module):
 
     def policy_tensors(self) -> dict[str, Tensor]:
         """Copies of what the policy is made of, by the names that a saved policy has."""
-        tensors = {f"actor.{name}": value.detach().clone() for name, value in self.actor.state_dict().items()}
+        tensors = {
+            name: value.detach().clone() for name, value in self.state_dict().items() if name.startswith(_POLICY)
+        }
         log_std = self.log_std if hasattr(self, "log_std") else self.std.log()
         return {**tensors, "log_std": log_std.detach().clone()}
 
     def load_policy_tensors(self, policy: Mapping[str, Tensor]) -> None:
         """Take what `policy_tensors` gave."""
-        actor = {name.removeprefix("actor."): value for name, value in policy.items() if name.startswith("actor.")}
-        self.actor.load_state_dict(actor)
+        weights = self.state_dict()
+        weights |= {name: policy[name] for name in weights if name.startswith(_POLICY)}
+        self.load_state_dict(weights)
         with torch.no_grad():
             if hasattr(self, "log_std"):
                 self.log_std.copy_(policy["log_std"])
             else:
                 self.raw_std.copy_(policy["log_std"].exp())
+
+
+def remembered(memory: Lstm, seen: Tensor, begins: Tensor, before: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """What a memory makes of several steps, and its state after each; it is blank where an episode begins.
+
+    (steps, n, d), (steps, n), (n, m) -> (steps, n, cells), (n, m) each
+    """
+    features, states = [], []
+    for obs, begin in zip(seen, begins, strict=True):
+        feature, before = memory(obs, before * (1.0 - begin)[:, None])
+        features.append(feature)
+        states.append(before)
+    return torch.stack(features), states
 
 
 class ValueNormalizer(Normalizer):

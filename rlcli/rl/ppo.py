@@ -16,14 +16,15 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.vec_env import StepResult, VecEnv
-from rlcli.errors import ConfigError, DivergedError
+from rlcli.errors import DivergedError
 from rlcli.random import derive
 from rlcli.rl import distributed
 from rlcli.rl.capture import captured
-from rlcli.rl.networks import ActorCritic, ValueNormalizer, adam, flatten
-from rlcli.rl.policy import Normalizer, Policy, PolicySpec
+from rlcli.rl.networks import ActorCritic, ValueNormalizer, adam, flatten, remembered
+from rlcli.rl.policy import Lstm, Normalizer, Policy
 from rlcli.rl.ppo_config import PpoConfig
 from rlcli.rl.ppo_rollout import Rollout, Samples
+from rlcli.rl.ppo_setup import critic_groups, minibatch_sizes, policy_spec
 from rlcli.rl.rng import load_rng_state, rng_state
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
@@ -56,8 +57,8 @@ class PpoTrainer:
         self.steps_per_iteration = self._own_steps * self.peers.size
         env.final_obs_of = "truncated"
         self.statistics = EpisodeStatistics(env.config.episode_length_s)
-        self._groups = _critic_groups(env, config)
-        self.spec = _policy_spec(env, config)
+        self._groups = critic_groups(env, config)
+        self.spec = policy_spec(env, config)
         obs_size, critic_size = self.spec.observation_size, sum(env.layout.size(group) for group in self._groups)
         shared = self._groups == ("policy",)
 
@@ -67,7 +68,7 @@ class PpoTrainer:
         self._vector, self._shared, places = flatten(self.networks)
         self._gradient, self._shared_kl = self._shared[:-1], self._shared[-1]
         self.peers.lead_(self._vector.data)
-        self._actor_end = min(place.start for name, place in places.items() if name.startswith("critic."))
+        self._actor_end = min(place.start for name, place in places.items() if name.startswith("critic"))
         self.learning_rate = torch.tensor(config.learning_rate, device=self.device)
         torch.manual_seed(self.peers.seed(derive(seed, "exploration"), "exploration"))
         self._ceiling = torch.tensor(config.learning_rate_range[1], device=self.device)
@@ -78,10 +79,13 @@ class PpoTrainer:
         self.value_normalizer = ValueNormalizer().to(self.device) if config.normalize_value else None
 
         sizes = (obs_size, 0 if shared else critic_size, self.spec.action_size)
-        minibatches = _minibatches(env, config, self._own_steps)
-        self._rollout = Rollout(config.num_steps, env.num_envs, sizes, minibatches, self.device)
+        minibatches = minibatch_sizes(env, config, self._own_steps)
+        self._rollout = Rollout(config.num_steps, env.num_envs, sizes, minibatches, config.rnn is not None, self.device)
         self._obs = {g: torch.zeros(env.num_envs, env.layout.size(g), device=self.device) for g in self._read()}
         self._raw = {g: torch.zeros(config.num_steps, *obs.shape, device=self.device) for g, obs in self._obs.items()}
+        self._begins = torch.ones(env.num_envs, device=self.device)
+        # what actor and critic remember now, and what they remembered when the rollout began
+        self._memory, self._memory_before = ({k: m.blank(env.num_envs) for k, m in self._memories()} for _ in range(2))
         self._old_std = torch.ones(len(minibatches), self.spec.action_size, device=self.device)
         self._kl = torch.zeros((), device=self.device)
         self._sums = torch.zeros(len(_METRICS), device=self.device)
@@ -129,9 +133,12 @@ class PpoTrainer:
         """Take `num_steps` in every environment with the policy as it is."""
         samples, bound = self._rollout.samples, self.config.action_bound
         std = self.networks.std
+        for name, memory in self._memory.items():
+            self._memory_before[name].copy_(memory)
         for t in range(self.config.num_steps):
             obs, critic_obs = self._see(t)
-            mean = self.networks.actor(obs)
+            mean = self.networks.actor(self._recall(obs))
+            samples.begins[t].copy_(self._begins)
             noise = torch.randn_like(mean)
             action = mean + std * noise
             step = self.env.step(action if bound is None else action.clamp(-bound, bound))
@@ -154,10 +161,20 @@ class PpoTrainer:
                 self._update_normalizers(self._obs)
         return self._actor_input(self._obs), self._critic_input(self._obs)
 
+    def _recall(self, obs: Tensor) -> Tensor:
+        """What the actor's network sees: the observation, or what the memory makes of it."""
+        if self.networks.memory is None:
+            return obs
+        memory = self._memory["actor"]
+        features, after = self.networks.memory(obs, memory * (1.0 - self._begins)[:, None])
+        memory.copy_(after)
+        return features
+
     def _keep_outcome(self, t: int, step: StepResult) -> None:
         rollout = self._rollout
         torch.mul(step.reward, self.config.reward_scale, out=rollout.reward[t])
         rollout.ended[t].copy_(step.terminated | step.truncated)
+        self._begins.copy_(rollout.ended[t])
         torch.logical_and(step.truncated, ~step.terminated, out=rollout.cut[t])
         if step.final_obs is not None and self.config.bootstrap == "final_obs":
             rollout.final_obs[t].copy_(self._critic_input(step.final_obs))
@@ -169,11 +186,8 @@ class PpoTrainer:
     def _estimate_advantages(self) -> None:
         """Generalised advantage estimation (Schulman et al. 2016), backwards over the rollout."""
         config, rollout, samples = self.config, self._rollout, self._rollout.samples
-        value = self._value(samples.critic_obs)
-        next_value = self._value(self._critic_input(self._obs))
-        if config.bootstrap == "final_obs":
-            beyond = self._value_where(rollout.cut, rollout.final_obs)
-        else:
+        value, next_value, beyond = self._values() if self.networks.memory is None else self._remembered_values()
+        if config.bootstrap == "pre_step":
             beyond = value * rollout.cut
         reward = rollout.reward + config.gamma * beyond
         advantage = torch.zeros_like(next_value)
@@ -192,6 +206,23 @@ class PpoTrainer:
                 column.copy_(self.value_normalizer(column))
         if config.normalize_advantage == "batch":
             samples.advantage.copy_(self._standardized(samples.advantage))
+
+    def _values(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Of all observations, of those after the rollout, and of the last ones of episodes that time cut."""
+        rollout = self._rollout
+        value, next_value = self._value(rollout.samples.critic_obs), self._value(self._critic_input(self._obs))
+        return value, next_value, self._value_where(rollout.cut, rollout.final_obs)
+
+    def _remembered_values(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The same of a critic with a memory."""
+        recall, memory, rollout = self.networks.critic_memory, self._memory["critic"], self._rollout
+        assert recall is not None
+        seen, states = remembered(recall, rollout.samples.critic_obs, rollout.samples.begins, memory)
+        finals = [recall(obs, state)[0] for obs, state in zip(rollout.final_obs, states, strict=True)]
+        memory.copy_(states[-1])
+        following, _ = recall(self._critic_input(self._obs), memory * (1.0 - self._begins)[:, None])
+        beyond = torch.where(rollout.cut, self._value(torch.stack(finals)), 0.0)
+        return self._value(seen), self._value(following), beyond
 
     def _value(self, critic_obs: Tensor) -> Tensor:
         value = self.networks.value(critic_obs)
@@ -230,20 +261,24 @@ class PpoTrainer:
                 rollout.arrange(self._order())
             self._kl.zero_()
             for number, minibatch in enumerate(rollout.minibatches):
-                self._descend(minibatch, self._old_std[number])
+                self._descend(minibatch, number)
             self._adapt(self._kl / len(rollout.minibatches), "epoch")
         self._adapt(self._kl / len(rollout.minibatches), "iteration")
         self._conclude()
 
     def _order(self) -> Tensor:
-        if self.config.shuffle == "none":
-            return self._rollout.by_environment
-        return torch.randperm(self._own_steps, device=self.device)
+        """The samples in the order of the minibatches."""
+        shuffled, rollout = self.config.shuffle != "none", self._rollout
+        if self.networks.memory is not None:
+            some = torch.randperm if shuffled else torch.arange
+            return rollout.group(some(self.env.num_envs, device=self.device))
+        return torch.randperm(self._own_steps, device=self.device) if shuffled else rollout.by_environment
 
-    def _descend(self, batch: Samples, old_std: Tensor) -> None:
+    def _descend(self, batch: Samples, number: int) -> None:
         """One step of Adam down the clipped surrogate objective."""
-        config, networks = self.config, self.networks
-        std, mean, value = networks.std, networks.actor(batch.obs), networks.value(batch.critic_obs)
+        config, networks, old_std = self.config, self.networks, self._old_std[number]
+        obs, critic_obs = self._inputs(batch, number)
+        std, mean, value = networks.std, networks.actor(obs), networks.value(critic_obs)
         advantage = batch.advantage
         if config.normalize_advantage == "minibatch":
             advantage = self._standardized(advantage)
@@ -280,6 +315,23 @@ class PpoTrainer:
             self._adapt(self._shared_kl, "minibatch")
             batch.mean.copy_(mean.detach())
             old_std.copy_(std.detach())
+
+    def _inputs(self, batch: Samples, number: int) -> tuple[Tensor, Tensor]:
+        """What the networks see of a minibatch: with memories, they go through its environments' steps again."""
+        if self.networks.memory is None:
+            return batch.obs, batch.critic_obs
+        environments, seen = self._rollout.environments[number], {"actor": batch.obs, "critic": batch.critic_obs}
+        steps = (self.config.num_steps, len(environments))
+        features = [
+            remembered(
+                memory,
+                seen[name].unflatten(0, steps),
+                batch.begins.unflatten(0, steps),
+                self._memory_before[name].index_select(0, environments),
+            )[0].flatten(0, 1)
+            for name, memory in self._memories()
+        ]
+        return features[0], features[1]
 
     def _value_loss(self, value: Tensor, batch: Samples) -> Tensor:
         config = self.config
@@ -349,6 +401,10 @@ class PpoTrainer:
     def _record(self) -> None:
         self._recorded = torch.cat([self._obs["policy"][:_RECORDED], self._recorded])[:_RECORDED]
 
+    def _memories(self) -> list[tuple[str, Lstm]]:
+        pairs = (("actor", self.networks.memory), ("critic", self.networks.critic_memory))
+        return [(name, memory) for name, memory in pairs if memory is not None]
+
     # --- observations ---
 
     def _read(self) -> tuple[str, ...]:
@@ -415,7 +471,10 @@ class PpoTrainer:
         rng = rng_state()
         if self.device.type == "cuda":
             rng["cuda"] = torch.cuda.get_rng_state(self.device)
-        return {n: value.cpu() for n, value in self.env.state_dict().items()}, rng, self.statistics.state()
+        env = {name: value.cpu() for name, value in self.env.state_dict().items()}
+        env["begins"] = _copy(self._begins)
+        env |= {f"memory.{name}": _copy(value) for name, value in self._memory.items()}
+        return env, rng, self.statistics.state()
 
     def load(self, state: TrainerState) -> None:
         """Go back to a boundary: on a CPU the next iteration gives the same bits as it did then.
@@ -430,13 +489,18 @@ class PpoTrainer:
         self._recorded = saved["observations"].to(self.device)
         self.iteration, self.env_steps = values["iteration"], values["env_steps"]
         if values["processes"] != self.peers.size:
+            self._begins.fill_(1.0)
             self.statistics.load(values["statistics"])
             torch.manual_seed(derive(torch.initial_seed(), f"after {self.env_steps} steps"))
             self._take_in(self.env.reset(seed=derive(self.env.seed, f"after {self.env_steps} steps")))
             return
         suffix = f".{self.peers.rank}" if self.peers.rank else ""
         self.statistics.load(values[f"statistics{suffix}"])
-        self._take_in(self.env.load_state_dict(state.tensors[f"env{suffix}"]))
+        env = state.tensors[f"env{suffix}"]
+        self._begins.copy_(env["begins"])
+        for name, memory in self._memory.items():
+            memory.copy_(env[f"memory.{name}"])
+        self._take_in(self.env.load_state_dict(env))
         rng = state.tensors[f"rng{suffix}"]
         load_rng_state(rng)
         if self.device.type == "cuda" and "cuda" in rng:
@@ -458,7 +522,11 @@ class PpoTrainer:
 
     def _learner(self) -> dict[str, Tensor]:
         """Everything but the policy that learning goes on from, as it stands."""
-        tensors = {name: value for name, value in self.networks.named_parameters() if not name.startswith("actor.")}
+        tensors = {
+            name: value
+            for name, value in self.networks.named_parameters()
+            if not name.startswith(("actor.", "memory."))
+        }
         for name, module in (
             ("critic_normalizer", self.critic_normalizer),
             ("value_normalizer", self.value_normalizer),
@@ -486,44 +554,3 @@ def _joined(obs: Mapping[str, Tensor], groups: tuple[str, ...]) -> Tensor:
 
 def _copy(value: Tensor) -> Tensor:
     return value.detach().to("cpu", copy=True)
-
-
-def _policy_spec(env: VecEnv, config: PpoConfig) -> PolicySpec:
-    return PolicySpec(
-        observation_size=env.layout.size("policy"),
-        action_size=env.layout.action_size,
-        hidden=list(config.actor.hidden),
-        activation=config.actor.activation,
-        action_bound=config.action_bound,
-        normalize=config.normalize_observations,
-    )
-
-
-def _critic_groups(env: VecEnv, config: PpoConfig) -> tuple[str, ...]:
-    have = env.layout.observations
-    groups = config.critic_obs or (("critic",) if "critic" in have else ("policy",))
-    for group in groups:
-        if group not in have:
-            raise _problem(env, "critic_obs", f"no observation group '{group}'", f"groups: {', '.join(have)}")
-    return groups
-
-
-def _minibatches(env: VecEnv, config: PpoConfig, total: int) -> list[int]:
-    """How many samples each minibatch has."""
-    rollout = f"a rollout holds num_steps x num_envs = {config.num_steps} x {env.num_envs} = {total} samples"
-    if config.minibatch_size is not None:
-        sizes = [len(part) for part in torch.arange(total).split(config.minibatch_size)]
-    else:
-        sizes = [len(part) for part in torch.arange(total).tensor_split(config.num_minibatches)]
-    if min(sizes) == 0:
-        message = f"{config.num_minibatches} minibatches cannot be made: {rollout}"
-    elif (config.normalize_advantage == "minibatch" and min(sizes) == 1) or (config.normalize_advantage and total == 1):
-        message = f"advantages cannot be normalised over one sample: {rollout}"
-    else:
-        return sizes
-    key = "num_minibatches" if config.minibatch_size is None else "minibatch_size"
-    raise _problem(env, key, message, "more environments, more num_steps, or fewer minibatches")
-
-
-def _problem(env: VecEnv, key: str, message: str, hint: str) -> ConfigError:
-    return ConfigError([env.resolved.problem(("agents", env.resolved.agent_name or "", key), message, hint)])

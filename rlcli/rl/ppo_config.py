@@ -22,6 +22,17 @@ class NetworkConfig(StrictModel):
     """Activation between layers."""
 
 
+class RnnConfig(StrictModel):
+    """A memory before each network. Minibatches then hold whole environments."""
+
+    type: Literal["lstm"] = "lstm"
+    """lstm"""
+    hidden: Count = 64
+    """Cells of a layer."""
+    layers: Count = 1
+    """Layers."""
+
+
 class PpoConfig(AgentConfig):
     """Proximal policy optimisation, on the CPU or the GPU."""
 
@@ -84,7 +95,8 @@ class PpoConfig(AgentConfig):
     desired_kl: Positive | None = None
     """Divergence between the policies before and after an update that an adaptive schedule aims at."""
     kl_grain: Literal["minibatch", "epoch", "iteration"] = "minibatch"
-    """How often an adaptive schedule looks at the divergence; of an epoch its mean, of an iteration that of the last."""
+    """How often an adaptive schedule looks at the divergence; of an epoch at its mean, of an iteration at that of the
+    last epoch."""
     kl_from: Literal["rollout", "last_pass"] = "rollout"
     """The old policy: the one that acted, looked at before a minibatch's update; or, as rl_games has it, the one that
     the epoch before found for the same sample, looked at after the update."""
@@ -104,6 +116,8 @@ class PpoConfig(AgentConfig):
     """The policy's network."""
     critic: NetworkConfig = NetworkConfig()
     """The value's network."""
+    rnn: RnnConfig | None = None
+    """Actor and critic remember what they saw of the episode; null: they do not."""
     init: Literal["default", "zero_bias", "orthogonal"] = "default"
     """Initial weights: torch's; torch's with biases of zero; orthogonal, with a gain of sqrt(2) in the hidden layers,
     0.01 at the actor's output and 1 at the critic's, and biases of zero."""

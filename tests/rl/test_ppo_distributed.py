@@ -103,8 +103,8 @@ def in_two_processes(*arguments: str) -> None:
     workers = [
         subprocess.Popen(
             [sys.executable, "-c", *arguments],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2",
-                 "MASTER_ADDR": "localhost", "MASTER_PORT": port},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "RANK": str(rank), "LOCAL_RANK": str(rank),
+                 "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "localhost", "MASTER_PORT": port},
             stderr=subprocess.PIPE, text=True,
         )
         for rank in range(2)

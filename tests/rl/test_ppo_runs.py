@@ -41,7 +41,7 @@ def open_checkpoint_of(done):
 
 
 def test_a_resumed_run_ends_bit_for_bit_where_an_uninterrupted_one_does(cli):
-    normalize = ("agent.normalize_observations=true", "agent.normalize_value=true")
+    normalize = ("agent.normalize_observations=true", "agent.normalize_value=true", "agent.schedule=adaptive")
     whole = cli(*TRAIN, *normalize, "--max-iterations", "4", "--name", "whole")
     cli(*TRAIN, *normalize, "--max-iterations", "2", "--name", "parts")
     parts = cli("train", "--resume", "latest", "--max-iterations", "4")

@@ -380,11 +380,9 @@ def test_the_watch_sees_what_would_wait():
     assert watch.seen == ["_local_scalar_dense", "index", "nonzero"]
 
 
-@pytest.mark.parametrize("dialect", ["null", "rsl_rl", "rl_games", "sb3"])
-def test_the_update_asks_the_device_for_nothing(own, dialect, monkeypatch):
-    trainer = trainer_of(
-        own, f"agent.dialect={dialect}", "agent.normalize_observations=true", "agent.normalize_value=true"
-    )
+@pytest.mark.parametrize("setting", ["dialect=rsl_rl", "dialect=rl_games", "dialect=sb3", "rnn={hidden: 4}"])
+def test_the_update_asks_the_device_for_nothing(own, setting, monkeypatch):
+    trainer = trainer_of(own, f"agent.{setting}", "agent.normalize_observations=true", "agent.normalize_value=true")
     trainer.iterate()
     monkeypatch.setattr(
         trainer, "_value_where", lambda mask, obs: torch.where(mask, trainer._value(obs), 0.0)
