@@ -107,7 +107,7 @@ def command(
             overrides=overrides or [],
             flags={**flags(scene__num_envs=num_envs), **budget},
         )
-        _require_parallel(resolved, gpus)
+        _require_parallel(resolved, gpus or 1)
     if gpus is not None and gpus > 1 and not distributed.launched():
         raise typer.Exit(distributed.launch(gpus, sys.argv[1:]))
 
@@ -163,7 +163,7 @@ def _device(wanted: str, gpus: int | None) -> str:
     if gpus is not None and wanted != "cuda":
         raise UsageError(f"--gpus {gpus} and --device {wanted} contradict each other", hint="--gpus alone")
     device = choose_device(wanted)
-    if not several or device == "cpu" or ":" in device:
+    if not several or device == "cpu" or ":" in wanted:
         return device
     import torch
 
@@ -174,14 +174,14 @@ def _device(wanted: str, gpus: int | None) -> str:
     return f"cuda:{number}"
 
 
-def _require_parallel(resolved: Resolved, gpus: int | None) -> None:
+def _require_parallel(resolved: Resolved, gpus: int = 1) -> None:
     from rlcli.errors import UsageError
     from rlcli.rl import distributed
 
     resolved.require_agent()
     assert resolved.agent is not None
     assert resolved.trainer is not None
-    if ((gpus or 1) > 1 or distributed.launched()) and not resolved.trainer.parallel:
+    if (gpus > 1 or distributed.launched()) and not resolved.trainer.parallel:
         raise UsageError(
             f"trainer '{resolved.agent.trainer}' of agent '{resolved.agent_name}' trains in one process",
             hint="name an agent of trainer ppo with --agent",
@@ -198,7 +198,7 @@ def _together(
         return _followed(distributed.join(device).share(), resolved, budget)
     try:
         job = begin()
-    except BaseException:
+    except Exception:
         distributed.join(device).share(None)  # the others wait for word
         raise
     try:
@@ -297,6 +297,7 @@ def _resumed(
         console.document("train", run=str(run.folder), state="finished", checkpoint=str(folder), step=step)
         return None
     resolved = resolve_run(run, play=False, flags=budget)
+    _require_parallel(resolved)
     loggers = check_loggers(logger) if logger else list(run.record.get("loggers", []))
     run.lock()
     try:

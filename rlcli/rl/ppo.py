@@ -208,7 +208,7 @@ class PpoTrainer:
             samples.advantage.copy_(self._standardized(samples.advantage))
 
     def _values(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Of all observations, of those after the rollout, and of the last ones of episodes that time cut."""
+        """The values of all observations, of those after the rollout, and of the last ones of episodes cut by time."""
         rollout = self._rollout
         value, next_value = self._value(rollout.samples.critic_obs), self._value(self._critic_input(self._obs))
         return value, next_value, self._value_where(rollout.cut, rollout.final_obs)
