@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rlcli.envs.vec_env import StepResult, VecEnv
 from rlcli.errors import ConfigError
+from rlcli.rl.policy import Policy
 
 Act = Callable[[Tensor], Tensor]
 PATIENCE = 10
@@ -70,6 +71,20 @@ def evaluate(
                 _take(result, step, quota)
     result.diverged = env.divergences - start
     return result
+
+
+def acting(env: VecEnv, policy: Policy, *, stochastic: bool = False, generator: torch.Generator | None = None) -> Act:
+    """A policy in an environment; what it remembers begins anew with each episode."""
+    memory: Tensor | None = None
+
+    def act(obs: Tensor) -> Tensor:
+        nonlocal memory
+        if memory is not None:
+            memory = memory * (env.episode_length_buf > 0)[:, None]
+        action, memory = policy.step(obs, memory, stochastic=stochastic, generator=generator)
+        return action
+
+    return act
 
 
 def zero_policy(env: VecEnv) -> Act:
