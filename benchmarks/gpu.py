@@ -17,10 +17,10 @@ import tempfile
 import time
 from pathlib import Path
 
+import mujoco_warp as mjw
 import torch
 import warp as wp
 
-import mujoco_warp as mjw
 from rlcli.config.load import resolve
 from rlcli.envs.vec_env import make_env
 from rlcli.registry import find_task
@@ -70,7 +70,7 @@ def recorded(work):
         work()
         kept = wp.capture_end(stream=on), on
     torch.cuda.synchronize()
-    return lambda kept=kept: graph.replay()
+    return lambda kept=(kept, work): graph.replay()
 
 
 def environment(task, num_envs, **flags):
@@ -116,8 +116,8 @@ def measure_env(task, num_envs):
     pairs = [(seconds(physics, 1, 4), seconds(ours, 1, 4)) for _ in range(REPEATS)]
     bare_s, ours_s = (statistics.median(column) / STEPS for column in zip(*pairs, strict=True))
     env.check()
-    report(what="env", task=task, num_envs=num_envs, bare_steps_per_s=num_envs / bare_s,
-           steps_per_s=num_envs / ours_s, ratio=bare_s / ours_s, bare_us=bare_s * 1e6, step_us=ours_s * 1e6)  # fmt: skip
+    rates = {"bare_steps_per_s": num_envs / bare_s, "steps_per_s": num_envs / ours_s, "ratio": bare_s / ours_s}
+    report(what="env", task=task, num_envs=num_envs, **rates, bare_us=bare_s * 1e6, step_us=ours_s * 1e6)
     env.close()
 
 

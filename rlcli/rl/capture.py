@@ -37,7 +37,8 @@ class Recording:
     """Runs the work once as it is, records it at the second call, and replays it from then on."""
 
     def __init__(self, work: Work, device: torch.device, holders: list[Any], tell: Tell) -> None:
-        self._work, self._device, self._holders, self._tell = work, device, holders, tell
+        self._work, self._holders, self._tell = work, holders, tell
+        self._device = torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
         self._graph: torch.cuda.CUDAGraph | None = None
         self._kept: Any = None  # what Warp allocated while recording lives as long as this
         self._runs = 0
@@ -67,7 +68,7 @@ class Recording:
                 self._work()
             finally:
                 torch.cuda.set_sync_debug_mode(before)
-        waits = [w for w in caught if "synchroniz" in str(w.message)]
+        waits = [w for w in caught if "synchronizing CUDA operation" in str(w.message)]
         if waits:
             where = sorted({f"{w.filename}:{w.lineno}" for w in waits})
             self._refuse(f"{where[0]} waits for the GPU{f' (and {len(where) - 1} more places)' if where[1:] else ''}")

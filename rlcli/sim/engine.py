@@ -125,12 +125,20 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
     if wanted == "batch":
         from rlcli.sim.batch import BatchEngine
 
-        return BatchEngine(model, num_envs, config.engine_threads or available_cores())
+        return BatchEngine(model, num_envs, config.engine_threads or available_cores(), config.forces_after_reset)
     try:
         from rlcli.sim.warp import WarpEngine
     except ImportError as error:
         raise DependencyError(f"the GPU engine needs mujoco-warp: {error}", hint='pip install "rlcli[gpu]"') from None
-    return WarpEngine(model, num_envs, device, capacity(model, config.contacts_per_env, config.constraints_per_env))
+    room = capacity(model, config.contacts_per_env, config.constraints_per_env)
+    return WarpEngine(model, num_envs, device, room, config.forces_after_reset)
+
+
+def force_sensors(model: mujoco.MjModel) -> list[int]:
+    """Columns of `sensordata` that belong to the acceleration stage."""
+    acceleration = int(mujoco.mjtStage.mjSTAGE_ACC)
+    sensors = [s for s in range(model.nsensor) if int(model.sensor_needstage[s]) == acceleration]
+    return [int(model.sensor_adr[s]) + i for s in sensors for i in range(int(model.sensor_dim[s]))]
 
 
 def quiet_mujoco() -> None:
