@@ -144,7 +144,10 @@ def test_two_processes_update_as_one_does_on_both_their_rollouts_and_act_differe
 
 # --- from the command line ---
 
-TRAIN = ("train", "cartpole", "--agent", "ppo", "--num-envs", "16", "--device", "cpu", "--logger", "none", "--json")
+TRAIN = (
+    "train", "cartpole", "--agent", "ppo", "--num-envs", "16", "--device", "cpu", "--logger", "none", "--json",
+    "agent.schedule=adaptive",
+)  # fmt: skip
 LAUNCHED = "import sys; from rlcli.rl.distributed import launch; sys.exit(launch(2, sys.argv[1:]))"
 TORCHRUN = ("torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "rlcli")
 
@@ -217,7 +220,7 @@ def test_a_signal_stops_all_processes_at_the_same_boundary(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "code", "said"),
     [
-        (("agent.learning_rate=1e30",), 6, "not finite"),
+        (("agent.learning_rate=1e30", "agent.learning_rate_range=[1e-5, 1e30]"), 6, "not finite"),
         (("agent.num_stepz=3",), 3, "num_stepz"),
         (("--agent", "sb3-ppo"), 2, "trains in one process"),
     ],
