@@ -26,8 +26,8 @@ class DirectTask:
     """Base of a direct task. The framework owns the buffers; the hooks fill them.
 
     Order of a step: `pre_physics_step`, physics, `progress_buf += 1`, `get_observations`, `get_states`,
-    `calculate_metrics`, `is_done`; then `reset` (or `reset_idx`) for the environments that ended, and their observations
-    again.
+    `calculate_metrics`, `is_done`; then `reset` (or `reset_idx`) for the environments that ended, and their
+    observations again.
     """
 
     num_observations: ClassVar[int]
@@ -76,7 +76,8 @@ class DirectTask:
     def reset(self, selection: Selection) -> None:
         """Write start states; the environments are in their default state.
 
-        Draw from the selection, write through it: `entity.write_joint_positions(selection, ...)`, `selection.write(...)`.
+        Draw from the selection, write through it: `entity.write_joint_positions(selection, ...)`,
+        `selection.write(...)`.
         A GPU runs this form as part of the captured step. A task defines this hook or `reset_idx`, not both.
         """
 
@@ -108,7 +109,8 @@ class DirectTask:
         They depend on the seed, the environment, its episode and `name`, and on nothing else.
         """
         ids = env_ids.numpy()
-        return IdSelection(ids, self.env.seed, self.env.episode_index.numpy()[ids], stream(f"direct.{name}"))
+        first, episodes = self.env.engine.first_env, self.env.episode_index.numpy()[ids]
+        return IdSelection(ids, self.env.seed, episodes, first, stream(f"direct.{name}"))
 
 
 class DirectEnv(VecEnv):

@@ -188,7 +188,7 @@ class Policy(nn.Module):
         bound = self.spec.action_bound
         if not self.spec.kind.startswith("gaussian-"):
             assert bound is not None
-            return torch.tanh(action) * bound
+            action = torch.tanh(action) * bound  # some runtimes' tanh goes beyond 1 by a rounding
         return action if bound is None else action.clamp(-bound, bound)
 
 

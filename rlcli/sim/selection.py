@@ -65,9 +65,15 @@ class IdSelection:
     """A selection as a sorted list of ids, on the CPU."""
 
     def __init__(
-        self, ids: NDArray[np.int64], seed: int, counters: NDArray[np.int64], stream: np.uint64 | None = None
+        self,
+        ids: NDArray[np.int64],
+        seed: int,
+        counters: NDArray[np.int64],
+        first_env: int = 0,
+        stream: np.uint64 | None = None,
     ) -> None:
         self.ids = ids
+        self._first_env = first_env
         self._seed = seed
         self._counters = counters
         self._keys: random.Keys | None = None
@@ -116,13 +122,13 @@ class IdSelection:
 
     def stream(self, stream: np.uint64) -> IdSelection:
         """The same rows drawing from another stream."""
-        other = IdSelection(self.ids, self._seed, self._counters, stream)
+        other = IdSelection(self.ids, self._seed, self._counters, self._first_env, stream)
         other._keys = self._row_keys()
         return other
 
     def _row_keys(self) -> random.Keys:
         if self._keys is None:
-            self._keys = random.row_keys(self._seed, self.ids, self._counters)
+            self._keys = random.row_keys(self._seed, self.ids + self._first_env, self._counters)
         return self._keys
 
     def _next(self, shape: tuple[int, ...]) -> tuple[random.Keys, np.uint64, int, int]:

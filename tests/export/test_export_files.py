@@ -1,13 +1,17 @@
 """What an exported file computes and what it says of itself."""
 
+import hashlib
 import json
 import os
 import re
+import shutil
+from pathlib import Path
 
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
+import safetensors.torch
 import torch
 
 from rlcli.config.load import resolve
@@ -74,6 +78,26 @@ def test_export_equals_the_policy_on_1000_observations(exported, newest, task, f
     assert metadata["action_bound"] == 1.0
     assert float(actions.abs().max()) <= 1.0
     assert len(actions.unique()) > 100  # a constant would also be bounded and equal
+
+
+def test_outputs_stay_inside_the_bound_where_a_runtimes_tanh_does_not(newest, tmp_path):
+    """onnxruntime's float32 tanh of 8.3 .. 9 is 1.0000001 here and there."""
+    folder = Path(shutil.copytree(newest("cartpole-direct sac"), tmp_path / "checkpoint"))
+    weights = {name: torch.zeros_like(t) for name, t in open_checkpoint(folder).tensors("policy").items()}
+    for layer in (0, 2, 4):
+        weights[f"actor.{layer}.weight"][0, 0] = 1.0  # tanh of the first observation
+    data = safetensors.torch.save(weights)
+    (folder / "policy.safetensors").write_bytes(data)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["files"]["policy.safetensors"] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    export(open_checkpoint(folder), tmp_path / "policy.onnx", "onnx")
+    session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
+    obs = torch.zeros(40_000, 4)
+    obs[:, 0] = torch.linspace(1.0, 10.0, len(obs))
+    (action,) = session.run(["action"], {"obs": obs.numpy()})
+    assert action.max() == 1.0
+    np.testing.assert_allclose(action[:, 0], np.tanh(obs[:, 0].numpy()), atol=1e-6)
 
 
 def test_the_deployed_policy_does_not_depend_on_the_batch(newest):
