@@ -84,7 +84,7 @@ def command(
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     console.follows = not distributed.leads()
     runs, budget = runs_dir or default_runs_dir(), _budget(max_iterations, max_steps)
-    device = _device(device, gpus)
+    wanted, device = device, _device(device, gpus)
     fixed = {
         "--agent": agent,
         "--seed": seed,
@@ -108,6 +108,7 @@ def command(
             flags={**flags(scene__num_envs=num_envs), **budget},
         )
         _require_parallel(resolved, gpus or 1)
+        device = _fitting(resolved, device, wanted)
     if gpus is not None and gpus > 1 and not distributed.launched():
         raise typer.Exit(distributed.launch(gpus, sys.argv[1:]))
 
@@ -172,6 +173,22 @@ def _device(wanted: str, gpus: int | None) -> str:
     if have < need:
         raise DeviceError(f"{need} processes need a GPU each, and torch sees {have}", hint=f"--gpus {have}")
     return f"cuda:{number}"
+
+
+def _fitting(resolved: Resolved, device: str, wanted: str) -> str:
+    """The device, or the CPU where the GPU was not asked for and the trainer cannot use it."""
+    from rlcli.errors import UsageError
+
+    assert resolved.agent is not None
+    assert resolved.trainer is not None
+    if device == "cpu" or resolved.trainer.gpu:
+        return device
+    if wanted == "auto":
+        return "cpu"
+    raise UsageError(
+        f"agent '{resolved.agent_name}' (trainer {resolved.agent.trainer}) trains on the CPU only, not on '{device}'",
+        hint="--device cpu, or an agent whose trainer uses the GPU (trainer: ppo)",
+    )
 
 
 def _require_parallel(resolved: Resolved, gpus: int = 1) -> None:
@@ -428,6 +445,7 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
                 save_interval=agent.save_interval,
                 manifest=manifest,
                 show=view.show,
+                tell=console.warn,
                 divergences=lambda: env.divergences,
                 stop=stop,
             )

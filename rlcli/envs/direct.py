@@ -108,9 +108,9 @@ class DirectTask:
 
         They depend on the seed, the environment, its episode and `name`, and on nothing else.
         """
-        ids = env_ids.numpy()
-        first, episodes = self.env.engine.first_env, self.env.episode_index.numpy()[ids]
-        return IdSelection(ids, self.env.seed, episodes, first, stream(f"direct.{name}"))
+        ids, episodes = env_ids.cpu().numpy(), self.env.episode_index.cpu().numpy()
+        device = None if self.device.type == "cpu" else self.device
+        return IdSelection(ids, self.env.seed, episodes[ids], stream(f"direct.{name}"), device)
 
 
 class DirectEnv(VecEnv):
@@ -177,6 +177,10 @@ class DirectEnv(VecEnv):
             self.config.decimation,
         )
 
+    def holders(self) -> list[Any]:
+        """The task."""
+        return [self.task]
+
     def extras(self) -> dict[str, float]:
         """The task's `extras`: numbers, and means of tensors."""
         found = {}
@@ -231,7 +235,9 @@ class DirectEnv(VecEnv):
         task = self.task
         task.reset(selection.stream(_RESET))
         if self._resets_by_id:
-            self._reset_hook(selection.read(self._ids))
+            ids = selection.env_ids()
+            if len(ids):
+                self._reset_hook(ids)
         selection.write(task.progress_buf, 0)
         selection.write(task.reset_buf, 1)
         selection.write(self._fresh, True)
@@ -244,7 +250,7 @@ class DirectEnv(VecEnv):
             self._fill()
         obs.copy_(task.obs_buf)
         states.copy_(task.states_buf)
-        if self._observed and not self._settled and bool(self._fresh.any()):
+        if self._observed and not self._settled and self._maybe(self._fresh):
             self._fill()
             fresh = self._fresh[:, None]
             task.obs_buf.copy_(torch.where(fresh, task.obs_buf, obs, out=obs))

@@ -91,8 +91,9 @@ class PpoTrainer:
         self._sums = torch.zeros(len(_METRICS), device=self.device)
         self._metrics = torch.zeros(len(_METRICS) + 4, device=self.device)
         self._recorded = torch.zeros(0, obs_size, device=self.device)
-        self._collect = captured(self._roll_out, self.device)
-        self._learn = captured(self._update, self.device)
+        self._notes: list[str] = []
+        self._collect = captured(self._roll_out, self.device, env.holders(), self._notes.append)
+        self._learn = captured(self._update, self.device, tell=self._notes.append)
 
     def start(self) -> None:
         """Reset the environment to its first episodes."""
@@ -115,6 +116,7 @@ class PpoTrainer:
         self.env_steps += self.steps_per_iteration
         self._learn()
         losses = self._losses()
+        self.env.check()
         updated = time.perf_counter()
         physics, step = self.env.seconds["physics"] - physics, self.env.seconds["step"] - step
         seconds = {
@@ -123,8 +125,11 @@ class PpoTrainer:
             "policy": collected - begin - step,
             "update": updated - collected,
         }
+        if self.device.type == "cuda":  # a replayed rollout cannot be told apart
+            seconds = {"rollout": collected - begin, "update": updated - collected}
+        notes, self._notes[:] = list(self._notes), []
         task = {f"Task/{name}": value for name, value in self.env.extras().items() if math.isfinite(value)}
-        return Report({**self.statistics.flush(), **task, **losses}, seconds)
+        return Report({**self.statistics.flush(), **task, **losses}, seconds, notes)
 
     # --- the rollout ---
 

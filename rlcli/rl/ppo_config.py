@@ -204,6 +204,7 @@ SPEC = TrainerSpec(
     algorithms={"ppo": "rlcli.rl.ppo_config:PpoConfig"},
     trainer="rlcli.rl.ppo:PpoTrainer",
     parallel=True,
+    gpu=True,
 )
 
 

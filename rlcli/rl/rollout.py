@@ -69,6 +69,7 @@ def evaluate(
             on_step(step)
             if step.episodes is not None:
                 _take(result, step, quota)
+        env.check()
     result.diverged = env.divergences - start
     return result
 
@@ -121,8 +122,8 @@ def _require_end(env: VecEnv) -> None:
 
 
 def _take(result: Evaluation, step: StepResult, quota: Tensor) -> None:
-    ended = step.episodes
-    assert ended is not None
+    assert step.episodes is not None
+    ended = step.episodes.ended()
     for row, env in enumerate(ended.ids.tolist()):
         if quota[env] <= 0:
             continue

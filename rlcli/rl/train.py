@@ -76,6 +76,7 @@ def fit(
     save_interval: int | None = None,
     manifest: dict[str, Any] | None = None,
     show: Callable[[Progress], None] = lambda _: None,
+    tell: Callable[[str], None] = lambda _: None,
     divergences: Callable[[], int] = lambda: 0,
     stop: StopRequest | None = None,
 ) -> None:
@@ -108,6 +109,8 @@ def fit(
             late = save_interval is None and peers.leads and time.monotonic() - saved_at > SAVE_EVERY_S
             diverged, overdue = peers.total(divergences() - before, late)
             _require_stable(diverged, trainer)
+            for note in report.notes:
+                tell(note)
             metrics = _with_rates(report, trainer.steps_per_iteration)
             for logger in loggers:
                 logger.write(trainer.iteration, trainer.env_steps, metrics)

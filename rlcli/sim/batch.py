@@ -57,7 +57,6 @@ class BatchEngine:
         self.num_envs = num_envs
         self.device = torch.device("cpu")
         self.threads = threads
-        self.first_env = 0
         self.divergences = 0
         self.warnings = dict.fromkeys(_NOTED, 0)
         self._batch = Batch(model, num_envs, threads)
@@ -158,7 +157,7 @@ class BatchEngine:
     def select(self, mask: Tensor, seed: int, counters: Tensor) -> IdSelection | None:
         """The worlds where `mask` holds, as ids; None for none."""
         ids = mask.numpy().nonzero()[0]
-        return IdSelection(ids, seed, counters.numpy()[ids], self.first_env) if len(ids) else None
+        return IdSelection(ids, seed, counters.numpy()[ids]) if len(ids) else None
 
     def watch(self, values: Tensor, what: str) -> None:
         """Never needed: values are checked where they are made."""

@@ -84,7 +84,7 @@ def _pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
                 model.geom_contype[b] & model.geom_conaffinity[a]
             )
             first, second = int(weld[one]), int(weld[two])
-            related = first and second and first == int(weld[parent[second]]) or second == int(weld[parent[first]])
+            related = (first and second and first == int(weld[parent[second]])) or second == int(weld[parent[first]])
             related = bool(first and second and related)
             signature = (min(one, two) << 16) + max(one, two)
             if bits and first != second and not related and signature not in excluded:

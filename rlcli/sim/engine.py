@@ -26,8 +26,6 @@ class Engine(Protocol):
     model: mujoco.MjModel
     threads: int
     warnings: dict[str, int]
-    first_env: int
-    """Number of the first world among those of all processes: random streams are numbered on from it."""
     asynchronous: bool
     """Whether reading a value waits for a device: then nothing on the path of a step may."""
 

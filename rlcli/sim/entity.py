@@ -233,7 +233,9 @@ class EntityData:
         """Default root pose and velocity: position, quat (w, x, y, z), linear, angular. (num_envs, 13)"""
         self._gravity = torch.tensor(model.opt.gravity, dtype=torch.float32, device=device)
         norm = self._gravity.norm()
-        self._down = (self._gravity / norm if norm > 0 else torch.tensor([0.0, 0.0, -1.0], device=device)).expand(num_envs, -1)
+        self._down = (self._gravity / norm if norm > 0 else torch.tensor([0.0, 0.0, -1.0], device=device)).expand(
+            num_envs, -1
+        )
 
     @property
     def joint_pos(self) -> Tensor:

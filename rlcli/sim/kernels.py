@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import warp as wp
 
-wp.config.log_level = wp.LOG_ERROR
+wp.config.log_level = wp.LOG_ERROR  # standard output belongs to data
+wp.init()
 # nothing here is differentiated: half the code to compile
 wp.set_module_options({"enable_backward": False})
 
@@ -42,14 +43,13 @@ def draw_uniform(
     counters: wp.array(dtype=wp.int64),
     stream: wp.uint64,
     index: int,
-    first_env: int,
     low: float,
     span: float,
     out: wp.array2d(dtype=float),
 ):
     """Uniform in [low, low + span). out (num_envs, count)"""
     env, column = wp.tid()
-    out[env, column] = unit(start, counters[env], stream, first_env + env, index + column) * span + low
+    out[env, column] = unit(start, counters[env], stream, env, index + column) * span + low
 
 
 @wp.kernel
@@ -58,14 +58,13 @@ def draw_normal(
     counters: wp.array(dtype=wp.int64),
     stream: wp.uint64,
     index: int,
-    first_env: int,
     out: wp.array2d(dtype=float),
 ):
     """Standard normal, by Box and Muller. out (num_envs, count)"""
     env, column = wp.tid()
     count = out.shape[1]
-    u = unit(start, counters[env], stream, first_env + env, index + column)
-    v = unit(start, counters[env], stream, first_env + env, index + count + column)
+    u = unit(start, counters[env], stream, env, index + column)
+    v = unit(start, counters[env], stream, env, index + count + column)
     out[env, column] = wp.sqrt(-2.0 * wp.log(1.0 - u)) * wp.cos(2.0 * wp.pi * v)
 
 
@@ -83,17 +82,17 @@ def guard(
 ):
     """Find worlds whose state is not finite or beyond MuJoCo's limit, and put them back to the last good state."""
     world = wp.tid()
-    bad = bool(False)
+    bad = wp.int32(0)  # a plain number would be a constant
     for i in range(qpos.shape[1]):
         x = qpos[world, i]
         if not wp.isfinite(x) or wp.abs(x) > _TOO_LARGE:
-            bad = bool(True)
+            bad = wp.int32(1)
     for i in range(qvel.shape[1]):
         x = qvel[world, i]
         if not wp.isfinite(x) or wp.abs(x) > _TOO_LARGE:
-            bad = bool(True)
-    diverged[world] = bad
-    if bad:
+            bad = wp.int32(1)
+    diverged[world] = bad != 0
+    if bad != 0:
         wp.atomic_add(count, 0, wp.int64(1))
         for i in range(qpos.shape[1]):
             qpos[world, i] = last_qpos[world, i]

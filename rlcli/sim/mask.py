@@ -17,13 +17,10 @@ from rlcli.sim.selection import ALL, Columns
 class MaskSelection:
     """Every row takes part in the arithmetic; only masked ones are written. Draws are those of `IdSelection`."""
 
-    def __init__(
-        self, mask: Tensor, seed: int, counters: Tensor, first_env: int = 0, stream: np.uint64 | None = None
-    ) -> None:
+    def __init__(self, mask: Tensor, seed: int, counters: Tensor, stream: np.uint64 | None = None) -> None:
         self.mask = mask
         self._seed = seed
         self._counters = counters
-        self._first_env = first_env
         self._stream = np.uint64(0) if stream is None else stream
         self._drawn = 0
 
@@ -41,7 +38,7 @@ class MaskSelection:
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Gaussian. (num_envs, *shape)"""
         out, index = self._room(shape, 2)
-        inputs = [self._start(), self._counter_array(), int(self._stream), index, self._first_env]
+        inputs = [self._start(), self._counter_array(), int(self._stream), index]
         self._launch(kernels.draw_normal, inputs, out)
         return out.view(len(self.mask), *shape).mul_(std).add_(mean)
 
@@ -76,13 +73,17 @@ class MaskSelection:
         """Mean of a (num_envs,) tensor over the masked rows. ()"""
         return torch.where(self.mask, values.float(), 0.0).sum() / self.count.clamp(min=1)
 
+    def env_ids(self) -> Tensor:
+        """The masked rows' numbers; waits for the device. (rows,) int64"""
+        return self.mask.nonzero()[:, 0]
+
     def stream(self, stream: np.uint64) -> MaskSelection:
         """The same rows drawing from another stream."""
-        return MaskSelection(self.mask, self._seed, self._counters, self._first_env, stream)
+        return MaskSelection(self.mask, self._seed, self._counters, stream)
 
     def _uniform(self, low: float, high: float, shape: tuple[int, ...]) -> Tensor:
         out, index = self._room(shape, 1)
-        inputs = [self._start(), self._counter_array(), int(self._stream), index, self._first_env, low, high - low]
+        inputs = [self._start(), self._counter_array(), int(self._stream), index, low, high - low]
         self._launch(kernels.draw_uniform, inputs, out)
         return out.view(len(self.mask), *shape)
 

@@ -14,12 +14,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
-import mujoco_warp as mjw
 from rlcli.errors import ConfigError, DeviceError, DivergedError, Problem, did_you_mean
 from rlcli.sim import kernels
 from rlcli.sim.capacity import Capacity
@@ -84,14 +84,20 @@ class WarpEngine:
         quiet_mujoco()
         self.model = model
         self.num_envs = num_envs
-        self.first_env = 0
         self.device = torch.device(device)
         self.capacity = capacity
         self.warnings: dict[str, int] = {}
+        if self.device.type == "cuda" and self.device.index is None:
+            self.device = torch.device("cuda", torch.cuda.current_device())
         self._device = wp.device_from_torch(self.device)
+        self._fields: dict[str, Tensor] = {}
+        self._watched: list[str] = []
+        self._stage = _NONE
+        self._expanded: dict[str, Tensor] = {}
+        self._graphs: dict[int, Any] = {}
+        self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         with wp.ScopedDevice(self._device), _on_torch_stream(self.device):
             self._model, self._data = self._put(model, capacity)
-            self._fields: dict[str, Tensor] = {}
             self._arrays = {name: getattr(self._data, name) for name in _STATE}
             qpos, qvel = self.field("qpos"), self.field("qvel")
             self._last_qpos, self._last_qvel = qpos.clone(), qvel.clone()
@@ -100,11 +106,6 @@ class WarpEngine:
             self._diverged = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
             self._count = torch.zeros(1, dtype=torch.int64, device=self.device)
             self._flags = torch.zeros(16, dtype=torch.int32, device=self.device)
-        self._watched: list[str] = []
-        self._stage = _NONE
-        self._expanded: dict[str, Tensor] = {}
-        self._graphs: dict[int, Any] = {}
-        self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
 
     @property
     def divergences(self) -> int:
@@ -231,7 +232,7 @@ class WarpEngine:
 
     def select(self, mask: Tensor, seed: int, counters: Tensor) -> MaskSelection:
         """The worlds where `mask` holds; whether there are any is known to the device alone."""
-        return MaskSelection(mask, seed, counters, self.first_env)
+        return MaskSelection(mask, seed, counters)
 
     def watch(self, values: Tensor, what: str) -> None:
         """Have the device note if a value is not finite; `noted` tells."""
@@ -346,7 +347,8 @@ class WarpEngine:
         return name == "sensordata" and bool((stages == int(mujoco.mjtStage.mjSTAGE_ACC)).any())
 
     def _capture(self, nstep: int) -> Any:
-        with wp.ScopedCapture(self._device, force_module_load=False) as capture:
+        stream = wp.Stream(self._device)  # torch's default stream cannot be recorded
+        with wp.ScopedStream(stream), wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
             self._advance(nstep)
         return capture.graph
 
@@ -416,4 +418,3 @@ def _bytes(value: Any) -> int:
     if dataclasses.is_dataclass(value):
         return sum(_bytes(getattr(value, f.name)) for f in dataclasses.fields(value))
     return 0
-
