@@ -46,7 +46,8 @@ class EpisodeStatistics:
         weight = torch.ones(matrix.shape[1]) if episodes.mask is None else episodes.mask.float()
         names = ",".join([*values, *facts, "length"])
         if names not in self._sums:
-            self._sums[names] = torch.zeros(len(matrix), dtype=torch.float32, device=matrix.device)
+            with torch.inference_mode(False):  # `flush` writes to it where there is no such mode
+                self._sums[names] = torch.zeros(len(matrix), dtype=torch.float32, device=matrix.device)
         self._sums[names].addmv_(matrix, weight)
 
     def flush(self) -> dict[str, float]:
