@@ -117,6 +117,8 @@ class PpoTrainer:
         self._learn()
         losses = self._losses()
         self.env.check()
+        if self.peers.size > 1:
+            self.statistics.share(self.peers)
         updated = time.perf_counter()
         physics, step = self.env.seconds["physics"] - physics, self.env.seconds["step"] - step
         seconds = {

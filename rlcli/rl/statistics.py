@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.vec_env import Episodes
+from rlcli.rl.distributed import Peers
 
 
 class EpisodeStatistics:
@@ -46,8 +47,17 @@ class EpisodeStatistics:
         weight = torch.ones(matrix.shape[1]) if episodes.mask is None else episodes.mask.float()
         names = ",".join([*values, *facts, "length"])
         if names not in self._sums:
-            self._sums[names] = torch.zeros(len(matrix), dtype=torch.float32, device=matrix.device)
+            with torch.inference_mode(False):  # `flush` writes to it where there is no such mode
+                self._sums[names] = torch.zeros(len(matrix), dtype=torch.float32, device=matrix.device)
         self._sums[names].addmv_(matrix, weight)
+
+    def share(self, peers: Peers) -> None:
+        """Add up what several processes gathered, once each of them has seen an episode end."""
+        known = len(self._sums)
+        (everywhere,) = peers.total(known)
+        if known and everywhere == known * peers.size:
+            for values in self._sums.values():
+                peers.average_(values).mul_(peers.size)
 
     def flush(self) -> dict[str, float]:
         """Metrics of the iteration that ends; a mean over no episode is left out."""

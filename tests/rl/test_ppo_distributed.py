@@ -53,8 +53,13 @@ given = {"update": trainer._vector.detach().clone(), "metrics": trainer._losses(
          "value": {name: value.clone() for name, value in trainer.value_normalizer.state_dict().items()}}
 trainer.start()
 first = trainer._obs["policy"].clone()
-trainer.iterate(); trainer.iterate()
+own = trainer.statistics._sums
+ended = []
+share = trainer.statistics.share
+trainer.statistics.share = lambda peers: (ended.append(sum(float(v[-2]) for v in own.values())), share(peers))
+for _ in range(6): trainer.iterate()
 torch.save({**given, "first": first, "vector": trainer._vector.detach(), "steps": trainer.env_steps,
+            "ended": sum(ended), "episodes": trainer.statistics.total,
             "noise": trainer._rollout.samples.action}, f"{folder}/{peers.rank}.pt")
 distributed.leave()
 """
@@ -139,12 +144,17 @@ def test_two_processes_update_as_one_does_on_both_their_rollouts_and_act_differe
     assert not torch.equal(both[0]["vector"], both[0]["update"])
     assert not torch.equal(both[0]["first"], both[1]["first"])
     assert not torch.equal(both[0]["noise"], both[1]["noise"])
-    assert both[0]["steps"] == both[1]["steps"] == 2 * 8 * 4 * 2
+    assert both[0]["steps"] == both[1]["steps"] == 6 * 8 * 4 * 2
+    assert both[0]["episodes"] == both[1]["episodes"] == both[0]["ended"] + both[1]["ended"]
+    assert min(both[0]["ended"], both[1]["ended"]) > 0
 
 
 # --- from the command line ---
 
-TRAIN = ("train", "cartpole", "--agent", "ppo", "--num-envs", "16", "--device", "cpu", "--logger", "none", "--json")
+TRAIN = (
+    "train", "cartpole", "--agent", "ppo", "--num-envs", "16", "--device", "cpu", "--logger", "none", "--json",
+    "agent.schedule=adaptive",
+)  # fmt: skip
 LAUNCHED = "import sys; from rlcli.rl.distributed import launch; sys.exit(launch(2, sys.argv[1:]))"
 TORCHRUN = ("torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "rlcli")
 
@@ -217,9 +227,9 @@ def test_a_signal_stops_all_processes_at_the_same_boundary(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "code", "said"),
     [
-        (("agent.learning_rate=1e30",), 6, "not finite"),
+        (("agent.learning_rate=1e30", "agent.learning_rate_range=[1e-5, 1e30]"), 6, "not finite"),
         (("agent.num_stepz=3",), 3, "num_stepz"),
-        (("--agent", "sb3-ppo"), 2, "trains in one process"),
+        (("--agent", "sb3-ppo", "agent.desired_kl=0.01"), 2, "trains in one process"),
     ],
 )
 def test_the_launcher_passes_on_why_the_processes_failed(tmp_path, changes, code, said):
