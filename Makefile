@@ -16,6 +16,7 @@ $(VENV)/.demo: pyproject.toml constraints.txt
 
 $(VENV)/.dev: $(VENV)/.demo
 	$(PIP) install -c constraints.txt -e '.[dev]'
+	$(PIP) install -c constraints.txt --no-deps rsl-rl-lib rl_games
 	touch $@
 
 setup: $(VENV)/.dev

@@ -38,7 +38,7 @@ def mix(x: Keys) -> Keys:
 
 def row_keys(seed: int, env_ids: NDArray[np.int64], counters: NDArray[np.int64]) -> Keys:
     """One key a row, from the seed, the environment and a counter (its episode, or its step). (n,)"""
-    keys = mix(env_ids.astype(np.uint64) * _GOLDEN + _start(seed))
+    keys = mix(env_ids.astype(np.uint64) * _GOLDEN + start(seed))
     keys += counters.astype(np.uint64) * _GOLDEN
     return mix(keys)
 
@@ -75,7 +75,8 @@ def derive(seed: int, name: str) -> int:
 
 
 @functools.lru_cache
-def _start(seed: int) -> Keys:
+def start(seed: int) -> Keys:
+    """The word that every key of a seed begins from. (1,)"""
     return mix(_word(seed) + _GOLDEN)
 
 

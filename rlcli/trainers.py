@@ -15,9 +15,13 @@ class TrainerSpec:
         algorithms: algorithm name -> `module:Model`, the pydantic model of its settings (an `AgentConfig`).
         trainer: `module:Class` of a `Trainer`, called as `Class(env, config, seed=, device=, torch_threads=)`.
         refused: algorithms that the library has and this trainer cannot run -> why.
+        parallel: whether several processes can train one policy (`rlcli.rl.distributed`).
+        gpu: whether it trains with everything on a GPU.
     """
 
     summary: str
     algorithms: Mapping[str, str]
     trainer: str
     refused: Mapping[str, str] = field(default_factory=dict)
+    parallel: bool = False
+    gpu: bool = False

@@ -23,7 +23,19 @@ ANYWHERE = {"rlcli", "rlcli.__main__"}
 """The package itself, which imports nothing, and what starts the command line."""
 
 HEAVY = {"torch", "mujoco", "numpy", "stable_baselines3", "gymnasium"}
-LIGHT = ["errors", "task", "trainers", "config", "registry", "probe", "cli", "rl/trainer.py", "rl/sb3_config.py"]
+LIGHT = [
+    "errors",
+    "task",
+    "trainers",
+    "config",
+    "registry",
+    "probe",
+    "cli",
+    "rl/trainer.py",
+    "rl/sb3_config.py",
+    "rl/ppo_config.py",
+    "rl/distributed.py",
+]
 """What is imported before a configuration is known to be good."""
 
 

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 SCHEMA_VERSION = 1
+_OWN = ("bug", "device", "diverged")
+"""Kinds of errors that one process of several may have alone."""
 
 
 @dataclass(slots=True)
@@ -20,15 +22,17 @@ class Console:
     quiet: bool = False
     verbose: bool = False
     debug: bool = False
+    follows: bool = False
+    """Another process of the same run says what there is to say; only what is wrong with this one is said here."""
 
     def data(self, text: str) -> None:
         """The result, as text for people; left out with --json."""
-        if not self.json:
+        if not self.json and not self.follows:
             _write(sys.stdout, text)
 
     def document(self, command: str, **content: Any) -> None:
         """The result, as JSON; left out without --json."""
-        if self.json:
+        if self.json and not self.follows:
             _write(
                 sys.stdout,
                 json.dumps({"schema": SCHEMA_VERSION, "command": command, **content}, indent=2, default=str),
@@ -36,21 +40,25 @@ class Console:
 
     def info(self, text: str) -> None:
         """A message about what is being done."""
-        if not self.quiet:
+        if not self.quiet and not self.follows:
             _write(sys.stderr, text)
 
     def detail(self, text: str) -> None:
         """A message for -v."""
-        if self.verbose and not self.quiet:
+        if self.verbose and not self.quiet and not self.follows:
             _write(sys.stderr, text)
 
     def warn(self, text: str) -> None:
         """Something the user should know, but that stops nothing."""
+        if self.follows:
+            return
         _write(sys.stderr, f"warning: {text}")
 
     def error(self, kind: str, code: int, message: str, hint: str | None, problems: list[dict[str, Any]]) -> None:
         """Why the command failed."""
-        if self.json:
+        if self.follows and kind not in _OWN:
+            return
+        if self.json and not self.follows:
             error = {"kind": kind, "exit_code": code, "message": message, "hint": hint, "problems": problems}
             with contextlib.suppress(OSError):  # stdout may be what failed
                 _write(sys.stdout, json.dumps({"schema": SCHEMA_VERSION, "error": error}, indent=2))

@@ -54,22 +54,38 @@ def draw_seed(seed: int) -> int:
 
 
 def choose_device(wanted: str) -> str:
-    """auto, cpu, cuda or cuda:N -> a torch device that exists.
+    """auto, cpu, cuda or cuda:N -> a torch device that exists; auto is the GPU where there is one and rlcli[gpu] is.
 
     Raises:
         UsageError: for something else.
         DeviceError: for a device that is not there.
+        DependencyError: for a GPU without rlcli[gpu].
     """
-    from rlcli.errors import DeviceError, UsageError
+    from importlib.util import find_spec
 
-    if wanted in ("auto", "cpu"):
+    from rlcli.errors import DependencyError, DeviceError, UsageError
+
+    if wanted == "cpu" or (wanted == "auto" and not _may_have_gpu()):
         return "cpu"
-    kind, _, index = wanted.partition(":")
+    kind, _, index = "cuda:".partition(":") if wanted == "auto" else wanted.partition(":")
     if kind != "cuda" or (index and not index.isdigit()):
         raise UsageError(f"no device '{wanted}'", hint="auto, cpu, cuda or cuda:N")
     import torch
 
-    if not torch.cuda.is_available():
-        found = f"torch {torch.__version__} sees no CUDA device"
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if wanted == "auto":
+        return "cuda" if count and find_spec("mujoco_warp") else "cpu"
+    if not count or int(index or 0) >= count:
+        found = f"torch {torch.__version__} sees {f'{count} CUDA devices' if count else 'no CUDA device'}"
         raise DeviceError(f"device '{wanted}' is not available: {found}", hint="--device cpu")
-    raise DeviceError(f"no simulation engine for device '{wanted}'", hint="--device cpu")
+    if find_spec("mujoco_warp") is None:
+        raise DependencyError("the GPU engine needs mujoco-warp", hint='pip install "rlcli[gpu]"')
+    return wanted
+
+
+def _may_have_gpu() -> bool:
+    """Whether there is a driver to ask, found out without importing torch."""
+    from pathlib import Path
+    from shutil import which
+
+    return Path("/dev/nvidiactl").exists() or Path("/proc/driver/nvidia").exists() or which("nvidia-smi") is not None

@@ -76,7 +76,7 @@ def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic
     from rlcli.random import derive
     from rlcli.rl.checkpoint import open_checkpoint
     from rlcli.rl.load import policy_of, require_fit
-    from rlcli.rl.rollout import random_policy, zero_policy
+    from rlcli.rl.rollout import acting, random_policy, zero_policy
 
     torch.set_num_threads(1)
     trained, checkpoint = None, None
@@ -89,7 +89,7 @@ def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic
     if checkpoint is not None and trained is not None:
         require_fit(checkpoint, env.layout)
         generator = torch.Generator().manual_seed(derive(seed, "play"))
-        act = (lambda obs: trained.sample(obs, generator)) if stochastic else trained
+        act = acting(env, trained, stochastic=stochastic, generator=generator)
     elif policy == "zero":
         act = zero_policy(env)
     else:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -51,6 +52,9 @@ def command(
     max_iterations: Annotated[int | None, typer.Option("--max-iterations", help="Iterations to train for.")] = None,
     max_steps: Annotated[int | None, typer.Option("--max-steps", help="Environment steps to train for.")] = None,
     device: Device = "auto",
+    gpus: Annotated[
+        int | None, typer.Option("--gpus", min=1, help="Processes on this machine, a GPU each; num_envs is of each.")
+    ] = None,
     logger: Annotated[list[str] | None, typer.Option("--logger", help="tensorboard or none; repeatable.")] = None,
     config: ConfigFile = None,
     resume: Annotated[
@@ -71,41 +75,57 @@ def command(
     from rlcli.config.load import resolve
     from rlcli.errors import UsageError
     from rlcli.registry import find_task
+    from rlcli.rl import distributed
     from rlcli.rl.run import default_runs_dir
     from rlcli.rl.stop import StopRequest
 
     console.quiet, console.verbose = quiet, verbose
     # libgomp's threads spin while they wait; on a busy machine that makes an update ten times slower
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-    device, runs = choose_device(device), runs_dir or default_runs_dir()
-    budget = _budget(max_iterations, max_steps)
+    console.follows = not distributed.leads()
+    runs, budget = runs_dir or default_runs_dir(), _budget(max_iterations, max_steps)
+    wanted, device = device, _device(device, gpus)
+    fixed = {
+        "--agent": agent,
+        "--seed": seed,
+        "--num-envs": num_envs,
+        "--config": config,
+        "--init-from": init_from,
+        "--name": name,
+    }
+    resolved = None
+    if resume is not None:
+        _refuse_changes([task, *(overrides or [])], fixed)
+    elif task is None:
+        raise UsageError("which task?", hint="rlcli train TASK (rlcli list-tasks shows them), or --resume RUN")
+    else:
+        resolved = resolve(
+            find_task(task),
+            agent=agent,
+            device=device,
+            config_file=config,
+            overrides=overrides or [],
+            flags={**flags(scene__num_envs=num_envs), **budget},
+        )
+        _require_parallel(resolved, gpus or 1)
+        device = _fitting(resolved, device, wanted)
+    if gpus is not None and gpus > 1 and not distributed.launched():
+        raise typer.Exit(distributed.launch(gpus, sys.argv[1:]))
+
+    def begin() -> _Job | None:
+        if resolved is None:
+            assert resume is not None
+            return _resumed(resume, runs, find_task(task).name if task else None, budget, logger)
+        record = {"seed": draw_seed(42 if seed is None else seed), "device": device}
+        return _created(resolved, runs, name, record, logger, init_from)
+
     with StopRequest() as stop:
-        if resume is not None:
-            fixed = {
-                "--agent": agent,
-                "--seed": seed,
-                "--num-envs": num_envs,
-                "--config": config,
-                "--init-from": init_from,
-                "--name": name,
-            }
-            _refuse_changes([task, *(overrides or [])], fixed)
-            job = _resumed(resume, runs, find_task(task).name if task else None, budget, logger)
-        elif task is None:
-            raise UsageError("which task?", hint="rlcli train TASK (rlcli list-tasks shows them), or --resume RUN")
-        else:
-            resolved = resolve(
-                find_task(task),
-                agent=agent,
-                device=device,
-                config_file=config,
-                overrides=overrides or [],
-                flags={**flags(scene__num_envs=num_envs), **budget},
-            )
-            record = {"seed": draw_seed(42 if seed is None else seed), "device": device}
-            job = _created(resolved, runs, name, record, logger, init_from)
-        if job is not None:
-            _train(job, device, stop)
+        try:
+            job = _together(begin, resolved, budget, device)
+            if job is not None:
+                _train(job, device, stop)
+        finally:
+            distributed.leave()
 
 
 @dataclass(slots=True)
@@ -119,7 +139,111 @@ class _Job:
     """The checkpoint to go on from exactly."""
     init_from: Any = None
     """The checkpoint folder to take weights from."""
+    writes: bool = True
+    """Whether this process writes the run."""
     begin: float = field(default_factory=time.monotonic)
+
+    def word(self) -> dict[str, Any]:
+        """What other processes need to know of it."""
+        return {
+            "run": str(self.run.folder),
+            "record": self.run.record,
+            "resume_from": None if self.resume_from is None else str(self.resume_from.folder),
+            "init_from": self.init_from,
+        }
+
+
+def _device(wanted: str, gpus: int | None) -> str:
+    """The device of this process."""
+    from rlcli.errors import DeviceError, UsageError
+    from rlcli.rl import distributed
+
+    several = gpus is not None or distributed.launched()
+    if gpus is not None and wanted == "auto":
+        wanted = "cuda"
+    if gpus is not None and wanted != "cuda":
+        raise UsageError(f"--gpus {gpus} and --device {wanted} contradict each other", hint="--gpus alone")
+    device = choose_device(wanted)
+    if not several or device == "cpu" or ":" in wanted:
+        return device
+    import torch
+
+    number, processes = distributed.local()
+    need, have = max(gpus or 1, processes), torch.cuda.device_count()
+    if have < need:
+        raise DeviceError(f"{need} processes need a GPU each, and torch sees {have}", hint=f"--gpus {have}")
+    return f"cuda:{number}"
+
+
+def _fitting(resolved: Resolved, device: str, wanted: str) -> str:
+    """The device, or the CPU where the GPU was not asked for and the trainer cannot use it."""
+    from rlcli.errors import UsageError
+
+    assert resolved.agent is not None
+    assert resolved.trainer is not None
+    if device == "cpu" or resolved.trainer.gpu:
+        return device
+    if wanted == "auto":
+        return "cpu"
+    raise UsageError(
+        f"agent '{resolved.agent_name}' (trainer {resolved.agent.trainer}) trains on the CPU only, not on '{device}'",
+        hint="--device cpu, or an agent whose trainer uses the GPU (trainer: ppo)",
+    )
+
+
+def _require_parallel(resolved: Resolved, gpus: int = 1) -> None:
+    from rlcli.errors import UsageError
+    from rlcli.rl import distributed
+
+    resolved.require_agent()
+    assert resolved.agent is not None
+    assert resolved.trainer is not None
+    if (gpus > 1 or distributed.launched()) and not resolved.trainer.parallel:
+        raise UsageError(
+            f"trainer '{resolved.agent.trainer}' of agent '{resolved.agent_name}' trains in one process",
+            hint="name an agent of trainer ppo with --agent",
+        )
+
+
+def _together(
+    begin: Callable[[], _Job | None], resolved: Resolved | None, budget: dict[str, Any], device: str
+) -> _Job | None:
+    """What is to be done: the process that leads says it, the others hear it."""
+    from rlcli.rl import distributed
+
+    if not distributed.leads():
+        return _followed(distributed.join(device).share(), resolved, budget)
+    try:
+        job = begin()
+    except Exception:
+        distributed.join(device).share(None)  # the others wait for word
+        raise
+    try:
+        peers = distributed.join(device)
+        if job is not None and peers.size > 1 and job.resume_from is None:
+            job.run.update(processes=peers.size)
+        peers.share(None if job is None else job.word())
+    except BaseException:
+        if job is not None and job.resume_from is None:
+            job.run.discard()
+        raise
+    return job
+
+
+def _followed(word: dict[str, Any] | None, resolved: Resolved | None, budget: dict[str, Any]) -> _Job | None:
+    """The job of a process that does not lead: nothing of it is written."""
+    from rlcli.rl.checkpoint import open_checkpoint
+    from rlcli.rl.load import resolve_run
+    from rlcli.rl.run import Run, open_run
+
+    if word is None:
+        return None
+    folder = Path(word["run"])
+    if resolved is not None:
+        return _Job(Run(folder, word["record"]), resolved, [], init_from=word["init_from"], writes=False)
+    run = open_run(folder)
+    resolved = resolve_run(run, play=False, flags=budget)
+    return _Job(run, resolved, [], resume_from=open_checkpoint(Path(word["resume_from"])), writes=False)
 
 
 def _budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
@@ -155,7 +279,6 @@ def _created(
     from rlcli.rl.loggers import check_loggers
     from rlcli.rl.run import create_run, environment_record, find_checkpoint
 
-    resolved.require_agent()
     loggers = check_loggers(logger)
     initial = None
     if init_from is not None:
@@ -191,6 +314,7 @@ def _resumed(
         console.document("train", run=str(run.folder), state="finished", checkpoint=str(folder), step=step)
         return None
     resolved = resolve_run(run, play=False, flags=budget)
+    _require_parallel(resolved)
     loggers = check_loggers(logger) if logger else list(run.record.get("loggers", []))
     run.lock()
     try:
@@ -216,7 +340,7 @@ def _train(job: _Job, device: str, stop: StopRequest) -> None:
         if stop.signal is not None and new:
             raise Stopped("stopped before training began; nothing was written", exit_code=stop.exit_code)
     except BaseException:
-        if new:
+        if new and job.writes:
             run.discard()
         run.unlock()
         raise
@@ -232,7 +356,8 @@ def _train(job: _Job, device: str, stop: StopRequest) -> None:
         run.unlock()
         env.close()
     _warn_physics(env)
-    _report(job, trainer)
+    if job.writes:
+        _report(job, trainer)
 
 
 def _build(job: _Job, device: str) -> Any:
@@ -240,12 +365,14 @@ def _build(job: _Job, device: str) -> Any:
     from rlcli.envs.vec_env import make_env
     from rlcli.errors import CheckpointError
     from rlcli.registry import load_object
+    from rlcli.rl import distributed
     from rlcli.rl.checkpoint import drop_after, open_checkpoint
     from rlcli.rl.load import require_fit
 
     resolved, record = job.resolved, job.run.record
     assert resolved.trainer is not None
-    env = make_env(resolved, seed=record["seed"], device=device)
+    peers = distributed.current()
+    env = make_env(resolved, seed=peers.seed(record["seed"], "environments"), device=device)
     threads = int(record.get("torch_threads") or _threads(resolved)[1])
     make = load_object(resolved.trainer.trainer)
     trainer = make(env, resolved.agent, seed=record["seed"], device=device, torch_threads=threads)
@@ -262,7 +389,12 @@ def _build(job: _Job, device: str) -> Any:
     _take(saved, lambda: trainer.load(state), "it cannot be resumed")
     if trainer.env_steps != saved.step:
         raise CheckpointError(f"{saved.folder} cannot be resumed: its manifest and its state name different steps")
-    dropped = drop_after(job.run.checkpoints, saved.step)
+    processes = state.values.get("processes", 1)
+    if processes != peers.size:
+        console.info(
+            f"saved by {processes} processes, going on in {peers.size}: every environment begins a new episode"
+        )
+    dropped = drop_after(job.run.checkpoints, saved.step) if job.writes else []
     if dropped:
         console.info(f"removed {len(dropped)} later checkpoints: they are not what comes next")
     return trainer, env
@@ -296,11 +428,14 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
     def close(state: str) -> None:
         for sink in sinks:
             sink.close()
+        if not job.writes:
+            return
         run.update(state=state, step=trainer.env_steps, iteration=trainer.iteration)
 
     try:
-        run.update(state="running")
-        sinks += open_loggers(run, job.loggers, resume=resume)
+        if job.writes:
+            run.update(state="running")
+            sinks += open_loggers(run, job.loggers, resume=resume)
         with TrainingView(f"rlcli train {job.resolved.source.name}") as view:
             fit(
                 trainer,
@@ -310,6 +445,7 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
                 save_interval=agent.save_interval,
                 manifest=manifest,
                 show=view.show,
+                tell=console.warn,
                 divergences=lambda: env.divergences,
                 stop=stop,
             )

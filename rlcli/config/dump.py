@@ -22,6 +22,8 @@ class _Dumper(yaml.SafeDumper):
         """The tag that the strict reader gives a plain scalar, so that whatever it reads otherwise is quoted."""
         if kind is not yaml.ScalarNode or not implicit[0]:
             return super().resolve(kind, value, implicit)
+        if value == "<<":  # a merge, as a key
+            return "not a plain scalar"
         try:
             return f"tag:yaml.org,2002:{_TAGS[type(strict_yaml.load_value(value))]}"
         except (strict_yaml.YamlError, KeyError):

@@ -176,8 +176,6 @@ class _Reader:
         if not isinstance(key, str):
             raise YamlError(f"keys must be text, found {key!r}; quote it", mark)
         path = (*frame.path, key)
-        if key == "<<":
-            raise YamlError("merge keys (<<) are not allowed", mark)
         if key in frame.container:
             raise YamlError(f"duplicate key '{key}' (first on line {self.marks[path][0]})", mark)
         assert isinstance(frame.container, dict)
@@ -193,6 +191,8 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
         raise YamlError(f"a value longer than {MAX_SCALAR} characters", event.start_mark)
     if not event.implicit[0]:  # quoted or block: always text
         return text
+    if key and text == "<<":
+        raise YamlError("merge keys (<<) are not allowed", event.start_mark)
     if text in _CONSTANTS:
         return _CONSTANTS[text]
     if _OCTAL.match(text):

@@ -46,6 +46,8 @@ class ArticulationView:
         self._entity: Entity = env.entities[self.entity_name]
         engine = env.engine
         self._qpos, self._ctrl = engine.field("qpos"), engine.field("ctrl")
+        self._qpos_index = as_index(self._entity.qpos_columns.tolist(), engine.device)
+        self._dof_index = as_index(self._entity.dof_columns.tolist(), engine.device)
         driven = {joint for joint, _ in self._entity.actuators_of("motor")}
         self._without_motor = [j for j in range(len(self._entity.joint_names)) if j not in driven]
         self._actuators = {kind: _actuator_columns(self._entity, kind) for kind in ("motor", "position", "velocity")}
@@ -100,12 +102,12 @@ class ArticulationView:
 
     def set_joint_positions(self, positions: Tensor, indices: Tensor | None = None) -> None:
         """Set joint positions, and with them the targets of position actuators. (n, num_dof) [m or rad]"""
-        self._set("qpos", positions, indices, self._entity.qpos_columns)
+        self._set("qpos", positions, indices, self._qpos_index)
         self._command("position", positions, indices)
 
     def set_joint_velocities(self, velocities: Tensor, indices: Tensor | None = None) -> None:
         """Set joint velocities, and with them the targets of velocity actuators. (n, num_dof) [m/s or rad/s]"""
-        self._set("qvel", velocities, indices, self._entity.dof_columns)
+        self._set("qvel", velocities, indices, self._dof_index)
         self._command("velocity", velocities, indices)
 
     def set_joint_efforts(self, efforts: Tensor, indices: Tensor | None = None) -> None:
@@ -131,7 +133,7 @@ class ArticulationView:
     def set_world_poses(self, positions: Tensor, orientations: Tensor, indices: Tensor | None = None) -> None:
         """Set root poses of a floating robot, in each environment's frame. (n, 3) [m], (n, 4) w, x, y, z"""
         root, _ = self._entity.floating()
-        self._set("qpos", torch.cat([positions, orientations], dim=1), indices, torch.arange(root, root + 7))
+        self._set("qpos", torch.cat([positions, orientations], dim=1), indices, slice(root, root + 7))
 
     def set_velocities(self, velocities: Tensor, indices: Tensor | None = None) -> None:
         """Set root velocities of a floating robot, world frame. (n, 6) [m/s, rad/s]"""
@@ -139,26 +141,25 @@ class ArticulationView:
         rows = slice(None) if indices is None else indices.long()
         quat = self._qpos[rows][:, qpos + 3 : qpos + 7].float()
         local = torch.cat([velocities[:, :3], rotate_inverse(quat, velocities[:, 3:])], dim=1)
-        self._set("qvel", local, indices, torch.arange(dof, dof + 6))
+        self._set("qvel", local, indices, slice(dof, dof + 6))
 
     def _command(self, kind: str, values: Tensor, indices: Tensor | None) -> None:
         joints, controls, factor = self._actuators[kind]
-        if len(controls):
+        if len(factor):
             self._write(self._ctrl, values[:, joints] * factor, indices, controls)
 
-    def _set(self, name: str, values: Tensor, indices: Tensor | None, columns: Tensor) -> None:
+    def _set(self, name: str, values: Tensor, indices: Tensor | None, columns: Columns) -> None:
         self._write(self._env.engine.field(name), values, indices, columns)
         self._write(getattr(self._env.sim, name), values, indices, columns)  # what getters read
         self._env.sim.stamp += 1
 
-    def _write(self, field: Tensor, values: Tensor, indices: Tensor | None, columns: Tensor) -> None:
-        index = as_index(columns.tolist())
+    def _write(self, field: Tensor, values: Tensor, indices: Tensor | None, columns: Columns) -> None:
         if indices is None:
-            field[:, index] = values.to(field.dtype)
-        elif isinstance(index, slice):
-            field[indices.long(), index] = values.to(field.dtype)
+            field[:, columns] = values.to(field.dtype)
+        elif isinstance(columns, slice):
+            field[indices.long(), columns] = values.to(field.dtype)
         else:
-            field[indices.long()[:, None], index] = values.to(field.dtype)
+            field[indices.long()[:, None], columns] = values.to(field.dtype)
 
 
 def _rows(values: Tensor, indices: Tensor | None, clone: bool) -> Tensor:
@@ -167,7 +168,7 @@ def _rows(values: Tensor, indices: Tensor | None, clone: bool) -> Tensor:
     return values.clone() if clone else values
 
 
-def _actuator_columns(entity: Entity, kind: str) -> tuple[Columns, Tensor, Tensor]:
+def _actuator_columns(entity: Entity, kind: str) -> tuple[Columns, Columns, Tensor]:
     """Joint columns that have an actuator of the kind, those actuators' control columns, and what makes controls.
 
     A gear multiplies forces and lengths alike: so a joint's force is divided by it, a joint's target multiplied.
@@ -177,7 +178,7 @@ def _actuator_columns(entity: Entity, kind: str) -> tuple[Columns, Tensor, Tenso
     controls = [actuator for _, actuator in columns]
     gear = np.array([entity.engine.model.actuator_gear[a, 0] for a in controls])
     return (
-        as_index(joints),
-        torch.tensor(controls, dtype=torch.int64),
-        torch.tensor(1.0 / gear if kind == "motor" else gear, dtype=torch.float32),
+        as_index(joints, entity.engine.device),
+        as_index(controls, entity.engine.device),
+        torch.tensor(1.0 / gear if kind == "motor" else gear, dtype=torch.float32, device=entity.engine.device),
     )

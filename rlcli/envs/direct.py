@@ -26,8 +26,8 @@ class DirectTask:
     """Base of a direct task. The framework owns the buffers; the hooks fill them.
 
     Order of a step: `pre_physics_step`, physics, `progress_buf += 1`, `get_observations`, `get_states`,
-    `calculate_metrics`, `is_done`; then `reset` (or `reset_idx`) for the environments that ended, and their observations
-    again.
+    `calculate_metrics`, `is_done`; then `reset` (or `reset_idx`) for the environments that ended, and their
+    observations again.
     """
 
     num_observations: ClassVar[int]
@@ -76,7 +76,8 @@ class DirectTask:
     def reset(self, selection: Selection) -> None:
         """Write start states; the environments are in their default state.
 
-        Draw from the selection, write through it: `entity.write_joint_positions(selection, ...)`, `selection.write(...)`.
+        Draw from the selection, write through it: `entity.write_joint_positions(selection, ...)`,
+        `selection.write(...)`.
         A GPU runs this form as part of the captured step. A task defines this hook or `reset_idx`, not both.
         """
 
@@ -107,8 +108,9 @@ class DirectTask:
 
         They depend on the seed, the environment, its episode and `name`, and on nothing else.
         """
-        ids = env_ids.numpy()
-        return IdSelection(ids, self.env.seed, self.env.episode_index.numpy()[ids], stream(f"direct.{name}"))
+        ids, episodes = env_ids.cpu().numpy(), self.env.episode_index.cpu().numpy()
+        device = None if self.device.type == "cpu" else self.device
+        return IdSelection(ids, self.env.seed, episodes[ids], stream(f"direct.{name}"), device)
 
 
 class DirectEnv(VecEnv):
@@ -175,6 +177,10 @@ class DirectEnv(VecEnv):
             self.config.decimation,
         )
 
+    def holders(self) -> list[Any]:
+        """The task."""
+        return [self.task]
+
     def extras(self) -> dict[str, float]:
         """The task's `extras`: numbers, and means of tensors."""
         found = {}
@@ -229,7 +235,9 @@ class DirectEnv(VecEnv):
         task = self.task
         task.reset(selection.stream(_RESET))
         if self._resets_by_id:
-            self._reset_hook(selection.read(self._ids))
+            ids = selection.env_ids()
+            if len(ids):
+                self._reset_hook(ids)
         selection.write(task.progress_buf, 0)
         selection.write(task.reset_buf, 1)
         selection.write(self._fresh, True)
@@ -242,7 +250,7 @@ class DirectEnv(VecEnv):
             self._fill()
         obs.copy_(task.obs_buf)
         states.copy_(task.states_buf)
-        if self._observed and not self._settled and bool(self._fresh.any()):
+        if self._observed and not self._settled and self._maybe(self._fresh):
             self._fill()
             fresh = self._fresh[:, None]
             task.obs_buf.copy_(torch.where(fresh, task.obs_buf, obs, out=obs))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from torch import Tensor
 
@@ -12,7 +14,7 @@ from rlcli.config.terms import SELECTORS
 from rlcli.envs.vec_env import Layout, TermLayout, VecEnv
 from rlcli.managers.action import ActionManager, CommandMap
 from rlcli.managers.event import EventManager
-from rlcli.managers.observation import ObservationManager
+from rlcli.managers.observation import ObservationManager, Watch
 from rlcli.managers.reward import RewardManager
 from rlcli.managers.term import BoundTerm
 from rlcli.managers.termination import TerminationManager
@@ -46,7 +48,16 @@ class ManagedEnv(VecEnv):
         self.event_manager.startup(self._everyone())
         reward_dt = self.step_dt if self.config.reward_dt_scaling else 1.0
         self.reward_manager = RewardManager(self._rewards, n, reward_dt, device, self.config.divergence_reward)
-        self.observation_manager = ObservationManager(self._observations, n, device)
+        self.observation_manager = ObservationManager(self._observations, n, device, self._watch())
+
+    def holders(self) -> list[Any]:
+        """The terms that are objects."""
+        bound = [*self._actions, *self._events, *self._terminations, *self._rewards]
+        terms = [*bound, *(term for group in self._observations.values() for term in group)]
+        return [term.instance for term in terms if not isinstance(term.instance, functools.partial)]
+
+    def _watch(self) -> Watch | None:
+        return self.engine.watch if self.engine.asynchronous else None
 
     def _layout(self) -> Layout:
         observations = {
@@ -100,7 +111,7 @@ class ManagedEnv(VecEnv):
     def _between(self) -> None:
         if not self.event_manager.has_intervals:
             return
-        steps = self._ids.new_full((self.num_envs,), self.common_step)
+        steps = self._steps.expand(self.num_envs).contiguous()
         running = (self.episode_length_buf > 0).long()  # no time has passed for those just reset
         self.event_manager.interval(lambda mask: self.engine.select(mask, self.seed, steps), running, self._written)
 

@@ -46,6 +46,23 @@ class Episodes:
     """Ended by time alone. (n,) bool"""
     success: Tensor | None
     """Met the task's success condition; None where the task has none. (n,) bool"""
+    mask: Tensor | None = None
+    """A GPU gives a row for every environment, and which of them count. (num_envs,) bool; None: all rows do."""
+
+    def ended(self) -> Episodes:
+        """Only the rows that count; waits for the device."""
+        if self.mask is None:
+            return self
+        rows = self.mask
+        return Episodes(
+            self.ids[rows],
+            self.returns[rows],
+            self.lengths[rows],
+            {name: values[rows] for name, values in self.reward_terms.items()},
+            {name: values[rows] for name, values in self.causes.items()},
+            self.truncated[rows],
+            None if self.success is None else self.success[rows],
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +79,9 @@ class StepResult:
     """Time ran out: bootstrap from `final_obs`, unless it was terminated as well. (num_envs,) bool"""
     final_obs: dict[str, Tensor] | None
     """True last observations, full size; rows are valid where an episode ended (with `final_obs_of = "truncated"`:
-    where it ended by time). None if there is no such row. Valid until the next step."""
+    where it ended by time). None if there is known to be no such row. Valid until the next step."""
     episodes: Episodes | None
-    """The episodes that ended, if any."""
+    """The episodes that ended; None if it is known that none did."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +172,6 @@ class VecEnv(ABC):
         self.num_envs = self.config.scene.num_envs
         self.final_obs_of = "finished"
         self.seconds = {"physics": 0.0, "step": 0.0}
-        self.divergences = 0
         self._playing = True
         self._counters()
         self._open(resolved)
@@ -178,9 +194,10 @@ class VecEnv(ABC):
         if seed is not None:
             self.seed = seed
             self.episode_index.zero_()
-            self.common_step = 0
+            self._steps.zero_()
         else:
             self.episode_index += 1
+        self.engine.attach()
         self._start_over()
         self._restart(self._everyone())
         return self._observe()
@@ -199,12 +216,13 @@ class VecEnv(ABC):
             raise ValueError(
                 f"action has shape {tuple(action.shape)}, expected {(self.num_envs, self.layout.action_size)}"
             )
+        self.engine.attach()
         self._require_finite(action, "the policy's action")
 
         self._act(action)
         diverged = self._simulate()
         self.episode_length_buf += 1
-        self.common_step += 1
+        self._steps += 1
         reward, terminated, truncated = self._judge(diverged)
         self._require_finite(reward, "the reward")
         self._hold_success()
@@ -214,14 +232,37 @@ class VecEnv(ABC):
         self.episode_index += finished  # before the selection: what begins now draws from its own counter
         ended = self._select(finished)
         if ended is not None:
-            if self.final_obs_of == "finished" or bool((truncated & ~terminated).any()):
+            if self.final_obs_of == "finished" or self._maybe(truncated & ~terminated):
                 final_obs = self._final()
-            episodes = self._episodes(ended, terminated, truncated)
+            episodes = self._episodes(ended, finished, terminated, truncated)
             self._restart(ended)
         self._between()
         obs = self._observe()
         self.seconds["step"] += time.perf_counter() - start
         return StepResult(obs, reward, terminated, truncated, final_obs, episodes)
+
+    def holders(self) -> list[Any]:
+        """Objects that carry something of their own from step to step: terms with memory, a direct task."""
+        return []
+
+    def check(self) -> None:
+        """Raise what a device has found in the steps since the last call; a CPU raises at once.
+
+        Raises:
+            DivergedError: as `step`, or because the device ran out of room for contacts.
+        """
+        for what in self.engine.noted():
+            raise DivergedError(f"{what} is not finite, within the last steps before step {self.common_step}")
+
+    @property
+    def common_step(self) -> int:
+        """Steps since the start, the same in all environments."""
+        return int(self._steps)
+
+    @property
+    def divergences(self) -> int:
+        """Environments whose simulation diverged, ever."""
+        return self.engine.divergences
 
     def is_playing(self) -> bool:
         """False while paused; no step runs then."""
@@ -248,7 +289,7 @@ class VecEnv(ABC):
         own = {
             "episode_length": self.episode_length_buf.clone(),
             "episode_index": self.episode_index.clone(),
-            "common_step": torch.tensor(self.common_step),
+            "common_step": self._steps.clone(),
             "seed": torch.tensor(self.seed),
             "success_hold": self._success_hold.clone(),
         }
@@ -263,7 +304,7 @@ class VecEnv(ABC):
         """Take back what `state_dict` gave; returns the observations of that moment."""
         self.episode_length_buf.copy_(state["episode_length"])
         self.episode_index.copy_(state["episode_index"])
-        self.common_step = int(state["common_step"])
+        self._steps.copy_(state["common_step"])
         self.seed = int(state["seed"])
         self._success_hold.copy_(state["success_hold"])
         self.engine.load_state_dict(_below(state, "engine."))
@@ -336,14 +377,13 @@ class VecEnv(ABC):
         self.engine.step(self.config.decimation)
         self.seconds["physics"] += time.perf_counter() - start
         diverged = self.engine.diverged()
-        if diverged is not None:
+        if diverged is not None and not self.engine.asynchronous:
             self._put_back(diverged)
         self.sim.refresh()
         return diverged
 
     def _put_back(self, diverged: Tensor) -> None:
         """Return diverged worlds to their last finite state: they are judged by that, not by MuJoCo's own reset."""
-        self.divergences += int(diverged.sum())
         selection = self._select(diverged)
         if selection is not None:
             self.engine.reset(selection)
@@ -355,7 +395,7 @@ class VecEnv(ABC):
             self._success_hold += 1.0
             self._success_hold *= self._success()
 
-    def _episodes(self, ended: Selection, terminated: Tensor, truncated: Tensor) -> Episodes:
+    def _episodes(self, ended: Selection, finished: Tensor, terminated: Tensor, truncated: Tensor) -> Episodes:
         returns, terms, causes = self._terms_of(ended)
         timed_out = ended.read(truncated) & ~ended.read(terminated)
         success = None
@@ -369,6 +409,7 @@ class VecEnv(ABC):
             causes,
             timed_out,
             success,
+            finished if self.engine.asynchronous else None,
         )
 
     def _restart(self, selection: Selection) -> None:
@@ -388,7 +429,14 @@ class VecEnv(ABC):
         assert everyone is not None
         return everyone
 
+    def _maybe(self, mask: Tensor) -> bool:
+        """Whether a mask holds anywhere, as far as that is known without waiting for a device."""
+        return self.engine.asynchronous or bool(mask.any())
+
     def _require_finite(self, values: Tensor, what: str) -> None:
+        if self.engine.asynchronous:
+            self.engine.watch(values, what)
+            return
         if is_finite(values):
             return
         self._explain(what)
@@ -414,7 +462,7 @@ class VecEnv(ABC):
         scene.spec.visual.global_.offheight = config.viewer.height
         self.spec = scene.spec
         model = scene.compile()
-        self.engine = open_engine(model, self.num_envs, device=str(self.device), threads=config.sim.engine_threads)
+        self.engine = open_engine(model, self.num_envs, config.sim, device=str(self.device))
         self.sim = SimData(self.engine)
         self.entities: dict[str, Entity] = {}
         for name, entity in config.scene.entities.items():
@@ -432,8 +480,8 @@ class VecEnv(ABC):
     def _set_default(self, model: mujoco.MjModel) -> None:
         qpos, qvel = torch.tensor(model.qpos0), torch.zeros(model.nv, dtype=torch.float64)
         for entity in self.entities.values():
-            qpos[entity.qpos_columns] = entity.data.default_joint_pos[0].double()
-            qvel[entity.dof_columns] = entity.data.default_joint_vel[0].double()
+            qpos[entity.qpos_columns.cpu()] = entity.data.default_joint_pos[0].double().cpu()
+            qvel[entity.dof_columns.cpu()] = entity.data.default_joint_vel[0].double().cpu()
         self.engine.set_default(qpos, qvel)
         self.engine.reset(self._everyone())
         self.sim.refresh()
@@ -445,7 +493,7 @@ class VecEnv(ABC):
         self.episode_index = torch.full((self.num_envs,), -1, dtype=torch.int64, device=self.device)
         """Episodes begun before the running one; random streams are keyed by it. (num_envs,)"""
         self._ids = torch.arange(self.num_envs, device=self.device)
-        self.common_step = 0
+        self._steps = torch.zeros((), dtype=torch.int64, device=self.device)
 
 
 def grid(num_envs: int, spacing: float) -> Tensor:

@@ -24,11 +24,22 @@ class _Group:
     next: int = 0
 
 
+Watch = Callable[[Tensor, str], None]
+"""Notes, without waiting for a device, if values are not finite: (values, what they are)."""
+
+
 class ObservationManager:
     """Computes every group into one of three buffers in turn, so that consecutive observations share no memory."""
 
-    def __init__(self, groups: dict[str, list[BoundTerm]], num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self,
+        groups: dict[str, list[BoundTerm]],
+        num_envs: int,
+        device: torch.device,
+        watch: Watch | None = None,
+    ) -> None:
         self.num_envs = num_envs
+        self._watch = watch
         self.groups = {name: self._group(terms, device) for name, terms in groups.items()}
         self._final = {name: torch.zeros_like(group.buffers[0]) for name, group in self.groups.items()}
         self._final_views = {name: _split(self._final[name], group.sizes) for name, group in self.groups.items()}
@@ -74,10 +85,13 @@ class ObservationManager:
             check_shape(term, value, (self.num_envs, width), "observations")
             sizes.append(width)
         buffers = [torch.zeros(self.num_envs, sum(sizes), device=device) for _ in range(3)]
-        adjust = [_adjustment(term, size) for term, size in zip(terms, sizes, strict=True)]
+        adjust = [_adjustment(term, size, device) for term, size in zip(terms, sizes, strict=True)]
         return _Group(terms, sizes, buffers, [_split(buffer, sizes) for buffer in buffers], adjust)
 
     def _require_finite(self, name: str, group: _Group, values: Tensor) -> None:
+        if self._watch is not None:
+            self._watch(values, f"observation group '{name}'")
+            return
         if is_finite(values):
             return
         for term, view in zip(group.terms, _split(values, group.sizes), strict=True):
@@ -94,11 +108,11 @@ def _split(buffer: Tensor, sizes: list[int]) -> list[Tensor]:
     return list(buffer.split(sizes, dim=1))
 
 
-def _adjustment(term: BoundTerm, size: int) -> Callable[[Tensor], None] | None:
+def _adjustment(term: BoundTerm, size: int, device: torch.device) -> Callable[[Tensor], None] | None:
     clip, scale = term.config.clip, term.config.scale  # type: ignore[attr-defined]
     if clip is None and scale is None:
         return None
-    factor = torch.tensor(1.0 if scale is None else scale)
+    factor = torch.tensor(1.0 if scale is None else scale, device=device)
     if factor.dim() == 1 and len(factor) != size:
         path = ".".join(map(str, (*term.path, "scale")))
         raise ConfigError([Problem("observations", path, f"has {len(factor)} values for {size} columns")])

@@ -36,7 +36,7 @@ class _JointAction:
         offset: Tensor | float,
         clip: Range | None,
     ) -> None:
-        columns = torch.arange(len(entity.joint_names))[joints].tolist()
+        columns = torch.arange(len(entity.joint_names), device=env.device)[joints].tolist()
         driven = dict(entity.actuators_of(self.actuator))
         self.elements = tuple(entity.joint_names[c] for c in columns)
         missing = [name for name, c in zip(self.elements, columns, strict=True) if c not in driven]
@@ -45,12 +45,12 @@ class _JointAction:
         self.actuators = actuators = [driven[c] for c in columns]
         self.size = len(columns)
         self._scale, self._offset, self._clip = scale, offset, clip
-        gear = torch.tensor(entity.engine.model.actuator_gear[actuators, 0], dtype=torch.float32)
+        gear = torch.tensor(entity.engine.model.actuator_gear[actuators, 0], dtype=torch.float32, device=env.device)
         self._factor = 1.0 / gear if self.actuator == "motor" else gear
         self._geared = bool((gear != 1.0).any())
         self._limits = _command_limits(entity.engine.model, actuators, self.actuator)
         self._ctrl = entity.engine.field("ctrl")
-        self._columns = as_index(actuators)
+        self._columns = as_index(actuators, env.device)
         # consecutive controls: a view of the engine's own, made once
         self._target = self._ctrl[:, self._columns] if isinstance(self._columns, slice) else None
         self.command = torch.zeros(env.num_envs, self.size, device=env.device)

@@ -27,7 +27,7 @@ def reset_joints_by_offset(
 ) -> None:
     """Default joint state plus uniform offsets [m or rad, m/s or rad/s], positions kept within the soft limits."""
     default_pos, default_vel = _defaults(entity, selection, joints)
-    offset = selection.uniform(*_bounds(position, velocity), (2, default_pos.shape[1]))
+    offset = selection.uniform(*_bounds(env.device, position, velocity), (2, default_pos.shape[1]))
     _write_joints(entity, selection, joints, default_pos.add_(offset[:, 0]), default_vel.add_(offset[:, 1]))
 
 
@@ -42,7 +42,7 @@ def reset_joints_by_scale(
 ) -> None:
     """Default joint state times uniform factors, positions kept within the soft limits."""
     default_pos, default_vel = _defaults(entity, selection, joints)
-    factor = selection.uniform(*_bounds(position, velocity), (2, default_pos.shape[1]))
+    factor = selection.uniform(*_bounds(env.device, position, velocity), (2, default_pos.shape[1]))
     _write_joints(entity, selection, joints, default_pos.mul_(factor[:, 0]), default_vel.mul_(factor[:, 1]))
 
 
@@ -62,9 +62,9 @@ def reset_root_state_uniform(
 ) -> None:
     """Default root state plus uniform offsets: position [m], attitude [rad], velocity [m/s, rad/s], world frame."""
     default = selection.read(entity.data.default_root_state)
-    offset = selection.uniform(*_bounds(x, y, z), (3, 1)).squeeze(2)
-    turn = from_euler(*selection.uniform(*_bounds(roll, pitch, yaw), (3, 1)).squeeze(2).unbind(1))
-    velocity = selection.uniform(*_bounds(*linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
+    offset = selection.uniform(*_bounds(env.device, x, y, z), (3, 1)).squeeze(2)
+    turn = from_euler(*selection.uniform(*_bounds(env.device, roll, pitch, yaw), (3, 1)).squeeze(2).unbind(1))
+    velocity = selection.uniform(*_bounds(env.device, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
     entity.write_root_pose(selection, default[:, :3] + offset, multiply(default[:, 3:7], turn))
     entity.write_root_velocity(selection, default[:, 7:10] + velocity[:, :3], default[:, 10:] + velocity[:, 3:])
 
@@ -91,7 +91,7 @@ def push_by_setting_velocity(
     angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
 ) -> None:
     """Add a uniform draw to the root's velocity, world frame [m/s, rad/s]."""
-    push = selection.uniform(*_bounds(*linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
+    push = selection.uniform(*_bounds(env.device, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
     linear, angular = entity.read_root_velocity(selection)
     entity.write_root_velocity(selection, linear + push[:, :3], angular + push[:, 3:])
 
@@ -107,18 +107,27 @@ def apply_external_force_torque(
 ) -> None:
     """A uniform wrench on bodies, world frame, each component drawn [N, N m]; it lasts until changed or reset."""
     wrench = entity.engine.field("xfrc_applied").view(env.num_envs, -1)
-    ids = torch.as_tensor(entity.body_ids)[bodies]
-    columns = (ids[:, None] * 6 + torch.arange(6)).flatten()
-    shape = (len(ids), 3)
+    columns = _wrench_columns(entity, bodies)
+    shape = (len(columns) // 6, 3)
     drawn = torch.cat([selection.uniform(*force, shape), selection.uniform(*torque, shape)], dim=2)
     selection.write(wrench, drawn.flatten(1), columns)
 
 
 @functools.lru_cache
-def _bounds(*ranges: Range) -> tuple[Tensor, Tensor]:
+def _bounds(device: torch.device, *ranges: Range) -> tuple[Tensor, Tensor]:
     """Lower and upper ends of several ranges, for draws of shape (rows, ranges, k). (ranges, 1) each"""
-    low, high = torch.tensor(ranges).split(1, dim=1)
+    low, high = torch.tensor(ranges, device=device).split(1, dim=1)
     return low, high
+
+
+def _wrench_columns(entity: Entity, bodies: Bodies) -> Tensor:
+    """Where the wrenches of bodies lie in `xfrc_applied`, a row of it flattened. (6 k,)"""
+    cache = entity.__dict__.setdefault("_wrench_columns", {})
+    if id(bodies) not in cache:
+        device = entity.engine.device
+        ids = torch.as_tensor(entity.body_ids, device=device)[bodies]
+        cache[id(bodies)] = bodies, (ids[:, None] * 6 + torch.arange(6, device=device)).flatten()
+    return cache[id(bodies)][1]
 
 
 def _defaults(entity: Entity, selection: Selection, joints: Joints) -> tuple[Tensor, Tensor]:

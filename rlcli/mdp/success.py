@@ -19,3 +19,11 @@ def joints_near(
     """Every joint is within `tolerance` of `target` [m or rad], the difference wrapped to [-pi, pi]. (num_envs,)"""
     position = entity.data.joint_pos[:, joints]
     return (wrap_to_pi(position - target if target else position).abs_() < tolerance).all(dim=1)
+
+
+def root_moves(
+    env: VecEnv, *, entity: Entity = "robot", direction: tuple[float, float, float] = (1.0, 0.0, 0.0), speed: float
+) -> Tensor:
+    """The root's velocity, projected on `direction` (world frame, of length 1), is above `speed` [m/s]. (num_envs,)"""
+    x, y, z = entity.data.root_lin_vel_w.unbind(dim=1)
+    return direction[0] * x + direction[1] * y + direction[2] * z > speed

@@ -155,6 +155,11 @@ def export(checkpoint: Checkpoint, file: Path, format_: str = "onnx") -> Exporte
     if format_ == "onnx":
         _require_onnx()
     policy = policy_of(checkpoint)
+    if policy.memory is not None:
+        raise UsageError(
+            f"a policy with a memory ({policy.spec.kind}) cannot be exported",
+            hint="rlcli.rl.load.policy_of opens it in Python; train without agent.rnn to export",
+        )
     layout = _layout(checkpoint, policy)
     graph = Deployed(policy, layout.actions).eval().requires_grad_(False)
     metadata = describe(checkpoint, policy, layout)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -19,13 +19,14 @@ _CLIP = 10.0
 class PolicySpec(BaseModel):
     """What, besides the weights, a policy is made of.
 
-    Kinds: `gaussian-mlp`, a mean with a state-independent deviation, clipped to the bound; `squashed-gaussian-mlp`,
-    mean and deviation from the state, tanh times the bound; `deterministic-mlp`, tanh times the bound.
+    Kinds: `gaussian-mlp`, a mean with a state-independent deviation, clipped to the bound; `gaussian-lstm`, the same
+    behind a memory; `squashed-gaussian-mlp`, mean and deviation from the state, tanh times the bound;
+    `deterministic-mlp`, tanh times the bound.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    kind: Literal["gaussian-mlp", "squashed-gaussian-mlp", "deterministic-mlp"] = "gaussian-mlp"
+    kind: Literal["gaussian-mlp", "gaussian-lstm", "squashed-gaussian-mlp", "deterministic-mlp"] = "gaussian-mlp"
     group: str = "policy"
     observation_size: PositiveInt
     action_size: PositiveInt
@@ -33,11 +34,15 @@ class PolicySpec(BaseModel):
     activation: Literal["elu", "relu", "tanh", "silu"]
     action_bound: PositiveFloat | None
     normalize: bool = False
+    memory: list[PositiveInt] = []
+    """Cells of each layer of the memory."""
 
     @model_validator(mode="after")
     def _bounded(self) -> PolicySpec:
-        if self.kind != "gaussian-mlp" and self.action_bound is None:
+        if not self.kind.startswith("gaussian-") and self.action_bound is None:
             raise ValueError(f"a {self.kind} needs an action_bound")
+        if (self.kind == "gaussian-lstm") != bool(self.memory):
+            raise ValueError("memory belongs to a gaussian-lstm, and a gaussian-lstm needs it")
         return self
 
 
@@ -51,7 +56,7 @@ class Normalizer(nn.Module):
     var: Tensor
     count: Tensor
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int | tuple[()]) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
@@ -65,7 +70,10 @@ class Normalizer(nn.Module):
     def update(self, obs: Tensor) -> None:
         """Take in a batch. (n, d)"""
         batch = obs.double()
-        mean, var, count = batch.mean(dim=0), batch.var(dim=0, unbiased=False), float(len(batch))
+        self.merge(batch.mean(dim=0), batch.var(dim=0, unbiased=False), float(len(batch)))
+
+    def merge(self, mean: Tensor, var: Tensor, count: float) -> None:
+        """Take in the mean and the variance of `count` samples. (d,)"""
         total = self.count + count
         delta = mean - self.mean
         spread = self.var * self.count + var * count + delta.square() * self.count * count / total
@@ -86,8 +94,38 @@ class WideLinear(nn.Linear):
         return nn.functional.linear(x.double(), self.weight.double(), self.bias.double())
 
 
+class Lstm(nn.Module):
+    """Long short-term memory (Hochreiter and Schmidhuber 1997), one step at a time.
+
+    Args:
+        inputs: columns of what it sees.
+        cells: of each layer.
+        wide: compute in float64, as `WideLinear` does.
+    """
+
+    def __init__(self, inputs: int, cells: Sequence[int], *, wide: bool = False) -> None:
+        super().__init__()
+        sizes = [inputs, *cells]
+        self.layers = nn.ModuleList(nn.LSTMCell(*pair) for pair in zip(sizes[:-1], cells, strict=True))
+        self.cells, self.dtype = list(cells), torch.float64 if wide else torch.float32
+
+    def blank(self, rows: int) -> Tensor:
+        """The memory of episodes that begin: of each layer output and cell state. (rows, 2 x cells of all layers)"""
+        return torch.zeros(rows, 2 * sum(self.cells), dtype=self.dtype, device=next(self.parameters()).device)
+
+    def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """(n, inputs) and memory -> (n, cells of the last layer) and the memory after the step"""
+        parts, after = memory.split([size for size in self.cells for _ in range(2)], dim=1), []
+        x = x.to(self.dtype)
+        for layer, output, cell in zip(self.layers, parts[::2], parts[1::2], strict=True):
+            weights = [value.to(self.dtype) for value in layer.parameters()]
+            x, cell = torch.lstm_cell(x, (output, cell), *weights)
+            after += [x, cell]
+        return x, torch.cat(after, dim=1)
+
+
 class Policy(nn.Module):
-    """A multilayer perceptron, with its observation normaliser and its action bound.
+    """A multilayer perceptron, with its observation normaliser, its memory and its action bound.
 
     Args:
         spec: its shape.
@@ -97,39 +135,58 @@ class Policy(nn.Module):
         super().__init__()
         self.spec = spec
         self.normalizer = Normalizer(spec.observation_size) if spec.normalize else None
-        self.actor = mlp(spec.observation_size, spec.hidden, spec.action_size, spec.activation)
-        if spec.kind == "gaussian-mlp":
+        self.memory = Lstm(spec.observation_size, spec.memory, wide=True) if spec.memory else None
+        inputs = spec.memory[-1] if spec.memory else spec.observation_size
+        self.actor = mlp(inputs, spec.hidden, spec.action_size, spec.activation)
+        if spec.kind.startswith("gaussian-"):
             self.log_std = nn.Parameter(torch.zeros(spec.action_size))
         elif spec.kind == "squashed-gaussian-mlp":
             self.log_std_head = WideLinear(spec.hidden[-1] if spec.hidden else spec.observation_size, spec.action_size)
 
     def forward(self, obs: Tensor) -> Tensor:
-        """The deterministic action. (n, observation_size) -> (n, action_size)"""
-        return self._bounded(self.actor(self._seen(obs)).float())
+        """The deterministic action; with a memory, that of an episode's first step.
+
+        (n, observation_size) -> (n, action_size)
+        """
+        return self.step(obs, None)[0]
 
     def sample(self, obs: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """A stochastic action, as the policy's distribution has it; a deterministic policy has none.
 
         (n, observation_size) -> (n, action_size)
         """
-        features = self.actor[:-1](self._seen(obs))
+        return self.step(obs, None, stochastic=True, generator=generator)[0]
+
+    def step(
+        self,
+        obs: Tensor,
+        memory: Tensor | None,
+        *,
+        stochastic: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Tensor, Tensor | None]:
+        """The action, and the memory after it. (n, observation_size) -> (n, action_size)"""
+        seen = self._seen(obs)
+        if self.memory is not None:
+            seen, memory = self.memory(seen, self.memory.blank(len(obs)) if memory is None else memory)
+        features = self.actor[:-1](seen)
         mean = self.actor[-1](features).float()
-        if self.spec.kind == "deterministic-mlp":
-            return self._bounded(mean)
+        if not stochastic or self.spec.kind == "deterministic-mlp":
+            return self._bounded(mean), memory
         noise = torch.randn(mean.shape, generator=generator, device=mean.device)
         log_std = (
             self.log_std
-            if self.spec.kind == "gaussian-mlp"
+            if self.spec.kind.startswith("gaussian-")
             else self.log_std_head(features).float().clamp(*_LOG_STD_RANGE)
         )
-        return self._bounded(mean + log_std.exp() * noise)
+        return self._bounded(mean + log_std.exp() * noise), memory
 
     def _seen(self, obs: Tensor) -> Tensor:
         return obs if self.normalizer is None else self.normalizer(obs)
 
     def _bounded(self, action: Tensor) -> Tensor:
         bound = self.spec.action_bound
-        if self.spec.kind != "gaussian-mlp":
+        if not self.spec.kind.startswith("gaussian-"):
             assert bound is not None
             action = torch.tanh(action) * bound  # some runtimes' tanh goes beyond 1 by a rounding
         return action if bound is None else action.clamp(-bound, bound)

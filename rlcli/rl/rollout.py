@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rlcli.envs.vec_env import StepResult, VecEnv
 from rlcli.errors import ConfigError
+from rlcli.rl.policy import Policy
 
 Act = Callable[[Tensor], Tensor]
 PATIENCE = 10
@@ -68,8 +69,23 @@ def evaluate(
             on_step(step)
             if step.episodes is not None:
                 _take(result, step, quota)
+        env.check()
     result.diverged = env.divergences - start
     return result
+
+
+def acting(env: VecEnv, policy: Policy, *, stochastic: bool = False, generator: torch.Generator | None = None) -> Act:
+    """A policy in an environment; what it remembers begins anew with each episode."""
+    memory: Tensor | None = None
+
+    def act(obs: Tensor) -> Tensor:
+        nonlocal memory
+        if memory is not None:
+            memory = memory * (env.episode_length_buf > 0)[:, None]
+        action, memory = policy.step(obs, memory, stochastic=stochastic, generator=generator)
+        return action
+
+    return act
 
 
 def zero_policy(env: VecEnv) -> Act:
@@ -106,8 +122,8 @@ def _require_end(env: VecEnv) -> None:
 
 
 def _take(result: Evaluation, step: StepResult, quota: Tensor) -> None:
-    ended = step.episodes
-    assert ended is not None
+    assert step.episodes is not None
+    ended = step.episodes.ended()
     for row, env in enumerate(ended.ids.tolist()):
         if quota[env] <= 0:
             continue

@@ -5,70 +5,95 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from rlcli.envs.vec_env import Episodes
+from rlcli.rl.distributed import Peers
 
 
 class EpisodeStatistics:
-    """Gathers the episodes of an iteration; returns and lengths are means over the last 100.
+    """Gathers the episodes of an iteration; returns and lengths are means over the last iterations with 100 episodes.
 
     `Episode_Reward/<term>` is the mean episodic sum over the episode's full length in seconds (Isaac Lab's
-    definition); `Episode_Termination/<term>` the share of episodes at whose end the term had fired.
+    definition); `Episode_Termination/<term>` the share of episodes at whose end the term had fired. Sums are kept where
+    the episodes are, so that adding them never waits for a device.
     """
 
     WINDOW = 100
 
     def __init__(self, episode_length_s: float) -> None:
         self._episode_length_s = episode_length_s
-        self._returns: deque[float] = deque(maxlen=self.WINDOW)
-        self._lengths: deque[int] = deque(maxlen=self.WINDOW)
-        self._successes: deque[bool] = deque(maxlen=self.WINDOW)
-        self._terms: dict[str, float] = {}
-        self._causes: dict[str, float] = {}
-        self._count = 0
+        self._sums: dict[str, Tensor] = {}
+        self._recent: deque[list[float]] = deque()
         self.total = 0
 
     def add(self, episodes: Episodes | None) -> None:
         """Take in the episodes that a step finished."""
         if episodes is None:
             return
-        self._returns.extend(episodes.returns.tolist())
-        self._lengths.extend(episodes.lengths.tolist())
+        values = {"return": episodes.returns, **{f"term.{k}": v for k, v in episodes.reward_terms.items()}}
+        facts = {f"cause.{k}": v for k, v in episodes.causes.items()}
         if episodes.success is not None:
-            self._successes.extend(episodes.success.tolist())
-        for name, values in episodes.reward_terms.items():
-            self._terms[name] = self._terms.get(name, 0.0) + float(values.sum())
-        for name, fired in episodes.causes.items():
-            self._causes[name] = self._causes.get(name, 0.0) + float(fired.sum())
-        self._count += len(episodes.ids)
-        self.total += len(episodes.ids)
+            facts["success"] = episodes.success
+        facts["count"] = torch.ones_like(episodes.truncated) if episodes.mask is None else episodes.mask
+        matrix = torch.cat(
+            [
+                torch.stack(list(values.values())),
+                torch.stack(list(facts.values())).float(),
+                episodes.lengths.float()[None],
+            ]
+        )
+        weight = torch.ones(matrix.shape[1]) if episodes.mask is None else episodes.mask.float()
+        names = ",".join([*values, *facts, "length"])
+        if names not in self._sums:
+            with torch.inference_mode(False):  # `flush` writes to it where there is no such mode
+                self._sums[names] = torch.zeros(len(matrix), dtype=torch.float32, device=matrix.device)
+        self._sums[names].addmv_(matrix, weight)
+
+    def share(self, peers: Peers) -> None:
+        """Add up what several processes gathered, once each of them has seen an episode end."""
+        known = len(self._sums)
+        (everywhere,) = peers.total(known)
+        if known and everywhere == known * peers.size:
+            for values in self._sums.values():
+                peers.average_(values).mul_(peers.size)
 
     def flush(self) -> dict[str, float]:
         """Metrics of the iteration that ends; a mean over no episode is left out."""
-        metrics: dict[str, float] = {}
-        if self._returns:
-            metrics["Train/mean_reward"] = sum(self._returns) / len(self._returns)
-            metrics["Train/mean_episode_length"] = sum(self._lengths) / len(self._lengths)
-        if self._successes:
-            metrics["Train/success_rate"] = sum(self._successes) / len(self._successes)
-        if self._count:
-            scale = 1.0 / (self._count * self._episode_length_s)
-            metrics |= {f"Episode_Reward/{name}": value * scale for name, value in self._terms.items()}
-            metrics |= {f"Episode_Termination/{name}": value / self._count for name, value in self._causes.items()}
-        self._terms, self._causes, self._count = {}, {}, 0
-        return metrics
+        sums: dict[str, float] = {}
+        for names, values in self._sums.items():
+            for name, value in zip(names.split(","), values.tolist(), strict=True):
+                sums[name] = sums.get(name, 0.0) + value
+            values.zero_()
+        count = sums.get("count", 0.0)
+        if count:
+            self.total += round(count)
+            self._recent.append([count, sums["return"], sums["length"], sums.get("success", -1.0)])
+            while sum(row[0] for row in self._recent) - self._recent[0][0] >= self.WINDOW:
+                self._recent.popleft()
+        return {**self._means(), **self._shares(sums, count)}
 
     def state(self) -> dict[str, Any]:
-        """The windows, as plain JSON."""
-        return {
-            "returns": list(self._returns),
-            "lengths": list(self._lengths),
-            "successes": list(self._successes),
-            "total": self.total,
-        }
+        """The recent iterations, as plain JSON; between iterations nothing else is pending."""
+        return {"recent": [list(row) for row in self._recent], "total": self.total}
 
     def load(self, state: dict[str, Any]) -> None:
         """Take back what `state` gave."""
-        self._returns = deque(state["returns"], maxlen=self.WINDOW)
-        self._lengths = deque(state["lengths"], maxlen=self.WINDOW)
-        self._successes = deque(state["successes"], maxlen=self.WINDOW)
+        self._recent = deque(list(row) for row in state["recent"])
         self.total = state["total"]
+
+    def _means(self) -> dict[str, float]:
+        if not self._recent:
+            return {}
+        count, returns, lengths, successes = (sum(column) for column in zip(*self._recent, strict=True))
+        means = {"Train/mean_reward": returns / count, "Train/mean_episode_length": lengths / count}
+        return means if successes < 0 else {**means, "Train/success_rate": successes / count}
+
+    def _shares(self, sums: dict[str, float], count: float) -> dict[str, float]:
+        if not count:
+            return {}
+        scale = 1.0 / (count * self._episode_length_s)
+        shares = {f"Episode_Reward/{n.removeprefix('term.')}": v * scale for n, v in sums.items() if n[:5] == "term."}
+        causes = {n.removeprefix("cause."): v / count for n, v in sums.items() if n.startswith("cause.")}
+        return {**shares, **{f"Episode_Termination/{name}": share for name, share in causes.items()}}

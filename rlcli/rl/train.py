@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rlcli.errors import DivergedError, Stopped
-from rlcli.rl import checkpoint
+from rlcli.rl import checkpoint, distributed
 from rlcli.rl.loggers import Logger
 from rlcli.rl.run import Run
 from rlcli.rl.stop import StopRequest
@@ -76,10 +76,13 @@ def fit(
     save_interval: int | None = None,
     manifest: dict[str, Any] | None = None,
     show: Callable[[Progress], None] = lambda _: None,
+    tell: Callable[[str], None] = lambda _: None,
     divergences: Callable[[], int] = lambda: 0,
     stop: StopRequest | None = None,
 ) -> None:
     """Train until the budget is spent. Checkpoints are written at iteration boundaries only.
+
+    Several processes do the same at each boundary; the one that leads writes the checkpoints.
 
     Raises:
         Stopped: on SIGINT or SIGTERM, after the checkpoint of the last boundary was written; at once on the second.
@@ -87,37 +90,43 @@ def fit(
         MachineError: if the disk refuses.
     """
     saved_at = time.monotonic()
+    peers = distributed.current()
 
     def save() -> None:
-        checkpoint.save(
-            run.checkpoints,
-            trainer.env_steps,
-            trainer.state(),
-            {**(manifest or {}), "iteration": trainer.iteration},
-        )
+        state = trainer.state()
+        if peers.leads:
+            extra = {**(manifest or {}), "iteration": trainer.iteration}
+            checkpoint.save(run.checkpoints, trainer.env_steps, state, extra)
 
     stop = stop or StopRequest()
     try:
         if trainer.iteration == 0:
             save()
         begin, first_step = time.monotonic(), trainer.env_steps
-        while not budget.spent(trainer) and stop.signal is None:
-            diverged = divergences()
+        while not (stopped := _any_asked(stop, peers)) and not budget.spent(trainer):
+            before = divergences()
             report = trainer.iterate()
-            _require_stable(divergences() - diverged, trainer)
+            late = save_interval is None and peers.leads and time.monotonic() - saved_at > SAVE_EVERY_S
+            diverged, overdue = peers.total(divergences() - before, late)
+            _require_stable(diverged, trainer)
+            for note in report.notes:
+                tell(note)
             metrics = _with_rates(report, trainer.steps_per_iteration)
             for logger in loggers:
                 logger.write(trainer.iteration, trainer.env_steps, metrics)
             show(_progress(trainer, budget, report, metrics, time.monotonic() - begin, first_step))
-            interval_over = save_interval is not None and trainer.iteration % save_interval == 0
-            if interval_over or (save_interval is None and time.monotonic() - saved_at > SAVE_EVERY_S):
+            if overdue or (save_interval is not None and trainer.iteration % save_interval == 0):
                 save()
                 saved_at = time.monotonic()
         save()
     except KeyboardInterrupt:
         raise _stopped("stopped at once; what came after the last checkpoint is lost", run, stop) from None
-    if stop.signal is not None and not budget.spent(trainer):
+    if stopped and not budget.spent(trainer):
         raise _stopped(f"stopped at iteration {trainer.iteration}, checkpoint written", run, stop)
+
+
+def _any_asked(stop: StopRequest, peers: distributed.Peers) -> bool:
+    return any(peers.total(stop.signal is not None))
 
 
 def _stopped(message: str, run: Run, stop: StopRequest) -> Stopped:
@@ -151,7 +160,7 @@ def _progress(
     return Progress(trainer.iteration, iterations, trainer.env_steps, elapsed, remaining, rate, report.seconds, metrics)
 
 
-def _require_stable(diverged: int, trainer: Trainer) -> None:
+def _require_stable(diverged: float, trainer: Trainer) -> None:
     share = diverged / trainer.steps_per_iteration
     if share > DIVERGED_SHARE:
         raise DivergedError(

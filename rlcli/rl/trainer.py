@@ -26,6 +26,8 @@ class Report:
 
     metrics: dict[str, float]
     seconds: dict[str, float]
+    notes: list[str] = field(default_factory=list)
+    """What the user should know, said once."""
 
 
 class Trainer(Protocol):

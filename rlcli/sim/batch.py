@@ -12,7 +12,7 @@ from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
 from torch import Tensor
 
 from rlcli.errors import DivergedError, did_you_mean
-from rlcli.sim.engine import quiet_mujoco
+from rlcli.sim.engine import force_sensors, quiet_mujoco
 from rlcli.sim.selection import IdSelection, Selection
 
 _STATE = mujoco.mjtState
@@ -49,12 +49,15 @@ _NONE, _VEL, _ACC = (
 class BatchEngine:
     """Many worlds of one model on CPU threads. Physics is float64."""
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, threads: int) -> None:
+    asynchronous = False
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int, threads: int, forces_after_reset: bool = True) -> None:
         quiet_mujoco()
         self.model = model
         self.num_envs = num_envs
         self.device = torch.device("cpu")
         self.threads = threads
+        self.divergences = 0
         self.warnings = dict.fromkeys(_NOTED, 0)
         self._batch = Batch(model, num_envs, threads)
         self._state = torch.from_numpy(self._batch.state)
@@ -65,6 +68,11 @@ class BatchEngine:
         self._step_stage = _NONE
         self._forward_stage = _NONE
         self._own_constants = False
+        self._reset_stage = _ACC if forces_after_reset else _VEL
+        self._force_sensors = force_sensors(model)
+
+    def attach(self) -> None:
+        """Nothing to do: calls return when their work is done."""
 
     def field(self, name: str) -> Tensor:
         """A live view of an MjData field; binding a derived one makes the last substep compute its stage."""
@@ -73,12 +81,15 @@ class BatchEngine:
                 raise ValueError(f"'{name}' is not an MjData field; {did_you_mean(name, DATA_FIELDS) or ''}")
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # torch has no read-only tensors; derived views must only be read
-                self._fields[name] = torch.from_numpy(self._batch.bind(name))
-            if name in _ACCELERATION:
+                bound = torch.from_numpy(self._batch.bind(name))
+            if self._of_substep(name):
                 self._forward_stage = _ACC
-            elif name not in _NOT_DERIVED:
+            if name not in _NOT_DERIVED and name not in _ACCELERATION and not self._senses_forces_alone(name):
                 self._step_stage = _VEL
-                self._forward_stage = max(self._forward_stage, _ACC if self._senses(name) else _VEL)
+                self._forward_stage = max(self._forward_stage, _VEL)
+            if name not in _NOT_DERIVED:
+                self._forward_all()  # a field asked for late holds zeros until then
+            self._fields[name] = bound
         return self._fields[name]
 
     def expand(self, name: str) -> Tensor:
@@ -112,7 +123,10 @@ class BatchEngine:
         if self._batch._expanded:  # a time step or a mass of its own that is NaN gives no warning at first
             silent = ~(self.field("qpos").isfinite().all(dim=1) & self.field("qvel").isfinite().all(dim=1))
             bad = silent if bad is None else bad | silent
-        return bad if bad is not None and bool(bad.any()) else None
+        if bad is None or not bool(bad.any()):
+            return None
+        self.divergences += int(bad.sum())
+        return bad
 
     def _warned(self) -> Tensor:
         counts = self._batch.warning[:, :, 1]
@@ -127,9 +141,19 @@ class BatchEngine:
         if self._forward_stage == _NONE:
             return
         try:
-            self._batch.forward(_ids(selection).astype(np.int32), stage=self._forward_stage)
+            self._batch.forward(_ids(selection).astype(np.int32), stage=min(self._forward_stage, self._reset_stage))
         except SimulationError as error:
             raise _engine_error(error) from None
+        if self._reset_stage < self._forward_stage:
+            self._clear_forces(selection)
+
+    def _clear_forces(self, selection: Selection) -> None:
+        """No force has acted on a start state yet."""
+        for name, field in self._fields.items():
+            if name in _ACCELERATION:
+                field[_ids(selection)] = 0.0
+            elif self._senses(name):
+                field[_ids(selection)[:, None], self._force_sensors] = 0.0
 
     def reset(self, selection: Selection) -> None:
         """Put the selected worlds into the default state: the whole row, controls and warm start included."""
@@ -146,6 +170,13 @@ class BatchEngine:
         """The worlds where `mask` holds, as ids; None for none."""
         ids = mask.numpy().nonzero()[0]
         return IdSelection(ids, seed, counters.numpy()[ids]) if len(ids) else None
+
+    def watch(self, values: Tensor, what: str) -> None:
+        """Never needed: values are checked where they are made."""
+
+    def noted(self) -> list[str]:
+        """Nothing."""
+        return []
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copies of the state rows, of the warning counters and of the model fields that differ between worlds.
@@ -167,11 +198,13 @@ class BatchEngine:
                 self.expand(name.removeprefix("model.")).copy_(values)
         if bool(state["constants"]):
             self.set_constants()
+        substep = {n.removeprefix("substep."): values for n, values in state.items() if n.startswith("substep.")}
+        for name in substep:
+            self.field(name)  # whoever saved had asked for it; here that may come later
         if self._forward_stage != _NONE:
             self._batch.forward(stage=self._forward_stage)
-        for name, field in self._fields.items():
-            if f"substep.{name}" in state:
-                field.copy_(state[f"substep.{name}"])
+        for name, values in substep.items():
+            self._fields[name].copy_(values)
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """One world as MjModel and MjData, forwarded; asked again for the same world, the same two objects, updated."""
@@ -187,10 +220,23 @@ class BatchEngine:
     def close(self) -> None:
         """Nothing is held that Python does not free."""
 
+    def _forward_all(self) -> None:
+        """Compute what is bound from the state of every world; fields of the last substep keep their values."""
+        kept = {name: value.clone() for name, value in self._fields.items() if self._of_substep(name)}
+        try:
+            self._batch.forward(stage=self._forward_stage)
+        except SimulationError as error:
+            raise _engine_error(error) from None
+        for name, value in kept.items():
+            self._fields[name].copy_(value)
+
     def _senses(self, name: str) -> bool:
         """Whether the field holds sensors of the acceleration stage."""
-        stages = self.model.sensor_needstage
-        return name == "sensordata" and bool((stages == int(mujoco.mjtStage.mjSTAGE_ACC)).any())
+        return name == "sensordata" and bool(self._force_sensors)
+
+    def _senses_forces_alone(self, name: str) -> bool:
+        """Whether the field holds sensors of the acceleration stage and no others: no other stage writes it."""
+        return name == "sensordata" and len(self._force_sensors) == self.model.nsensordata
 
     def _of_substep(self, name: str) -> bool:
         return name in _ACCELERATION or self._senses(name)

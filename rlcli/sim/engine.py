@@ -8,8 +8,10 @@ import mujoco
 import torch
 from torch import Tensor
 
-from rlcli.errors import DeviceError
+from rlcli.config.schema import SimConfig
+from rlcli.errors import ConfigError, DependencyError, Problem
 from rlcli.machine import available_cores
+from rlcli.sim.capacity import capacity
 from rlcli.sim.selection import Selection
 
 if TYPE_CHECKING:
@@ -24,6 +26,17 @@ class Engine(Protocol):
     model: mujoco.MjModel
     threads: int
     warnings: dict[str, int]
+    asynchronous: bool
+    """Whether reading a value waits for a device: then nothing on the path of a step may."""
+
+    @property
+    def divergences(self) -> int:
+        """Worlds that diverged, ever."""
+        ...
+
+    def attach(self) -> None:
+        """Called before a step: launch where torch launches."""
+        ...
 
     def field(self, name: str) -> Tensor:
         """A live view of an MjData field: state fields are writable, derived ones (xpos, ...) must only be read.
@@ -49,7 +62,10 @@ class Engine(Protocol):
         ...
 
     def diverged(self) -> Tensor | None:
-        """Worlds in which the last `step` went wrong, (num_envs,) bool; None for none. Asked once a step."""
+        """Worlds in which the last `step` went wrong, (num_envs,) bool; None for none. Asked once a step.
+
+        An `asynchronous` engine has put them back into the state before by itself.
+        """
         ...
 
     def forward(self, selection: Selection) -> None:
@@ -66,6 +82,14 @@ class Engine(Protocol):
 
     def select(self, mask: Tensor, seed: int, counters: Tensor) -> Selection | None:
         """The worlds where `mask` holds, with their random streams; None where that is known to be nobody."""
+        ...
+
+    def watch(self, values: Tensor, what: str) -> None:
+        """Note, without waiting, if a value is not finite."""
+        ...
+
+    def noted(self) -> list[str]:
+        """What `watch` found since the last call."""
         ...
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -85,17 +109,36 @@ class Engine(Protocol):
         ...
 
 
-def open_engine(model: mujoco.MjModel, num_envs: int, *, device: str = "cpu", threads: int | None = None) -> Engine:
+def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, device: str = "cpu") -> Engine:
     """The engine for a device.
 
     Raises:
-        DeviceError: for a device that no engine serves.
+        DependencyError: if the GPU engine is not installed.
+        ConfigError: for a model that the engine cannot run.
+        DeviceError: for more worlds than the device's memory holds.
     """
-    if torch.device(device).type != "cpu":
-        raise DeviceError(f"no simulation engine for device '{device}'", hint="use --device cpu")
-    from rlcli.sim.batch import BatchEngine
+    on_cpu = torch.device(device).type == "cpu"
+    wanted = config.engine if config.engine != "auto" else "batch" if on_cpu else "warp"
+    if wanted == "batch" and not on_cpu:
+        message = f"sim.engine 'batch' runs on a CPU, not on '{device}'"
+        raise ConfigError([Problem("sim", "sim.engine", message, "auto, or --device cpu")])
+    if wanted == "batch":
+        from rlcli.sim.batch import BatchEngine
 
-    return BatchEngine(model, num_envs, threads or available_cores())
+        return BatchEngine(model, num_envs, config.engine_threads or available_cores(), config.forces_after_reset)
+    try:
+        from rlcli.sim.warp import WarpEngine
+    except ImportError as error:
+        raise DependencyError(f"the GPU engine needs mujoco-warp: {error}", hint='pip install "rlcli[gpu]"') from None
+    room = capacity(model, config.contacts_per_env, config.constraints_per_env)
+    return WarpEngine(model, num_envs, device, room, config.forces_after_reset)
+
+
+def force_sensors(model: mujoco.MjModel) -> list[int]:
+    """Columns of `sensordata` that belong to the acceleration stage."""
+    acceleration = int(mujoco.mjtStage.mjSTAGE_ACC)
+    sensors = [s for s in range(model.nsensor) if int(model.sensor_needstage[s]) == acceleration]
+    return [int(model.sensor_adr[s]) + i for s in sensors for i in range(int(model.sensor_dim[s]))]
 
 
 def quiet_mujoco() -> None:

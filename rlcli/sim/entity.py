@@ -27,7 +27,7 @@ class SimData:
     """The engine's joint state as float32, copied once a step, and derived fields cast when read.
 
     `qpos` (num_envs, nq) and `qvel` (num_envs, nv) keep their storage for ever, so views of them stay valid. Where the
-    engine keeps the two side by side they are one copy.
+    engine keeps the two side by side they are one copy; where its own are float32, they are the engine's own.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -36,6 +36,7 @@ class SimData:
         joined = _joined(qpos, qvel)
         self._sources = [qpos, qvel] if joined is None else [joined]
         self._copies = [source.to(torch.float32).contiguous() for source in self._sources]
+        self._stale = [] if self._copies[0] is self._sources[0] else list(zip(self._copies, self._sources, strict=True))
         self.qpos = self._copies[0][:, : qpos.shape[1]]
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
@@ -43,19 +44,19 @@ class SimData:
 
     def refresh(self) -> None:
         """Copy the state of every world."""
-        for copy, source in zip(self._copies, self._sources, strict=True):
+        for copy, source in self._stale:
             copy.copy_(source)
         self.stamp += 1
 
     def refresh_rows(self, selection: Selection) -> None:
         """Copy the state of the selected worlds, and drop what was computed from it."""
-        for copy, source in zip(self._copies, self._sources, strict=True):
+        for copy, source in self._stale:
             selection.write(copy, selection.read(source))
         self.stamp += 1
 
     def restore_rows(self, selection: Selection) -> None:
         """Write the last copied state of the selected worlds back to the engine."""
-        for copy, source in zip(self._copies, self._sources, strict=True):
+        for copy, source in self._stale:
             selection.write(source, selection.read(copy))
 
     def derived(self, name: str) -> Tensor:
@@ -90,8 +91,8 @@ class Entity:
             "Actuators": _names(model, name, mujoco.mjtObj.mjOBJ_ACTUATOR, self.actuator_ids),
         }
         self.joint_names = self.names["Joints"]
-        self.qpos_columns = torch.from_numpy(model.jnt_qposadr[self.joint_ids].astype(np.int64))
-        self.dof_columns = torch.from_numpy(model.jnt_dofadr[self.joint_ids].astype(np.int64))
+        self.qpos_columns = torch.from_numpy(model.jnt_qposadr[self.joint_ids].astype(np.int64)).to(engine.device)
+        self.dof_columns = torch.from_numpy(model.jnt_dofadr[self.joint_ids].astype(np.int64)).to(engine.device)
         self.root_body = int(self.body_ids[0]) if len(self.body_ids) else 0
         self.root_qpos, self.root_dof = self._root(model)
         self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
@@ -113,8 +114,8 @@ class Entity:
         singular = {"Bodies": "body"}.get(alias, alias[:-1].lower())
         positions = match(patterns, names, singular)
         if alias == "Sensors":
-            return as_index(self._sensor_columns(positions)), [names[p] for p in positions]
-        return as_index(positions), [names[p] for p in positions]
+            return self._index(self._sensor_columns(positions)), [names[p] for p in positions]
+        return self._index(positions), [names[p] for p in positions]
 
     def actuators_of(self, kind: str) -> list[tuple[int, int]]:
         """(joint column, actuator id) of every joint that a motor, position or velocity actuator drives."""
@@ -171,11 +172,14 @@ class Entity:
             raise TaskError(f"entity '{self.name}' is fixed to the world and cannot be moved")
         return self.root_qpos, self.root_dof
 
+    def _index(self, positions: Sequence[int]) -> Columns:
+        return as_index(positions, self.engine.device)
+
     def _columns(self, of: Tensor, joints: Columns) -> Columns:
         key = (id(of), joints.start, joints.stop) if isinstance(joints, slice) else (id(of), id(joints), None)
         if key not in self._column_cache:
             # the joints stay referenced, so that their id is not given to another tensor
-            self._column_cache[key] = (joints, as_index(of[joints].tolist()))
+            self._column_cache[key] = (joints, self._index(of[joints].tolist()))
         return self._column_cache[key][1]
 
     def _sensor_columns(self, positions: Sequence[int]) -> list[int]:
@@ -201,14 +205,16 @@ class EntityData:
         self._sim = sim
         self._cache: dict[str, tuple[int, Tensor]] = {}
         model, num_envs = entity.engine.model, entity.engine.num_envs
-        self._qpos_index = as_index(entity.qpos_columns.tolist())
-        self._dof_index = as_index(entity.dof_columns.tolist())
+        device = entity.engine.device
+        self._qpos_index = as_index(entity.qpos_columns.tolist(), device)
+        self._dof_index = as_index(entity.dof_columns.tolist(), device)
+        self._body_index = as_index(entity.body_ids.tolist(), device)
         # consecutive columns: a view of the copied state, made once
         self._joint_pos = sim.qpos[:, self._qpos_index] if isinstance(self._qpos_index, slice) else None
         self._joint_vel = sim.qvel[:, self._dof_index] if isinstance(self._dof_index, slice) else None
-        ranges = torch.tensor(model.jnt_range[entity.joint_ids], dtype=torch.float32)
-        limited = torch.tensor(model.jnt_limited[entity.joint_ids], dtype=torch.bool)
-        infinite = torch.tensor([-torch.inf, torch.inf])
+        ranges = torch.tensor(model.jnt_range[entity.joint_ids], dtype=torch.float32, device=device)
+        limited = torch.tensor(model.jnt_limited[entity.joint_ids], dtype=torch.bool, device=device)
+        infinite = torch.tensor([-torch.inf, torch.inf], device=device)
         self.joint_pos_limits = torch.where(limited[:, None], ranges, infinite)
         """Lower and upper limit of each joint, infinite where it has none. (k, 2) [m or rad]"""
         middle, half = (
@@ -218,16 +224,18 @@ class EntityData:
         soft = torch.stack([middle - half, middle + half], dim=1)
         self.soft_joint_pos_limits = torch.where(limited[:, None], soft, infinite)
         """The limits, drawn in by `soft_joint_pos_limit_factor`. (k, 2) [m or rad]"""
-        position, velocity = default_joint_state(entity)
+        position, velocity = (values.to(device) for values in default_joint_state(entity))
         self.default_joint_pos = position.expand(num_envs, -1).clone()
         """Default joint positions. (num_envs, k) [m or rad]"""
         self.default_joint_vel = velocity.expand(num_envs, -1).clone()
         """Default joint velocities. (num_envs, k) [m/s or rad/s]"""
-        self.default_root_state = self._default_root(model).expand(num_envs, -1).clone()
+        self.default_root_state = self._default_root(model).to(device).expand(num_envs, -1).clone()
         """Default root pose and velocity: position, quat (w, x, y, z), linear, angular. (num_envs, 13)"""
-        self._gravity = torch.tensor(model.opt.gravity, dtype=torch.float32)
+        self._gravity = torch.tensor(model.opt.gravity, dtype=torch.float32, device=device)
         norm = self._gravity.norm()
-        self._down = (self._gravity / norm if norm > 0 else torch.tensor([0.0, 0.0, -1.0])).expand(num_envs, -1)
+        self._down = (self._gravity / norm if norm > 0 else torch.tensor([0.0, 0.0, -1.0], device=device)).expand(
+            num_envs, -1
+        )
 
     @property
     def joint_pos(self) -> Tensor:
@@ -295,12 +303,12 @@ class EntityData:
     @property
     def body_pos_w(self) -> Tensor:
         """Body positions. (num_envs, bodies, 3) [m]"""
-        return self._sim.derived("xpos")[:, as_index(self._entity.body_ids.tolist())]
+        return self._sim.derived("xpos")[:, self._body_index]
 
     @property
     def body_quat_w(self) -> Tensor:
         """Body orientations (w, x, y, z). (num_envs, bodies, 4)"""
-        return self._sim.derived("xquat")[:, as_index(self._entity.body_ids.tolist())]
+        return self._sim.derived("xquat")[:, self._body_index]
 
     @property
     def sensordata(self) -> Tensor:
@@ -332,7 +340,7 @@ def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:
     Raises:
         NameProblem: if `init` names a joint that the model does not have.
     """
-    position = torch.tensor(entity.engine.model.qpos0[entity.qpos_columns.numpy()], dtype=torch.float32)
+    position = torch.tensor(entity.engine.model.qpos0[entity.qpos_columns.cpu().numpy()], dtype=torch.float32)
     velocity = torch.zeros_like(position)
     for values, target in (
         (entity.config.init.joint_pos, position),
@@ -343,12 +351,12 @@ def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:
     return position, velocity
 
 
-def as_index(positions: Sequence[int]) -> Columns:
+def as_index(positions: Sequence[int], device: torch.device | None = None) -> Columns:
     """Column positions as a slice where they are consecutive (a view, not a copy), else as a tensor."""
     first = positions[0] if len(positions) else 0
     if list(positions) == list(range(first, first + len(positions))):
         return slice(first, first + len(positions))
-    return torch.tensor(list(positions), dtype=torch.int64)
+    return torch.tensor(list(positions), dtype=torch.int64, device=device)
 
 
 def is_finite(values: Tensor) -> bool:

@@ -57,6 +57,13 @@ def from_euler(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
     )
 
 
+def atan2(y: Tensor, x: Tensor) -> Tensor:
+    """Angle from the x axis to the point (x, y), within 1e-6 of torch's atan2; 0 at the origin [rad]. (...) each"""
+    x = x + 1e-30  # neither 0 nor -0, so that the quotient is a number at the origin too
+    behind = (x < 0.0).mul(math.pi).copysign_(y)
+    return torch.atan(y / x).add_(behind)
+
+
 def wrap_to_pi(angle: Tensor) -> Tensor:
     """The same angle in [-pi, pi] [rad]; one that lies there already is returned bit for bit."""
     turns = torch.round(angle * (0.5 / math.pi))

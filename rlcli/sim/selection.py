@@ -56,18 +56,28 @@ class Selection(Protocol):
         """Mean of a (num_envs,) tensor over the rows. ()"""
         ...
 
+    def env_ids(self) -> Tensor:
+        """The rows' numbers, for code that wants ids; on a GPU this waits for the device. (rows,) int64"""
+        ...
+
     def stream(self, stream: np.uint64) -> Selection:
         """The same rows drawing from another stream."""
         ...
 
 
 class IdSelection:
-    """A selection as a sorted list of ids, on the CPU."""
+    """A selection as a sorted list of ids, on the CPU. Its draws may be sent to a device."""
 
     def __init__(
-        self, ids: NDArray[np.int64], seed: int, counters: NDArray[np.int64], stream: np.uint64 | None = None
+        self,
+        ids: NDArray[np.int64],
+        seed: int,
+        counters: NDArray[np.int64],
+        stream: np.uint64 | None = None,
+        device: torch.device | None = None,
     ) -> None:
         self.ids = ids
+        self._device = device
         self._seed = seed
         self._counters = counters
         self._keys: random.Keys | None = None
@@ -83,20 +93,20 @@ class IdSelection:
         """Uniform in [low, high). (rows, *shape)"""
         unit = random.uniform(*self._next(shape))
         if isinstance(low, Tensor) or isinstance(high, Tensor):
-            return torch.from_numpy(unit).view(self.count, *shape).mul_(high - low).add_(low)
+            return self._tensor(unit, shape).mul_(high - low).add_(low)
         unit *= high - low  # in numpy: the arrays are short, and its calls cost half of torch's
         unit += low
-        return torch.from_numpy(unit if len(shape) == 1 else unit.reshape(self.count, *shape))
+        return self._tensor(unit, shape)
 
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Gaussian. (rows, *shape)"""
         size = math.prod(shape)
         keys, stream, index, _ = self._next((2 * size,))
-        return torch.from_numpy(random.normal(keys, stream, index, size)).view(self.count, *shape).mul_(std).add_(mean)
+        return self._tensor(random.normal(keys, stream, index, size), shape).mul_(std).add_(mean)
 
     def choice(self, options: int, shape: tuple[int, ...] = ()) -> Tensor:
         """Whole numbers in [0, options), each as likely. (rows, *shape)"""
-        return torch.from_numpy(random.integers(*self._next(shape), options)).view(self.count, *shape)
+        return self._tensor(random.integers(*self._next(shape), options), shape)
 
     def read(self, field: Tensor, columns: Columns = ALL) -> Tensor:
         """The rows of a (num_envs, ...) tensor, copied."""
@@ -114,11 +124,19 @@ class IdSelection:
         """Mean of a (num_envs,) tensor over the rows. ()"""
         return self.read(values).float().mean()
 
+    def env_ids(self) -> Tensor:
+        """The rows' numbers. (rows,) int64"""
+        return torch.from_numpy(self.ids)
+
     def stream(self, stream: np.uint64) -> IdSelection:
         """The same rows drawing from another stream."""
-        other = IdSelection(self.ids, self._seed, self._counters, stream)
+        other = IdSelection(self.ids, self._seed, self._counters, stream, self._device)
         other._keys = self._row_keys()
         return other
+
+    def _tensor(self, drawn: NDArray, shape: tuple[int, ...]) -> Tensor:
+        values = torch.from_numpy(drawn if len(shape) == 1 else drawn.reshape(self.count, *shape))
+        return values if self._device is None else values.to(self._device)
 
     def _row_keys(self) -> random.Keys:
         if self._keys is None:

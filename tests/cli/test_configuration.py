@@ -157,7 +157,7 @@ def test_validate_names_agents_that_it_could_not_check(in_process, small):
 
 
 def test_validate_deep_accepts_the_built_in_tasks(in_process):
-    for name in ("cartpole", "cartpole-direct"):
+    for name in ("ant-direct", "cartpole", "cartpole-direct"):
         code, out, _ = in_process("validate", name, "--deep")
         assert code == 0
         assert "valid (files and model)" in out

@@ -70,12 +70,13 @@ def same(a, b):
 @settings(max_examples=300, deadline=None)
 @given(_DATA)
 @example({"a": 1e-05, "b": 1e22, "c": -0.0, "d": 5e-324, "e": 1.7976931348623157e308, "f": 1.0})
+@example({"<<": "<<"})
 @example({"on": "on", "010": "010", "x": ["1e-3", "null", ""], "y": {}, "z": []})
 def test_plain_data_reads_back_unchanged(data):
     assert same(strict_yaml.load(to_yaml(data)).data, data)
 
 
-@pytest.mark.parametrize("name", ["cartpole", "cartpole-direct"])
+@pytest.mark.parametrize("name", ["ant-direct", "cartpole", "cartpole-direct"])
 @pytest.mark.parametrize("play", [False, True])
 def test_a_built_in_task_reads_back_as_the_same_configuration(name, play, tmp_path):
     from dataclasses import replace
@@ -148,7 +149,7 @@ def validator(source):
     return jsonschema.Draft202012Validator(schema)
 
 
-@pytest.mark.parametrize("name", ["cartpole", "cartpole-direct"])
+@pytest.mark.parametrize("name", ["ant-direct", "cartpole", "cartpole-direct"])
 def test_the_schema_accepts_the_built_in_tasks_as_written_and_as_shown(name):
     source = find_task(name)
     check = validator(source)

@@ -2,7 +2,7 @@ import pytest
 import yaml
 from worlds import CRITTER_TASK, build, critter, dump, edited, life, run, same
 
-TASKS = ["cartpole", "cartpole-direct", "critter"]
+TASKS = ["ant-direct", "cartpole", "cartpole-direct", "critter"]
 
 
 @pytest.fixture

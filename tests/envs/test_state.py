@@ -4,7 +4,7 @@ import pytest
 import torch
 from worlds import CRITTER_TASK, actions, build, clone, critter, edited, life, same
 
-TASKS = ["cartpole", "cartpole-direct", "critter"]
+TASKS = ["ant-direct", "cartpole", "cartpole-direct", "critter"]
 
 
 @pytest.fixture

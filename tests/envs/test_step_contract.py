@@ -205,7 +205,7 @@ def test_reward_terms_add_up_to_the_return_and_the_return_to_the_rewards(tmp_pat
     assert seen > 10
 
 
-@pytest.mark.parametrize("name", ["cartpole", "cartpole-direct", "critter"])
+@pytest.mark.parametrize("name", ["ant-direct", "cartpole", "cartpole-direct", "critter"])
 def test_consecutive_observations_and_rewards_share_no_memory(tmp_path, name):
     env = build(critter(tmp_path) if name == "critter" else name, 4)
     previous = env.reset()["policy"]
@@ -221,7 +221,7 @@ def test_consecutive_observations_and_rewards_share_no_memory(tmp_path, name):
         reward = (result.reward, result.reward.clone())
 
 
-@pytest.mark.parametrize("name", ["cartpole", "cartpole-direct", "critter"])
+@pytest.mark.parametrize("name", ["ant-direct", "cartpole", "cartpole-direct", "critter"])
 def test_partial_reset_leaves_other_envs_untouched(tmp_path, name):
     task = critter(tmp_path) if name == "critter" else name
     twins = [build(task, 6) for _ in range(2)]

@@ -25,7 +25,7 @@ def errors(folder):
     return found
 
 
-@pytest.mark.parametrize("name", ["cartpole", "cartpole-direct"])
+@pytest.mark.parametrize("name", ["ant-direct", "cartpole", "cartpole-direct"])
 def test_built_in_tasks_keep_the_contract(name):
     assert name in [entry.name for entry in catalog()[0]]
     assert check_task(name) == []

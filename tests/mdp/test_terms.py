@@ -100,6 +100,10 @@ TERMINATIONS = [
     (success.joints_near, {"joints": ["hip_fl", "hip_bl"], "target": 0.2, "tolerance": 0.11}, True),
     (success.joints_near, {"joints": ["hip_fl", "hip_bl"], "target": 0.2, "tolerance": 0.09}, False),
     (success.joints_near, {"joints": ["hip_fl"], "target": 0.1 + 2 * pi, "tolerance": 0.01}, True),
+    (success.root_moves, {"speed": LIN[0] - 0.01}, True),
+    (success.root_moves, {"speed": LIN[0] + 0.01}, False),
+    (success.root_moves, {"speed": 0.6 * LIN[0] + 0.8 * LIN[2] - 0.01, "direction": (0.6, 0.0, 0.8)}, True),
+    (success.root_moves, {"speed": 0.6 * LIN[0] + 0.8 * LIN[2] + 0.01, "direction": (0.6, 0.0, 0.8)}, False),
 ]
 
 

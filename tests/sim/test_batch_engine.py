@@ -127,6 +127,46 @@ def test_acceleration_fields_are_those_of_the_last_substep():
     np.testing.assert_array_equal(force[0], data.actuator_force)
 
 
+def test_a_derived_field_that_is_asked_for_late_is_that_of_the_state():
+    engine = open_engine(model_of(), N)
+    qacc = engine.field("qacc")
+    scatter(engine)
+    engine.step(3)
+    kept = qacc.clone()
+    for name in ("xpos", "sensordata"):
+        for i in range(N):
+            np.testing.assert_allclose(engine.field(name)[i], getattr(kinematics(engine, i), name), atol=1e-9)
+    assert torch.equal(qacc, kept), "what was asked for before keeps the values of its substep"
+
+
+def test_sensors_of_forces_alone_are_those_of_the_last_substep_and_start_again_with_the_world():
+    xml = XML.replace('<accelerometer name="acc" site="imu"/><gyro name="gyro" site="imu"/>', '<force site="hip"/>')
+    xml = xml.replace('<joint name="hip_fl"', '<site name="hip"/><joint name="hip_fl"')
+    model = model_of(xml)
+    engine = open_engine(model, N)
+    sensors = engine.field("sensordata")
+    scatter(engine)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = (engine.field(f)[1].numpy() for f in ("qpos", "qvel", "ctrl"))
+    engine.step(3)
+    mujoco.mj_step(model, data, 3)
+    np.testing.assert_array_equal(sensors[1], data.sensordata)
+    assert np.abs(kinematics(engine, 1).sensordata - data.sensordata).max() > 1e-3, "another one than the state's"
+    engine.reset(some(2))
+    engine.forward(some(2))
+    np.testing.assert_allclose(sensors[2], kinematics(engine, 2).sensordata, atol=1e-9)
+    np.testing.assert_array_equal(sensors[1], data.sensordata)
+
+
+def test_a_restored_engine_has_the_last_substep_of_fields_not_asked_for_yet():
+    engine, fresh = open_engine(model_of(), N), open_engine(model_of(), N)
+    engine.field("qacc")
+    scatter(engine)
+    engine.step(3)
+    fresh.load_state_dict(engine.state_dict())
+    assert torch.equal(fresh.field("qacc"), engine.field("qacc"))
+
+
 def test_reset_restores_the_whole_row_and_only_the_chosen_ones():
     engine = open_engine(model_of(), N)
     engine.set_default(torch.arange(11, dtype=torch.float64) / 10, torch.full((10,), 0.5, dtype=torch.float64))

@@ -1,0 +1,244 @@
+"""Training and stepping on an NVIDIA GPU: rlcli, bare MuJoCo Warp and mjlab with rsl_rl, in one run on one machine.
+
+    python benchmarks/gpu.py [--peer-path FOLDER:FOLDER] [--only env,train,features,ant,solve] [--output FILE.json]
+
+Equal networks (32-32), horizon (16), epochs (5) and minibatches (4) everywhere. `--peer-path` is the PYTHONPATH that
+mjlab runs under; without it the peer's rows are left out. Figures are medians; one JSON line a measurement.
+"""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import mujoco_warp as mjw
+import torch
+import warp as wp
+
+from rlcli.config.load import resolve
+from rlcli.envs.vec_env import make_env
+from rlcli.registry import find_task
+from rlcli.rl.ppo import PpoTrainer
+
+DEVICE = "cuda"
+REPEATS = 7
+ENVS = (4096, 16384)
+STEPS = 32
+"""Environment steps in one captured graph."""
+EQUAL = {
+    "num_steps": 16, "num_epochs": 5, "num_minibatches": 4, "entropy_coef": 0.005, "max_iterations": 100000,
+    "schedule": "adaptive", "desired_kl": 0.01, "actor.hidden": [32, 32], "critic.hidden": [32, 32],
+}  # fmt: skip
+HERE = Path(__file__).parent
+rows = []
+
+
+def report(**row):
+    rows.append(row)
+    print(json.dumps(row), flush=True)
+
+
+def seconds(work, repeats=REPEATS, times=1):
+    """Seconds of one run of the work: median of several blocks, measured by events on the device."""
+    found = []
+    for _ in range(repeats):
+        begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        begin.record()
+        for _ in range(times):
+            work()
+        end.record()
+        end.synchronize()
+        found.append(begin.elapsed_time(end) / 1e3 / times)
+    return statistics.median(found)
+
+
+def recorded(work):
+    """The work as a CUDA graph of torch and Warp."""
+    work()
+    graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream()
+    torch.cuda.synchronize()
+    with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+        on = wp.stream_from_torch(stream)
+        wp.set_stream(on, wp.get_device(DEVICE))
+        wp.capture_begin(stream=on, external=True)
+        work()
+        kept = wp.capture_end(stream=on), on
+    torch.cuda.synchronize()
+    return lambda kept=(kept, work): graph.replay()
+
+
+def environment(task, num_envs, **flags):
+    resolved = resolve(find_task(task), device=DEVICE, flags={"scene.num_envs": num_envs, **flags})
+    return make_env(resolved, seed=1, device=DEVICE)
+
+
+def bare(env):
+    """MuJoCo Warp alone: the environment's own model and capacities, random controls, no resets, no tasks."""
+    engine = env.engine
+    with wp.ScopedDevice(DEVICE):
+        model = mjw.put_model(engine.model)
+        model.opt.warn_overflow = 0
+        room = engine.capacity
+        data = mjw.make_data(engine.model, nworld=env.num_envs, nconmax=room.contacts, njmax=room.constraints)
+    controls = wp.to_torch(data.ctrl)
+    controls.uniform_(-1.0, 1.0)
+    qpos = wp.to_torch(data.qpos)
+    qpos.copy_(engine.field("qpos"))
+    start = qpos.clone()
+
+    def step():
+        for _ in range(env.config.decimation):
+            mjw.step(model, data)
+
+    return recorded(lambda: [step() for _ in range(STEPS)]), lambda: qpos.copy_(start)
+
+
+def stepping(env):
+    """The environment's step with random actions drawn beforehand, everything on."""
+    actions = torch.rand(STEPS, env.num_envs, env.layout.action_size, device=DEVICE) * 2.0 - 1.0
+    env.reset()
+    return recorded(lambda: [env.step(action) for action in actions])
+
+
+def measure_env(task, num_envs):
+    env = environment(task, num_envs)
+    env.reset()
+    for _ in range(20):  # a typical mixture of states, for bare physics too
+        env.step(torch.rand(num_envs, env.layout.action_size, device=DEVICE) * 2.0 - 1.0)
+    physics, _ = bare(env)
+    ours = stepping(env)
+    pairs = [(seconds(physics, 1, 4), seconds(ours, 1, 4)) for _ in range(REPEATS)]
+    bare_s, ours_s = (statistics.median(column) / STEPS for column in zip(*pairs, strict=True))
+    env.check()
+    rates = {"bare_steps_per_s": num_envs / bare_s, "steps_per_s": num_envs / ours_s, "ratio": bare_s / ours_s}
+    report(what="env", task=task, num_envs=num_envs, **rates, bare_us=bare_s * 1e6, step_us=ours_s * 1e6)
+    env.close()
+
+
+def measure_train(num_envs, name="all on", task="cartpole", iterations=40, change=lambda trainer: None, **flags):
+    settings = {f"agent.{key}": value for key, value in {**EQUAL, **flags}.items()}
+    settings["scene.num_envs"] = num_envs
+    resolved = resolve(find_task(task), agent="ppo", device=DEVICE, flags=settings)
+    env = make_env(resolved, seed=1, device=DEVICE)
+    begin = time.perf_counter()
+    trainer = PpoTrainer(env, resolved.agent, seed=1, device=DEVICE, torch_threads=1)
+    change(trainer)
+    trainer.start()
+    notes = trainer.iterate().notes
+    first = time.perf_counter() - begin
+    notes = [*notes, *trainer.iterate().notes]
+    reports, walls = [], []
+    for _ in range(iterations):
+        begin = time.perf_counter()
+        reports.append(trainer.iterate())
+        walls.append(time.perf_counter() - begin)
+    wall = statistics.median(walls)
+    parts = {key: statistics.median(r.seconds[key] for r in reports) for key in reports[0].seconds}
+    report(what="train", task=task, feature=name, num_envs=num_envs, steps_per_s=trainer.steps_per_iteration / wall,
+           iteration_ms=wall * 1e3, first_iteration_s=first, notes=notes,
+           **{f"{key}_ms": value * 1e3 for key, value in parts.items()})  # fmt: skip
+    env.close()
+
+
+def without(*parts):
+    """Switch off what the environment and the trainer do beside learning."""
+
+    def change(trainer):
+        if "statistics" in parts:
+            trainer.statistics.add = lambda episodes: None
+        if "guard" in parts:
+            trainer.env.engine.diverged = lambda: None
+        if "finite" in parts:
+            trainer.env.engine.watch = lambda values, what: None
+
+    return change
+
+
+def measure_features(num_envs):
+    measure_train(num_envs, "all on")
+    measure_train(num_envs, "bootstrap from the state before", bootstrap="pre_step")
+    measure_train(num_envs, "constant learning rate", schedule="constant", desired_kl=None)
+    measure_train(num_envs, "no episode statistics", change=without("statistics"))
+    measure_train(num_envs, "no divergence guard", change=without("guard"))
+    measure_train(num_envs, "no finiteness checks", change=without("finite"))
+
+
+def peer(path, *arguments):
+    environ = {**os.environ, "PYTHONPATH": path, "MUJOCO_GL": "disabled"}
+    command = [sys.executable, str(HERE / "gpu_mjlab.py"), *map(str, arguments)]
+    done = subprocess.run(command, env=environ, capture_output=True, text=True, check=False)
+    found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    if done.returncode or not found:
+        report(what="peer failed", arguments=[str(a) for a in arguments], error=done.stderr[-1500:])
+    for row in found:
+        report(**{**row, "peer": "mjlab"})
+
+
+def rlcli(*arguments):
+    return subprocess.run([sys.executable, "-m", "rlcli", *arguments], capture_output=True, text=True, check=False)
+
+
+def measure_solve(seeds):
+    """Wall-clock of `rlcli train cartpole`, from the process's start to its end, and what the policy is worth."""
+    for seed in seeds:
+        with tempfile.TemporaryDirectory() as runs:
+            begin = time.time()
+            trained = rlcli("train", "cartpole", "--device", "cuda", "--seed", str(seed), "--runs-dir", runs, "--json")
+            wall = time.time() - begin
+            if trained.returncode:
+                report(what="solve failed", error=(trained.stderr + trained.stdout)[-1500:])
+                continue
+            run = json.loads(trained.stdout)["run"]
+            judged = rlcli("eval", "--checkpoint", run, "--episodes", "1000", "--json")
+            try:
+                success = json.loads(judged.stdout)["success"]["rate"]
+            except (ValueError, KeyError):
+                success = (judged.stdout + judged.stderr)[-600:]
+            report(what="solve", seed=seed, seconds=wall, success=success)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--peer-path")
+    parser.add_argument("--only", default="env,train,ant,features,solve")
+    parser.add_argument("--output", type=Path)
+    parser.add_argument("--seeds", default="1,2,3")
+    parser.add_argument("--num-envs", default=",".join(map(str, ENVS)))
+    args = parser.parse_args()
+    parts, sizes = args.only.split(","), [int(n) for n in args.num_envs.split(",")]
+    seeds = [int(s) for s in args.seeds.split(",")]
+    versions = {"torch": torch.__version__, "warp": wp.__version__, "mujoco_warp": mjw.__version__}
+    report(what="machine", gpu=torch.cuda.get_device_name(), python=platform.python_version(), **versions)
+    try:
+        if "env" in parts:
+            for n in sizes:
+                measure_env("cartpole", n)
+            if args.peer_path:
+                peer(args.peer_path, "env", "--num-envs", *sizes)
+        if "ant" in parts:
+            measure_env("ant-direct", 4096)
+        if "train" in parts:
+            for n in sizes:
+                measure_train(n)
+            if args.peer_path:
+                peer(args.peer_path, "train", "--num-envs", *sizes)
+        if "features" in parts:
+            measure_features(sizes[0])
+        if "solve" in parts:
+            measure_solve(seeds)
+            if args.peer_path:
+                for seed in seeds:
+                    peer(args.peer_path, "solve", "--seed", seed, "--num-envs", 4096, "--budget-s", 120)
+    finally:
+        if args.output:
+            args.output.write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()

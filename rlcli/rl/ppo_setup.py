@@ -1,0 +1,66 @@
+"""What the built-in PPO makes of its settings in an environment, before it begins."""
+
+from __future__ import annotations
+
+import torch
+
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import ConfigError
+from rlcli.rl.policy import PolicySpec
+from rlcli.rl.ppo_config import PpoConfig
+
+
+def policy_spec(env: VecEnv, config: PpoConfig) -> PolicySpec:
+    """What the trained policy is made of."""
+    return PolicySpec(
+        kind="gaussian-lstm" if config.rnn else "gaussian-mlp",
+        memory=[config.rnn.hidden] * config.rnn.layers if config.rnn else [],
+        observation_size=env.layout.size("policy"),
+        action_size=env.layout.action_size,
+        hidden=list(config.actor.hidden),
+        activation=config.actor.activation,
+        action_bound=config.action_bound,
+        normalize=config.normalize_observations,
+    )
+
+
+def critic_groups(env: VecEnv, config: PpoConfig) -> tuple[str, ...]:
+    """The observation groups that the critic sees.
+
+    Raises:
+        ConfigError: if the task has no such group.
+    """
+    have = env.layout.observations
+    groups = config.critic_obs or (("critic",) if "critic" in have else ("policy",))
+    for group in groups:
+        if group not in have:
+            raise _problem(env, "critic_obs", f"no observation group '{group}'", f"groups: {', '.join(have)}")
+    return groups
+
+
+def minibatch_sizes(env: VecEnv, config: PpoConfig, total: int) -> list[int]:
+    """How many samples each minibatch has.
+
+    Raises:
+        ConfigError: if the rollout is too small for them.
+    """
+    rollout = f"a rollout holds num_steps x num_envs = {config.num_steps} x {env.num_envs} = {total} samples"
+    whole = config.num_steps if config.rnn else 1  # samples that stay together
+    parts = torch.arange(total // whole)
+    if config.minibatch_size is not None:
+        split = parts.split(max(1, config.minibatch_size // whole))
+    else:
+        split = parts.tensor_split(config.num_minibatches)
+    sizes = [len(part) * whole for part in split]
+    if min(sizes) == 0:
+        message = f"{config.num_minibatches} minibatches cannot be made: {rollout}"
+    elif (config.normalize_advantage == "minibatch" and min(sizes) == 1) or (config.normalize_advantage and total == 1):
+        message = f"advantages cannot be normalised over one sample: {rollout}"
+    else:
+        return sizes
+    key = "num_minibatches" if config.minibatch_size is None else "minibatch_size"
+    raise _problem(env, key, message, "more environments, more num_steps, or fewer minibatches")
+
+
+def _problem(env: VecEnv, key: str, message: str, hint: str) -> ConfigError:
+    return ConfigError([env.resolved.problem(("agents", env.resolved.agent_name or "", key), message, hint)])

@@ -1,0 +1,106 @@
+"""How much room a world needs for contacts and constraints: MuJoCo Warp allocates both beforehand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+_TRIALS, _STEPS = 8, 100
+_MARGIN = 3
+"""How many times what a short random simulation needed is set aside, where the model's own bound is larger."""
+_MANY = 8
+"""Contacts that two geoms may have where nothing better is known (two boxes)."""
+_G = mujoco.mjtGeom
+_POINTS = {
+    (_G.mjGEOM_PLANE, _G.mjGEOM_SPHERE): 1,
+    (_G.mjGEOM_PLANE, _G.mjGEOM_ELLIPSOID): 1,
+    (_G.mjGEOM_PLANE, _G.mjGEOM_CAPSULE): 2,
+    (_G.mjGEOM_PLANE, _G.mjGEOM_CYLINDER): 4,
+    (_G.mjGEOM_PLANE, _G.mjGEOM_BOX): 4,
+    (_G.mjGEOM_SPHERE, _G.mjGEOM_SPHERE): 1,
+    (_G.mjGEOM_SPHERE, _G.mjGEOM_CAPSULE): 1,
+    (_G.mjGEOM_SPHERE, _G.mjGEOM_BOX): 1,
+    (_G.mjGEOM_CAPSULE, _G.mjGEOM_CAPSULE): 2,
+    (_G.mjGEOM_CAPSULE, _G.mjGEOM_BOX): 2,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Capacity:
+    """Room in a world: contacts, and rows of the constraint Jacobian."""
+
+    contacts: int
+    constraints: int
+
+
+def capacity(model: mujoco.MjModel, contacts: int | None = None, constraints: int | None = None) -> Capacity:
+    """Room for what the model can need: its own bound, or a multiple of what a random simulation needs if that is less.
+
+    Args:
+        model: the compiled model.
+        contacts: a setting that replaces the estimate.
+        constraints: likewise.
+    """
+    most_contacts, most_rows = _bound(model)
+    seen_contacts, seen_rows = _sample(model)
+    found_contacts = min(most_contacts, max(32, _MARGIN * seen_contacts))
+    found_rows = min(most_rows, max(64, _MARGIN * seen_rows))
+    return Capacity(contacts or max(1, found_contacts), constraints or max(1, found_rows))
+
+
+def _bound(model: mujoco.MjModel) -> tuple[int, int]:
+    """Contacts of every pair of geoms that may touch, and all rows that they, joints and equalities can make."""
+    contacts = rows = 0
+    for a, b in _pairs(model):
+        kinds = tuple(sorted((_G(model.geom_type[a]), _G(model.geom_type[b])), key=int))
+        points = _POINTS.get(kinds, _MANY)
+        condim = int(max(model.geom_condim[a], model.geom_condim[b]))
+        contacts += points
+        rows += points * _contact_rows(model, condim)
+    for pair in range(model.npair):
+        contacts += _MANY
+        rows += _MANY * _contact_rows(model, int(model.pair_dim[pair]))
+    limits = int(model.jnt_limited.sum() + model.tendon_limited.sum()) * 2
+    friction = int((model.dof_frictionloss > 0).sum() + (model.tendon_frictionloss > 0).sum())
+    return contacts, rows + limits + friction + 6 * model.neq
+
+
+def _contact_rows(model: mujoco.MjModel, condim: int) -> int:
+    pyramidal = model.opt.cone == int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
+    return 1 if condim == 1 else 2 * (condim - 1) if pyramidal else condim
+
+
+def _pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """Geoms that MuJoCo's filters let touch: bits that match, bodies that are neither welded nor parent and child."""
+    weld, parent = model.body_weldid, model.body_parentid
+    excluded = {int(s) for s in model.exclude_signature}
+    found = []
+    for a in range(model.ngeom):
+        for b in range(a + 1, model.ngeom):
+            one, two = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
+            bits = (model.geom_contype[a] & model.geom_conaffinity[b]) | (
+                model.geom_contype[b] & model.geom_conaffinity[a]
+            )
+            first, second = int(weld[one]), int(weld[two])
+            related = (first and second and first == int(weld[parent[second]])) or second == int(weld[parent[first]])
+            related = bool(first and second and related)
+            signature = (min(one, two) << 16) + max(one, two)
+            if bits and first != second and not related and signature not in excluded:
+                found.append((a, b))
+    return found
+
+
+def _sample(model: mujoco.MjModel) -> tuple[int, int]:
+    """The most contacts and rows seen in short simulations under random controls, from shaken start poses."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    contacts = rows = 0
+    for _ in range(_TRIALS):
+        mujoco.mj_resetData(model, data)
+        data.qvel[:] = rng.normal(0.0, 1.0, model.nv)
+        for _ in range(_STEPS):
+            data.ctrl[:] = rng.uniform(-1.0, 1.0, model.nu)
+            mujoco.mj_step(model, data)
+            contacts, rows = max(contacts, data.ncon), max(rows, data.nefc)
+    return contacts, rows

@@ -1,0 +1,432 @@
+"""The GPU engine, on MuJoCo Warp: every world in one launch, float32, fit for capture in a CUDA graph.
+
+It also runs on Warp's CPU device, slowly: that is how its tests run where there is no GPU. Results are not
+bit-identical from run to run (atomic additions).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from rlcli.errors import ConfigError, DeviceError, DivergedError, Problem, did_you_mean
+from rlcli.sim import kernels
+from rlcli.sim.capacity import Capacity
+from rlcli.sim.engine import force_sensors, quiet_mujoco
+from rlcli.sim.entity import as_index
+from rlcli.sim.mask import MaskSelection
+from rlcli.sim.selection import ALL, Selection
+
+_STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
+"""What every world carries from step to step, and every reset restores."""
+_INPUTS = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
+"""Further state, zero unless somebody binds it."""
+_KINEMATIC = frozenset(
+    [
+        *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos"),
+        *("site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir", "subtree_com", "ten_length", "cinert"),
+    ]
+)
+"""Derived fields of the position stage that kinematics alone give."""
+_ACCELERATION = frozenset(
+    [
+        *("qacc", "qacc_smooth", "actuator_force", "qfrc_actuator", "qfrc_smooth", "qfrc_constraint", "qfrc_inverse"),
+        *("act_dot", "cacc", "cfrc_int", "cfrc_ext"),
+    ]
+)
+"""Fields of the acceleration stage: read as the last substep left them."""
+_KINEMATICS, _VELOCITY, _FORCE = range(3)
+"""Groups of derived fields."""
+_FULL = {
+    mjw.OverflowType.NEFC: "constraints_per_env",
+    mjw.OverflowType.NJMAX_NNZ: "constraints_per_env",
+    mjw.OverflowType.BROADPHASE: "contacts_per_env",
+    mjw.OverflowType.NARROWPHASE: "contacts_per_env",
+    mjw.OverflowType.CCD: "contacts_per_env",
+    mjw.OverflowType.HFIELD: "contacts_per_env",
+    mjw.OverflowType.EPA_HORIZON: "contacts_per_env",
+}
+"""Capacities that a step may exceed -> the setting that raises them. Solver iterations are no capacity."""
+_CONSTANTS = (
+    *("body_subtreemass", "dof_invweight0", "body_invweight0", "tendon_invweight0", "tendon_length0"),
+    *("actuator_acc0", "eq_data"),
+)
+"""Model fields that `set_const` derives from others."""
+
+
+class WarpEngine:
+    """Many worlds of one model on a GPU.
+
+    Args:
+        model: the compiled model.
+        num_envs: worlds.
+        device: cuda, cuda:N, or cpu.
+        capacity: room for contacts and constraints in a world.
+        forces_after_reset: whether `forward` computes the acceleration stage, or leaves zeros there.
+
+    Raises:
+        ConfigError: for a model that MuJoCo Warp cannot run.
+        DeviceError: for more worlds than the device's memory holds.
+    """
+
+    threads = 1
+    asynchronous = True
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        device: str,
+        capacity: Capacity,
+        forces_after_reset: bool = True,
+    ) -> None:
+        quiet_mujoco()
+        self.model = model
+        self.num_envs = num_envs
+        self.device = torch.device(device)
+        self.capacity = capacity
+        self.warnings: dict[str, int] = {}
+        if self.device.type == "cuda" and self.device.index is None:
+            self.device = torch.device("cuda", torch.cuda.current_device())
+        self._device = wp.device_from_torch(self.device)
+        self._fields: dict[str, Tensor] = {}
+        self._watched: list[str] = []
+        self._derived: set[int] = set()
+        self._forces_after_reset = forces_after_reset
+        force_columns = force_sensors(model)
+        self._sensor_stages = {_FORCE} if force_columns else set()
+        if len(force_columns) < model.nsensordata:
+            self._sensor_stages.add(_VELOCITY)
+        self._force_columns = as_index(force_columns, self.device)
+        self._expanded: dict[str, Tensor] = {}
+        self._graphs: dict[int, Any] = {}
+        self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
+        with wp.ScopedDevice(self._device), _on_torch_stream(self.device):
+            self._model, self._data = self._put(model, capacity)
+            self._arrays = {name: getattr(self._data, name) for name in _STATE}
+            qpos, qvel = self.field("qpos"), self.field("qvel")
+            self._last_qpos, self._last_qvel = qpos.clone(), qvel.clone()
+            self._default_qpos = torch.tensor(model.qpos0, dtype=torch.float32, device=self.device)
+            self._default_qvel = torch.zeros(model.nv, device=self.device)
+            self._diverged = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
+            self._count = torch.zeros(1, dtype=torch.int64, device=self.device)
+            self._flags = torch.zeros(16, dtype=torch.int32, device=self.device)
+
+    @property
+    def divergences(self) -> int:
+        """Worlds that diverged, ever; waits for the device."""
+        return int(self._count)
+
+    def attach(self) -> None:
+        """Let Warp launch on torch's current stream, so that the two take turns."""
+        if self.device.type == "cuda":
+            stream = torch.cuda.current_stream(self.device)
+            if self._device.stream.cuda_stream != stream.cuda_stream:
+                wp.set_stream(wp.stream_from_torch(stream), self._device)
+
+    def field(self, name: str) -> Tensor:
+        """A live view of an MjData field; binding a derived one makes `step` compute its stage."""
+        if name not in self._fields:
+            array = getattr(self._data, name, None)
+            if not isinstance(array, wp.array) or array.ndim == 0 or array.shape[0] != self.num_envs:
+                known = [f.name for f in dataclasses.fields(self._data)]
+                raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {did_you_mean(name, known) or ''}")
+            self._fields[name] = wp.to_torch(array)
+            self._derived |= self._stages(name)
+            self._graphs.clear()
+            if self._stages(name):
+                with self._launching():
+                    mjw.forward(self._model, self._data)  # a field asked for late is that of the state
+        return self._fields[name]
+
+    def expand(self, name: str) -> Tensor:
+        """A model field with a value for every world."""
+        if name not in self._expanded:
+            owner, attribute = (self._model.opt, name[4:]) if name.startswith("opt.") else (self._model, name)
+            array = getattr(owner, attribute, None)
+            batched = {f.name for f in dataclasses.fields(owner) if _is_batched(f.type)}
+            if attribute not in batched or array is None:
+                raise ValueError(f"'{name}' cannot differ between worlds; {did_you_mean(attribute, batched) or ''}")
+            values = np.repeat(array.numpy()[:1], self.num_envs, axis=0)
+            wide = wp.array(values, dtype=array.dtype, device=self._device)
+            setattr(owner, attribute, wide)
+            self._expanded[name] = wp.to_torch(wide)
+            self._graphs.clear()
+        return self._expanded[name]
+
+    def set_constants(self) -> None:
+        """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
+        for name in _CONSTANTS:
+            array = getattr(self._model, name, None)
+            if array is not None and array.size:
+                self.expand(name)
+        with self._launching():
+            mjw.set_const(self._model, self._data)
+
+    def step(self, nstep: int) -> None:
+        """Advance every world by `nstep` physics steps, and compute what is bound of the derived fields."""
+        with self._launching():
+            if self.device.type != "cuda" or torch.cuda.is_current_stream_capturing():
+                self._advance(nstep)
+            elif nstep in self._graphs:
+                wp.capture_launch(self._graphs[nstep])
+            else:
+                self._advance(nstep)  # compiles
+                self._graphs[nstep] = self._capture(nstep)
+
+    def diverged(self) -> Tensor:
+        """Worlds that the last step drove out of bounds; they are back in the state before it, at rest. (num_envs,)"""
+        with self._launching():
+            wp.launch(
+                kernels.guard,
+                dim=self.num_envs,
+                inputs=[self._arrays[name] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "act")],
+                outputs=[
+                    wp.from_torch(self._last_qpos),
+                    wp.from_torch(self._last_qvel),
+                    wp.from_torch(self._diverged),
+                    wp.from_torch(self._count),
+                ],
+                device=self._device,
+            )
+        return self._diverged
+
+    def forward(self, selection: Selection) -> None:
+        """Compute what is bound of the derived fields; of the acceleration stage for the selected worlds only."""
+        if _FORCE not in self._derived or not self._forces_after_reset:
+            with self._launching():
+                self._derive()
+            for name in self._of_substep():  # no force has acted on a start state yet
+                columns = self._force_columns if name == "sensordata" else ALL
+                selection.write(self._fields[name].view(self.num_envs, -1), 0.0, columns)
+            return
+        before = {name: self.field(name).clone() for name in [*self._of_substep(), "qacc_warmstart"]}
+        with self._launching():
+            mjw.forward(self._model, self._data)
+        for name, old in before.items():
+            now = self.field(name)
+            new = now.clone()
+            now.copy_(old)
+            selection.write(now, new)
+
+    def reset(self, selection: Selection) -> None:
+        """Put the selected worlds into the default state, applied forces included."""
+        assert isinstance(selection, MaskSelection)
+        with self._launching():
+            wp.launch(
+                kernels.reset,
+                dim=self.num_envs,
+                inputs=[
+                    wp.from_torch(selection.mask),
+                    wp.from_torch(self._default_qpos),
+                    wp.from_torch(self._default_qvel),
+                ],
+                outputs=[self._arrays[name] for name in _STATE[:2]]
+                + [self._arrays[name] for name in ("qacc_warmstart", "ctrl", "act", "time")],
+                device=self._device,
+            )
+        for name in _INPUTS:
+            if name in self._fields and name not in ("eq_active", "mocap_pos", "mocap_quat"):
+                selection.write(self._fields[name].view(self.num_envs, -1), 0.0)
+
+    def set_default(self, qpos: Tensor, qvel: Tensor) -> None:
+        """The joint state that `reset` restores."""
+        self._default_qpos.copy_(qpos)
+        self._default_qvel.copy_(qvel)
+
+    def select(self, mask: Tensor, seed: int, counters: Tensor) -> MaskSelection:
+        """The worlds where `mask` holds; whether there are any is known to the device alone."""
+        return MaskSelection(mask, seed, counters)
+
+    def watch(self, values: Tensor, what: str) -> None:
+        """Have the device note if a value is not finite; `noted` tells."""
+        if what not in self._watched:
+            self._watched.append(what)
+        with self._launching():
+            flat = values.view(len(values), -1) if values.is_contiguous() else values.contiguous().view(len(values), -1)
+            inputs = [wp.from_torch(flat), wp.from_torch(self._flags), self._watched.index(what)]
+            wp.launch(kernels.watch, dim=tuple(flat.shape), inputs=inputs, device=self._device)
+
+    def noted(self) -> list[str]:
+        """What was not finite since the last call. Also looks whether contacts or constraints ran out of room.
+
+        Raises:
+            DivergedError: naming the setting to raise, if they did.
+        """
+        flags, overflow = self._flags.tolist(), wp.to_torch(self._data.overflow)
+        found = 0
+        for bit in _FULL:
+            found |= int(bit) if bool((overflow & int(bit)).any()) else 0
+        if found:
+            overflow.zero_()
+            raise _overflow(found, self.capacity)
+        if any(flags):
+            self._flags.zero_()
+        return [what for what, flag in zip(self._watched, flags, strict=False) if flag]
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Copies of the state, of bound inputs and of the model fields that differ between worlds."""
+        inputs = [name for name in _INPUTS if name in self._fields]
+        return {
+            **{name: self.field(name).clone() for name in (*_STATE, *inputs)},
+            "last_qpos": self._last_qpos.clone(),
+            "last_qvel": self._last_qvel.clone(),
+            **{f"model.{name}": values.clone() for name, values in self._expanded.items()},
+            **{f"substep.{name}": self.field(name).clone() for name in self._of_substep()},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `state_dict` gave; derived fields are computed anew."""
+        for name, values in state.items():
+            if name.startswith("model."):
+                self.expand(name.removeprefix("model.")).copy_(values)
+        for name, values in state.items():
+            if name in (*_STATE, *_INPUTS):
+                self.field(name).copy_(values)
+        self._last_qpos.copy_(state["last_qpos"])
+        self._last_qvel.copy_(state["last_qvel"])
+        with self._launching():
+            self._derive()
+        for name, values in state.items():
+            if name.startswith("substep."):
+                self.field(name.removeprefix("substep.")).copy_(values)
+
+    def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """One world as MjModel and MjData, forwarded; asked again for the same world, the same two objects, updated."""
+        if env not in self._worlds:
+            model = copy.copy(self.model)
+            self._worlds[env] = (model, mujoco.MjData(model))
+        model, data = self._worlds[env]
+        for name, values in self._expanded.items():
+            owner, attribute = (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
+            value = values[env].cpu().numpy()
+            if np.ndim(getattr(owner, attribute)):
+                getattr(owner, attribute)[:] = value.reshape(getattr(owner, attribute).shape)
+            else:
+                setattr(owner, attribute, float(value))
+        for name in (*_STATE[:-1], *(n for n in _INPUTS if n in self._fields)):
+            target = getattr(data, name)
+            target[:] = self.field(name)[env].cpu().numpy().reshape(target.shape)
+        data.time = float(self.field("time")[env])
+        mujoco.mj_forward(model, data)
+        return model, data
+
+    def close(self) -> None:
+        """Let go of the captured graphs; the memory goes with the object."""
+        self._graphs.clear()
+
+    @contextlib.contextmanager
+    def _launching(self) -> Any:
+        with wp.ScopedDevice(self._device):
+            yield
+
+    def _advance(self, nstep: int) -> None:
+        for _ in range(nstep):
+            mjw.step(self._model, self._data)
+        self._derive()
+
+    def _derive(self) -> None:
+        """Bring the derived fields that somebody reads up to the state; those of forces are the last substep's."""
+        m, d = self._model, self._data
+        if _VELOCITY in self._derived:
+            mjw.fwd_position(m, d, factorize=False)
+            mjw.fwd_velocity(m, d)
+            if "sensordata" in self._fields:
+                mjw.sensor_pos(m, d)
+                mjw.sensor_vel(m, d)
+        elif _KINEMATICS in self._derived:
+            mjw.fwd_kinematics(m, d)
+
+    def _stages(self, name: str) -> set[int]:
+        """What a field derives from."""
+        if name in (*_STATE, *_INPUTS):
+            return set()
+        if name == "sensordata":
+            return self._sensor_stages
+        return {_KINEMATICS if name in _KINEMATIC else _FORCE if name in _ACCELERATION else _VELOCITY}
+
+    def _of_substep(self) -> list[str]:
+        return [name for name in self._fields if _FORCE in self._stages(name)]
+
+    def _capture(self, nstep: int) -> Any:
+        stream = wp.Stream(self._device)  # torch's default stream cannot be recorded
+        with wp.ScopedStream(stream), wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
+            self._advance(nstep)
+        return capture.graph
+
+    def _put(self, model: mujoco.MjModel, capacity: Capacity) -> tuple[mjw.Model, mjw.Data]:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                on_device = mjw.put_model(model)
+            on_device.opt.warn_overflow = 0  # printing stops the device; `noted` tells
+            if self._device.is_cpu:
+                on_device.opt.graph_conditional = False
+        except (NotImplementedError, ValueError) as error:
+            message = f"the GPU engine (MuJoCo Warp) cannot run this model: {' '.join(str(error).split())}"
+            hint = "--device cpu runs it; or change the option in the MJCF"
+            raise ConfigError([Problem("scene", "", message, hint)]) from None
+        try:
+            return on_device, self._make(model, self.num_envs, capacity)
+        except RuntimeError as error:
+            if "alloc" not in str(error) and "memory" not in str(error):
+                raise
+            raise self._too_little(lambda n: self._make(model, n, capacity)) from None
+
+    def _make(self, model: mujoco.MjModel, num_envs: int, capacity: Capacity) -> mjw.Data:
+        return mjw.make_data(model, nworld=num_envs, nconmax=capacity.contacts, njmax=capacity.constraints)
+
+    def _too_little(self, make: Callable[[int], mjw.Data]) -> DeviceError:
+        some = 64
+        sample = sum(_bytes(value) for value in vars(make(some)).values())
+        free = self._device.free_memory if self._device.is_cuda else 0
+        fits = int(0.8 * free / (sample / some))
+        return DeviceError(
+            f"{self.num_envs} environments need {sample / some * self.num_envs / 2**30:.1f} GiB,"
+            f" {free / 2**30:.1f} GiB are free on {self.device}",
+            hint=f"--num-envs {max(1, fits)} would fit",
+        )
+
+
+def _overflow(found: int, capacity: Capacity) -> DivergedError:
+    settings = {setting for bit, setting in _FULL.items() if found & int(bit)}
+    kinds = " and ".join(bit.name.lower() for bit in _FULL if found & int(bit) and bit.name)
+    now = {"contacts_per_env": capacity.contacts, "constraints_per_env": capacity.constraints}
+    advice = " ".join(f"sim.{setting}={2 * now[setting]}" for setting in sorted(settings))
+    return DivergedError(
+        f"the GPU engine ran out of room ({kinds}): {capacity.contacts} contacts and {capacity.constraints} constraints"
+        " an environment were set aside, and the results since are wrong",
+        hint=f"give it more: {advice}",
+    )
+
+
+@contextlib.contextmanager
+def _on_torch_stream(device: torch.device) -> Any:
+    if device.type != "cuda":
+        yield
+        return
+    with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
+        yield
+
+
+def _is_batched(kind: Any) -> bool:
+    return next(iter(getattr(kind, "shape", ())), None) == "*"
+
+
+def _bytes(value: Any) -> int:
+    if isinstance(value, wp.array):
+        return int(value.capacity)
+    if dataclasses.is_dataclass(value):
+        return sum(_bytes(getattr(value, f.name)) for f in dataclasses.fields(value))
+    return 0

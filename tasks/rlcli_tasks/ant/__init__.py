@@ -1,0 +1,10 @@
+"""Ant: a four-legged walker runs towards a far target. Numbers and their sources: docs/ant.md."""
+
+from rlcli.task import TaskSpec
+
+DIRECT = TaskSpec(
+    package=__name__,
+    config="direct.yaml",
+    summary="Run with a four-legged walker (direct, OmniIsaacGymEnvs' numbers).",
+    task="rlcli_tasks.ant.task:AntTask",
+)

@@ -1,0 +1,35 @@
+"""Rotations and angles: right, and the same bits for a row whatever the number of rows."""
+
+import math
+
+import pytest
+import torch
+
+from rlcli.sim.rotations import atan2
+
+torch.set_num_threads(1)
+
+
+def test_the_angle_of_a_point_is_that_of_the_standard_library_all_around():
+    angles = torch.linspace(-math.pi, math.pi, 1441, dtype=torch.float64)
+    for radius in (1e-6, 1.0, 1e3):
+        x, y = (radius * angles.cos()).float(), (radius * angles.sin()).float()
+        expected = [math.atan2(b, a) for a, b in zip(x.tolist(), y.tolist(), strict=True)]
+        assert atan2(y, x).tolist() == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("y", "x", "angle"),
+    [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, math.pi / 2), (1.0, -0.0, math.pi / 2), (-1.0, 0.0, -math.pi / 2),
+     (-1.0, -0.0, -math.pi / 2), (0.0, -1.0, math.pi), (-0.0, -1.0, -math.pi)],
+)  # fmt: skip
+def test_the_angle_is_defined_on_the_axes_and_at_the_origin(y, x, angle):
+    assert float(atan2(torch.tensor(y), torch.tensor(x))) == pytest.approx(angle, abs=1e-6)
+
+
+def test_an_angle_has_the_same_bits_whatever_the_number_of_rows():
+    points = torch.randn(203, 2, generator=torch.Generator().manual_seed(0))
+    together = atan2(points[:, 0], points[:, 1])
+    for rows in range(1, 40):
+        alone = points[:rows].clone()
+        assert torch.equal(atan2(alone[:, 0], alone[:, 1]), together[:rows])
