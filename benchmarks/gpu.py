@@ -215,6 +215,22 @@ def rlcli(*arguments):
     return subprocess.run([sys.executable, "-m", "rlcli", *arguments], capture_output=True, text=True, check=False)
 
 
+def measure_scaling(num_envs, most):
+    """Weak scaling: as many environments for each GPU, however many there are."""
+    single = None
+    for gpus in [n for n in (1, 2, 4, 8) if n <= most]:
+        with tempfile.TemporaryDirectory() as runs:
+            options = ["--gpus", str(gpus), "--num-envs", str(num_envs), "--runs-dir", runs, "--max-iterations", "120"]
+            done = rlcli("train", "cartpole", *options, "--agent", "ppo", "--logger", "none", "--json")
+            if done.returncode:
+                report(what="scaling failed", gpus=gpus, error=(done.stderr + done.stdout)[-1500:])
+                continue
+            lines = (Path(json.loads(done.stdout)["run"]) / "metrics.jsonl").read_text().splitlines()
+        rate = statistics.median(json.loads(line)["Perf/total_fps"] for line in lines[20:])
+        single = single or rate
+        report(what="scaling", gpus=gpus, num_envs_each=num_envs, steps_per_s=rate, of_linear=rate / (gpus * single))
+
+
 def measure_solve(seeds):
     """Wall-clock of `rlcli train cartpole`, from the process's start to its end, and what the policy is worth."""
     for seed in seeds:
@@ -268,6 +284,8 @@ def main():
         if "features" in parts:
             for name in FEATURES:
                 alone("train-one", sizes[0], name)
+        if "scaling" in parts:
+            measure_scaling(sizes[-1], torch.cuda.device_count())
         if "solve" in parts:
             measure_solve(seeds)
             if args.peer_path:
