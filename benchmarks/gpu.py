@@ -212,7 +212,8 @@ def peer(path, *arguments):
 
 
 def rlcli(*arguments):
-    return subprocess.run([sys.executable, "-m", "rlcli", *arguments], capture_output=True, text=True, check=False)
+    command = ["timeout", "100", sys.executable, "-m", "rlcli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def measure_scaling(num_envs, most):
