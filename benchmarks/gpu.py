@@ -282,6 +282,7 @@ def main():
                 alone("train-one", n)
             if args.peer_path:
                 peer(args.peer_path, "train", "--num-envs", *sizes)
+                peer(args.peer_path, "train", "--num-envs", *sizes, "--logs")
         if "features" in parts:
             for name in FEATURES:
                 alone("train-one", sizes[0], name)
