@@ -253,6 +253,8 @@ class WarpEngine:
         """Have the device note if a value is not finite; `noted` tells."""
         if what not in self._watched:
             self._watched.append(what)
+            if len(self._watched) > len(self._flags):
+                self._flags = torch.cat([self._flags, torch.zeros_like(self._flags)])
         with self._launching():
             flat = values.view(len(values), -1) if values.is_contiguous() else values.contiguous().view(len(values), -1)
             inputs = [wp.from_torch(flat), wp.from_torch(self._flags), self._watched.index(what)]
