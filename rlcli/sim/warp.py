@@ -31,7 +31,7 @@ from rlcli.sim.selection import ALL, Selection
 _STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
 """What every world carries from step to step, and every reset restores."""
 _INPUTS = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
-"""Further state, zero unless somebody binds it."""
+"""Further state, as the model has it unless somebody binds it."""
 _KINEMATIC = frozenset(
     [
         *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos"),
@@ -102,6 +102,7 @@ class WarpEngine:
         self._device = wp.device_from_torch(self.device)
         self._fields: dict[str, Tensor] = {}
         self._watched: list[str] = []
+        self._start_inputs: dict[str, Tensor] = {}
         self._derived: set[int] = set()
         self._forces_after_reset = forces_after_reset
         force_columns = force_sensors(model)
@@ -143,6 +144,8 @@ class WarpEngine:
                 known = [f.name for f in dataclasses.fields(self._data)]
                 raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {did_you_mean(name, known) or ''}")
             self._fields[name] = wp.to_torch(array)
+            if name in _INPUTS:  # nobody has written to it yet
+                self._start_inputs[name] = self._fields[name].view(self.num_envs, -1).clone()
             self._derived |= self._stages(name)
             self._graphs.clear()
             if self._stages(name):
@@ -236,9 +239,8 @@ class WarpEngine:
                 + [self._arrays[name] for name in ("qacc_warmstart", "ctrl", "act", "time")],
                 device=self._device,
             )
-        for name in _INPUTS:
-            if name in self._fields and name not in ("eq_active", "mocap_pos", "mocap_quat"):
-                selection.write(self._fields[name].view(self.num_envs, -1), 0.0)
+        for name, start in self._start_inputs.items():
+            selection.write(self._fields[name].view(self.num_envs, -1), start)
 
     def set_default(self, qpos: Tensor, qvel: Tensor) -> None:
         """The joint state that `reset` restores."""
