@@ -103,6 +103,7 @@ class WarpEngine:
         self._fields: dict[str, Tensor] = {}
         self._watched: list[str] = []
         self._start_inputs: dict[str, Tensor] = {}
+        self._last_derived: dict[str, Tensor] = {}
         self._derived: set[int] = set()
         self._forces_after_reset = forces_after_reset
         force_columns = force_sensors(model)
@@ -116,7 +117,7 @@ class WarpEngine:
         with wp.ScopedDevice(self._device), _on_torch_stream(self.device):
             self._model, self._data = self._put(model, capacity)
             self._arrays = {name: getattr(self._data, name) for name in _STATE}
-            qpos, qvel = self.field("qpos"), self.field("qvel")
+            qpos, qvel, _ = (self.field(name) for name in ("qpos", "qvel", "qacc_warmstart"))
             self._last_qpos, self._last_qvel = qpos.clone(), qvel.clone()
             self._default_qpos = torch.tensor(model.qpos0, dtype=torch.float32, device=self.device)
             self._default_qvel = torch.zeros(model.nv, device=self.device)
@@ -143,6 +144,7 @@ class WarpEngine:
             if not isinstance(array, wp.array) or array.ndim == 0 or array.shape[0] != self.num_envs:
                 known = [f.name for f in dataclasses.fields(self._data)]
                 raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {did_you_mean(name, known) or ''}")
+            kept = self._before_forward()
             self._fields[name] = wp.to_torch(array)
             if name in _INPUTS:  # nobody has written to it yet
                 self._start_inputs[name] = self._fields[name].view(self.num_envs, -1).clone()
@@ -151,6 +153,10 @@ class WarpEngine:
             if self._stages(name):
                 with self._launching():
                     mjw.forward(self._model, self._data)  # a field asked for late is that of the state
+                for other, values in kept.items():
+                    self._fields[other].copy_(values)
+                if self._fields[name].dtype == torch.float32:
+                    self._last_derived[name] = self._fields[name].clone()
         return self._fields[name]
 
     def expand(self, name: str) -> Tensor:
@@ -214,7 +220,7 @@ class WarpEngine:
                 columns = self._force_columns if name == "sensordata" else ALL
                 selection.write(self._fields[name].view(self.num_envs, -1), 0.0, columns)
             return
-        before = {name: self.field(name).clone() for name in [*self._of_substep(), "qacc_warmstart"]}
+        before = self._before_forward()
         with self._launching():
             mjw.forward(self._model, self._data)
         for name, old in before.items():
@@ -295,6 +301,9 @@ class WarpEngine:
         for name, values in state.items():
             if name.startswith("model."):
                 self.expand(name.removeprefix("model.")).copy_(values)
+        for name in state:
+            if name.startswith("substep."):
+                self.field(name.removeprefix("substep."))  # whoever saved had asked for it; here that may come later
         for name, values in state.items():
             if name in (*_STATE, *_INPUTS):
                 self.field(name).copy_(values)
@@ -305,6 +314,8 @@ class WarpEngine:
         for name, values in state.items():
             if name.startswith("substep."):
                 self.field(name.removeprefix("substep.")).copy_(values)
+        for name, last in self._last_derived.items():
+            last.copy_(self._fields[name])
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """One world as MjModel and MjData, forwarded; asked again for the same world, the same two objects, updated."""
@@ -362,6 +373,12 @@ class WarpEngine:
 
     def _of_substep(self) -> list[str]:
         return [name for name in self._fields if _FORCE in self._stages(name)]
+
+    def _before_forward(self) -> dict[str, Tensor]:
+        """Copies of what a forward pass would overwrite, and which is the last substep's."""
+        return {
+            name: self._fields[name].clone() for name in (*self._of_substep(), "qacc_warmstart") if name in self._fields
+        }
 
     def _capture(self, nstep: int) -> Any:
         stream = wp.Stream(self._device)  # torch's default stream cannot be recorded
