@@ -195,7 +195,10 @@ class WarpEngine:
                 self._graphs[nstep] = self._capture(nstep)
 
     def diverged(self) -> Tensor:
-        """Worlds that the last step drove out of bounds; they are back in the state before it, at rest. (num_envs,)"""
+        """Worlds that the last step drove out of bounds; they are back in the state before it, at rest. (num_envs,)
+
+        What is bound of the derived fields is that of the state before, too: terms judge by it.
+        """
         with self._launching():
             wp.launch(
                 kernels.guard,
@@ -209,25 +212,22 @@ class WarpEngine:
                 ],
                 device=self._device,
             )
+            for name, last in self._last_derived.items():
+                self._launch_rows(kernels.hold, self._diverged, self._fields[name], last)
         return self._diverged
 
     def forward(self, selection: Selection) -> None:
-        """Compute what is bound of the derived fields; of the acceleration stage for the selected worlds only."""
-        if _FORCE not in self._derived or not self._forces_after_reset:
-            with self._launching():
-                self._derive()
-            for name in self._of_substep():  # no force has acted on a start state yet
-                columns = self._force_columns if name == "sensordata" else ALL
-                selection.write(self._fields[name].view(self.num_envs, -1), 0.0, columns)
-            return
-        before = self._before_forward()
+        """Compute what is bound of the derived fields; of the acceleration stage for the selected worlds only.
+
+        What a selected world is now is what it goes back to if it diverges.
+        """
+        assert isinstance(selection, MaskSelection)
+        self._forward(selection)
+        fields = [(self.field("qpos"), self._last_qpos), (self.field("qvel"), self._last_qvel)]
+        fields += [(self._fields[name], last) for name, last in self._last_derived.items()]
         with self._launching():
-            mjw.forward(self._model, self._data)
-        for name, old in before.items():
-            now = self.field(name)
-            new = now.clone()
-            now.copy_(old)
-            selection.write(now, new)
+            for now, last in fields:
+                self._launch_rows(kernels.remember, selection.mask, now, last)
 
     def reset(self, selection: Selection) -> None:
         """Put the selected worlds into the default state, applied forces included."""
@@ -373,6 +373,27 @@ class WarpEngine:
 
     def _of_substep(self) -> list[str]:
         return [name for name in self._fields if _FORCE in self._stages(name)]
+
+    def _forward(self, selection: Selection) -> None:
+        if _FORCE not in self._derived or not self._forces_after_reset:
+            with self._launching():
+                self._derive()
+            for name in self._of_substep():  # no force has acted on a start state yet
+                columns = self._force_columns if name == "sensordata" else ALL
+                selection.write(self._fields[name].view(self.num_envs, -1), 0.0, columns)
+            return
+        before = self._before_forward()
+        with self._launching():
+            mjw.forward(self._model, self._data)
+        for name, old in before.items():
+            now = self.field(name)
+            new = now.clone()
+            now.copy_(old)
+            selection.write(now, new)
+
+    def _launch_rows(self, kernel: wp.Kernel, mask: Tensor, now: Tensor, last: Tensor) -> None:
+        flat = [wp.from_torch(values.view(self.num_envs, -1)) for values in (now, last)]
+        wp.launch(kernel, dim=flat[0].shape, inputs=[wp.from_torch(mask), *flat], device=self._device)
 
     def _before_forward(self) -> dict[str, Tensor]:
         """Copies of what a forward pass would overwrite, and which is the last substep's."""
