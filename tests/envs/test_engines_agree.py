@@ -20,13 +20,6 @@ def pair(task, num_envs=N, *overrides, seed=3):
     return [build(task, num_envs, f"sim.engine={engine}", *overrides, seed=seed) for engine in ("batch", "warp")]
 
 
-def rows(result, device_result):
-    """What ended in a step, by environment."""
-    if device_result.episodes is None:
-        return None, None
-    return result.episodes, device_result.episodes.ended()
-
-
 def assert_same_step(host, device, tolerance, where):
     close = {"rtol": tolerance, "atol": tolerance, "msg": lambda text: f"{where}: {text}"}
     assert torch.equal(host.terminated, device.terminated), where
@@ -78,9 +71,6 @@ def follow(host, device, tolerance, steps=STEPS, strength=0.5):
 @pytest.mark.parametrize("task", SHORT)
 def test_they_agree_step_by_step_through_resets(task):
     host, device = pair(task, N, *SHORT[task])
-    # staggered, so that some environments end in a step and others run on
-    for env in (host, device):
-        env.reset(seed=5)
     ended = follow(host, device, TOLERANCE[task])
     assert ended >= 2 * N
 
@@ -102,10 +92,13 @@ def test_they_agree_step_by_step_through_terminations(task):
 
 
 def test_they_agree_where_every_kind_of_term_is_used(tmp_path):
-    """Contacts, position actuators, sensors, root resets, pushes and wrenches at intervals, terms of forces."""
-    host, device = pair(critter(tmp_path), 6)
-    ended = follow(host, device, 5e-2, steps=20, strength=0.3)
-    assert ended >= 6
+    """Position actuators, root resets, pushes and wrenches at intervals, terms of forces; in free fall.
+
+    Feet that strike the ground would be chaos: there a millionth grows to a hundredth within three steps.
+    """
+    host, device = pair(critter(tmp_path), 6, "scene.ground=null")
+    ended = follow(host, device, 2e-5, steps=40, strength=0.3)
+    assert ended >= 12
 
 
 def test_they_agree_on_environments_that_end_at_different_times(tmp_path):
