@@ -141,11 +141,10 @@ def test_importing_the_package_imports_nothing_else():
 
 
 def test_training_on_the_cpu_loads_nothing_of_the_gpu_engine(tmp_path):
-    words = (
-        "train cartpole --agent ppo --device cpu --num-envs 4 --max-iterations 1 --logger none -q --runs-dir".split()
-    )
+    words = ["train", "cartpole", "--agent", "ppo", "--device", "cpu", "--num-envs", "4", "--max-iterations", "1"]
+    words += ["--logger", "none", "-q", "--runs-dir", str(tmp_path)]
     program = (
-        f"import sys; from rlcli.cli.app import main; code = main({[*words, str(tmp_path)]!r}); "
+        f"import sys; from rlcli.cli.app import main; code = main({words!r}); "
         "gpu = {'warp', 'mujoco_warp', 'rlcli.sim.warp', 'rlcli.sim.mask', 'rlcli.sim.kernels'}; "
         "print(code, 'torch' in sys.modules, sorted(gpu & set(sys.modules)))"
     )

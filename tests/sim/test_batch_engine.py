@@ -278,7 +278,7 @@ def test_a_device_that_is_not_there_is_refused(device):
 
 
 def test_the_engine_of_the_cpu_is_refused_on_another_device():
-    with pytest.raises(ConfigError, match="sim.engine 'batch' runs on a CPU, not on 'cuda'"):
+    with pytest.raises(ConfigError, match="'batch' runs on a CPU, not on 'cuda'"):
         engine_of(model_of(), 1, device="cuda", engine="batch")
 
 
