@@ -12,6 +12,8 @@ _MARGIN = 3
 """How many times what a short random simulation needed is set aside, where the model's own bound is larger."""
 _MANY = 8
 """Contacts that two geoms may have where nothing better is known (two boxes)."""
+_ON_HILLS = 50
+"""Contacts that a geom may have with a height field: MuJoCo keeps no more of a pair."""
 _G = mujoco.mjtGeom
 _POINTS = {
     (_G.mjGEOM_PLANE, _G.mjGEOM_SPHERE): 1,
@@ -55,7 +57,7 @@ def _bound(model: mujoco.MjModel) -> tuple[int, int]:
     contacts = rows = 0
     for a, b in _pairs(model):
         kinds = tuple(sorted((_G(model.geom_type[a]), _G(model.geom_type[b])), key=int))
-        points = _POINTS.get(kinds, _MANY)
+        points = _ON_HILLS if _G.mjGEOM_HFIELD in kinds else _POINTS.get(kinds, _MANY)
         condim = int(max(model.geom_condim[a], model.geom_condim[b]))
         contacts += points
         rows += points * _contact_rows(model, condim)
@@ -75,6 +77,7 @@ def _contact_rows(model: mujoco.MjModel, condim: int) -> int:
 def _pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
     """Geoms that MuJoCo's filters let touch: bits that match, bodies that are neither welded nor parent and child."""
     weld, parent = model.body_weldid, model.body_parentid
+    families = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
     excluded = {int(s) for s in model.exclude_signature}
     found = []
     for a in range(model.ngeom):
@@ -85,7 +88,7 @@ def _pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
             )
             first, second = int(weld[one]), int(weld[two])
             related = (first and second and first == int(weld[parent[second]])) or second == int(weld[parent[first]])
-            related = bool(first and second and related)
+            related = bool(families and first and second and related)
             signature = (min(one, two) << 16) + max(one, two)
             if bits and first != second and not related and signature not in excluded:
                 found.append((a, b))

@@ -75,12 +75,17 @@ def guard(
     warmstart: wp.array2d(dtype=float),
     ctrl: wp.array2d(dtype=float),
     act: wp.array2d(dtype=float),
+    overflow: wp.array(dtype=wp.int32),
     last_qpos: wp.array2d(dtype=float),
     last_qvel: wp.array2d(dtype=float),
     diverged: wp.array(dtype=wp.bool),
     count: wp.array(dtype=wp.int64),
+    overflowed: wp.array(dtype=wp.int32),
 ):
-    """Find worlds whose state is not finite or beyond MuJoCo's limit, and put them back to the last good state."""
+    """Find worlds whose state is not finite or beyond MuJoCo's limit, and put them back to the last good state.
+
+    What ran out of room is kept in `overflowed`, unless that was a world on its way to infinity.
+    """
     world = wp.tid()
     bad = wp.int32(0)  # a plain number would be a constant
     for i in range(qpos.shape[1]):
@@ -94,6 +99,7 @@ def guard(
     diverged[world] = bad != 0
     if bad != 0:
         wp.atomic_add(count, 0, wp.int64(1))
+        overflow[world] = 0
         for i in range(qpos.shape[1]):
             qpos[world, i] = last_qpos[world, i]
         for i in range(qvel.shape[1]):
@@ -104,6 +110,9 @@ def guard(
         for i in range(act.shape[1]):
             act[world, i] = 0.0
     else:
+        if overflow[world] != 0:
+            overflowed[world] = overflowed[world] | overflow[world]
+            overflow[world] = 0
         for i in range(qpos.shape[1]):
             last_qpos[world, i] = qpos[world, i]
         for i in range(qvel.shape[1]):

@@ -123,6 +123,7 @@ class WarpEngine:
             self._default_qvel = torch.zeros(model.nv, device=self.device)
             self._diverged = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
             self._count = torch.zeros(1, dtype=torch.int64, device=self.device)
+            self._overflowed = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
             self._flags = torch.zeros(16, dtype=torch.int32, device=self.device)
 
     @property
@@ -203,12 +204,14 @@ class WarpEngine:
             wp.launch(
                 kernels.guard,
                 dim=self.num_envs,
-                inputs=[self._arrays[name] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "act")],
+                inputs=[self._arrays[name] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "act")]
+                + [self._data.overflow],
                 outputs=[
                     wp.from_torch(self._last_qpos),
                     wp.from_torch(self._last_qvel),
                     wp.from_torch(self._diverged),
                     wp.from_torch(self._count),
+                    wp.from_torch(self._overflowed),
                 ],
                 device=self._device,
             )
@@ -274,12 +277,12 @@ class WarpEngine:
         Raises:
             DivergedError: naming the setting to raise, if they did.
         """
-        flags, overflow = self._flags.tolist(), wp.to_torch(self._data.overflow)
+        flags = self._flags.tolist()
         found = 0
         for bit in _FULL:
-            found |= int(bit) if bool((overflow & int(bit)).any()) else 0
+            found |= int(bit) if bool((self._overflowed & int(bit)).any()) else 0
         if found:
-            overflow.zero_()
+            self._overflowed.zero_()
             raise _overflow(found, self.capacity)
         if any(flags):
             self._flags.zero_()

@@ -282,10 +282,10 @@ def test_an_environment_continues_equally_from_its_state(tmp_path, task):
 # --- divergence ---
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, 1e12])
-@pytest.mark.parametrize("field", ["qpos", "qvel"])
-@pytest.mark.parametrize("who", [0, 3])
-def test_a_diverged_world_is_terminated_and_put_back_and_the_others_are_untouched(tmp_path, value, field, who):
+@pytest.mark.parametrize(
+    ("field", "value", "who"), [("qpos", math.nan, 0), ("qvel", math.inf, 3), ("qvel", 1e12, 3), ("qpos", 1e12, 4)]
+)
+def test_a_diverged_world_is_terminated_and_put_back_and_the_others_are_untouched(tmp_path, field, value, who):
     sound, sick = (build(critter(tmp_path), N, "sim.engine=warp", "episode_length_s=9.0") for _ in range(2))
     action = torch.full((N, 4), 0.2)
     for env in (sound, sick):

@@ -1,0 +1,80 @@
+"""A step on the GPU engine asks the host nothing: no value is read back, no size depends on one."""
+
+import pytest
+import torch
+import yaml
+from torch.utils._python_dispatch import TorchDispatchMode
+from worlds import CRITTER, CRITTER_TASK, build, dump, write
+
+WAITS = {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "item", "unique", "_unique2"}
+"""Operations whose result the host must have before it goes on."""
+
+
+class NoHost(TorchDispatchMode):
+    """Refuses what waits for the device."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.overloadpacket.__name__
+        assert name not in WAITS, name
+        if name in ("index", "index_put", "index_put_"):
+            masks = [i for i in args[1] if i is not None and i.dtype in (torch.bool, torch.uint8)]
+            assert not masks, f"{name} with a mask is a search"
+        return func(*args, **(kwargs or {}))
+
+
+def every_term():
+    """The critter's task with what it lacks of the vocabulary."""
+    task = yaml.safe_load(CRITTER_TASK)
+    task["sim"]["engine"] = "warp"
+    task["success"] = {"func": "joints_near", "tolerance": 0.5, "hold_s": 0.1}
+    task["divergence_reward"] = -1.0
+    task["actions"]["push"] = {"func": "joint_effort", "joints": ["hip_fl"], "scale": 0.1, "clip": [-1.0, 1.0]}
+    task["observations"]["policy"]["vel"].pop("joints")
+    task["events"]["scene"] = {"func": "reset_scene_to_default", "mode": "reset"}
+    task["events"]["offset"] = {"func": "reset_joints_by_offset", "mode": "reset", "joints": ["hip_fl", "hip_br"],
+                                "position": [-0.1, 0.1], "velocity": [-0.1, 0.1]}  # fmt: skip
+    task["rewards"]["target"] = {"func": "joint_pos_target_l2", "weight": -0.1, "target": 0.0}
+    task["rewards"].pop("power")  # one joint a column of the action: here two actions drive the same joint
+    task["terminations"] |= {
+        "manual": {"func": "joint_pos_out_of_manual_limit", "bounds": [-2.0, 2.0]},
+        "soft": {"func": "joint_pos_out_of_limit"},
+        "fast": {"func": "joint_vel_out_of_manual_limit", "max_velocity": 500.0},
+    }
+    return dump(task)
+
+
+def watched_steps(env, steps):
+    """Steps with resets among them; how many episodes ended."""
+    action = 0.3 * torch.ones(env.num_envs, env.layout.action_size)
+    env.reset()
+    env.step(action)
+    ended = torch.zeros((), dtype=torch.int64)
+    with NoHost():
+        for _ in range(steps):
+            ended += env.step(action).episodes.mask.sum()
+    env.check()
+    return int(ended)
+
+
+@pytest.mark.parametrize("task", ["cartpole", "ant-direct"])
+def test_a_step_of_a_built_in_task_reads_nothing_back(task):
+    env = build(task, 4, "sim.engine=warp", "episode_length_s=0.1")
+    assert watched_steps(env, 14) >= 4
+
+
+def test_a_step_of_a_task_with_every_kind_of_term_reads_nothing_back(tmp_path):
+    folder = write(tmp_path / "critter", every_term(), critter_xml=CRITTER)
+    env = build(folder, 4, "episode_length_s=0.1", "sim.forces_after_reset=true")
+    assert watched_steps(env, 14) >= 4
+    env.engine.field("qvel")[1, 0] = torch.nan
+    with NoHost():
+        result = env.step(torch.zeros(4, env.layout.action_size))
+    assert result.terminated[1]
+    assert env.divergences == 1
+
+
+def test_the_detector_sees_a_mask_and_a_number_read_back():
+    values = torch.arange(4.0)
+    for reading in (lambda: values[values > 1], lambda: float(values.sum()), lambda: (values > 1).nonzero()):
+        with pytest.raises(AssertionError), NoHost():
+            reading()

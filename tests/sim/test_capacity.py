@@ -1,0 +1,141 @@
+"""How much room the GPU engine sets aside for contacts and constraints, and what happens when it was too little."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from worlds import build
+
+from rlcli.config.schema import SimConfig
+from rlcli.errors import DivergedError
+from rlcli.sim.capacity import capacity
+from rlcli.sim.engine import open_engine
+
+torch.set_num_threads(1)
+
+BOXES = (
+    '<mujoco><worldbody><geom type="plane" size="5 5 1"/>'
+    + "".join(
+        f'<body pos="0 0 {0.11 + 0.21 * i}"><freejoint/><geom type="box" size="0.1 0.1 0.1" mass="1"/></body>'
+        for i in range(4)
+    )
+    + "</worldbody></mujoco>"
+)
+BALL = '<mujoco>{}<worldbody>{}<body pos="0 0 0.1"><freejoint/>{}</body></worldbody></mujoco>'
+
+
+def ant():
+    """The model of the built-in task, ground and motors included."""
+    return build("ant-direct", 1).engine.model
+
+
+def needed(model, steps, shake=2.0):
+    """The most contacts and rows of a long simulation."""
+    data, random = mujoco.MjData(model), np.random.default_rng(7)
+    contacts = rows = 0
+    for trial in range(4):
+        mujoco.mj_resetData(model, data)
+        data.qvel[:] = random.normal(0.0, shake if trial else 0.0, model.nv)
+        for _ in range(steps):
+            data.ctrl[:] = random.uniform(-1.0, 1.0, model.nu)
+            mujoco.mj_step(model, data)
+            contacts, rows = max(contacts, data.ncon), max(rows, data.nefc)
+    return contacts, rows
+
+
+def test_the_estimate_covers_what_a_longer_simulation_of_the_ant_needs():
+    model = ant()
+    room, (contacts, rows) = capacity(model), needed(model, 800)
+    assert contacts >= 4
+    assert room.contacts >= contacts
+    assert room.constraints >= rows
+
+
+def test_the_estimate_covers_a_stack_of_boxes():
+    model = mujoco.MjModel.from_xml_string(BOXES)
+    room, (contacts, rows) = capacity(model), needed(model, 400, shake=0.5)
+    assert contacts >= 12
+    assert room.contacts >= contacts
+    assert room.constraints >= rows
+
+
+HILLS = '<asset><hfield name="hills" nrow="20" ncol="20" size="1 1 0.1 0.1" elevation="{}"/></asset>'.format(
+    " ".join(str(float((i * 7 + j * 3) % 5)) for i in range(20) for j in range(20))
+)
+CUBE = " ".join(f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1))
+LYING = {
+    "capsule": ("", '<geom type="plane" size="5 5 1"/>', '<geom type="capsule" size="0.1 0.3" euler="90 0 0"/>'),
+    "box": ("", '<geom type="plane" size="5 5 1"/>', '<geom type="box" size="0.1 0.1 0.1"/>'),
+    "cylinder": ("", '<geom type="plane" size="5 5 1"/>', '<geom type="cylinder" size="0.1 0.1"/>'),
+    "mesh": (
+        f'<asset><mesh name="cube" vertex="{CUBE}"/></asset>',
+        '<geom type="plane" size="5 5 1"/>',
+        '<geom type="mesh" mesh="cube"/>',
+    ),
+    "box on box": ("", '<geom type="box" size="1 1 0.1" pos="0 0 -0.1"/>', '<geom type="box" size="0.1 0.1 0.1"/>'),
+    "capsule on box": (
+        "",
+        '<geom type="box" size="1 1 0.1" pos="0 0 -0.1"/>',
+        '<geom type="capsule" size="0.1 0.3" euler="90 0 0"/>',
+    ),
+    "capsule on hills": (
+        HILLS,
+        '<geom type="hfield" hfield="hills"/>',
+        '<geom type="capsule" size="0.1 0.5" euler="90 0 0"/>',
+    ),
+    "box on hills": (HILLS, '<geom type="hfield" hfield="hills"/>', '<geom type="box" size="0.5 0.5 0.1"/>'),
+}
+
+
+@pytest.mark.parametrize("xml", [BALL.format(*parts) for parts in LYING.values()], ids=LYING)
+def test_two_geoms_that_lie_on_each_other_have_room(xml):
+    model = mujoco.MjModel.from_xml_string(xml)
+    room, (contacts, rows) = capacity(model), needed(model, 200, shake=0.2)
+    assert contacts > 0
+    assert room.contacts >= contacts
+    assert room.constraints >= rows
+
+
+def test_a_model_whose_parents_and_children_may_touch_has_room_for_that():
+    xml = """<mujoco><option><flag filterparent="disable"/></option><worldbody><body><joint/><geom size="0.1"/>
+      <body pos="0 0 0.15"><joint axis="0 1 0"/><geom size="0.1"/></body></body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    room, (contacts, rows) = capacity(model), needed(model, 20)
+    assert contacts == 1
+    assert room.contacts >= contacts
+    assert room.constraints >= rows
+
+
+def test_settings_replace_the_estimate():
+    model = mujoco.MjModel.from_xml_string(BOXES)
+    estimate, found = capacity(model), capacity(model, contacts=5)
+    assert (found.contacts, found.constraints) == (5, estimate.constraints)
+    assert capacity(model, constraints=9).constraints == 9
+
+
+def test_a_model_without_contacts_gets_little():
+    room = build("cartpole", 2, "sim.engine=warp").engine.capacity
+    assert room.contacts <= 2
+    assert room.constraints <= 4
+
+
+@pytest.mark.parametrize("setting", ["contacts_per_env", "constraints_per_env"])
+def test_too_little_room_is_an_error_of_check_that_names_the_setting(setting):
+    env = build("ant-direct", 3, "sim.engine=warp", f"sim.{setting}=1")
+    env.reset()
+    for _ in range(60):
+        env.step(torch.zeros(3, 8))
+    with pytest.raises(DivergedError) as error:
+        env.check()
+    assert setting in error.value.hint
+    assert f"sim.{setting}=2" in error.value.hint
+    assert "1" in str(error.value)
+
+
+def test_enough_room_is_no_error():
+    model = mujoco.MjModel.from_xml_string(BOXES)
+    engine = open_engine(model, 2, SimConfig(dt=0.002, engine="warp"))
+    for _ in range(40):
+        engine.step(1)
+        engine.diverged()
+    assert engine.noted() == []
