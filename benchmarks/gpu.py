@@ -212,7 +212,8 @@ def peer(path, *arguments):
 
 
 def rlcli(*arguments):
-    return subprocess.run([sys.executable, "-m", "rlcli", *arguments], capture_output=True, text=True, check=False)
+    command = ["timeout", "100", sys.executable, "-m", "rlcli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def measure_scaling(num_envs, most):
@@ -281,6 +282,7 @@ def main():
                 alone("train-one", n)
             if args.peer_path:
                 peer(args.peer_path, "train", "--num-envs", *sizes)
+                peer(args.peer_path, "train", "--num-envs", *sizes, "--logs")
         if "features" in parts:
             for name in FEATURES:
                 alone("train-one", sizes[0], name)

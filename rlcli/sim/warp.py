@@ -31,7 +31,7 @@ from rlcli.sim.selection import ALL, Selection
 _STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
 """What every world carries from step to step, and every reset restores."""
 _INPUTS = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
-"""Further state, zero unless somebody binds it."""
+"""Further state, as the model has it unless somebody binds it."""
 _KINEMATIC = frozenset(
     [
         *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos"),
@@ -102,6 +102,8 @@ class WarpEngine:
         self._device = wp.device_from_torch(self.device)
         self._fields: dict[str, Tensor] = {}
         self._watched: list[str] = []
+        self._start_inputs: dict[str, Tensor] = {}
+        self._last_derived: dict[str, Tensor] = {}
         self._derived: set[int] = set()
         self._forces_after_reset = forces_after_reset
         force_columns = force_sensors(model)
@@ -115,7 +117,7 @@ class WarpEngine:
         with wp.ScopedDevice(self._device), _on_torch_stream(self.device):
             self._model, self._data = self._put(model, capacity)
             self._arrays = {name: getattr(self._data, name) for name in _STATE}
-            qpos, qvel = self.field("qpos"), self.field("qvel")
+            qpos, qvel, _ = (self.field(name) for name in ("qpos", "qvel", "qacc_warmstart"))
             self._last_qpos, self._last_qvel = qpos.clone(), qvel.clone()
             self._default_qpos = torch.tensor(model.qpos0, dtype=torch.float32, device=self.device)
             self._default_qvel = torch.zeros(model.nv, device=self.device)
@@ -142,12 +144,19 @@ class WarpEngine:
             if not isinstance(array, wp.array) or array.ndim == 0 or array.shape[0] != self.num_envs:
                 known = [f.name for f in dataclasses.fields(self._data)]
                 raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {did_you_mean(name, known) or ''}")
+            kept = self._before_forward()
             self._fields[name] = wp.to_torch(array)
+            if name in _INPUTS:  # nobody has written to it yet
+                self._start_inputs[name] = self._fields[name].view(self.num_envs, -1).clone()
             self._derived |= self._stages(name)
             self._graphs.clear()
             if self._stages(name):
                 with self._launching():
                     mjw.forward(self._model, self._data)  # a field asked for late is that of the state
+                for other, values in kept.items():
+                    self._fields[other].copy_(values)
+                if self._fields[name].dtype == torch.float32:
+                    self._last_derived[name] = self._fields[name].clone()
         return self._fields[name]
 
     def expand(self, name: str) -> Tensor:
@@ -186,7 +195,10 @@ class WarpEngine:
                 self._graphs[nstep] = self._capture(nstep)
 
     def diverged(self) -> Tensor:
-        """Worlds that the last step drove out of bounds; they are back in the state before it, at rest. (num_envs,)"""
+        """Worlds that the last step drove out of bounds; they are back in the state before it, at rest. (num_envs,)
+
+        What is bound of the derived fields is that of the state before, too: terms judge by it.
+        """
         with self._launching():
             wp.launch(
                 kernels.guard,
@@ -200,25 +212,22 @@ class WarpEngine:
                 ],
                 device=self._device,
             )
+            for name, last in self._last_derived.items():
+                self._launch_rows(kernels.hold, self._diverged, self._fields[name], last)
         return self._diverged
 
     def forward(self, selection: Selection) -> None:
-        """Compute what is bound of the derived fields; of the acceleration stage for the selected worlds only."""
-        if _FORCE not in self._derived or not self._forces_after_reset:
-            with self._launching():
-                self._derive()
-            for name in self._of_substep():  # no force has acted on a start state yet
-                columns = self._force_columns if name == "sensordata" else ALL
-                selection.write(self._fields[name].view(self.num_envs, -1), 0.0, columns)
-            return
-        before = {name: self.field(name).clone() for name in [*self._of_substep(), "qacc_warmstart"]}
+        """Compute what is bound of the derived fields; of the acceleration stage for the selected worlds only.
+
+        What a selected world is now is what it goes back to if it diverges.
+        """
+        assert isinstance(selection, MaskSelection)
+        self._forward(selection)
+        fields = [(self.field("qpos"), self._last_qpos), (self.field("qvel"), self._last_qvel)]
+        fields += [(self._fields[name], last) for name, last in self._last_derived.items()]
         with self._launching():
-            mjw.forward(self._model, self._data)
-        for name, old in before.items():
-            now = self.field(name)
-            new = now.clone()
-            now.copy_(old)
-            selection.write(now, new)
+            for now, last in fields:
+                self._launch_rows(kernels.remember, selection.mask, now, last)
 
     def reset(self, selection: Selection) -> None:
         """Put the selected worlds into the default state, applied forces included."""
@@ -236,9 +245,8 @@ class WarpEngine:
                 + [self._arrays[name] for name in ("qacc_warmstart", "ctrl", "act", "time")],
                 device=self._device,
             )
-        for name in _INPUTS:
-            if name in self._fields and name not in ("eq_active", "mocap_pos", "mocap_quat"):
-                selection.write(self._fields[name].view(self.num_envs, -1), 0.0)
+        for name, start in self._start_inputs.items():
+            selection.write(self._fields[name].view(self.num_envs, -1), start)
 
     def set_default(self, qpos: Tensor, qvel: Tensor) -> None:
         """The joint state that `reset` restores."""
@@ -253,6 +261,8 @@ class WarpEngine:
         """Have the device note if a value is not finite; `noted` tells."""
         if what not in self._watched:
             self._watched.append(what)
+            if len(self._watched) > len(self._flags):
+                self._flags = torch.cat([self._flags, torch.zeros_like(self._flags)])
         with self._launching():
             flat = values.view(len(values), -1) if values.is_contiguous() else values.contiguous().view(len(values), -1)
             inputs = [wp.from_torch(flat), wp.from_torch(self._flags), self._watched.index(what)]
@@ -291,6 +301,9 @@ class WarpEngine:
         for name, values in state.items():
             if name.startswith("model."):
                 self.expand(name.removeprefix("model.")).copy_(values)
+        for name in state:
+            if name.startswith("substep."):
+                self.field(name.removeprefix("substep."))  # whoever saved had asked for it; here that may come later
         for name, values in state.items():
             if name in (*_STATE, *_INPUTS):
                 self.field(name).copy_(values)
@@ -301,6 +314,8 @@ class WarpEngine:
         for name, values in state.items():
             if name.startswith("substep."):
                 self.field(name.removeprefix("substep.")).copy_(values)
+        for name, last in self._last_derived.items():
+            last.copy_(self._fields[name])
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """One world as MjModel and MjData, forwarded; asked again for the same world, the same two objects, updated."""
@@ -358,6 +373,33 @@ class WarpEngine:
 
     def _of_substep(self) -> list[str]:
         return [name for name in self._fields if _FORCE in self._stages(name)]
+
+    def _forward(self, selection: Selection) -> None:
+        if _FORCE not in self._derived or not self._forces_after_reset:
+            with self._launching():
+                self._derive()
+            for name in self._of_substep():  # no force has acted on a start state yet
+                columns = self._force_columns if name == "sensordata" else ALL
+                selection.write(self._fields[name].view(self.num_envs, -1), 0.0, columns)
+            return
+        before = self._before_forward()
+        with self._launching():
+            mjw.forward(self._model, self._data)
+        for name, old in before.items():
+            now = self.field(name)
+            new = now.clone()
+            now.copy_(old)
+            selection.write(now, new)
+
+    def _launch_rows(self, kernel: wp.Kernel, mask: Tensor, now: Tensor, last: Tensor) -> None:
+        flat = [wp.from_torch(values.view(self.num_envs, -1)) for values in (now, last)]
+        wp.launch(kernel, dim=flat[0].shape, inputs=[wp.from_torch(mask), *flat], device=self._device)
+
+    def _before_forward(self) -> dict[str, Tensor]:
+        """Copies of what a forward pass would overwrite, and which is the last substep's."""
+        return {
+            name: self._fields[name].clone() for name in (*self._of_substep(), "qacc_warmstart") if name in self._fields
+        }
 
     def _capture(self, nstep: int) -> Any:
         stream = wp.Stream(self._device)  # torch's default stream cannot be recorded
