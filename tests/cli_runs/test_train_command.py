@@ -198,7 +198,7 @@ def test_init_from_another_task_shows_what_differs(cli):
         (("--logger", "tensorbord"), 2),
         (("--device", "cuda:7"), 8),
         (("--device", "tpu"), 2),
-        (("--agent", "sac"), 3),
+        (("--agent", "ddpg"), 3),
         (("--max-iterations", 0), 3),
         (("--max-iterations", "x"), 2),
         (("--seed", -2), 2),
