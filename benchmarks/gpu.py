@@ -17,10 +17,10 @@ import tempfile
 import time
 from pathlib import Path
 
+import mujoco_warp as mjw
 import torch
 import warp as wp
 
-import mujoco_warp as mjw
 from rlcli.config.load import resolve
 from rlcli.envs.vec_env import make_env
 from rlcli.registry import find_task
@@ -70,7 +70,7 @@ def recorded(work):
         work()
         kept = wp.capture_end(stream=on), on
     torch.cuda.synchronize()
-    return lambda kept=kept: graph.replay()
+    return lambda kept=(kept, work): graph.replay()
 
 
 def environment(task, num_envs, **flags):
@@ -78,46 +78,64 @@ def environment(task, num_envs, **flags):
     return make_env(resolved, seed=1, device=DEVICE)
 
 
-def bare(env):
-    """MuJoCo Warp alone: the environment's own model and capacities, random controls, no resets, no tasks."""
+def bare(env, controls):
+    """MuJoCo Warp alone: the environment's own model and room, the controls it was given, no resets, no task.
+
+    Returns:
+        The recorded work, and what puts it into the states that the environment is in now.
+    """
     engine = env.engine
     with wp.ScopedDevice(DEVICE):
         model = mjw.put_model(engine.model)
         model.opt.warn_overflow = 0
         room = engine.capacity
         data = mjw.make_data(engine.model, nworld=env.num_envs, nconmax=room.contacts, njmax=room.constraints)
-    controls = wp.to_torch(data.ctrl)
-    controls.uniform_(-1.0, 1.0)
-    qpos = wp.to_torch(data.qpos)
-    qpos.copy_(engine.field("qpos"))
-    start = qpos.clone()
+    names = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
+    fields = {name: wp.to_torch(getattr(data, name)) for name in names}
+    saved = {name: engine.field(name).clone() for name in names}
 
-    def step():
-        for _ in range(env.config.decimation):
-            mjw.step(model, data)
+    def work():
+        for control in controls:
+            fields["ctrl"].copy_(control)
+            for _ in range(env.config.decimation):
+                mjw.step(model, data)
 
-    return recorded(lambda: [step() for _ in range(STEPS)]), lambda: qpos.copy_(start)
+    def start():
+        for name, value in saved.items():
+            fields[name].copy_(value)
 
-
-def stepping(env):
-    """The environment's step with random actions drawn beforehand, everything on."""
-    actions = torch.rand(STEPS, env.num_envs, env.layout.action_size, device=DEVICE) * 2.0 - 1.0
-    env.reset()
-    return recorded(lambda: [env.step(action) for action in actions])
+    start()
+    return recorded(work), start
 
 
 def measure_env(task, num_envs):
+    """Bare physics and whole steps from the same states under the same actions, in turn."""
     env = environment(task, num_envs)
     env.reset()
-    for _ in range(20):  # a typical mixture of states, for bare physics too
-        env.step(torch.rand(num_envs, env.layout.action_size, device=DEVICE) * 2.0 - 1.0)
-    physics, _ = bare(env)
-    ours = stepping(env)
-    pairs = [(seconds(physics, 1, 4), seconds(ours, 1, 4)) for _ in range(REPEATS)]
+
+    def actions(steps):
+        return torch.rand(steps, num_envs, env.layout.action_size, device=DEVICE) * 2.0 - 1.0
+
+    for action in actions(200):  # episodes of all ages
+        env.step(action)
+    saved, plan = env.state_dict(), actions(STEPS)
+    controls = []
+    for action in plan:
+        env.step(action)
+        controls.append(env.engine.field("ctrl").clone())
+    env.load_state_dict(saved)
+    physics, physics_start = bare(env, controls)
+    whole = recorded(lambda: [env.step(action) for action in plan])
+    pairs = []
+    for _ in range(REPEATS):
+        physics_start()
+        bare_s = seconds(physics, 1)
+        env.load_state_dict(saved)
+        pairs.append((bare_s, seconds(whole, 1)))
     bare_s, ours_s = (statistics.median(column) / STEPS for column in zip(*pairs, strict=True))
     env.check()
-    report(what="env", task=task, num_envs=num_envs, bare_steps_per_s=num_envs / bare_s,
-           steps_per_s=num_envs / ours_s, ratio=bare_s / ours_s, bare_us=bare_s * 1e6, step_us=ours_s * 1e6)  # fmt: skip
+    rates = {"bare_steps_per_s": num_envs / bare_s, "steps_per_s": num_envs / ours_s, "ratio": bare_s / ours_s}
+    report(what="env", task=task, num_envs=num_envs, **rates, bare_us=bare_s * 1e6, step_us=ours_s * 1e6)
     env.close()
 
 
@@ -146,27 +164,40 @@ def measure_train(num_envs, name="all on", task="cartpole", iterations=40, chang
     env.close()
 
 
-def without(*parts):
-    """Switch off what the environment and the trainer do beside learning."""
+def without(part):
+    """Switch off what the environment or the trainer does beside learning."""
 
     def change(trainer):
-        if "statistics" in parts:
+        if part == "statistics":
             trainer.statistics.add = lambda episodes: None
-        if "guard" in parts:
-            trainer.env.engine.diverged = lambda: None
-        if "finite" in parts:
+        elif part == "guard":
+            trainer.env.engine.diverged = lambda: torch.zeros(trainer.env.num_envs, dtype=torch.bool, device=DEVICE)
+        elif part == "finite":
             trainer.env.engine.watch = lambda values, what: None
 
     return change
 
 
-def measure_features(num_envs):
-    measure_train(num_envs, "all on")
-    measure_train(num_envs, "bootstrap from the state before", bootstrap="pre_step")
-    measure_train(num_envs, "constant learning rate", schedule="constant", desired_kl=None)
-    measure_train(num_envs, "no episode statistics", change=without("statistics"))
-    measure_train(num_envs, "no divergence guard", change=without("guard"))
-    measure_train(num_envs, "no finiteness checks", change=without("finite"))
+FEATURES = {
+    "all on": {},
+    "bootstrap from the state before, not from final_obs": {"bootstrap": "pre_step"},
+    "constant learning rate": {"schedule": "constant", "desired_kl": None},
+    "no episode statistics": {"change": without("statistics")},
+    "no divergence guard": {"change": without("guard")},
+    "no finiteness checks": {"change": without("finite")},
+    "observations normalised": {"normalize_observations": True},
+}
+
+
+def alone(what, *arguments):
+    """A measurement in a process of its own, so that none is left with another's memory."""
+    command = [sys.executable, str(HERE / "gpu.py"), "--one", json.dumps([what, *arguments])]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    if done.returncode or not found:
+        report(what="failed", arguments=[what, *arguments], error=done.stderr[-1500:])
+    for row in found:
+        report(**row)
 
 
 def peer(path, *arguments):
@@ -181,7 +212,24 @@ def peer(path, *arguments):
 
 
 def rlcli(*arguments):
-    return subprocess.run([sys.executable, "-m", "rlcli", *arguments], capture_output=True, text=True, check=False)
+    command = ["timeout", "100", sys.executable, "-m", "rlcli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def measure_scaling(num_envs, most):
+    """Weak scaling: as many environments for each GPU, however many there are."""
+    single = None
+    for gpus in [n for n in (1, 2, 4, 8) if n <= most]:
+        with tempfile.TemporaryDirectory() as runs:
+            options = ["--gpus", str(gpus), "--num-envs", str(num_envs), "--runs-dir", runs, "--max-iterations", "120"]
+            done = rlcli("train", "cartpole", *options, "--agent", "ppo", "--logger", "none", "--json")
+            if done.returncode:
+                report(what="scaling failed", gpus=gpus, error=(done.stderr + done.stdout)[-1500:])
+                continue
+            lines = (Path(json.loads(done.stdout)["run"]) / "metrics.jsonl").read_text().splitlines()
+        rate = statistics.median(json.loads(line)["Perf/total_fps"] for line in lines[20:])
+        single = single or rate
+        report(what="scaling", gpus=gpus, num_envs_each=num_envs, steps_per_s=rate, of_linear=rate / (gpus * single))
 
 
 def measure_solve(seeds):
@@ -210,7 +258,13 @@ def main():
     parser.add_argument("--output", type=Path)
     parser.add_argument("--seeds", default="1,2,3")
     parser.add_argument("--num-envs", default=",".join(map(str, ENVS)))
+    parser.add_argument("--one", help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if args.one:
+        _, num_envs, *name = json.loads(args.one)
+        chosen = name[0] if name else "all on"
+        measure_train(num_envs, chosen, **FEATURES[chosen])
+        return
     parts, sizes = args.only.split(","), [int(n) for n in args.num_envs.split(",")]
     seeds = [int(s) for s in args.seeds.split(",")]
     versions = {"torch": torch.__version__, "warp": wp.__version__, "mujoco_warp": mjw.__version__}
@@ -225,11 +279,15 @@ def main():
             measure_env("ant-direct", 4096)
         if "train" in parts:
             for n in sizes:
-                measure_train(n)
+                alone("train-one", n)
             if args.peer_path:
                 peer(args.peer_path, "train", "--num-envs", *sizes)
+                peer(args.peer_path, "train", "--num-envs", *sizes, "--logs")
         if "features" in parts:
-            measure_features(sizes[0])
+            for name in FEATURES:
+                alone("train-one", sizes[0], name)
+        if "scaling" in parts:
+            measure_scaling(sizes[-1], torch.cuda.device_count())
         if "solve" in parts:
             measure_solve(seeds)
             if args.peer_path:

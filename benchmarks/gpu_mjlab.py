@@ -13,7 +13,8 @@ rsl_rl say goes to stderr.
 mjlab is set up as its own cartpole is: its terms where it has them, CUDA graphs on, contacts off, no terrain, no
 sensors, its torch settings (TF32), episodes begun at random ages. Where there was a choice, it is the faster one: room
 for the model's one constraint, one observation group for actor and critic, and rsl_rl's log writer, episode sums and
-checkpoints off. rsl_rl's check for NaN is on, as it is by default. `gpu_mdp_check.py` shows that the task is ours.
+checkpoints off (`--logs` turns the first two on). rsl_rl's check for NaN is on, as it is by default.
+`gpu_mdp_check.py` shows that the task is ours.
 """
 
 from __future__ import annotations
@@ -28,11 +29,13 @@ import os
 import platform
 import statistics
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from importlib import metadata
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -171,11 +174,15 @@ def make_env(num_envs: int, device: str, seed: int | None = None, endless: bool 
 
 
 def make_runner(env: Any, options: argparse.Namespace) -> Any:
-    """rsl_rl's runner as mjlab's `train` makes it, without a log folder."""
+    """rsl_rl's runner as mjlab's `train` makes it, without a log folder unless it is asked for."""
     from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 
-    cfg = {**asdict(ppo_cfg(options.seed)), "torch_compile_mode": options.torch_compile}
-    return MjlabOnPolicyRunner(RslRlVecEnvWrapper(env), cfg, None, options.device)
+    cfg = {**asdict(ppo_cfg(options.seed)), "torch_compile_mode": options.torch_compile, "logger": "tensorboard"}
+    folder = tempfile.mkdtemp() if getattr(options, "logs", False) else None
+    runner = MjlabOnPolicyRunner(RslRlVecEnvWrapper(env), cfg, folder, options.device)
+    runner.logger.git_status_repos = []
+    runner.save = lambda *given, **named: None  # its checkpoints do not count against it
+    return runner
 
 
 # The measurements: one row each.
@@ -229,19 +236,33 @@ def train(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
     environment = make_env(num_envs, options.device, options.seed)
     runner = make_runner(environment, options)
     times: list[tuple[float, float]] = []
-    runner.logger.log = lambda **report: times.append((report["collect_time"], report["learn_time"]))
+    ends: list[float] = []
+    write = runner.logger.log
+
+    def log(**report: Any) -> None:
+        times.append((report["collect_time"], report["learn_time"]))
+        if options.logs:
+            write(**report)
+        ends.append(time.perf_counter())
+
+    runner.logger.log = log
     runner.learn(options.warm_up, init_at_random_ep_len=True)
     _synchronize(options.device)
     ready = time.perf_counter() - begin
     times.clear()
+    ends.clear()
     runner.learn(options.iterations)
-    rates = [STEPS_PER_ENV * num_envs / (collect + learn) for collect, learn in times]
+    whole = [collect + learn for collect, learn in times]
+    if options.logs:  # what writing the logs takes counts too
+        whole = [after - before for before, after in pairwise(ends)]
+    rates = [STEPS_PER_ENV * num_envs / seconds for seconds in whole]
     return {
         "num_envs": num_envs,
         "env_steps_per_s": statistics.median(rates),
         "env_steps_per_s_min": min(rates),
         "env_steps_per_s_max": max(rates),
-        "iteration_s": statistics.median(collect + learn for collect, learn in times),
+        "iteration_s": statistics.median(whole),
+        "logs": options.logs,
         "collection_s": statistics.median(collect for collect, _ in times),
         "learning_s": statistics.median(learn for _, learn in times),
         "iterations": len(times),
@@ -412,6 +433,7 @@ def _options() -> argparse.Namespace:
     solving.add_argument("--episodes", type=int, default=1024, help="of an evaluation, all at once")
     solving.add_argument("--success", type=float, default=0.99)
     solving.add_argument("--started", type=float, help="Unix time to count from; default: when the process was created")
+    training.add_argument("--logs", action="store_true", help="write rsl_rl's logs, and count the time it takes")
     for trainer in (training, solving):
         trainer.add_argument("--torch-compile", metavar="MODE", help="rsl_rl's torch_compile_mode; mjlab leaves it off")
     tracing = command(trace)

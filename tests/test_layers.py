@@ -138,3 +138,15 @@ def test_importing_the_package_imports_nothing_else():
     program = "import sys; before = set(sys.modules); import rlcli; print(sorted(set(sys.modules) - before))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "['rlcli']"
+
+
+def test_training_on_the_cpu_loads_nothing_of_the_gpu_engine(tmp_path):
+    words = ["train", "cartpole", "--agent", "ppo", "--device", "cpu", "--num-envs", "4", "--max-iterations", "1"]
+    words += ["--logger", "none", "-q", "--runs-dir", str(tmp_path)]
+    program = (
+        f"import sys; from rlcli.cli.app import main; code = main({words!r}); "
+        "gpu = {'warp', 'mujoco_warp', 'rlcli.sim.warp', 'rlcli.sim.mask', 'rlcli.sim.kernels'}; "
+        "print(code, 'torch' in sys.modules, sorted(gpu & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "0 True []", done.stderr

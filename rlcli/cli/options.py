@@ -62,22 +62,20 @@ def choose_device(wanted: str) -> str:
         DependencyError: for a GPU without rlcli[gpu].
     """
     from importlib.util import find_spec
+    from re import fullmatch
 
-    from rlcli.errors import DependencyError, DeviceError, UsageError
+    from rlcli.errors import DependencyError, UsageError
+    from rlcli.machine import require_device
 
     if wanted == "cpu" or (wanted == "auto" and not _may_have_gpu()):
         return "cpu"
-    kind, _, index = "cuda:".partition(":") if wanted == "auto" else wanted.partition(":")
-    if kind != "cuda" or (index and not index.isdigit()):
-        raise UsageError(f"no device '{wanted}'", hint="auto, cpu, cuda or cuda:N")
-    import torch
-
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if wanted == "auto":
-        return "cuda" if count and find_spec("mujoco_warp") else "cpu"
-    if not count or int(index or 0) >= count:
-        found = f"torch {torch.__version__} sees {f'{count} CUDA devices' if count else 'no CUDA device'}"
-        raise DeviceError(f"device '{wanted}' is not available: {found}", hint="--device cpu")
+        import torch
+
+        return "cuda" if torch.cuda.is_available() and find_spec("mujoco_warp") else "cpu"
+    if not fullmatch(r"cuda(:[0-9]+)?", wanted):
+        raise UsageError(f"no device '{wanted}'", hint="auto, cpu, cuda or cuda:N")
+    require_device(wanted)
     if find_spec("mujoco_warp") is None:
         raise DependencyError("the GPU engine needs mujoco-warp", hint='pip install "rlcli[gpu]"')
     return wanted

@@ -160,6 +160,9 @@ class SimConfig(StrictModel):
     """What steps the worlds: auto is batch (MuJoCo's threads) on a CPU and warp (MuJoCo Warp) on a GPU."""
     engine_threads: Count | None = None
     """Threads that step physics; null is every core this process may use."""
+    forces_after_reset: bool = True
+    """Compute accelerations and forces of a start state; false: they are 0 until an episode's first step, which saves
+    a GPU that reads them a forward pass over all environments a step."""
     contacts_per_env: Count | None = None
     """Room for contacts that warp sets aside, an environment; null estimates it from the model."""
     constraints_per_env: Count | None = None

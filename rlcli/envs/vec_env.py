@@ -20,6 +20,7 @@ from torch import Tensor
 from rlcli.config.load import Resolved
 from rlcli.config.schema import InitialStateConfig
 from rlcli.errors import DivergedError
+from rlcli.machine import require_device
 from rlcli.managers.term import Binder
 from rlcli.sim.engine import open_engine
 from rlcli.sim.entity import Entity, SimData, is_finite
@@ -159,9 +160,11 @@ class VecEnv(ABC):
 
     Raises:
         ConfigError: with everything that does not fit the compiled model.
+        DeviceError: for a device that is not there.
     """
 
     def __init__(self, resolved: Resolved, *, seed: int = 42, device: str = "cpu") -> None:
+        require_device(device)
         self.config = resolved.task
         self.resolved = resolved
         self.seed = seed

@@ -7,9 +7,10 @@ they were at the end of the recording; everything else that cannot be recorded i
 
 from __future__ import annotations
 
+import contextlib
 import traceback
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import torch
@@ -33,11 +34,34 @@ def captured(work: Work, device: torch.device, holders: Iterable[Any] = (), tell
     return Recording(work, device, list(holders), tell) if device.type == "cuda" else work
 
 
+class Beside:
+    """Work that a GPU may do at the same time as what follows, until `join`; a CPU does it in turn."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+
+    @contextlib.contextmanager
+    def __call__(self) -> Iterator[None]:
+        """What is launched inside needs what was launched before, and nothing that comes after."""
+        if self._stream is None:
+            yield
+            return
+        self._stream.wait_stream(torch.cuda.current_stream(self._stream.device))
+        with torch.cuda.stream(self._stream):
+            yield
+
+    def join(self) -> None:
+        """What comes after needs it."""
+        if self._stream is not None:
+            torch.cuda.current_stream(self._stream.device).wait_stream(self._stream)
+
+
 class Recording:
     """Runs the work once as it is, records it at the second call, and replays it from then on."""
 
     def __init__(self, work: Work, device: torch.device, holders: list[Any], tell: Tell) -> None:
-        self._work, self._device, self._holders, self._tell = work, device, holders, tell
+        self._work, self._holders, self._tell = work, holders, tell
+        self._device = torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
         self._graph: torch.cuda.CUDAGraph | None = None
         self._kept: Any = None  # what Warp allocated while recording lives as long as this
         self._runs = 0
@@ -67,7 +91,7 @@ class Recording:
                 self._work()
             finally:
                 torch.cuda.set_sync_debug_mode(before)
-        waits = [w for w in caught if "synchroniz" in str(w.message)]
+        waits = [w for w in caught if "synchronizing CUDA operation" in str(w.message)]
         if waits:
             where = sorted({f"{w.filename}:{w.lineno}" for w in waits})
             self._refuse(f"{where[0]} waits for the GPU{f' (and {len(where) - 1} more places)' if where[1:] else ''}")

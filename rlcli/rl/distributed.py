@@ -147,9 +147,12 @@ def leave() -> None:
     """Part from the other processes."""
     global _peers
     if _peers.size > 1:
+        import gc
+
         import torch.distributed as dist
 
         _peers = Peers()
+        gc.collect()  # NCCL waits for ever while a recorded graph uses it
         with contextlib.suppress(RuntimeError):
             dist.destroy_process_group()
 

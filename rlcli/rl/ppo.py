@@ -19,7 +19,7 @@ from rlcli.envs.vec_env import StepResult, VecEnv
 from rlcli.errors import DivergedError
 from rlcli.random import derive
 from rlcli.rl import distributed
-from rlcli.rl.capture import captured
+from rlcli.rl.capture import Beside, captured
 from rlcli.rl.networks import ActorCritic, ValueNormalizer, adam, flatten, remembered
 from rlcli.rl.policy import Lstm, Normalizer, Policy
 from rlcli.rl.ppo_config import PpoConfig
@@ -92,6 +92,7 @@ class PpoTrainer:
         self._metrics = torch.zeros(len(_METRICS) + 4, device=self.device)
         self._recorded = torch.zeros(0, obs_size, device=self.device)
         self._notes: list[str] = []
+        self._beside = Beside(self.device)
         self._collect = captured(self._roll_out, self.device, env.holders(), self._notes.append)
         self._learn = captured(self._update, self.device, tell=self._notes.append)
 
@@ -196,14 +197,11 @@ class PpoTrainer:
         value, next_value, beyond = self._values() if self.networks.memory is None else self._remembered_values()
         if config.bootstrap == "pre_step":
             beyond = value * rollout.cut
-        reward = rollout.reward + config.gamma * beyond
-        advantage = torch.zeros_like(next_value)
+        reward, alive = rollout.reward + config.gamma * beyond, 1.0 - rollout.ended
+        delta = reward + config.gamma * torch.cat([value[1:], next_value[None]]) * alive - value
+        fading, advantage = config.gamma * config.lam * alive, torch.zeros_like(next_value)
         for t in reversed(range(config.num_steps)):
-            alive = 1.0 - rollout.ended[t]
-            delta = reward[t] + config.gamma * next_value * alive - value[t]
-            advantage = delta + config.gamma * config.lam * alive * advantage
-            samples.advantage[t].copy_(advantage)
-            next_value = value[t]
+            advantage = torch.addcmul(delta[t], fading[t], advantage, out=samples.advantage[t])
         samples.value.copy_(value)
         torch.add(samples.advantage, value, out=samples.target)
         self._explain(value)
@@ -285,8 +283,9 @@ class PpoTrainer:
         """One step of Adam down the clipped surrogate objective."""
         config, networks, old_std = self.config, self.networks, self._old_std[number]
         obs, critic_obs = self._inputs(batch, number)
-        std, mean, value = networks.std, networks.actor(obs), networks.value(critic_obs)
-        advantage = batch.advantage
+        with self._beside():
+            value_loss = self._value_loss(networks.value(critic_obs), batch)
+        std, mean, advantage = networks.std, networks.actor(obs), batch.advantage
         if config.normalize_advantage == "minibatch":
             advantage = self._standardized(advantage)
 
@@ -294,8 +293,8 @@ class PpoTrainer:
         ratio = log_ratio.exp()
         clipped = ratio.clamp(1.0 - config.clip_range, 1.0 + config.clip_range)
         surrogate = -torch.min(advantage * ratio, advantage * clipped).mean()
-        value_loss = self._value_loss(value, batch)
         entropy = (std.log() + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
+        self._beside.join()
         loss = surrogate + config.value_coef * value_loss - config.entropy_coef * entropy
         if config.bounds_coef:
             bounds = (mean.abs() - config.bounds_margin).clamp(min=0.0).square().sum(dim=-1).mean()
@@ -303,15 +302,16 @@ class PpoTrainer:
         else:
             bounds = torch.zeros_like(loss)
 
-        with torch.no_grad():
-            acted = config.kl_from == "rollout"
+        acted = config.kl_from == "rollout"
+        with torch.no_grad(), self._beside():
             old, new = (batch.mean, old_std), (mean, std)
             kl = _divergence(*old, *new) if acted else _divergence(*new, *old, eps=1e-5)
             clip_fraction = ((ratio - 1.0).abs() > config.clip_range).float().mean()
             self._sums += torch.stack((surrogate, value_loss, entropy, kl, clip_fraction, bounds))
+            self._shared_kl.copy_(kl)
         self._gradient.zero_()
         loss.backward()
-        self._shared_kl.copy_(kl)
+        self._beside.join()
         self.peers.average_(self._shared)
         self._kl += self._shared_kl
         if acted:

@@ -12,7 +12,7 @@ from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
 from torch import Tensor
 
 from rlcli.errors import DivergedError, did_you_mean
-from rlcli.sim.engine import quiet_mujoco
+from rlcli.sim.engine import force_sensors, quiet_mujoco
 from rlcli.sim.selection import IdSelection, Selection
 
 _STATE = mujoco.mjtState
@@ -51,7 +51,7 @@ class BatchEngine:
 
     asynchronous = False
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, threads: int) -> None:
+    def __init__(self, model: mujoco.MjModel, num_envs: int, threads: int, forces_after_reset: bool = True) -> None:
         quiet_mujoco()
         self.model = model
         self.num_envs = num_envs
@@ -68,6 +68,8 @@ class BatchEngine:
         self._step_stage = _NONE
         self._forward_stage = _NONE
         self._own_constants = False
+        self._reset_stage = _ACC if forces_after_reset else _VEL
+        self._force_sensors = force_sensors(model)
 
     def attach(self) -> None:
         """Nothing to do: calls return when their work is done."""
@@ -139,9 +141,19 @@ class BatchEngine:
         if self._forward_stage == _NONE:
             return
         try:
-            self._batch.forward(_ids(selection).astype(np.int32), stage=self._forward_stage)
+            self._batch.forward(_ids(selection).astype(np.int32), stage=min(self._forward_stage, self._reset_stage))
         except SimulationError as error:
             raise _engine_error(error) from None
+        if self._reset_stage < self._forward_stage:
+            self._clear_forces(selection)
+
+    def _clear_forces(self, selection: Selection) -> None:
+        """No force has acted on a start state yet."""
+        for name, field in self._fields.items():
+            if name in _ACCELERATION:
+                field[_ids(selection)] = 0.0
+            elif self._senses(name):
+                field[_ids(selection)[:, None], self._force_sensors] = 0.0
 
     def reset(self, selection: Selection) -> None:
         """Put the selected worlds into the default state: the whole row, controls and warm start included."""
@@ -220,13 +232,11 @@ class BatchEngine:
 
     def _senses(self, name: str) -> bool:
         """Whether the field holds sensors of the acceleration stage."""
-        stages = self.model.sensor_needstage
-        return name == "sensordata" and bool((stages == int(mujoco.mjtStage.mjSTAGE_ACC)).any())
+        return name == "sensordata" and bool(self._force_sensors)
 
     def _senses_forces_alone(self, name: str) -> bool:
         """Whether the field holds sensors of the acceleration stage and no others: no other stage writes it."""
-        stages = self.model.sensor_needstage
-        return name == "sensordata" and bool((stages == int(mujoco.mjtStage.mjSTAGE_ACC)).all())
+        return name == "sensordata" and len(self._force_sensors) == self.model.nsensordata
 
     def _of_substep(self, name: str) -> bool:
         return name in _ACCELERATION or self._senses(name)

@@ -55,7 +55,7 @@ def _bound(model: mujoco.MjModel) -> tuple[int, int]:
     contacts = rows = 0
     for a, b in _pairs(model):
         kinds = tuple(sorted((_G(model.geom_type[a]), _G(model.geom_type[b])), key=int))
-        points = _POINTS.get(kinds, _MANY)  # type: ignore[arg-type]
+        points = _POINTS.get(kinds, _MANY)
         condim = int(max(model.geom_condim[a], model.geom_condim[b]))
         contacts += points
         rows += points * _contact_rows(model, condim)

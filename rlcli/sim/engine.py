@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DependencyError, Problem
-from rlcli.machine import available_cores
+from rlcli.machine import available_cores, require_device
 from rlcli.sim.capacity import capacity
 from rlcli.sim.selection import Selection
 
@@ -115,9 +115,9 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
     Raises:
         DependencyError: if the GPU engine is not installed.
         ConfigError: for a model that the engine cannot run.
-        DeviceError: for more worlds than the device's memory holds.
+        DeviceError: for a device that is not there, or more worlds than its memory holds.
     """
-    on_cpu = torch.device(device).type == "cpu"
+    on_cpu = device.partition(":")[0] == "cpu"
     wanted = config.engine if config.engine != "auto" else "batch" if on_cpu else "warp"
     if wanted == "batch" and not on_cpu:
         message = f"sim.engine 'batch' runs on a CPU, not on '{device}'"
@@ -125,12 +125,21 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
     if wanted == "batch":
         from rlcli.sim.batch import BatchEngine
 
-        return BatchEngine(model, num_envs, config.engine_threads or available_cores())
+        return BatchEngine(model, num_envs, config.engine_threads or available_cores(), config.forces_after_reset)
+    require_device(device)
     try:
         from rlcli.sim.warp import WarpEngine
     except ImportError as error:
         raise DependencyError(f"the GPU engine needs mujoco-warp: {error}", hint='pip install "rlcli[gpu]"') from None
-    return WarpEngine(model, num_envs, device, capacity(model, config.contacts_per_env, config.constraints_per_env))
+    room = capacity(model, config.contacts_per_env, config.constraints_per_env)
+    return WarpEngine(model, num_envs, device, room, config.forces_after_reset)
+
+
+def force_sensors(model: mujoco.MjModel) -> list[int]:
+    """Columns of `sensordata` that belong to the acceleration stage."""
+    acceleration = int(mujoco.mjtStage.mjSTAGE_ACC)
+    sensors = [s for s in range(model.nsensor) if int(model.sensor_needstage[s]) == acceleration]
+    return [int(model.sensor_adr[s]) + i for s in sensors for i in range(int(model.sensor_dim[s]))]
 
 
 def quiet_mujoco() -> None:

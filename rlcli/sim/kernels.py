@@ -111,6 +111,24 @@ def guard(
 
 
 @wp.kernel
+def hold(diverged: wp.array(dtype=wp.bool), now: wp.array2d(dtype=float), last: wp.array2d(dtype=float)):
+    """Put the rows of diverged worlds back to their last values; the others' are the last ones from now on."""
+    world, column = wp.tid()
+    if diverged[world]:
+        now[world, column] = last[world, column]
+    else:
+        last[world, column] = now[world, column]
+
+
+@wp.kernel
+def remember(mask: wp.array(dtype=wp.bool), now: wp.array2d(dtype=float), last: wp.array2d(dtype=float)):
+    """The masked rows are the last ones from now on."""
+    world, column = wp.tid()
+    if mask[world]:
+        last[world, column] = now[world, column]
+
+
+@wp.kernel
 def reset(
     mask: wp.array(dtype=wp.bool),
     default_qpos: wp.array(dtype=float),

@@ -31,8 +31,10 @@ class MaskSelection:
 
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Uniform in [low, high). (num_envs, *shape)"""
-        if isinstance(low, Tensor) or isinstance(high, Tensor):
-            return torch.addcmul(low, self._uniform(0.0, 1.0, shape), high - low)  # type: ignore[arg-type]
+        if isinstance(low, Tensor):
+            return torch.addcmul(low, self._uniform(0.0, 1.0, shape), high - low)
+        if isinstance(high, Tensor):
+            return self._uniform(0.0, 1.0, shape).mul_(high - low).add_(low)
         return self._uniform(low, high, shape)
 
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:

@@ -23,14 +23,15 @@ from torch import Tensor
 from rlcli.errors import ConfigError, DeviceError, DivergedError, Problem, did_you_mean
 from rlcli.sim import kernels
 from rlcli.sim.capacity import Capacity
-from rlcli.sim.engine import quiet_mujoco
+from rlcli.sim.engine import force_sensors, quiet_mujoco
+from rlcli.sim.entity import as_index
 from rlcli.sim.mask import MaskSelection
-from rlcli.sim.selection import Selection
+from rlcli.sim.selection import ALL, Selection
 
 _STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
 """What every world carries from step to step, and every reset restores."""
 _INPUTS = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
-"""Further state, zero unless somebody binds it."""
+"""Further state, as the model has it unless somebody binds it."""
 _KINEMATIC = frozenset(
     [
         *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos"),
@@ -45,7 +46,8 @@ _ACCELERATION = frozenset(
     ]
 )
 """Fields of the acceleration stage: read as the last substep left them."""
-_NONE, _POS, _VEL, _ACC = range(4)
+_KINEMATICS, _VELOCITY, _FORCE = range(3)
+"""Groups of derived fields."""
 _FULL = {
     mjw.OverflowType.NEFC: "constraints_per_env",
     mjw.OverflowType.NJMAX_NNZ: "constraints_per_env",
@@ -71,6 +73,7 @@ class WarpEngine:
         num_envs: worlds.
         device: cuda, cuda:N, or cpu.
         capacity: room for contacts and constraints in a world.
+        forces_after_reset: whether `forward` computes the acceleration stage, or leaves zeros there.
 
     Raises:
         ConfigError: for a model that MuJoCo Warp cannot run.
@@ -80,7 +83,14 @@ class WarpEngine:
     threads = 1
     asynchronous = True
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, device: str, capacity: Capacity) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        device: str,
+        capacity: Capacity,
+        forces_after_reset: bool = True,
+    ) -> None:
         quiet_mujoco()
         self.model = model
         self.num_envs = num_envs
@@ -92,14 +102,22 @@ class WarpEngine:
         self._device = wp.device_from_torch(self.device)
         self._fields: dict[str, Tensor] = {}
         self._watched: list[str] = []
-        self._stage = _NONE
+        self._start_inputs: dict[str, Tensor] = {}
+        self._last_derived: dict[str, Tensor] = {}
+        self._derived: set[int] = set()
+        self._forces_after_reset = forces_after_reset
+        force_columns = force_sensors(model)
+        self._sensor_stages = {_FORCE} if force_columns else set()
+        if len(force_columns) < model.nsensordata:
+            self._sensor_stages.add(_VELOCITY)
+        self._force_columns = as_index(force_columns, self.device)
         self._expanded: dict[str, Tensor] = {}
         self._graphs: dict[int, Any] = {}
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         with wp.ScopedDevice(self._device), _on_torch_stream(self.device):
             self._model, self._data = self._put(model, capacity)
             self._arrays = {name: getattr(self._data, name) for name in _STATE}
-            qpos, qvel = self.field("qpos"), self.field("qvel")
+            qpos, qvel, _ = (self.field(name) for name in ("qpos", "qvel", "qacc_warmstart"))
             self._last_qpos, self._last_qvel = qpos.clone(), qvel.clone()
             self._default_qpos = torch.tensor(model.qpos0, dtype=torch.float32, device=self.device)
             self._default_qvel = torch.zeros(model.nv, device=self.device)
@@ -126,14 +144,19 @@ class WarpEngine:
             if not isinstance(array, wp.array) or array.ndim == 0 or array.shape[0] != self.num_envs:
                 known = [f.name for f in dataclasses.fields(self._data)]
                 raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {did_you_mean(name, known) or ''}")
+            kept = self._before_forward()
             self._fields[name] = wp.to_torch(array)
-            if name in _KINEMATIC:
-                self._stage = max(self._stage, _POS)
-            elif name in _ACCELERATION:
-                self._stage = max(self._stage, _ACC)
-            elif name not in (*_STATE, *_INPUTS):
-                self._stage = max(self._stage, _ACC if self._senses(name) else _VEL)
+            if name in _INPUTS:  # nobody has written to it yet
+                self._start_inputs[name] = self._fields[name].view(self.num_envs, -1).clone()
+            self._derived |= self._stages(name)
             self._graphs.clear()
+            if self._stages(name):
+                with self._launching():
+                    mjw.forward(self._model, self._data)  # a field asked for late is that of the state
+                for other, values in kept.items():
+                    self._fields[other].copy_(values)
+                if self._fields[name].dtype == torch.float32:
+                    self._last_derived[name] = self._fields[name].clone()
         return self._fields[name]
 
     def expand(self, name: str) -> Tensor:
@@ -172,7 +195,10 @@ class WarpEngine:
                 self._graphs[nstep] = self._capture(nstep)
 
     def diverged(self) -> Tensor:
-        """Worlds that the last step drove out of bounds; they are back in the state before it, at rest. (num_envs,)"""
+        """Worlds that the last step drove out of bounds; they are back in the state before it, at rest. (num_envs,)
+
+        What is bound of the derived fields is that of the state before, too: terms judge by it.
+        """
         with self._launching():
             wp.launch(
                 kernels.guard,
@@ -186,24 +212,22 @@ class WarpEngine:
                 ],
                 device=self._device,
             )
+            for name, last in self._last_derived.items():
+                self._launch_rows(kernels.hold, self._diverged, self._fields[name], last)
         return self._diverged
 
     def forward(self, selection: Selection) -> None:
-        """Compute what is bound of the derived fields; of the acceleration stage for the selected worlds only."""
-        if self._stage == _NONE:
-            return
+        """Compute what is bound of the derived fields; of the acceleration stage for the selected worlds only.
+
+        What a selected world is now is what it goes back to if it diverges.
+        """
+        assert isinstance(selection, MaskSelection)
+        self._forward(selection)
+        fields = [(self.field("qpos"), self._last_qpos), (self.field("qvel"), self._last_qvel)]
+        fields += [(self._fields[name], last) for name, last in self._last_derived.items()]
         with self._launching():
-            if self._stage < _ACC:
-                self._derive()
-                return
-            names = [name for name in self._fields if name in _ACCELERATION or self._senses(name)]
-            kept = {name: self.field(name).clone() for name in [*names, "qacc_warmstart"]}
-            mjw.forward(self._model, self._data)
-            for name, before in kept.items():
-                now = self.field(name)
-                after = now.clone()
-                now.copy_(before)
-                selection.write(now, after)
+            for now, last in fields:
+                self._launch_rows(kernels.remember, selection.mask, now, last)
 
     def reset(self, selection: Selection) -> None:
         """Put the selected worlds into the default state, applied forces included."""
@@ -221,9 +245,8 @@ class WarpEngine:
                 + [self._arrays[name] for name in ("qacc_warmstart", "ctrl", "act", "time")],
                 device=self._device,
             )
-        for name in _INPUTS:
-            if name in self._fields and name not in ("eq_active", "mocap_pos", "mocap_quat"):
-                selection.write(self._fields[name].view(self.num_envs, -1), 0.0)
+        for name, start in self._start_inputs.items():
+            selection.write(self._fields[name].view(self.num_envs, -1), start)
 
     def set_default(self, qpos: Tensor, qvel: Tensor) -> None:
         """The joint state that `reset` restores."""
@@ -238,6 +261,8 @@ class WarpEngine:
         """Have the device note if a value is not finite; `noted` tells."""
         if what not in self._watched:
             self._watched.append(what)
+            if len(self._watched) > len(self._flags):
+                self._flags = torch.cat([self._flags, torch.zeros_like(self._flags)])
         with self._launching():
             flat = values.view(len(values), -1) if values.is_contiguous() else values.contiguous().view(len(values), -1)
             inputs = [wp.from_torch(flat), wp.from_torch(self._flags), self._watched.index(what)]
@@ -263,13 +288,12 @@ class WarpEngine:
     def state_dict(self) -> dict[str, Tensor]:
         """Copies of the state, of bound inputs and of the model fields that differ between worlds."""
         inputs = [name for name in _INPUTS if name in self._fields]
-        substep = [name for name in self._fields if name in _ACCELERATION or self._senses(name)]
         return {
             **{name: self.field(name).clone() for name in (*_STATE, *inputs)},
             "last_qpos": self._last_qpos.clone(),
             "last_qvel": self._last_qvel.clone(),
             **{f"model.{name}": values.clone() for name, values in self._expanded.items()},
-            **{f"substep.{name}": self.field(name).clone() for name in substep},
+            **{f"substep.{name}": self.field(name).clone() for name in self._of_substep()},
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
@@ -277,17 +301,21 @@ class WarpEngine:
         for name, values in state.items():
             if name.startswith("model."):
                 self.expand(name.removeprefix("model.")).copy_(values)
+        for name in state:
+            if name.startswith("substep."):
+                self.field(name.removeprefix("substep."))  # whoever saved had asked for it; here that may come later
         for name, values in state.items():
             if name in (*_STATE, *_INPUTS):
                 self.field(name).copy_(values)
         self._last_qpos.copy_(state["last_qpos"])
         self._last_qvel.copy_(state["last_qvel"])
-        if self._stage != _NONE:
-            with self._launching():
-                self._derive()
+        with self._launching():
+            self._derive()
         for name, values in state.items():
             if name.startswith("substep."):
                 self.field(name.removeprefix("substep.")).copy_(values)
+        for name, last in self._last_derived.items():
+            last.copy_(self._fields[name])
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """One world as MjModel and MjData, forwarded; asked again for the same world, the same two objects, updated."""
@@ -324,27 +352,54 @@ class WarpEngine:
         self._derive()
 
     def _derive(self) -> None:
-        """Bring the derived fields that somebody reads up to the state."""
+        """Bring the derived fields that somebody reads up to the state; those of forces are the last substep's."""
         m, d = self._model, self._data
-        if self._stage == _POS:
-            mjw.fwd_kinematics(m, d)
-        elif self._stage in (_VEL, _ACC) and self._reads_velocity():
+        if _VELOCITY in self._derived:
             mjw.fwd_position(m, d, factorize=False)
             mjw.fwd_velocity(m, d)
             if "sensordata" in self._fields:
                 mjw.sensor_pos(m, d)
                 mjw.sensor_vel(m, d)
-        elif self._stage == _ACC and any(name in _KINEMATIC for name in self._fields):
+        elif _KINEMATICS in self._derived:
             mjw.fwd_kinematics(m, d)
 
-    def _reads_velocity(self) -> bool:
-        plain = {*_STATE, *_INPUTS, *_KINEMATIC, *_ACCELERATION}
-        return any(name not in plain for name in self._fields)
+    def _stages(self, name: str) -> set[int]:
+        """What a field derives from."""
+        if name in (*_STATE, *_INPUTS):
+            return set()
+        if name == "sensordata":
+            return self._sensor_stages
+        return {_KINEMATICS if name in _KINEMATIC else _FORCE if name in _ACCELERATION else _VELOCITY}
 
-    def _senses(self, name: str) -> bool:
-        """Whether the field holds sensors of the acceleration stage."""
-        stages = self.model.sensor_needstage
-        return name == "sensordata" and bool((stages == int(mujoco.mjtStage.mjSTAGE_ACC)).any())
+    def _of_substep(self) -> list[str]:
+        return [name for name in self._fields if _FORCE in self._stages(name)]
+
+    def _forward(self, selection: Selection) -> None:
+        if _FORCE not in self._derived or not self._forces_after_reset:
+            with self._launching():
+                self._derive()
+            for name in self._of_substep():  # no force has acted on a start state yet
+                columns = self._force_columns if name == "sensordata" else ALL
+                selection.write(self._fields[name].view(self.num_envs, -1), 0.0, columns)
+            return
+        before = self._before_forward()
+        with self._launching():
+            mjw.forward(self._model, self._data)
+        for name, old in before.items():
+            now = self.field(name)
+            new = now.clone()
+            now.copy_(old)
+            selection.write(now, new)
+
+    def _launch_rows(self, kernel: wp.Kernel, mask: Tensor, now: Tensor, last: Tensor) -> None:
+        flat = [wp.from_torch(values.view(self.num_envs, -1)) for values in (now, last)]
+        wp.launch(kernel, dim=flat[0].shape, inputs=[wp.from_torch(mask), *flat], device=self._device)
+
+    def _before_forward(self) -> dict[str, Tensor]:
+        """Copies of what a forward pass would overwrite, and which is the last substep's."""
+        return {
+            name: self._fields[name].clone() for name in (*self._of_substep(), "qacc_warmstart") if name in self._fields
+        }
 
     def _capture(self, nstep: int) -> Any:
         stream = wp.Stream(self._device)  # torch's default stream cannot be recorded
@@ -408,8 +463,7 @@ def _on_torch_stream(device: torch.device) -> Any:
 
 
 def _is_batched(kind: Any) -> bool:
-    shape = getattr(kind, "shape", ())
-    return bool(shape) and shape[0] == "*"
+    return next(iter(getattr(kind, "shape", ())), None) == "*"
 
 
 def _bytes(value: Any) -> int:

@@ -57,6 +57,8 @@ def test_no_command_shows_the_help_on_stderr(in_process):
         (["train", "cartpole", "--num-envs"], "requires an argument"),
         (["train"], "which task?"),
         (["train", "cartpole", "--device", "gpu"], "no device 'gpu'"),
+        (["train", "cartpole", "--device", "cuda:"], "no device 'cuda:'"),
+        (["train", "cartpole", "--device", "cuda:one"], "no device 'cuda:one'"),
         (["play", "cartpole", "--policy", "traned"], "did you mean 'trained'"),
     ],
 )

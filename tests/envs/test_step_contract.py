@@ -6,6 +6,11 @@ import pytest
 import torch
 from worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, edited, pendulum, run
 
+from rlcli.config.load import resolve
+from rlcli.envs.vec_env import make_env
+from rlcli.errors import DeviceError
+from rlcli.registry import find_task
+
 TERMS = '''
 import torch
 
@@ -349,3 +354,9 @@ def test_success_needs_the_condition_held_to_a_time_out(tmp_path):
             env.engine.field("qpos")[i, 0] = angle
         result = env.step(idle(env))
     assert result.episodes.success.tolist() == [True, True, False, False]
+
+
+def test_an_environment_on_a_device_that_is_not_there_is_refused(tmp_path):
+    resolved = resolve(find_task(str(pendulum(tmp_path))))
+    with pytest.raises(DeviceError, match="device 'cuda:99' is not available"):
+        make_env(resolved, device="cuda:99")

@@ -1,4 +1,4 @@
-"""What the agents of the built-in tasks learn, in about half of their own budget."""
+"""What the off-policy agents of the built-in tasks learn in the budget that they come with."""
 
 import pytest
 import torch
@@ -14,12 +14,8 @@ def _threads_as_before():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("task", "agent", "iterations"),
-    [("cartpole", "sac", 700), ("cartpole", "td3", 900), ("cartpole-direct", "sac", 500)],
-)
-def test_an_off_policy_agent_learns_its_task(task, agent, iterations, tmp_path):
+@pytest.mark.parametrize(("task", "agent"), [("cartpole", "sac"), ("cartpole", "td3"), ("cartpole-direct", "sac")])
+def test_an_off_policy_agent_solves_its_task(task, agent, tmp_path):
     runs = ("--runs-dir", str(tmp_path))
-    train = ("train", task, "--agent", agent, "--seed", "1", "--max-iterations", str(iterations), "--logger", "none")
-    assert main([*train, "-q", *runs]) == 0
-    assert main(["eval", task, "--episodes", "500", "--fail-under", "success=0.9", *runs]) == 0
+    assert main(["train", task, "--agent", agent, "--seed", "4", "--logger", "none", "-q", *runs]) == 0
+    assert main(["eval", task, "--episodes", "1000", "--fail-under", "success=0.97", *runs]) == 0

@@ -6,7 +6,8 @@ import pytest
 import torch
 from worlds import CRITTER, PENDULUM
 
-from rlcli.errors import DeviceError
+from rlcli.config.schema import SimConfig
+from rlcli.errors import ConfigError, DeviceError
 from rlcli.sim.engine import open_engine
 from rlcli.sim.selection import IdSelection
 
@@ -20,6 +21,10 @@ N = 6
 
 def model_of(xml=XML):
     return mujoco.MjModel.from_xml_string(xml)
+
+
+def engine_of(model, num_envs, *, device="cpu", **settings):
+    return open_engine(model, num_envs, SimConfig(dt=model.opt.timestep, **settings), device=device)
 
 
 def some(*ids):
@@ -40,7 +45,7 @@ def scatter(engine, seed=0):
 @pytest.mark.parametrize("threads", [1, 3])
 def test_it_steps_like_a_loop_of_mj_step_bit_for_bit(threads):
     model = model_of()
-    engine = open_engine(model, N, threads=threads)
+    engine = engine_of(model, N, engine_threads=threads)
     engine.field("xpos")  # with a stage asked for the last substep, too
     scatter(engine)
     worlds = []
@@ -58,7 +63,7 @@ def test_it_steps_like_a_loop_of_mj_step_bit_for_bit(threads):
 
 
 def test_fields_are_live_views():
-    engine = open_engine(model_of(), N)
+    engine = engine_of(model_of(), N)
     qpos, again = engine.field("qpos"), engine.field("qpos")
     qpos[2, 2] = 5.0
     assert again.data_ptr() == qpos.data_ptr()
@@ -77,7 +82,7 @@ def kinematics(engine, i):
 
 
 def test_derived_fields_are_those_of_the_state_after_a_step_and_after_a_partial_reset():
-    engine = open_engine(model_of(), N)
+    engine = engine_of(model_of(), N)
     fields = {name: engine.field(name) for name in ("xpos", "xquat", "cvel", "site_xpos")}
     scatter(engine)
     engine.step(4)
@@ -96,7 +101,7 @@ def test_derived_fields_are_those_of_the_state_after_a_step_and_after_a_partial_
 
 
 def test_gyro_and_accelerometer_are_the_new_episodes_after_a_partial_reset():
-    engine = open_engine(model_of(), N)
+    engine = engine_of(model_of(), N)
     sensors = engine.field("sensordata")
     scatter(engine)
     engine.step(4)
@@ -113,13 +118,13 @@ def test_gyro_and_accelerometer_are_the_new_episodes_after_a_partial_reset():
 
 def test_acceleration_fields_are_those_of_the_last_substep():
     model = model_of()
-    engine = open_engine(model, 1)
+    engine = engine_of(model, 1)
     qacc, force = engine.field("qacc"), engine.field("actuator_force")
     scatter(engine)
     data = kinematics(engine, 0)
     engine.step(3)
     data = mujoco.MjData(model)
-    fresh = open_engine(model, 1)
+    fresh = engine_of(model, 1)
     scatter(fresh)
     data.qpos[:], data.qvel[:], data.ctrl[:] = (fresh.field(f)[0].numpy() for f in ("qpos", "qvel", "ctrl"))
     mujoco.mj_step(model, data, 3)
@@ -128,7 +133,7 @@ def test_acceleration_fields_are_those_of_the_last_substep():
 
 
 def test_a_derived_field_that_is_asked_for_late_is_that_of_the_state():
-    engine = open_engine(model_of(), N)
+    engine = engine_of(model_of(), N)
     qacc = engine.field("qacc")
     scatter(engine)
     engine.step(3)
@@ -143,7 +148,7 @@ def test_sensors_of_forces_alone_are_those_of_the_last_substep_and_start_again_w
     xml = XML.replace('<accelerometer name="acc" site="imu"/><gyro name="gyro" site="imu"/>', '<force site="hip"/>')
     xml = xml.replace('<joint name="hip_fl"', '<site name="hip"/><joint name="hip_fl"')
     model = model_of(xml)
-    engine = open_engine(model, N)
+    engine = engine_of(model, N)
     sensors = engine.field("sensordata")
     scatter(engine)
     data = mujoco.MjData(model)
@@ -159,7 +164,7 @@ def test_sensors_of_forces_alone_are_those_of_the_last_substep_and_start_again_w
 
 
 def test_a_restored_engine_has_the_last_substep_of_fields_not_asked_for_yet():
-    engine, fresh = open_engine(model_of(), N), open_engine(model_of(), N)
+    engine, fresh = engine_of(model_of(), N), engine_of(model_of(), N)
     engine.field("qacc")
     scatter(engine)
     engine.step(3)
@@ -168,7 +173,7 @@ def test_a_restored_engine_has_the_last_substep_of_fields_not_asked_for_yet():
 
 
 def test_reset_restores_the_whole_row_and_only_the_chosen_ones():
-    engine = open_engine(model_of(), N)
+    engine = engine_of(model_of(), N)
     engine.set_default(torch.arange(11, dtype=torch.float64) / 10, torch.full((10,), 0.5, dtype=torch.float64))
     engine.reset(some(0))
     default = engine.state_dict()["state"][0]
@@ -186,7 +191,7 @@ def test_reset_restores_the_whole_row_and_only_the_chosen_ones():
 
 
 def test_gravity_of_each_world_is_seen_by_its_dynamics():
-    engine = open_engine(
+    engine = engine_of(
         model_of(PENDULUM.replace("base", "ball").replace('<body name="ball">', '<body name="ball"><freejoint/>')), 3
     )
     gravity = torch.tensor([-9.81, -1.62, 0.0], dtype=torch.float64)
@@ -200,7 +205,7 @@ def test_gravity_of_each_world_is_seen_by_its_dynamics():
 def test_mass_of_each_world_is_seen_by_its_dynamics():
     xml = '<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="s" type="slide" axis="1 0 0"/>'
     xml += '<geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="s"/></actuator></mujoco>'
-    engine = open_engine(model_of(xml), 3)
+    engine = engine_of(model_of(xml), 3)
     engine.expand("body_mass")[:, 1] = torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)
     engine.set_constants()
     engine.field("ctrl")[:] = 8.0
@@ -212,7 +217,7 @@ def test_mass_of_each_world_is_seen_by_its_dynamics():
 @pytest.mark.parametrize("threads", [1, 4])
 def test_a_restored_engine_goes_on_bit_for_bit_with_any_number_of_threads(threads):
     model = model_of()
-    engine = open_engine(model, N, threads=2)
+    engine = engine_of(model, N, engine_threads=2)
     derived = engine.field("xpos"), engine.field("qacc"), engine.field("sensordata")
     engine.expand("body_mass")[:, 1] = torch.linspace(2, 4, N, dtype=torch.float64)
     engine.set_constants()
@@ -221,7 +226,7 @@ def test_a_restored_engine_goes_on_bit_for_bit_with_any_number_of_threads(thread
     saved = engine.state_dict()
     at_save = [value.clone() for value in derived]
     engine.step(25)
-    other = open_engine(model, N, threads=threads)
+    other = engine_of(model, N, engine_threads=threads)
     restored = other.field("xpos"), other.field("qacc"), other.field("sensordata")
     other.load_state_dict(saved)
     for value, expected in zip(restored, at_save, strict=True):
@@ -232,7 +237,7 @@ def test_a_restored_engine_goes_on_bit_for_bit_with_any_number_of_threads(thread
 
 
 def test_a_state_dict_is_a_copy():
-    engine = open_engine(model_of(), N)
+    engine = engine_of(model_of(), N)
     saved = engine.state_dict()
     kept = saved["state"].clone()
     engine.step(2)
@@ -240,7 +245,7 @@ def test_a_state_dict_is_a_copy():
 
 
 def test_world_shows_one_world_without_disturbing_it():
-    engine = open_engine(model_of(), N)
+    engine = engine_of(model_of(), N)
     engine.expand("body_mass")[3, 1] = 9.0
     scatter(engine)
     engine.step(5)
@@ -259,20 +264,26 @@ def test_world_shows_one_world_without_disturbing_it():
 
 
 def test_unknown_fields_are_named_with_the_nearest():
-    engine = open_engine(model_of(), 1)
+    engine = engine_of(model_of(), 1)
     with pytest.raises(ValueError, match=r"'qvle' is not an MjData field; did you mean .*'qvel'"):
         engine.field("qvle")
     with pytest.raises(ValueError, match=r"'body_masss' cannot differ between worlds; did you mean .*'body_mass'"):
         engine.expand("body_masss")
 
 
-def test_a_device_without_an_engine_is_refused():
-    with pytest.raises(DeviceError, match="no simulation engine for device 'cuda'"):
-        open_engine(model_of(), 1, device="cuda")
+@pytest.mark.parametrize("device", ["cuda:99", "tpu", "mps"])
+def test_a_device_that_is_not_there_is_refused(device):
+    with pytest.raises(DeviceError, match=f"device '{device}' is not available"):
+        engine_of(model_of(), 1, device=device)
+
+
+def test_the_engine_of_the_cpu_is_refused_on_another_device():
+    with pytest.raises(ConfigError, match="'batch' runs on a CPU, not on 'cuda'"):
+        engine_of(model_of(), 1, device="cuda", engine="batch")
 
 
 def test_dropped_contacts_are_counted_and_are_no_divergence():
-    engine = open_engine(model_of(), 2)
+    engine = engine_of(model_of(), 2)
     engine.step(1)
     engine._batch.warning[1, int(mujoco.mjtWarning.mjWARN_CONTACTFULL), 1] = 1
     assert engine.diverged() is None

@@ -1,0 +1,145 @@
+"""The GPU engine, on Warp's CPU device, lives the life of the CPU engine: step by step, and over many episodes."""
+
+import math
+
+import pytest
+import torch
+from worlds import actions, build, critter, pendulum
+
+STEPS, N = 50, 8
+SHORT = {  # episodes end and begin within the run, by time
+    "cartpole": ("episode_length_s=0.25",),
+    "cartpole-direct": ("episode_length_s=0.25",),
+    "ant-direct": ("episode_length_s=0.2",),
+}
+TOLERANCE = {"cartpole": 2e-5, "cartpole-direct": 2e-5, "ant-direct": 2e-3}
+"""float32 rounding, grown over the steps of one episode; contacts make it grow faster."""
+
+
+def pair(task, num_envs=N, *overrides, seed=3):
+    return [build(task, num_envs, f"sim.engine={engine}", *overrides, seed=seed) for engine in ("batch", "warp")]
+
+
+def assert_same_step(host, device, tolerance, where):
+    close = {"rtol": tolerance, "atol": tolerance, "msg": lambda text: f"{where}: {text}"}
+    assert torch.equal(host.terminated, device.terminated), where
+    assert torch.equal(host.truncated, device.truncated), where
+    torch.testing.assert_close(host.reward, device.reward, **close)
+    for group, values in host.obs.items():
+        assert device.obs[group].dtype == torch.float32
+        torch.testing.assert_close(values, device.obs[group], **close)
+    finished = host.terminated | host.truncated
+    episodes = device.episodes.ended()
+    assert episodes.ids.tolist() == finished.nonzero()[:, 0].tolist(), where
+    if not finished.any():
+        return 0
+    for group, values in host.final_obs.items():
+        torch.testing.assert_close(values[finished], device.final_obs[group][finished], **close)
+    assert torch.equal(host.episodes.ids, episodes.ids)
+    assert torch.equal(host.episodes.lengths, episodes.lengths)
+    assert torch.equal(host.episodes.truncated, episodes.truncated)
+    torch.testing.assert_close(host.episodes.returns, episodes.returns, **close)
+    assert host.episodes.reward_terms.keys() == episodes.reward_terms.keys()
+    for name, values in host.episodes.reward_terms.items():
+        torch.testing.assert_close(values, episodes.reward_terms[name], **close)
+    assert {n: v.tolist() for n, v in host.episodes.causes.items() if v.any()} == {
+        n: v.tolist() for n, v in episodes.causes.items() if v.any()
+    }
+    if host.episodes.success is None:
+        assert episodes.success is None
+    else:
+        assert torch.equal(host.episodes.success, episodes.success)
+    return len(episodes.ids)
+
+
+def follow(host, device, tolerance, steps=STEPS, strength=0.5):
+    """Step both under the same actions; how many episodes ended."""
+    first = [env.reset(seed=5) for env in (host, device)]
+    for group, values in first[0].items():
+        torch.testing.assert_close(values, first[1][group], rtol=tolerance, atol=tolerance)
+    ended = 0
+    for i, action in enumerate(actions(steps, host.num_envs, host.layout.action_size)):
+        results = [env.step(strength * action) for env in (host, device)]
+        ended += assert_same_step(*results, tolerance, f"step {i}")
+    device.check()
+    assert host.divergences == device.divergences == 0
+    assert torch.equal(host.episode_index, device.episode_index)
+    assert host.common_step == device.common_step == steps
+    return ended
+
+
+@pytest.mark.parametrize("task", SHORT)
+def test_they_agree_step_by_step_through_resets(task):
+    host, device = pair(task, N, *SHORT[task])
+    ended = follow(host, device, TOLERANCE[task])
+    assert ended >= 2 * N
+
+
+@pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
+def test_they_agree_step_by_step_through_terminations(task):
+    host, device = pair(task, N)
+    states = [env.reset(seed=5) for env in (host, device)]
+    assert torch.equal(states[0]["policy"].isfinite(), states[1]["policy"].isfinite())
+    causes = 0
+    for i, action in enumerate(actions(STEPS, N, 1)):
+        push = torch.where(torch.arange(N)[:, None] < N // 2, 4.0 + action, 0.1 * action)
+        results = [env.step(push) for env in (host, device)]
+        assert_same_step(*results, 1e-3, f"step {i}")
+        causes += int(results[0].terminated.sum())
+    assert causes >= 2, "carts left their track"
+    assert not results[0].terminated.all()
+    device.check()
+
+
+def test_they_agree_where_every_kind_of_term_is_used(tmp_path):
+    """Position actuators, root resets, pushes and wrenches at intervals, terms of forces; in free fall.
+
+    Feet that strike the ground would be chaos: there a millionth grows to a hundredth within three steps.
+    """
+    host, device = pair(critter(tmp_path), 6, "scene.ground=null")
+    ended = follow(host, device, 2e-5, steps=40, strength=0.3)
+    assert ended >= 12
+
+
+def test_they_agree_on_environments_that_end_at_different_times(tmp_path):
+    host, device = pair(pendulum(tmp_path), 5)
+    for env in (host, device):
+        env.reset(seed=5)
+        env.episode_length_buf.copy_(torch.tensor([0, 3, 7, 9, 1]))
+    ended = []
+    for i, action in enumerate(actions(12, 5, 1)):
+        results = [env.step(action) for env in (host, device)]
+        ended.append(assert_same_step(*results, 1e-5, f"step {i}"))
+    assert 1 in ended
+    assert 0 in ended
+    assert sum(ended) >= 5
+
+
+def gather(env, episodes):
+    """Returns and lengths of each environment's first episode under a random policy."""
+    env.reset(seed=11)
+    generator = torch.Generator().manual_seed(env.num_envs)
+    returns, lengths = torch.full((env.num_envs,), math.nan), torch.zeros(env.num_envs)
+    for _ in range(env.max_episode_length):
+        result = env.step(torch.rand(env.num_envs, env.layout.action_size, generator=generator) * 2 - 1)
+        if result.episodes is not None:
+            ended = result.episodes.ended()
+            new = returns[ended.ids].isnan()
+            returns[ended.ids[new]], lengths[ended.ids[new]] = ended.returns[new], ended.lengths[new].float()
+    assert not returns.isnan().any()
+    env.check()
+    return returns[:episodes], lengths[:episodes]
+
+
+@pytest.mark.parametrize("task", ["cartpole", "ant-direct"])
+def test_they_agree_in_distribution_over_episodes(task):
+    """Other start states and other actions on each side: only the distributions can be equal."""
+    overrides = {"cartpole": ("episode_length_s=1.5",), "ant-direct": ("episode_length_s=0.5",)}[task]
+    host = build(task, 256, "sim.engine=batch", *overrides, seed=1)
+    device = build(task, 256, "sim.engine=warp", *overrides, seed=2)
+    host_values, device_values = gather(host, 256), gather(device, 256)
+    for here, there in zip(host_values, device_values, strict=True):
+        error = math.sqrt(float(here.var() + there.var()) / 256)
+        assert abs(float(here.mean() - there.mean())) <= 4.0 * error + 1e-9
+        if float(here.std()) > 0:
+            assert 0.7 < float(there.std() / here.std()) < 1.4

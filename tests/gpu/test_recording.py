@@ -1,0 +1,130 @@
+"""What only an NVIDIA GPU can show: nothing on the path of a step waits for it, and recordings replay the same work."""
+
+import pytest
+import torch
+
+from rlcli.config.load import resolve
+from rlcli.envs.vec_env import make_env
+from rlcli.registry import find_task
+from rlcli.rl.capture import Recording
+from rlcli.rl.ppo import PpoTrainer
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU, and there is none here")
+
+
+def environment(task, **flags):
+    return make_env(
+        resolve(find_task(task), device="cuda", flags={"scene.num_envs": 256, **flags}), seed=1, device="cuda"
+    )
+
+
+@pytest.mark.parametrize("task", ["cartpole", "ant-direct"])
+def test_a_step_does_not_wait_for_the_device(task):
+    env = environment(task, episode_length_s=0.5)
+    action = torch.zeros(256, env.layout.action_size, device="cuda")
+    env.reset()
+    env.step(action)  # compiles
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(40):
+            env.step(action)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    env.check()
+
+
+@pytest.mark.parametrize("task", ["cartpole", "ant-direct"])
+def test_a_recorded_rollout_goes_on_like_an_eager_one(task):
+    """The physics is not bit-identical on a GPU, so trajectories are compared within what that explains."""
+    finals = []
+    for record in (False, True):
+        env = environment(task, episode_length_s=0.5)
+        obs = env.reset(seed=3)["policy"].clone()
+        actions = torch.rand(8, 256, env.layout.action_size, device="cuda", generator=_generator()) * 0.2
+
+        def work(env=env, obs=obs, actions=actions):
+            for action in actions:
+                obs.copy_(env.step(action).obs["policy"])
+
+        run = Recording(work, torch.device("cuda"), env.holders(), pytest.fail) if record else work
+        for _ in range(6):  # 48 steps, over an end of all episodes
+            run()
+        finals.append(obs.cpu())
+        env.check()
+    torch.testing.assert_close(finals[0], finals[1], rtol=1e-2, atol=2e-2)
+
+
+def _generator():
+    return torch.Generator("cuda").manual_seed(0)
+
+
+class Counter:
+    def __init__(self):
+        self.total = torch.zeros((), device="cuda")
+        self.steps = 0
+
+
+def test_what_is_bound_anew_is_carried_from_replay_to_replay():
+    holder = Counter()
+
+    def work():
+        holder.total = holder.total + 1.0
+
+    run = Recording(work, torch.device("cuda"), [holder], pytest.fail)
+    for _ in range(5):
+        run()
+    assert holder.total.item() == 5.0
+
+
+def test_work_that_waits_for_the_device_is_named_and_runs_as_it_is():
+    holder, said = Counter(), []
+
+    def work():
+        if holder.total.item() < 100.0:
+            holder.total += 1.0
+
+    run = Recording(work, torch.device("cuda"), [holder], said.append)
+    for _ in range(3):
+        run()
+    assert holder.total.item() == 3.0
+    assert len(said) == 1
+    assert "test_recording.py" in said[0]
+
+
+def test_a_number_that_changes_from_step_to_step_is_named():
+    holder, said = Counter(), []
+
+    def work():
+        holder.steps += 1
+        holder.total += holder.steps
+
+    run = Recording(work, torch.device("cuda"), [holder], said.append)
+    for _ in range(3):
+        run()
+    assert holder.total.item() == 6.0
+    assert "Counter.steps" in said[0]
+
+
+def test_training_records_rollout_and_update():
+    settings = {"scene.num_envs": 512, "agent.max_iterations": 8}
+    resolved = resolve(find_task("cartpole"), agent="ppo", device="cuda", flags=settings)
+    env = make_env(resolved, seed=1, device="cuda")
+    trainer = PpoTrainer(env, resolved.agent, seed=1, device="cuda", torch_threads=1)
+    trainer.start()
+    reports = [trainer.iterate() for _ in range(8)]
+    assert not any(report.notes for report in reports)
+    assert all(report.metrics["Loss/learning_rate"] > 0 for report in reports)
+    state = trainer.state()
+    trainer.load(state)
+    assert trainer.iterate().metrics["Train/mean_episode_length"] > 1.0
+
+
+def test_a_task_with_ids_runs_eagerly_and_says_why():
+    settings = {"scene.num_envs": 64, "agent.max_iterations": 3}
+    resolved = resolve(find_task("cartpole-direct"), agent="ppo", device="cuda", flags=settings)
+    env = make_env(resolved, seed=1, device="cuda")
+    trainer = PpoTrainer(env, resolved.agent, seed=1, device="cuda", torch_threads=1)
+    trainer.start()
+    notes = [note for _ in range(3) for note in trainer.iterate().notes]
+    assert len(notes) == 1
+    assert "waits for the GPU" in notes[0]

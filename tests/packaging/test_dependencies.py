@@ -1,0 +1,37 @@
+"""The lists of dependencies agree with each other."""
+
+import tomllib
+
+import pytest
+from fenced import REPOSITORY
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+
+
+def pinned():
+    lines = (REPOSITORY / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = [line.split("==") for line in lines if not line.startswith("#")]
+    names = [canonicalize_name(name) for name, _ in pins]
+    assert len(set(names)) == len(names), "a package with two pins"
+    return dict(zip(names, (version for _, version in pins), strict=True))
+
+
+@pytest.mark.parametrize("extra", [None, *EXTRAS])
+def test_what_is_asked_for_is_pinned_within_its_bounds(extra):
+    pins = pinned()
+    wanted = [Requirement(line) for line in (PROJECT["dependencies"] if extra is None else EXTRAS[extra])]
+    assert wanted
+    for requirement in wanted:
+        name = canonicalize_name(requirement.name)
+        if name == PROJECT["name"]:
+            assert requirement.extras <= set(EXTRAS)
+        else:
+            assert requirement.specifier.contains(pins[name]), name
+
+
+def test_bounds_are_lower_bounds():
+    every = [Requirement(line) for lines in (PROJECT["dependencies"], *EXTRAS.values()) for line in lines]
+    assert {bound.operator for requirement in every for bound in requirement.specifier} == {">="}

@@ -1,0 +1,103 @@
+"""Statistics of finished episodes, on episodes made by hand."""
+
+import json
+
+import pytest
+import torch
+
+from rlcli.envs.vec_env import Episodes
+from rlcli.rl.statistics import EpisodeStatistics
+
+LENGTH_S = 2.0
+
+
+def ended(returns, lengths, fell, success=None, mask=None):
+    returns, fell = torch.tensor(returns), torch.tensor(fell)
+    return Episodes(
+        ids=torch.arange(len(returns)),
+        returns=returns,
+        lengths=torch.tensor(lengths),
+        reward_terms={"upright": returns * 0.75, "effort": returns * 0.25},
+        causes={"time_out": ~fell, "fell": fell},
+        truncated=~fell,
+        success=None if success is None else torch.tensor(success),
+        mask=None if mask is None else torch.tensor(mask),
+    )
+
+
+TWO = ended([4.0, 8.0], [10, 20], [True, False], [False, True])
+FIGURES = {
+    "Train/mean_reward": 6.0,
+    "Train/mean_episode_length": 15.0,
+    "Train/success_rate": 0.5,
+    "Episode_Reward/upright": 2.25,
+    "Episode_Reward/effort": 0.75,
+    "Episode_Termination/time_out": 0.5,
+    "Episode_Termination/fell": 0.5,
+}
+
+
+@pytest.mark.parametrize("mode", [torch.enable_grad, torch.no_grad, torch.inference_mode])
+def test_figures_of_two_episodes_whatever_mode_they_were_collected_in(mode):
+    statistics = EpisodeStatistics(LENGTH_S)
+    for _ in range(3):
+        with mode():
+            statistics.add(None)
+            statistics.add(TWO)
+        assert statistics.flush() == pytest.approx(FIGURES)
+    assert statistics.total == 6
+
+
+def test_sums_begun_without_inference_mode_go_on_within_it():
+    statistics = EpisodeStatistics(LENGTH_S)
+    statistics.add(TWO)
+    with torch.inference_mode():
+        statistics.add(ended([4.0, 8.0], [10, 20], [True, False], [False, True]))
+    assert statistics.flush() == pytest.approx(FIGURES)
+    assert statistics.total == 4
+
+
+def test_rows_that_did_not_end_do_not_count():
+    statistics = EpisodeStatistics(LENGTH_S)
+    columns = [4.0, 99.0, 8.0], [10, 77, 20], [True, True, False], [False, True, True]
+    statistics.add(ended(*columns, mask=[True, False, True]))
+    assert statistics.flush() == pytest.approx(FIGURES)
+    statistics.add(ended(*columns, mask=[False, False, False]))
+    means = {name: value for name, value in FIGURES.items() if name.startswith("Train/")}
+    assert statistics.flush() == pytest.approx(means), "a mean over no episode is left out"
+    assert statistics.total == 2
+
+
+def test_without_a_success_condition_there_is_no_success_rate():
+    statistics = EpisodeStatistics(LENGTH_S)
+    statistics.add(ended([1.0], [5], [False]))
+    assert "Train/success_rate" not in statistics.flush()
+
+
+def test_before_any_episode_ends_there_are_no_figures():
+    assert EpisodeStatistics(LENGTH_S).flush() == {}
+
+
+def test_means_are_those_of_the_last_iterations_with_a_hundred_episodes():
+    statistics = EpisodeStatistics(LENGTH_S)
+    for value in (1.0, 2.0, 3.0):
+        statistics.add(ended([value] * 60, [10] * 60, [False] * 60))
+        metrics = statistics.flush()
+    assert metrics["Train/mean_reward"] == 2.5  # the last two
+    statistics.add(ended([7.0] * 100, [10] * 100, [False] * 100))
+    assert statistics.flush()["Train/mean_reward"] == 7.0
+
+
+def test_statistics_restored_from_json_go_on_with_the_same_figures():
+    statistics, other = EpisodeStatistics(LENGTH_S), EpisodeStatistics(LENGTH_S)
+    for value in (0.1, 0.7):
+        statistics.add(ended([value] * 40, [10] * 40, [False] * 40, [True] * 40))
+        statistics.flush()
+    other.add(TWO)
+    other.flush()
+    other.load(json.loads(json.dumps(statistics.state())))
+    for each in (statistics, other):
+        each.add(TWO)
+    assert statistics.flush() == other.flush()
+    assert statistics.total == other.total == 82
+    assert statistics.state() == other.state()
