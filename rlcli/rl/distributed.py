@@ -130,6 +130,7 @@ def join(device: str) -> Peers:
         return _peers
     import torch
     import torch.distributed as dist
+    import torch.distributed.nn  # imported later, defaults of its functions would keep the group and its threads alive
 
     on_gpu = device.startswith("cuda")
     if on_gpu:
