@@ -228,7 +228,7 @@ class DirectEnv(VecEnv):
         return (
             ended.read(self._returns),
             {},
-            {name: ended.read(fired) for name, fired in self._causes.items()},
+            {name: ended.peek(fired) for name, fired in self._causes.items()},
         )
 
     def _restart_workflow(self, selection: Selection) -> None:

@@ -400,12 +400,12 @@ class VecEnv(ABC):
 
     def _episodes(self, ended: Selection, finished: Tensor, terminated: Tensor, truncated: Tensor) -> Episodes:
         returns, terms, causes = self._terms_of(ended)
-        timed_out = ended.read(truncated) & ~ended.read(terminated)
+        timed_out = ended.peek(truncated) & ~ended.peek(terminated)
         success = None
         if self._success is not None:
-            success = timed_out & (ended.read(self._success_hold) >= self._hold_steps)
+            success = timed_out & (ended.peek(self._success_hold) >= self._hold_steps)
         return Episodes(
-            ended.read(self._ids),
+            ended.peek(self._ids),
             returns,
             ended.read(self.episode_length_buf),
             terms,

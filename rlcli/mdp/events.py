@@ -28,7 +28,7 @@ def reset_joints_by_offset(
     """Default joint state plus uniform offsets [m or rad, m/s or rad/s], positions kept within the soft limits."""
     default_pos, default_vel = _defaults(entity, selection, joints)
     offset = selection.uniform(*_bounds(env.device, position, velocity), (2, default_pos.shape[1]))
-    _write_joints(entity, selection, joints, default_pos.add_(offset[:, 0]), default_vel.add_(offset[:, 1]))
+    _write_joints(entity, selection, joints, default_pos + offset[:, 0], default_vel + offset[:, 1])
 
 
 def reset_joints_by_scale(
@@ -43,7 +43,7 @@ def reset_joints_by_scale(
     """Default joint state times uniform factors, positions kept within the soft limits."""
     default_pos, default_vel = _defaults(entity, selection, joints)
     factor = selection.uniform(*_bounds(env.device, position, velocity), (2, default_pos.shape[1]))
-    _write_joints(entity, selection, joints, default_pos.mul_(factor[:, 0]), default_vel.mul_(factor[:, 1]))
+    _write_joints(entity, selection, joints, default_pos * factor[:, 0], default_vel * factor[:, 1])
 
 
 def reset_root_state_uniform(
@@ -132,7 +132,7 @@ def _wrench_columns(entity: Entity, bodies: Bodies) -> Tensor:
 
 def _defaults(entity: Entity, selection: Selection, joints: Joints) -> tuple[Tensor, Tensor]:
     data = entity.data
-    return selection.read(data.default_joint_pos, joints), selection.read(data.default_joint_vel, joints)
+    return selection.peek(data.default_joint_pos, joints), selection.peek(data.default_joint_vel, joints)
 
 
 def _write_joints(entity: Entity, selection: Selection, joints: Joints, position: Tensor, velocity: Tensor) -> None:

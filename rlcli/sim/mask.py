@@ -52,6 +52,10 @@ class MaskSelection:
         """All rows of a (num_envs, ...) tensor, copied."""
         return field.clone() if columns is ALL else field[:, columns].clone()
 
+    def peek(self, field: Tensor, columns: Columns = ALL) -> Tensor:
+        """All rows of a (num_envs, ...) tensor, where possible the tensor itself."""
+        return field if columns is ALL else field[:, columns]
+
     def write(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
         """Set the masked rows of a (num_envs, ...) tensor."""
         if isinstance(columns, Tensor):

@@ -44,6 +44,10 @@ class Selection(Protocol):
         """The rows of a (num_envs, ...) tensor."""
         ...
 
+    def peek(self, field: Tensor, columns: Columns = ALL) -> Tensor:
+        """The same for a moment: it may be the tensor itself, so do not write to it, nor keep it past a write there."""
+        ...
+
     def write(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
         """Set the rows of a (num_envs, ...) tensor."""
         ...
@@ -111,6 +115,10 @@ class IdSelection:
     def read(self, field: Tensor, columns: Columns = ALL) -> Tensor:
         """The rows of a (num_envs, ...) tensor, copied."""
         return torch.from_numpy(field.numpy()[self._index(columns)])
+
+    def peek(self, field: Tensor, columns: Columns = ALL) -> Tensor:
+        """The rows of a (num_envs, ...) tensor."""
+        return self.read(field, columns)
 
     def write(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
         """Set the rows of a (num_envs, ...) tensor."""
