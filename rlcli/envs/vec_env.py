@@ -48,7 +48,8 @@ class Episodes:
     success: Tensor | None
     """Met the task's success condition; None where the task has none. (n,) bool"""
     mask: Tensor | None = None
-    """A GPU gives a row for every environment, and which of them count. (num_envs,) bool; None: all rows do."""
+    """A GPU gives a row for every environment, valid until the next step, and which of them count. (num_envs,) bool;
+    None: all rows do."""
 
     def ended(self) -> Episodes:
         """Only the rows that count; waits for the device."""

@@ -108,31 +108,36 @@ class PpoTrainer:
         torch.set_num_threads(1)
         self._collect()
         self._record()
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        collected = time.perf_counter()
+        collected = self._now()
         torch.set_num_threads(self.torch_threads)
         self._decay()
         self.iteration += 1
         self.env_steps += self.steps_per_iteration
         self._learn()
+        learned = self._now()
         losses = self._losses()
         self.env.check()
         if self.peers.size > 1:
             self.statistics.share(self.peers)
-        updated = time.perf_counter()
         physics, step = self.env.seconds["physics"] - physics, self.env.seconds["step"] - step
-        seconds = {
-            "physics": physics,
-            "task": step - physics,
-            "policy": collected - begin - step,
-            "update": updated - collected,
-        }
-        if self.device.type == "cuda":  # a replayed rollout cannot be told apart
-            seconds = {"rollout": collected - begin, "update": updated - collected}
+        total = time.perf_counter() - begin
+        if isinstance(collected, float):
+            rollout = collected - begin
+            seconds = {"physics": physics, "task": step - physics, "policy": rollout - step, "update": total - rollout}
+        else:  # a replayed rollout cannot be told apart
+            update = collected.elapsed_time(learned) / 1e3
+            seconds = {"rollout": total - update, "update": update}
         notes, self._notes[:] = list(self._notes), []
         task = {f"Task/{name}": value for name, value in self.env.extras().items() if math.isfinite(value)}
         return Report({**self.statistics.flush(), **task, **losses}, seconds, notes)
+
+    def _now(self) -> Any:
+        """A moment: on a GPU one in the order of its work, so that nobody has to wait for it."""
+        if self.device.type != "cuda":
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record(torch.cuda.current_stream(self.device))
+        return event
 
     # --- the rollout ---
 
