@@ -82,7 +82,7 @@ class Sb3VecEnv(Sb3Base):
         infos = [self._nothing] * self.num_envs
         if result.episodes is not None and result.final_obs is not None:
             final = result.final_obs["policy"].numpy()
-            ended = result.episodes
+            ended = result.episodes.ended()
             for row, env in enumerate(ended.ids.tolist()):
                 infos[env] = {
                     "terminal_observation": final[env].copy(),

@@ -80,6 +80,8 @@ class EpisodeStatistics:
 
     def load(self, state: dict[str, Any]) -> None:
         """Take back what `state` gave."""
+        for pending in self._sums.values():
+            pending.zero_()  # in place: a recording adds to them
         self._recent = deque(list(row) for row in state["recent"])
         self.total = state["total"]
 

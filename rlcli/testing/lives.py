@@ -190,7 +190,7 @@ def _ends(subject: Subject, limit: int) -> list[_End]:
     ends = []
     for _ in range(2 * limit + 2):
         result = env.step(torch.zeros(NUM_ENVS, env.layout.action_size))
-        episodes = result.episodes
+        episodes = result.episodes.ended() if result.episodes else None
         for row, number in enumerate(episodes.ids.tolist() if episodes else []):
             assert episodes is not None
             fired = tuple(name for name, mask in episodes.causes.items() if bool(mask[row]))

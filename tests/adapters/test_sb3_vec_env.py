@@ -12,10 +12,10 @@ from rlcli.envs.vec_env import make_env
 from rlcli.registry import find_task
 
 
-@pytest.fixture
-def vec():
+@pytest.fixture(params=["batch", "warp"])
+def vec(request):
     torch.set_num_threads(1)
-    overrides = ["scene.num_envs=3", "episode_length_s=0.1"]
+    overrides = ["scene.num_envs=3", "episode_length_s=0.1", f"sim.engine={request.param}"]
     return Sb3VecEnv(make_env(resolve(find_task("cartpole"), overrides=overrides), seed=4), 1.0)
 
 
