@@ -216,6 +216,7 @@ class VecEnv(ABC):
         self.engine.attach()
         self._start_over()
         self._restart(self._everyone())
+        self._between()
         return self._observe()
 
     def step(self, action: Tensor) -> StepResult:
