@@ -13,7 +13,7 @@ from torch import Tensor
 from rlcli.config.schema import ActuatorConfig
 from rlcli.random import stream
 from rlcli.sim.entity import Entity, as_index
-from rlcli.sim.names import NameProblem, match
+from rlcli.sim.names import NameProblem, match, match_values
 from rlcli.sim.selection import Selection
 
 POSITION, VELOCITY, EFFORT = range(3)
@@ -180,9 +180,7 @@ def _by_joint(value: float | Mapping[str, float], names: Sequence[str], device: 
     """
     if isinstance(value, float | int):
         return torch.full((len(names),), float(value), device=device)
-    values = torch.full((len(names),), torch.nan)
-    for pattern, number in value.items():
-        values[match(pattern, names, "joint")] = number
-    if bool(values.isnan().any()):
-        raise NameProblem(f"no value for joint '{names[int(values.isnan().nonzero()[0, 0])]}'")
-    return values.to(device)
+    values = match_values(value, names, "joint")
+    if None in values:
+        raise NameProblem(f"no value for joint '{names[values.index(None)]}'")
+    return torch.tensor(values, dtype=torch.float32, device=device)
