@@ -42,7 +42,7 @@ class _JointAction:
         columns = torch.arange(len(entity.joint_names))[joints if isinstance(joints, slice) else joints.cpu()].tolist()
         self.elements = tuple(entity.joint_names[c] for c in columns)
         self._drive = JointCommand(entity, self.actuator, columns)
-        self.actuators = self._drive.actuators
+        self.sinks = self._drive.sinks
         self.size = len(columns)
         self._scale = self._by_joint(scale, 1.0, env)
         self._clip = self._bounds(clip, env)
@@ -94,7 +94,7 @@ class _AffineJointAction(_JointAction):
         super().__init__(env, entity, joints, scale, clip)
         own = self._by_joint(offset, 0.0, env)
         self._offset = own if default is None else default[:, joints] + own
-        self._limits = _command_limits(entity.engine.model, self.actuators, self.actuator)
+        self._limits = _command_limits(entity.engine.model, self._drive.actuators, self.actuator)
 
     def command_map(self) -> CommandMap:
         """What `process` computes, and the limits of the actuators behind it."""

@@ -144,6 +144,8 @@ class JointCommand:
         native = [i for i, c in enumerate(columns) if c not in by_model]
         self.actuators = [None if c in by_model else driven[c] for c in columns]
         """MuJoCo's actuator behind each column; None where a model drives the joint."""
+        self.sinks = [f"{entity.name}/{entity.joint_names[c]} {kind}" if c in by_model else driven[c] for c in columns]
+        """What each column writes to, so that two terms that write to the same are found."""
         controls = [driven[columns[i]] for i in native]
         gear = torch.tensor(model.actuator_gear[controls, 0], dtype=torch.float32, device=device)
         self._factor = (1.0 / gear if kind == "motor" else gear) if bool((gear != 1.0).any()) else None

@@ -8,7 +8,6 @@ from typing import TypeVar
 
 from rlcli.errors import did_you_mean, listing
 
-
 Value = TypeVar("Value")
 
 
