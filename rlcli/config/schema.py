@@ -58,6 +58,12 @@ def _rotation(value: tuple[float, float, float, float]) -> tuple[float, float, f
     return value
 
 
+def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if math.hypot(*value) < 1e-6:
+        raise ValueError("a direction must not be zero; straight down is [0, 0, -1]")
+    return value
+
+
 Number = Annotated[float, _Fraction()]
 Positive = Annotated[float, Field(gt=0), _Fraction()]
 NotNegative = Annotated[float, Field(ge=0), _Fraction()]
@@ -272,6 +278,67 @@ class EntityConfig(StrictModel):
     """Share of the joint range, about its middle, that counts as inside the soft limits."""
 
 
+class TouchedConfig(StrictModel):
+    """What a contact sensor listens to contacts with."""
+
+    entity: str
+    """Name of an entity."""
+    bodies: Names | None = None
+    """Names or regexes of its bodies; null: all of them."""
+
+
+class ContactSensorConfig(StrictModel):
+    """What touches bodies of an entity: net force, and how long they have been in contact or in the air."""
+
+    kind: Literal["contact"]
+    """contact."""
+    entity: str = "robot"
+    """Name of an entity."""
+    bodies: Names
+    """Names or regexes of its bodies, one slot each in the order written."""
+    against: Literal["ground"] | TouchedConfig | None = None
+    """Only contacts with this: ground (the plane or the terrain), or bodies of an entity; null: with anything."""
+    history: Count = 1
+    """Steps that `force_history` keeps."""
+    force_threshold: NotNegative = 0.0
+    """Net force from which on a body counts as in contact [N]; 0: any contact does."""
+
+
+class GridPatternConfig(StrictModel):
+    """Parallel rays that start from a grid about the sensor, x running fastest."""
+
+    size: tuple[NotNegative, NotNegative]
+    """Extent along x and y [m]."""
+    resolution: Positive
+    """Distance between neighbouring rays [m]."""
+    direction: Annotated[Vec3, AfterValidator(_direction)] = (0.0, 0.0, -1.0)
+    """Where the rays go, in the sensor's frame."""
+
+
+class RaySensorConfig(StrictModel):
+    """Distances along rays from a body, as a height scanner or a lidar gives them."""
+
+    kind: Literal["rays"]
+    """rays."""
+    entity: str = "robot"
+    """Name of an entity."""
+    body: str | None = None
+    """The body that carries the sensor; null: the root."""
+    pattern: GridPatternConfig | Annotated[list[Annotated[Vec3, AfterValidator(_direction)]], Field(min_length=1)]
+    """A grid of parallel rays, or a list of directions from one point, in the sensor's frame."""
+    offset: Vec3 = (0.0, 0.0, 0.0)
+    """Where the sensor sits in its frame [m]."""
+    alignment: Literal["base", "yaw", "world"] = "base"
+    """Axes of the sensor's frame: those of the body, those of the body's heading with z up, or the world's."""
+    max_distance: Positive = 10.0
+    """Range [m]; what lies farther is missed."""
+    sees: Literal["ground", "all"] | Annotated[list[Annotated[int, Field(ge=0, le=5)]], Field(min_length=1)] = "ground"
+    """ground: the plane or the terrain; all: every geom but those of the body; or a list of geom groups."""
+
+
+SensorConfig = Annotated[ContactSensorConfig | RaySensorConfig, Field(discriminator="kind")]
+
+
 class SceneConfig(StrictModel):
     """What stands in each environment."""
 
@@ -285,6 +352,8 @@ class SceneConfig(StrictModel):
     """Lights."""
     entities: Annotated[dict[str, EntityConfig], Field(min_length=1)]
     """Name -> robot or object."""
+    sensors: dict[str, SensorConfig] = {}
+    """Name -> contact or ray sensor, for terms that ask for one. Sensors of the MJCF need no entry here."""
 
 
 class TaskConfig(StrictModel):

@@ -43,14 +43,17 @@ SECTIONS: dict[str, type[TermConfig]] = {
 SELECTORS = ("Joints", "Bodies", "Sites", "Sensors", "Actuators")
 """Aliases of `rlcli.task` that pick elements of the term's `entity`."""
 
+NAMED = ("Entity", "ContactSensor", "RaySensor")
+"""Aliases of `rlcli.task` that name one object of the scene."""
+
 _TYPES: dict[str, Any] = {
     "float": Number,
     "int": int,
     "bool": bool,
     "str": str,
     "None": None,
-    "Entity": str,
     "Range": Range,
+    **dict.fromkeys(NAMED, str),
     **dict.fromkeys(SELECTORS, Names),
 }
 _MDP = Path(__file__).resolve().parent.parent / "mdp"
@@ -206,7 +209,7 @@ def annotation_type(node: ast.expr) -> Any:
             return tuple[tuple(annotation_type(item) for item in items)]  # type: ignore[misc]
     raise SignatureError(
         f"annotation '{ast.unparse(node)}' is not one that YAML can express; use float, int, bool, str, Literal, tuple,"
-        f" list, X | None, Range, Entity or {' / '.join(SELECTORS)}"
+        f" list, X | None, Range, {' / '.join(NAMED)} or {' / '.join(SELECTORS)}"
     )
 
 
@@ -287,7 +290,7 @@ def _alias(node: ast.expr) -> str | None:
     if isinstance(node, ast.BinOp):
         return _alias(node.left) or _alias(node.right)
     name = _last_name(node)
-    return name if name in SELECTORS or name == "Entity" else None
+    return name if name in SELECTORS or name in NAMED else None
 
 
 def _quoted(text: str) -> ast.expr:

@@ -27,6 +27,7 @@ from rlcli.sim.entity import Entity, SimData, is_finite
 from rlcli.sim.names import NameProblem
 from rlcli.sim.scene import Scene
 from rlcli.sim.selection import Selection
+from rlcli.sim.sensors import ContactSensor, RaySensor, make_sensors
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,6 +228,8 @@ class VecEnv(ABC):
         diverged = self._simulate()
         self.episode_length_buf += 1
         self._steps += 1
+        for sensor in self.sensors.values():
+            sensor.update(self.step_dt)
         reward, terminated, truncated = self._judge(diverged)
         self._require_finite(reward, "the reward")
         self._hold_success()
@@ -298,9 +301,15 @@ class VecEnv(ABC):
             "success_hold": self._success_hold.clone(),
         }
         engine = {f"engine.{name}": value for name, value in self.engine.state_dict().items()}
+        sensors = {
+            f"sensors.{name}.{key}": value
+            for name, sensor in self.sensors.items()
+            for key, value in sensor.state_dict().items()
+        }
         return {
             **own,
             **engine,
+            **sensors,
             **{f"workflow.{name}": value for name, value in self._workflow_state().items()},
         }
 
@@ -313,6 +322,8 @@ class VecEnv(ABC):
         self._success_hold.copy_(state["success_hold"])
         self.engine.load_state_dict(_below(state, "engine."))
         self.sim.refresh()
+        for name, sensor in self.sensors.items():
+            sensor.load_state_dict(_below(state, f"sensors.{name}."))
         self._load_workflow_state(_below(state, "workflow."))
         return self._observe()
 
@@ -424,6 +435,8 @@ class VecEnv(ABC):
         selection.write(self._success_hold, 0.0)
         self.engine.forward(selection)
         self.sim.refresh_rows(selection)
+        for sensor in self.sensors.values():
+            sensor.reset(selection)
 
     def _select(self, mask: Tensor) -> Selection | None:
         return self.engine.select(mask, self.seed, self.episode_index)
@@ -477,6 +490,8 @@ class VecEnv(ABC):
                 self._binder.problems.append(resolved.problem(path, str(problem), problem.hint))
                 blank = entity.model_copy(update={"init": InitialStateConfig()})  # to go on to the other problems
                 self.entities[name] = Entity(name, blank, self.engine, self.sim)
+        self.sensors: dict[str, ContactSensor | RaySensor] = make_sensors(scene.sensors, self.sim, self.entities)
+        """Contact and ray sensors of `scene.sensors`, by name."""
         self._set_default(model)
         self.views = scene.views
         self.env_origins = grid(self.num_envs, config.scene.env_spacing).to(self.device)

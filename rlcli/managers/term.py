@@ -22,6 +22,11 @@ from rlcli.sim.names import NameProblem
 
 if TYPE_CHECKING:
     from rlcli.envs.vec_env import VecEnv
+    from rlcli.sim.sensors import ContactSensor, RaySensor
+
+
+SENSORS = {"ContactSensor": "contact", "RaySensor": "rays"}
+"""Alias of `rlcli.task` -> kind of the sensor that it names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +144,11 @@ class Binder:
                     return None, elements
                 params[parameter.name] = entity
         for parameter in signature.parameters:
+            if parameter.alias in SENSORS and params[parameter.name] is not None:
+                sensor = self._sensor(path, parameter.name, params[parameter.name], SENSORS[parameter.alias])
+                good = good and sensor is not None
+                params[parameter.name] = sensor
+        for parameter in signature.parameters:
             if parameter.alias in SELECTORS and params[parameter.name] is not None:
                 try:
                     index, names = params["entity"].select(parameter.alias, params[parameter.name])
@@ -148,6 +158,19 @@ class Binder:
                     continue
                 params[parameter.name], elements[parameter.name] = index, names
         return (params if good else None), elements
+
+    def _sensor(self, path: Path, parameter: str, name: str, kind: str) -> ContactSensor | RaySensor | None:
+        configs = self.resolved.task.scene.sensors
+        found = configs.get(name)
+        if found is not None and found.kind == kind:
+            return self.env.sensors.get(name)  # absent if the scene refused it, and has said so
+        names = [other for other, config in configs.items() if config.kind == kind]
+        message = f"no sensor '{name}' of kind {kind} in scene.sensors"
+        if found is not None:
+            message = f"sensor '{name}' is of kind {found.kind}, the term needs one of kind {kind}"
+        near = did_you_mean(name, names) or f"sensors of this kind: {listing(names) if names else 'none'}"
+        self._problem(path, parameter, message, near)
+        return None
 
     def _problem(self, path: Path, parameter: str, message: str, hint: str | None) -> None:
         self.problems.append(self.resolved.problem((*path, parameter), message, hint))

@@ -10,8 +10,16 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from rlcli.config.schema import EntityConfig, JointConfig, LightsConfig, SceneConfig, SimConfig
-from rlcli.errors import ConfigError, Problem
+from rlcli.config.schema import (
+    ContactSensorConfig,
+    EntityConfig,
+    JointConfig,
+    LightsConfig,
+    RaySensorConfig,
+    SceneConfig,
+    SimConfig,
+)
+from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli.sim.names import NameProblem, match
 
 _INTEGRATORS = {
@@ -26,6 +34,14 @@ _OPTIONS = (
     "wind", "magnetic", "disableflags", "enableflags", "disableactuator",
 )  # fmt: skip
 
+_FOUND_AND_FORCE = (1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)) | (
+    1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+)
+_NET_FORCE = 3
+"""Of a contact sensor's reductions the one that adds all contacts up, in the world frame."""
+_DRAWN_GROUPS = (0, 1, 2)
+"""Geom groups that viewers draw."""
+
 
 @dataclass(frozen=True, slots=True)
 class ActuatorNeed:
@@ -35,6 +51,24 @@ class ActuatorNeed:
     joints: str | list[str]
     kind: str
     path: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ContactSlots:
+    """A contact sensor in the model: its bodies, and the MJCF sensors of each, whose forces add up."""
+
+    config: ContactSensorConfig
+    bodies: list[str]
+    sensors: list[list[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class RayMount:
+    """A ray sensor in the model: the full name of its body, and the geom groups that it sees (None: all)."""
+
+    config: RaySensorConfig
+    body: str
+    groups: tuple[int, ...] | None
 
 
 class SceneProblem(ValueError):
@@ -57,12 +91,14 @@ class Scene:
         self.spec.copy_during_attach = True
         self.problems: list[SceneProblem] = []
         self.views: list[object] = []
+        self.sensors: dict[str, ContactSlots | RayMount] = {}
         for name, entity in config.entities.items():
             self._attach(name, entity)
         self._options()
         if config.ground is not None:
             self._ground()
         self._lights(config.lights)
+        self._sensors()
 
     def add(self, view):
         """Register a view; it is bound to the simulation once the model is compiled."""
@@ -248,6 +284,104 @@ class Scene:
                 name="distant", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, dir=lights.distant.direction,
                 pos=[0, 0, 20], diffuse=[strength * c for c in lights.distant.color], castshadow=True,
             )  # fmt: skip
+
+    def _sensors(self) -> None:
+        for name, config in self.config.sensors.items():
+            try:
+                if isinstance(config, ContactSensorConfig):
+                    self.sensors[name] = self._contact_sensor(name, config)
+                else:
+                    self.sensors[name] = self._ray_sensor(name, config)
+            except SceneProblem as problem:
+                self.problems.append(problem)
+
+    def _contact_sensor(self, name: str, config: ContactSensorConfig) -> ContactSlots:
+        """For each body and what it may touch, a sensor of the model: net force on the body, and how many contacts.
+
+        The body is the second of the two, which makes the force the one that acts on it.
+        """
+        path = ("scene", "sensors", name)
+        bodies = self._bodies(config.entity, config.bodies, path, "bodies")
+        solid = [body for body in self._bodies(config.entity, ".*", path, "bodies") if self._can_touch(body)]
+        for body in bodies:
+            if not self._can_touch(body):
+                have = listing([b.removeprefix(f"{config.entity}/") for b in solid]) if solid else "none"
+                short = body.removeprefix(f"{config.entity}/")
+                message = f"body '{short}' has no geom that can touch anything"
+                raise SceneProblem((*path, "bodies"), message, f"bodies that have: {have}")
+        made: list[list[str]] = []
+        for slot, body in enumerate(bodies):
+            made.append([])
+            for number, other in enumerate(self._touched(config, path)):
+                sensor = self.spec.add_sensor(name=f"//{name}/{slot}/{number}", type=mujoco.mjtSensor.mjSENS_CONTACT)
+                if other is not None:
+                    sensor.objtype, sensor.objname = other
+                sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, body
+                sensor.intprm[:3] = [_FOUND_AND_FORCE, _NET_FORCE, 1]
+                made[-1].append(sensor.name)
+        return ContactSlots(config, [body.removeprefix(f"{config.entity}/") for body in bodies], made)
+
+    def _touched(self, config: ContactSensorConfig, path: tuple[str, ...]) -> list[tuple[mujoco.mjtObj, str] | None]:
+        against = config.against
+        if against is None:
+            return [None]
+        if against == "ground":
+            if not self._ground_geoms():
+                raise SceneProblem((*path, "against"), "the scene has no ground", "add scene.ground or scene.terrain")
+            return [(mujoco.mjtObj.mjOBJ_GEOM, "ground")]
+        path = (*path, "against")
+        if against.bodies is not None:
+            bodies = self._bodies(against.entity, against.bodies, path, "bodies")
+            return [(mujoco.mjtObj.mjOBJ_BODY, body) for body in bodies]
+        every = self._bodies(against.entity, ".*", path, "bodies")
+        roots = [body for body in every if not self.spec.body(body).parent.name.startswith(f"{against.entity}/")]
+        return [(mujoco.mjtObj.mjOBJ_XBODY, body) for body in roots]
+
+    def _ray_sensor(self, name: str, config: RaySensorConfig) -> RayMount:
+        path = ("scene", "sensors", name)
+        bodies = self._bodies(config.entity, ".*" if config.body is None else config.body, path, "body")
+        if config.body is not None and len(bodies) > 1:
+            short = listing([body.removeprefix(f"{config.entity}/") for body in bodies])
+            raise SceneProblem((*path, "body"), f"'{config.body}' is several bodies: {short}", "name one")
+        groups = tuple(config.sees) if isinstance(config.sees, list) else None
+        if config.sees == "ground":
+            groups = (self._group_of_ground((*path, "sees")),)
+        return RayMount(config, bodies[0], groups)
+
+    def _bodies(self, entity: str, patterns: str | list[str], path: tuple[str, ...], key: str) -> list[str]:
+        """Full names of bodies of an entity."""
+        if entity not in self.config.entities:
+            near = did_you_mean(entity, self.config.entities) or f"entities: {listing(self.config.entities)}"
+            raise SceneProblem((*path, "entity"), f"no entity '{entity}' in the scene", near)
+        prefix = f"{entity}/"
+        names = [body.name.removeprefix(prefix) for body in self.spec.bodies if body.name.startswith(prefix)]
+        try:
+            return [prefix + names[position] for position in match(patterns, names, "body")]
+        except NameProblem as problem:
+            raise SceneProblem((*path, key), str(problem), problem.hint) from None
+
+    def _can_touch(self, body: str) -> bool:
+        geoms = self.spec.body(body).geoms
+        paired = {name for pair in self.spec.pairs for name in (pair.geomname1, pair.geomname2)}
+        return any(geom.contype or geom.conaffinity or (geom.name and geom.name in paired) for geom in geoms)
+
+    def _ground_geoms(self) -> list[mujoco.MjsGeom]:
+        return [geom for geom in self.spec.worldbody.geoms if geom.name == "ground"]
+
+    def _group_of_ground(self, path: tuple[str, ...]) -> int:
+        """The geom group of the ground, made its own: a group is what a ray can be told to see."""
+        ground = self._ground_geoms()
+        if not ground:
+            raise SceneProblem(path, "the scene has no ground", "add scene.ground or scene.terrain, or write sees: all")
+        names = {geom.name for geom in ground}
+        taken = {int(geom.group) for geom in self.spec.geoms if geom.name not in names}
+        free = [group for group in _DRAWN_GROUPS if group not in taken]
+        if not free:
+            message = f"geoms of the entities are in all groups that are drawn, {listing(map(str, _DRAWN_GROUPS))}"
+            raise SceneProblem(path, message, "leave one of them to the ground in the MJCF, or write sees: all")
+        for geom in ground:
+            geom.group = free[0]
+        return free[0]
 
 
 def joint_settings(entity: EntityConfig, joint: str) -> JointConfig:
