@@ -253,29 +253,86 @@ class JointConfig(StrictModel):
 
 
 class InitialStateConfig(StrictModel):
-    """The default state of an entity, which resets start from."""
+    """The default state of an entity, which resets start from; its pose is the entity's `pos` and `quat`."""
 
     joint_pos: dict[str, Number] = {}
     """Joint name or regex -> position [m or rad]."""
     joint_vel: dict[str, Number] = {}
     """Joint name or regex -> velocity [m/s or rad/s]."""
+    lin_vel: Vec3 = (0.0, 0.0, 0.0)
+    """Velocity of a free root, world frame [m/s]."""
+    ang_vel: Vec3 = (0.0, 0.0, 0.0)
+    """Angular velocity of a free root, world frame [rad/s]."""
+
+
+_SIZES = {
+    "box": "[x, y, z], its edges",
+    "sphere": "[radius]",
+    "cylinder": "[radius, length]",
+    "capsule": "[radius, length], the length without the round ends",
+    "plane": "[x, y], its edges",
+}
+"""Shape -> what its `size` holds [m]."""
 
 
 class EntityConfig(StrictModel):
-    """A robot or object: an MJCF file attached to the scene under the entity's name."""
+    """A robot or object: an MJCF file attached to the scene under the entity's name, or a single shape."""
 
-    model: str
+    model: str | None = None
     """MJCF file, relative to the task's folder."""
+    shape: Literal["box", "sphere", "cylinder", "capsule", "plane"] | None = None
+    """Instead of a model: a body `body` with one geom `geom`."""
+    size: list[Positive] | None = None
+    """Of a shape [m]: box [x, y, z] and plane [x, y] edges; sphere [radius]; cylinder and capsule [radius, length]."""
+    free: bool = False
+    """A shape: it moves freely; false: it stands where `pos` has put it."""
+    mocap: bool = False
+    """A shape: it stands still, and events may move it."""
+    mass: Positive | None = None
+    """Mass of a shape [kg]; null: its density decides."""
+    density: Positive | None = None
+    """Density of a shape [kg/m^3]; null: 1000."""
+    friction: NotNegative = 1.0
+    """Sliding friction of a shape."""
+    color: Color = (0.55, 0.6, 0.65)
+    """Red, green, blue of a shape in [0, 1]."""
     pos: Vec3 = (0.0, 0.0, 0.0)
-    """Position of the MJCF's origin in the environment's frame [m]."""
+    """Position of the MJCF's origin, or of the middle of the shape, in the environment's frame [m]."""
     quat: Quaternion = (1.0, 0.0, 0.0, 0.0)
     """Orientation (w, x, y, z)."""
     joints: dict[str, JointConfig] = {}
     """Joint name or regex -> what to change; where two match, the later one wins key by key."""
     init: InitialStateConfig = InitialStateConfig()
-    """Default joint state; a joint not named starts at the MJCF's qpos0, at rest."""
+    """Default state; a joint not named starts at the MJCF's qpos0, at rest."""
     soft_joint_pos_limit_factor: Annotated[float, Field(gt=0, le=1), _Fraction()] = 1.0
     """Share of the joint range, about its middle, that counts as inside the soft limits."""
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> EntityConfig:
+        if (self.model is None) == (self.shape is None):
+            raise ValueError("an entity is a model (an MJCF file) or a shape: write one of the two")
+        if self.model is not None:
+            given = [key for key in ("size", "mass", "density") if getattr(self, key) is not None]
+            given += [key for key in ("free", "mocap") if getattr(self, key)]
+            if given:
+                raise ValueError(f"'{given[0]}' belongs to a shape; of a model the MJCF says it")
+            return self
+        self._check_shape()
+        return self
+
+    def _check_shape(self) -> None:
+        assert self.shape is not None
+        wanted = _SIZES[self.shape]
+        count = wanted.partition("]")[0].count(",") + 1
+        if self.size is None or len(self.size) != count:
+            found = "none" if self.size is None else f"{len(self.size)} numbers"
+            raise ValueError(f"size of a {self.shape} is {wanted} [m]; found {found}")
+        if self.mass is not None and self.density is not None:
+            raise ValueError("mass and density exclude each other")
+        if self.free and self.mocap:
+            raise ValueError("free and mocap exclude each other")
+        if self.shape == "plane" and (self.free or self.mocap):
+            raise ValueError("a plane cannot move; a flat box can")
 
 
 class TouchedConfig(StrictModel):

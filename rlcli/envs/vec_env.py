@@ -25,6 +25,7 @@ from rlcli.managers.term import Binder
 from rlcli.sim.engine import open_engine
 from rlcli.sim.entity import Entity, SimData, is_finite
 from rlcli.sim.names import NameProblem
+from rlcli.sim.rotations import rotate_inverse
 from rlcli.sim.scene import Scene
 from rlcli.sim.selection import Selection
 from rlcli.sim.sensors import ContactSensor, RaySensor, make_sensors
@@ -501,6 +502,11 @@ class VecEnv(ABC):
         for entity in self.entities.values():
             qpos[entity.qpos_columns.cpu()] = entity.data.default_joint_pos[0].double().cpu()
             qvel[entity.dof_columns.cpu()] = entity.data.default_joint_vel[0].double().cpu()
+            if entity.is_floating:
+                _, dof = entity.floating()
+                root = entity.data.default_root_state[:1].double().cpu()
+                local = rotate_inverse(root[:, 3:7], root[:, 10:])  # a free joint's is in the body's frame
+                qvel[dof : dof + 6] = torch.cat([root[:, 7:10], local], dim=1)[0]
         self.engine.set_default(qpos, qvel)
         self.engine.reset(self._everyone())
         self.sim.refresh()

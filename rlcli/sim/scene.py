@@ -28,6 +28,13 @@ _INTEGRATORS = {
     "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
+_SHAPES = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "plane": mujoco.mjtGeom.mjGEOM_PLANE,
+}
 _OPTIONS = (
     "integrator", "cone", "jacobian", "solver", "tolerance", "ls_tolerance", "noslip_tolerance", "iterations",
     "ls_iterations", "noslip_iterations", "ccd_iterations", "ccd_tolerance", "impratio", "density", "viscosity",
@@ -141,32 +148,12 @@ class Scene:
         return model
 
     def _attach(self, name: str, entity: EntityConfig) -> None:
-        path = ("scene", "entities", name)
-        file = (self.root / entity.model).resolve()
-        if not file.is_relative_to(self.root):
-            self.problems.append(
-                SceneProblem((*path, "model"), f"'{entity.model}' lies outside the task's folder {self.root}")
-            )
-            return
-        if not file.is_file():
-            have = sorted(str(p.relative_to(self.root)) for p in self.root.rglob("*.xml"))
-            self.problems.append(
-                SceneProblem(
-                    (*path, "model"),
-                    f"no file '{entity.model}' in {self.root}",
-                    f"MJCF files there: {', '.join(have) or 'none'}",
-                )
-            )
-            return
-        try:
-            child = mujoco.MjSpec.from_file(str(file))
-        except ValueError as error:
-            self.problems.append(
-                SceneProblem((*path, "model"), f"'{entity.model}' is not a valid MJCF: {_one_line(error)}")
-            )
+        child = self._load(name, entity) if entity.model is not None else _shape(entity)
+        if child is None:
             return
         _name_all(child)
-        if name == next(iter(self.config.entities)):
+        models = [other for other, config in self.config.entities.items() if config.model is not None]
+        if name == next(iter(models), None):
             for option in _OPTIONS:
                 if hasattr(child.option, option):
                     setattr(self.spec.option, option, getattr(child.option, option))
@@ -179,6 +166,34 @@ class Scene:
             warnings.simplefilter("ignore")
             self.spec.attach(child, prefix=f"{name}/", frame=frame)
         self._override_joints(name, entity, degrees=bool(child.compiler.degree))
+
+    def _load(self, name: str, entity: EntityConfig) -> mujoco.MjSpec | None:
+        """The MJCF of an entity; None if it cannot be read."""
+        path = ("scene", "entities", name)
+        assert entity.model is not None
+        file = (self.root / entity.model).resolve()
+        if not file.is_relative_to(self.root):
+            self.problems.append(
+                SceneProblem((*path, "model"), f"'{entity.model}' lies outside the task's folder {self.root}")
+            )
+            return None
+        if not file.is_file():
+            have = sorted(str(p.relative_to(self.root)) for p in self.root.rglob("*.xml"))
+            self.problems.append(
+                SceneProblem(
+                    (*path, "model"),
+                    f"no file '{entity.model}' in {self.root}",
+                    f"MJCF files there: {', '.join(have) or 'none'}",
+                )
+            )
+            return None
+        try:
+            return mujoco.MjSpec.from_file(str(file))
+        except ValueError as error:
+            self.problems.append(
+                SceneProblem((*path, "model"), f"'{entity.model}' is not a valid MJCF: {_one_line(error)}")
+            )
+            return None
 
     def _override_joints(self, name: str, entity: EntityConfig, *, degrees: bool) -> None:
         joints = self._joints(name)
@@ -417,6 +432,31 @@ def actuator_kind(
 
 def _spec_kind(a: mujoco.MjsActuator) -> str:
     return actuator_kind(int(a.trntype), int(a.dyntype), int(a.gaintype), int(a.biastype), a.gainprm, a.biasprm)
+
+
+def _shape(entity: EntityConfig) -> mujoco.MjSpec:
+    """A body with one geom."""
+    assert entity.shape is not None
+    assert entity.size is not None
+    child = mujoco.MjSpec()
+    body = child.worldbody.add_body(name="body", mocap=entity.mocap)
+    if entity.free:
+        body.add_freejoint(name="root")
+    half = [edge / 2 for edge in entity.size]
+    sizes = {
+        "box": half,
+        "sphere": entity.size,
+        "cylinder": [entity.size[0], half[-1]],
+        "capsule": [entity.size[0], half[-1]],
+        "plane": [*half, 1.0],
+    }
+    size = sizes[entity.shape]
+    body.add_geom(
+        name="geom", type=_SHAPES[entity.shape], size=[*size, *[0.0] * (3 - len(size))], rgba=[*entity.color, 1.0],
+        friction=[entity.friction, 0.005, 0.0001], density=entity.density or 1000.0,
+        mass=np.nan if entity.mass is None else entity.mass,
+    )  # fmt: skip
+    return child
 
 
 def _name_all(child: mujoco.MjSpec) -> None:
