@@ -29,6 +29,7 @@ from rlcli.sim.rotations import rotate_inverse
 from rlcli.sim.scene import Scene
 from rlcli.sim.selection import Selection
 from rlcli.sim.sensors import ContactSensor, RaySensor, make_sensors
+from rlcli.sim.terrain import Terrain
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,6 +202,8 @@ class VecEnv(ABC):
             self.seed = seed
             self.episode_index.zero_()
             self._steps.zero_()
+            if self.terrain is not None:
+                self.terrain.start(seed)
         else:
             self.episode_index += 1
         self.engine.attach()
@@ -307,9 +310,11 @@ class VecEnv(ABC):
             for name, sensor in self.sensors.items()
             for key, value in sensor.state_dict().items()
         }
+        terrain = {} if self.terrain is None else self.terrain.state_dict()
         return {
             **own,
             **engine,
+            **{f"terrain.{name}": value for name, value in terrain.items()},
             **sensors,
             **{f"workflow.{name}": value for name, value in self._workflow_state().items()},
         }
@@ -323,6 +328,8 @@ class VecEnv(ABC):
         self._success_hold.copy_(state["success_hold"])
         self.engine.load_state_dict(_below(state, "engine."))
         self.sim.refresh()
+        if self.terrain is not None:
+            self.terrain.load_state_dict(_below(state, "terrain."))
         for name, sensor in self.sensors.items():
             sensor.load_state_dict(_below(state, f"sensors.{name}."))
         self._load_workflow_state(_below(state, "workflow."))
@@ -430,6 +437,7 @@ class VecEnv(ABC):
 
     def _restart(self, selection: Selection) -> None:
         self.engine.reset(selection)
+        self._place(selection)
         self.sim.refresh_rows(selection)  # a reset event or reset_idx reads the default state, not the last episode's
         self._restart_workflow(selection)
         selection.write(self.episode_length_buf, 0)
@@ -438,6 +446,16 @@ class VecEnv(ABC):
         self.sim.refresh_rows(selection)
         for sensor in self.sensors.values():
             sensor.reset(selection)
+
+    def _place(self, selection: Selection) -> None:
+        """Move what can move from its default place to the environment's own."""
+        if self.terrain is None:
+            return
+        for entity in self.entities.values():
+            if entity.is_floating or entity.mocap >= 0:
+                default = selection.peek(entity.data.default_root_state)
+                place = default[:, :3] + selection.peek(self.origins)
+                entity.write_root_pose(selection, place, default[:, 3:7])
 
     def _select(self, mask: Tensor) -> Selection | None:
         return self.engine.select(mask, self.seed, self.episode_index)
@@ -495,6 +513,12 @@ class VecEnv(ABC):
         """Contact and ray sensors of `scene.sensors`, by name."""
         self._set_default(model)
         self.views = scene.views
+        self.origins = torch.zeros(self.num_envs, 3, device=self.device)
+        """Where each environment's start place lies in its world: zeros without a terrain. (num_envs, 3) [m]"""
+        terrain = config.scene.terrain
+        self.terrain: Terrain | None = None
+        if terrain is not None and scene.ground is not None:
+            self.terrain = Terrain(scene.ground, terrain, self.origins, self.seed)
         self.env_origins = grid(self.num_envs, config.scene.env_spacing).to(self.device)
 
     def _set_default(self, model: mujoco.MjModel) -> None:

@@ -21,6 +21,8 @@ from rlcli.config.schema import (
 )
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli.sim.names import NameProblem, match
+from rlcli.sim.terrain import BODY as TERRAIN
+from rlcli.sim.terrain import Ground, add_ground, make_ground, misfits
 
 _INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
@@ -99,10 +101,13 @@ class Scene:
         self.problems: list[SceneProblem] = []
         self.views: list[object] = []
         self.sensors: dict[str, ContactSlots | RayMount] = {}
+        self.ground: Ground | None = None
         for name, entity in config.entities.items():
             self._attach(name, entity)
         self._options()
-        if config.ground is not None:
+        if config.terrain is not None:
+            self._terrain()
+        elif config.ground is not None:
             self._ground()
         self._lights(config.lights)
         self._sensors()
@@ -271,6 +276,24 @@ class Scene:
     def _ground(self) -> None:
         ground = self.config.ground
         assert ground is not None
+        self._surface()
+        self.spec.worldbody.add_geom(
+            name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[ground.size / 2, ground.size / 2, 1.0],
+            material="ground", friction=[ground.friction, 0.005, 0.0001],
+        )  # fmt: skip
+
+    def _terrain(self) -> None:
+        config = self.config.terrain
+        assert config is not None
+        wrong = [SceneProblem(("scene", "terrain", *p), text, hint) for p, text, hint in misfits(config, self.root)]
+        self.problems += wrong
+        if not wrong:
+            self._surface()
+            self.ground = make_ground(config, self.root)
+            add_ground(self.spec, self.ground, "ground")
+
+    def _surface(self) -> None:
+        """What the ground looks like, and the sky."""
         self.spec.add_texture(
             name="ground", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
             rgb1=[0.86, 0.88, 0.90], rgb2=[0.77, 0.79, 0.82], width=512, height=512,
@@ -280,10 +303,6 @@ class Scene:
         self.spec.add_texture(
             name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
             rgb1=[0.45, 0.63, 0.83], rgb2=[0.86, 0.91, 0.95], width=256, height=1536,
-        )  # fmt: skip
-        self.spec.worldbody.add_geom(
-            name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[ground.size / 2, ground.size / 2, 1.0],
-            material="ground", friction=[ground.friction, 0.005, 0.0001],
         )  # fmt: skip
 
     def _lights(self, lights: LightsConfig) -> None:
@@ -343,6 +362,8 @@ class Scene:
         if against == "ground":
             if not self._ground_geoms():
                 raise SceneProblem((*path, "against"), "the scene has no ground", "add scene.ground or scene.terrain")
+            if self.ground is not None:
+                return [(mujoco.mjtObj.mjOBJ_BODY, TERRAIN)]
             return [(mujoco.mjtObj.mjOBJ_GEOM, "ground")]
         path = (*path, "against")
         if against.bodies is not None:
@@ -381,6 +402,8 @@ class Scene:
         return any(geom.contype or geom.conaffinity or (geom.name and geom.name in paired) for geom in geoms)
 
     def _ground_geoms(self) -> list[mujoco.MjsGeom]:
+        if self.ground is not None:
+            return list(self.spec.body(TERRAIN).geoms)
         return [geom for geom in self.spec.worldbody.geoms if geom.name == "ground"]
 
     def _group_of_ground(self, path: tuple[str, ...]) -> int:
