@@ -156,7 +156,7 @@ class Binder:
                 params[parameter.name] = entity
         for parameter in signature.parameters:
             name = parameter.name
-            if parameter.alias == "Command":
+            if parameter.alias == "Command" and params[name] is not None:
                 params[name] = self._command(path, name, params[name])
                 good = good and params[name] is not None
             elif parameter.alias == "Address":

@@ -54,6 +54,8 @@ class Ground:
     """In world coordinates."""
     origins: NDArray[np.float32]
     """Of the patches. (rows, columns, 3) [m]"""
+    patch: tuple[float, float]
+    """Extent of a patch along x and y [m]."""
 
 
 def misfits(config: TerrainGeneratorConfig | TerrainHeightsConfig, root: Path) -> Iterator[Misfit]:
@@ -83,8 +85,9 @@ def make_ground(config: TerrainGeneratorConfig | TerrainHeightsConfig, root: Pat
     if isinstance(config, TerrainHeightsConfig):
         heights = np.load(root / config.file, allow_pickle=False).astype(np.float64)
         nx, ny = heights.shape
+        extent = ((nx - 1) * config.resolution, (ny - 1) * config.resolution)
         origin = np.array([[[0.0, 0.0, heights[nx // 2, ny // 2]]]], dtype=np.float32)
-        return Ground(heights, config.resolution, 0.0, config.friction, (), origin)
+        return Ground(heights, config.resolution, 0.0, config.friction, (), origin, extent)
     size, rows, columns = config.patch, config.rows, config.columns
     nx, ny = (round(edge / config.resolution) for edge in size)
     heights = np.zeros((rows * nx + 1, columns * ny + 1))
@@ -101,7 +104,7 @@ def make_ground(config: TerrainGeneratorConfig | TerrainHeightsConfig, root: Pat
             heights[row * nx : (row + 1) * nx + 1, column * ny : (column + 1) * ny + 1] = surface
             blocks += [_moved(block, low) for block in patch.blocks]
             origins[row, column] = (*(low + np.array(size) / 2), _spawn_height(patch.heights, config.resolution))
-    return Ground(heights, config.resolution, config.border, config.friction, tuple(blocks), origins)
+    return Ground(heights, config.resolution, config.border, config.friction, tuple(blocks), origins, size)
 
 
 def add_ground(spec: mujoco.MjSpec, ground: Ground, material: str) -> None:
@@ -164,6 +167,8 @@ class Terrain:
         """Column of each environment. (num_envs,) int64"""
         self.levels = torch.zeros(count, dtype=torch.int64, device=device)
         """Row of each environment. (num_envs,) int64"""
+        self.patch = ground.patch
+        """Extent of a patch along x and y [m]."""
         rows = len(self.origins)
         last = config.max_start_level if isinstance(config, TerrainGeneratorConfig) else None
         self._start_levels = rows if last is None else last + 1

@@ -264,6 +264,29 @@ def test_who_passes_the_last_level_lands_on_any_level(tmp_path):
     assert (counts > 25).all()
 
 
+def test_the_curriculum_of_levels_goes_by_the_distance_covered(tmp_path):
+    """Half a patch is 2 m; what is asked for is 0.5 m; every step ends an episode."""
+    none = dict.fromkeys(("joints", "push", "shove"))
+    terms = {"levels": {"func": "terrain_levels", "least": 0.5}}
+    env = on_terrain(tmp_path, HILLS, 4, events={**none, "root": {"func": "reset_scene_to_default", "mode": "reset"}},
+                     curriculum=terms, episode_length_s=0.02)  # fmt: skip
+    env.reset()
+    env.terrain.levels.copy_(torch.tensor([1, 1, 1, 2]))
+    env.engine.field("qpos")[:, 0] = env.origins[:, 0].double() + torch.tensor([2.2, 1.0, 0.1, -1.5])
+    env.engine.field("qpos")[:, 1] = env.origins[:, 1].double() + torch.tensor([0.0, 0.0, -0.1, -1.5])
+    assert env.step(torch.zeros(4, 4)).truncated.all()
+    assert env.terrain.levels.tolist() == [2, 1, 0, 3]
+    found = env.entities["robot"].data.root_pos_w - env.origins
+    torch.testing.assert_close(found, torch.tensor([[0.0, 0.0, 0.35]] * 4), atol=1e-5, rtol=0)
+    assert env.extras()["Curriculum/levels"] == pytest.approx(1.5)
+
+
+def test_a_curriculum_of_levels_without_a_terrain_is_refused(tmp_path):
+    task = edited(CRITTER_TASK, curriculum={"levels": {"func": "terrain_levels"}})
+    with pytest.raises(ConfigError, match=r"curriculum.levels: the scene has no terrain"):
+        build(critter(tmp_path, task), 1)
+
+
 def test_start_levels_depend_on_the_seed_and_are_bounded(tmp_path):
     env = on_terrain(tmp_path, {**HILLS, "max_start_level": 1}, 100)
     first = env.terrain.levels.clone()
