@@ -7,10 +7,9 @@ they were at the end of the recording; everything else that cannot be recorded i
 
 from __future__ import annotations
 
-import contextlib
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -32,28 +31,6 @@ def captured(work: Work, device: torch.device, holders: Iterable[Any] = (), tell
         tell: told once, in a sentence, if it cannot be recorded.
     """
     return Recording(work, device, list(holders), tell) if device.type == "cuda" else work
-
-
-class Beside:
-    """Work that a GPU may do at the same time as what follows, until `join`; a CPU does it in turn."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
-
-    @contextlib.contextmanager
-    def __call__(self) -> Iterator[None]:
-        """What is launched inside needs what was launched before, and nothing that comes after."""
-        if self._stream is None:
-            yield
-            return
-        self._stream.wait_stream(torch.cuda.current_stream(self._stream.device))
-        with torch.cuda.stream(self._stream):
-            yield
-
-    def join(self) -> None:
-        """What comes after needs it."""
-        if self._stream is not None:
-            torch.cuda.current_stream(self._stream.device).wait_stream(self._stream)
 
 
 class Recording:

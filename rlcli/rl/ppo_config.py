@@ -126,6 +126,9 @@ class PpoConfig(AgentConfig):
     std: Literal["log", "scalar"] = "log"
     """Whether the logarithm of the deviation is learned, or the deviation itself."""
 
+    compile: bool | None = None
+    """Whether torch's compiler fuses what a minibatch computes; null: on a GPU, if the run is long enough for it."""
+
     @model_validator(mode="before")
     @classmethod
     def _dialect(cls, data: Any) -> Any:
