@@ -1,14 +1,15 @@
-"""The parts of an update, fused by torch's own compiler, so that a GPU launches few kernels instead of many.
+"""What makes an update quick on a GPU: its parts fused by torch's own compiler, and matrices on tensor cores.
 
 What is compiled is kept in the user's cache folder. Nothing of a compiler is imported before `fused` is called.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
@@ -38,3 +39,14 @@ def fused(parts: Parts, rehearse: Callable[[Parts], None], tell: Callable[[str],
         tell(f"the update cannot be compiled and runs as it is: {type(error).__name__}: {said[:200]}")
         return parts
     return compiled
+
+
+@contextlib.contextmanager
+def tensor_cores(allowed: bool) -> Iterator[None]:
+    """Where it is allowed, products of float32 matrices may round what they multiply to TF32, 10 bits of mantissa."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if allowed else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)

@@ -20,7 +20,7 @@ from rlcli.errors import DivergedError
 from rlcli.random import derive
 from rlcli.rl import distributed
 from rlcli.rl.capture import captured
-from rlcli.rl.fusion import fused
+from rlcli.rl.fusion import fused, tensor_cores
 from rlcli.rl.networks import ActorCritic, ValueNormalizer, adam, flatten, remembered
 from rlcli.rl.policy import Lstm, Normalizer, Policy
 from rlcli.rl.ppo_config import PpoConfig
@@ -95,7 +95,7 @@ class PpoTrainer:
         self._recorded = torch.zeros(0, obs_size, device=self.device)
         self._notes: list[str] = []
         self._collect = captured(self._roll_out, self.device, env.holders(), self._notes.append)
-        self._parts = Parts()
+        self._tf32, self._parts = config.tf32 and self.device.type == "cuda", Parts()
         if to_be_compiled(config, self.device, self.steps_per_iteration):
             self._parts = fused(self._parts, self._rehearse, self._notes.append)
         self._learn = captured(self._update, self.device, tell=self._notes.append)
@@ -148,25 +148,26 @@ class PpoTrainer:
     @torch.no_grad()
     def _roll_out(self) -> None:
         """Take `num_steps` in every environment with the policy as it is."""
-        samples, bound = self._rollout.samples, self.config.action_bound
-        std = self.networks.std
+        rollout, samples, bound = self._rollout, self._rollout.samples, self.config.action_bound
         for name, memory in self._memory.items():
             self._memory_before[name].copy_(memory)
+        std, noise = self.networks.std, torch.randn_like(samples.action)
+        deviation = std * noise
+        samples.log_prob.copy_(log_prob(noise, std))
+        samples.begins[0].copy_(self._begins)
         for t in range(self.config.num_steps):
             obs, critic_obs = self._see(t)
             mean = self.networks.actor(self._recall(obs))
-            samples.begins[t].copy_(self._begins)
-            noise = torch.randn_like(mean)
-            action = mean + std * noise
+            action = mean + deviation[t]
             step = self.env.step(action if bound is None else action.clamp(-bound, bound))
             samples.obs[t].copy_(obs)
             if samples.critic_obs is not samples.obs:
                 samples.critic_obs[t].copy_(critic_obs)
             samples.action[t].copy_(action)
             samples.mean[t].copy_(mean)
-            samples.log_prob[t].copy_(log_prob(noise, std))
             self._keep_outcome(t, step)
             self._take_in(step.obs)
+        samples.begins[1:].copy_(rollout.ended[:-1])
         self._old_std.copy_(std.expand_as(self._old_std))
 
     def _see(self, t: int) -> tuple[Tensor, Tensor]:
@@ -190,9 +191,9 @@ class PpoTrainer:
     def _keep_outcome(self, t: int, step: StepResult) -> None:
         rollout = self._rollout
         torch.mul(step.reward, self.config.reward_scale, out=rollout.reward[t])
-        rollout.ended[t].copy_(step.terminated | step.truncated)
+        torch.logical_or(step.terminated, step.truncated, out=rollout.ended[t])
+        torch.gt(step.truncated, step.terminated, out=rollout.cut[t])  # true above false: by time alone
         self._begins.copy_(rollout.ended[t])
-        torch.logical_and(step.truncated, ~step.terminated, out=rollout.cut[t])
         if step.final_obs is not None and self.config.bootstrap == "final_obs":
             rollout.final_obs[t].copy_(self._critic_input(step.final_obs))
         self.statistics.add(step.episodes)
@@ -264,11 +265,17 @@ class PpoTrainer:
     # --- the update ---
 
     def _update(self) -> None:
+        """Estimate advantages, then descend."""
+        with tensor_cores(self._tf32):
+            self._estimate_advantages()
+            if self.normalizer is not None and self.config.normalizer_update == "rollout":
+                self._update_normalizers(self._raw)
+            self._optimize()
+            self._conclude()
+
+    def _optimize(self) -> None:
         """Several epochs of minibatches."""
         config, rollout = self.config, self._rollout
-        self._estimate_advantages()
-        if self.normalizer is not None and config.normalizer_update == "rollout":
-            self._update_normalizers(self._raw)
         self._sums.zero_()
         for epoch in range(config.num_epochs):
             if epoch == 0 or config.shuffle == "epoch":
@@ -278,7 +285,6 @@ class PpoTrainer:
                 self._descend(minibatch, number)
             self._adapt(self._kl / len(rollout.minibatches), "epoch")
         self._adapt(self._kl / len(rollout.minibatches), "iteration")
-        self._conclude()
 
     def _order(self) -> Tensor:
         """The samples in the order of the minibatches."""
@@ -337,12 +343,13 @@ class PpoTrainer:
 
     def _rehearse(self, parts: Parts) -> None:
         """Call what an update is made of on every shape of a minibatch; nothing that counts is changed."""
-        for number, minibatch in {len(b.target): (i, b) for i, b in enumerate(self._rollout.minibatches)}.values():
-            self._differentiate(parts.judge, minibatch, number)
-        if self.config.max_grad_norm is not None:
-            parts.clip_(self._gradient_parts, self.config.max_grad_norm)
-        if self.config.desired_kl is not None:
-            parts.adapt_(self.learning_rate.clone(), self._ceiling, self._shared_kl, self.config)
+        with tensor_cores(self._tf32):
+            for number, minibatch in {len(b.target): (i, b) for i, b in enumerate(self._rollout.minibatches)}.values():
+                self._differentiate(parts.judge, minibatch, number)
+            if self.config.max_grad_norm is not None:
+                parts.clip_(self._gradient_parts, self.config.max_grad_norm)
+            if self.config.desired_kl is not None:
+                parts.adapt_(self.learning_rate.clone(), self._ceiling, self._shared_kl, self.config)
 
     def _clip_gradient(self) -> None:
         if self.config.max_grad_norm is not None:

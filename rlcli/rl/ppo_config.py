@@ -128,6 +128,9 @@ class PpoConfig(AgentConfig):
 
     compile: bool | None = None
     """Whether torch's compiler fuses what a minibatch computes; null: on a GPU, if the run is long enough for it."""
+    tf32: bool = True
+    """On a GPU, updates multiply matrices in TF32: sums are float32, factors have 10 bits of mantissa. Acting is always
+    float32."""
 
     @model_validator(mode="before")
     @classmethod

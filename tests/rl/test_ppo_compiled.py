@@ -9,6 +9,7 @@ import worlds
 from rlcli.config.load import resolve
 from rlcli.envs.vec_env import make_env
 from rlcli.registry import find_task
+from rlcli.rl.fusion import tensor_cores
 from rlcli.rl.ppo import PpoTrainer
 from rlcli.rl.ppo_config import PpoConfig
 from rlcli.rl.ppo_setup import to_be_compiled
@@ -91,3 +92,12 @@ def test_without_a_compiler_the_update_runs_as_it_is_and_one_note_says_so(traine
 def test_an_update_is_compiled_if_asked_for_and_on_a_gpu_if_the_run_is_long(settings, device, expected):
     config = PpoConfig(trainer="ppo", **settings)
     assert to_be_compiled(config, torch.device(device), 65536) is expected
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+def test_rounding_to_tf32_ends_with_what_it_is_allowed_for(allowed):
+    before = torch.get_float32_matmul_precision()
+    with pytest.raises(ValueError, match="within"), tensor_cores(allowed):
+        assert torch.get_float32_matmul_precision() == ("high" if allowed else before)
+        raise ValueError("within")
+    assert torch.get_float32_matmul_precision() == before == "highest"
