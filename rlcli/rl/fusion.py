@@ -16,19 +16,23 @@ import torch
 
 from rlcli.rl.ppo_loss import Parts
 
+_FOLDER = "TORCHINDUCTOR_CACHE_DIR"
 
-def fused(parts: Parts, rehearse: Callable[[Parts], None], tell: Callable[[str], None]) -> Parts:
+
+def fused(
+    parts: Parts, rehearse: Callable[[Parts], None], tell: Callable[[str], None], *, tuned: bool = False
+) -> Parts:
     """The same functions, compiled; where they cannot be, as they are.
 
     Args:
         parts: what is to be compiled.
         rehearse: calls each of them once with every shape that will come, on tensors that may be spoilt.
         tell: told in a sentence if there is no compiler, or it fails.
+        tuned: try out kernels for the products of matrices, which takes its time, once a machine.
     """
-    import platformdirs
-
-    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(Path(platformdirs.user_cache_dir("rlcli")) / "inductor"))
-    compile_ = functools.partial(torch.compile, fullgraph=True, dynamic=False)
+    _keep_in_users_cache()
+    mode = "max-autotune-no-cudagraphs" if tuned else None
+    compile_ = functools.partial(torch.compile, fullgraph=True, dynamic=False, mode=mode)
     compiled = Parts(compile_(parts.judge), compile_(parts.clip_), compile_(parts.adapt_))
     try:
         with warnings.catch_warnings():
@@ -50,3 +54,12 @@ def tensor_cores(allowed: bool) -> Iterator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
+
+
+def _keep_in_users_cache() -> None:
+    """Let compiled code outlive the machine's temporary folder, where torch names a place as soon as it is imported."""
+    import platformdirs
+
+    asked = os.environ.get(_FOLDER)
+    if not asked or Path(asked).name.startswith("torchinductor_"):
+        os.environ[_FOLDER] = str(Path(platformdirs.user_cache_dir("rlcli")) / "inductor")

@@ -26,7 +26,7 @@ from rlcli.rl.policy import Lstm, Normalizer, Policy
 from rlcli.rl.ppo_config import PpoConfig
 from rlcli.rl.ppo_loss import KL, METRICS, Judged, Parts, log_prob
 from rlcli.rl.ppo_rollout import Rollout, Samples
-from rlcli.rl.ppo_setup import critic_groups, minibatch_sizes, policy_spec, to_be_compiled
+from rlcli.rl.ppo_setup import compilation, critic_groups, minibatch_sizes, policy_spec
 from rlcli.rl.rng import load_rng_state, rng_state
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
@@ -96,8 +96,9 @@ class PpoTrainer:
         self._notes: list[str] = []
         self._collect = captured(self._roll_out, self.device, env.holders(), self._notes.append)
         self._tf32, self._parts = config.tf32 and self.device.type == "cuda", Parts()
-        if to_be_compiled(config, self.device, self.steps_per_iteration):
-            self._parts = fused(self._parts, self._rehearse, self._notes.append)
+        how = compilation(config, self.device, self.steps_per_iteration)
+        if how:
+            self._parts = fused(self._parts, self._rehearse, self._notes.append, tuned=how == "tuned")
         self._learn = captured(self._update, self.device, tell=self._notes.append)
 
     def start(self) -> None:
@@ -154,10 +155,10 @@ class PpoTrainer:
         std, noise = self.networks.std, torch.randn_like(samples.action)
         deviation = std * noise
         samples.log_prob.copy_(log_prob(noise, std))
-        samples.begins[0].copy_(self._begins)
+        seen, begins = self._obs, self._begins
         for t in range(self.config.num_steps):
-            obs, critic_obs = self._see(t)
-            mean = self.networks.actor(self._recall(obs))
+            obs, critic_obs = self._see(t, seen)
+            mean = self.networks.actor(self._recall(obs, begins))
             action = mean + deviation[t]
             step = self.env.step(action if bound is None else action.clamp(-bound, bound))
             samples.obs[t].copy_(obs)
@@ -166,25 +167,28 @@ class PpoTrainer:
             samples.action[t].copy_(action)
             samples.mean[t].copy_(mean)
             self._keep_outcome(t, step)
-            self._take_in(step.obs)
+            seen, begins = step.obs, rollout.ended[t]
+        self._take_in(seen)
+        samples.begins[0].copy_(self._begins)
         samples.begins[1:].copy_(rollout.ended[:-1])
+        self._begins.copy_(begins)
         self._old_std.copy_(std.expand_as(self._old_std))
 
-    def _see(self, t: int) -> tuple[Tensor, Tensor]:
+    def _see(self, t: int, obs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """The observations of step t as actor and critic see them."""
         if self.normalizer is not None:
-            for group, obs in self._obs.items():
-                self._raw[group][t].copy_(obs)
+            for group, raw in self._raw.items():
+                raw[t].copy_(obs[group])
             if self.config.normalizer_update == "step":
-                self._update_normalizers(self._obs)
-        return self._actor_input(self._obs), self._critic_input(self._obs)
+                self._update_normalizers(obs)
+        return self._actor_input(obs), self._critic_input(obs)
 
-    def _recall(self, obs: Tensor) -> Tensor:
+    def _recall(self, obs: Tensor, begins: Tensor) -> Tensor:
         """What the actor's network sees: the observation, or what the memory makes of it."""
         if self.networks.memory is None:
             return obs
         memory = self._memory["actor"]
-        features, after = self.networks.memory(obs, memory * (1.0 - self._begins)[:, None])
+        features, after = self.networks.memory(obs, memory * (1.0 - begins)[:, None])
         memory.copy_(after)
         return features
 
@@ -193,7 +197,6 @@ class PpoTrainer:
         torch.mul(step.reward, self.config.reward_scale, out=rollout.reward[t])
         torch.logical_or(step.terminated, step.truncated, out=rollout.ended[t])
         torch.gt(step.truncated, step.terminated, out=rollout.cut[t])  # true above false: by time alone
-        self._begins.copy_(rollout.ended[t])
         if step.final_obs is not None and self.config.bootstrap == "final_obs":
             rollout.final_obs[t].copy_(self._critic_input(step.final_obs))
         self.statistics.add(step.episodes)
@@ -307,7 +310,8 @@ class PpoTrainer:
             self._adapt(self._shared_kl, "minibatch")
             batch.mean.copy_(judged.mean)
             self._old_std[number].copy_(judged.std)
-        self._kl += self._shared_kl
+        if self.config.kl_grain != "minibatch":
+            self._kl += self._shared_kl
 
     def _differentiate(self, judge: Callable[..., Judged], batch: Samples, number: int) -> Judged:
         """Judge a minibatch; gradient and divergence are then where all processes can share them."""

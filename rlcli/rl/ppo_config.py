@@ -126,8 +126,9 @@ class PpoConfig(AgentConfig):
     std: Literal["log", "scalar"] = "log"
     """Whether the logarithm of the deviation is learned, or the deviation itself."""
 
-    compile: bool | None = None
-    """Whether torch's compiler fuses what a minibatch computes; null: on a GPU, if the run is long enough for it."""
+    compile: bool | Literal["tuned"] | None = None
+    """Whether torch's compiler fuses what a minibatch computes; tuned: it also tries out matrix kernels, for half a
+    minute more the first time; null: true on a GPU, if the run is long enough for it."""
     tf32: bool = True
     """On a GPU, updates multiply matrices in TF32: sums are float32, factors have 10 bits of mantissa. Acting is always
     float32."""

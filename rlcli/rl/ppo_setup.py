@@ -65,10 +65,10 @@ def minibatch_sizes(env: VecEnv, config: PpoConfig, total: int) -> list[int]:
     raise _problem(env, key, message, "more environments, more num_steps, or fewer minibatches")
 
 
-def to_be_compiled(config: PpoConfig, device: torch.device, steps_per_iteration: int) -> bool:
-    """Whether a compiler is to fuse the update: if asked for, else on a GPU where it pays within the budget."""
+def compilation(config: PpoConfig, device: torch.device, steps_per_iteration: int) -> bool | str:
+    """Whether, and how, a compiler is to fuse the update: as asked for, else on a GPU where it pays in the budget."""
     if config.compile is not None or device.type != "cuda":
-        return bool(config.compile)
+        return config.compile or False
     limits = []
     if config.max_iterations is not None:
         limits.append(config.max_iterations)
