@@ -4,8 +4,8 @@ What is recorded are launches on fixed addresses. So the work may not ask the de
 from one run to the next must stay where it is. Tensors that a task binds anew in every step are copied back to where
 they were at the end of the recording; everything else that cannot be recorded is found, named, and run as it is.
 
-All of it is recorded in one stream: once a process holds a single recording with parallel branches, each launch of every
-recording takes about a third of a microsecond longer (docs/gpu.md).
+All of it is recorded in one stream: once a process holds a single recording with parallel branches, each launch of
+every recording takes about a third of a microsecond longer (docs/gpu.md).
 """
 
 from __future__ import annotations
