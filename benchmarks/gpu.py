@@ -181,6 +181,9 @@ def without(part):
 FEATURES = {
     "all on": {},
     "bootstrap from the state before, not from final_obs": {"bootstrap": "pre_step"},
+    "update not compiled": {"compile": False},
+    "update compiled and tuned": {"compile": "tuned"},
+    "update without TF32": {"tf32": False},
     "constant learning rate": {"schedule": "constant", "desired_kl": None},
     "no episode statistics": {"change": without("statistics")},
     "no divergence guard": {"change": without("guard")},

@@ -102,7 +102,7 @@ class ValueNormalizer(Normalizer):
 
 
 def flatten(module: nn.Module) -> tuple[nn.Parameter, Tensor, dict[str, slice]]:
-    """Make a module's parameters views of one vector, and their gradients views of another.
+    """Make a module's parameters views of one vector, that has a gradient of its own.
 
     Returns:
         The vector, its gradient with room for one more number behind it, and where each parameter lies.
@@ -115,7 +115,6 @@ def flatten(module: nn.Module) -> tuple[nn.Parameter, Tensor, dict[str, slice]]:
     for name, parameter in parameters.items():
         place = slice(start, start + parameter.numel())
         parameter.data = vector.data[place].view_as(parameter)
-        parameter.grad = gradient[place].view_as(parameter)
         places[name], start = place, place.stop
     return vector, gradient, places
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -19,19 +19,19 @@ from rlcli.envs.vec_env import StepResult, VecEnv
 from rlcli.errors import DivergedError
 from rlcli.random import derive
 from rlcli.rl import distributed
-from rlcli.rl.capture import Beside, captured
+from rlcli.rl.capture import captured
+from rlcli.rl.fusion import fused, tensor_cores
 from rlcli.rl.networks import ActorCritic, ValueNormalizer, adam, flatten, remembered
 from rlcli.rl.policy import Lstm, Normalizer, Policy
 from rlcli.rl.ppo_config import PpoConfig
+from rlcli.rl.ppo_loss import KL, METRICS, Judged, Parts, log_prob
 from rlcli.rl.ppo_rollout import Rollout, Samples
-from rlcli.rl.ppo_setup import critic_groups, minibatch_sizes, policy_spec
+from rlcli.rl.ppo_setup import compilation, critic_groups, minibatch_sizes, policy_spec
 from rlcli.rl.rng import load_rng_state, rng_state
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
 from rlcli.rl.trainer import Report, TrainerState
 
-_METRICS = ("surrogate", "value", "entropy", "kl", "clip_fraction", "bounds")
-"""Means over the updates of an iteration."""
 _RECORDED = 256
 """Recent observations that a checkpoint keeps, for checking what is made of the policy later."""
 _LEARNER_HINT = "lower learning_rate or max_grad_norm; the last good checkpoint is kept"
@@ -68,7 +68,9 @@ class PpoTrainer:
         self._vector, self._shared, places = flatten(self.networks)
         self._gradient, self._shared_kl = self._shared[:-1], self._shared[-1]
         self.peers.lead_(self._vector.data)
-        self._actor_end = min(place.start for name, place in places.items() if name.startswith("critic"))
+        end = min(place.start for name, place in places.items() if name.startswith("critic"))
+        joint = config.clip_grad == "joint"
+        self._gradient_parts = (self._gradient,) if joint else (self._gradient[:end], self._gradient[end:])
         self.learning_rate = torch.tensor(config.learning_rate, device=self.device)
         torch.manual_seed(self.peers.seed(derive(seed, "exploration"), "exploration"))
         self._ceiling = torch.tensor(config.learning_rate_range[1], device=self.device)
@@ -88,12 +90,15 @@ class PpoTrainer:
         self._memory, self._memory_before = ({k: m.blank(env.num_envs) for k, m in self._memories()} for _ in range(2))
         self._old_std = torch.ones(len(minibatches), self.spec.action_size, device=self.device)
         self._kl = torch.zeros((), device=self.device)
-        self._sums = torch.zeros(len(_METRICS), device=self.device)
-        self._metrics = torch.zeros(len(_METRICS) + 4, device=self.device)
+        self._sums = torch.zeros(len(METRICS), device=self.device)
+        self._metrics = torch.zeros(len(METRICS) + 4, device=self.device)
         self._recorded = torch.zeros(0, obs_size, device=self.device)
         self._notes: list[str] = []
-        self._beside = Beside(self.device)
         self._collect = captured(self._roll_out, self.device, env.holders(), self._notes.append)
+        self._tf32, self._parts = config.tf32 and self.device.type == "cuda", Parts()
+        how = compilation(config, self.device, self.steps_per_iteration)
+        if how:
+            self._parts = fused(self._parts, self._rehearse, self._notes.append, tuned=how == "tuned")
         self._learn = captured(self._update, self.device, tell=self._notes.append)
 
     def start(self) -> None:
@@ -144,51 +149,54 @@ class PpoTrainer:
     @torch.no_grad()
     def _roll_out(self) -> None:
         """Take `num_steps` in every environment with the policy as it is."""
-        samples, bound = self._rollout.samples, self.config.action_bound
-        std = self.networks.std
+        rollout, samples, bound = self._rollout, self._rollout.samples, self.config.action_bound
         for name, memory in self._memory.items():
             self._memory_before[name].copy_(memory)
+        std, noise = self.networks.std, torch.randn_like(samples.action)
+        deviation = std * noise
+        samples.log_prob.copy_(log_prob(noise, std))
+        seen, begins = self._obs, self._begins
         for t in range(self.config.num_steps):
-            obs, critic_obs = self._see(t)
-            mean = self.networks.actor(self._recall(obs))
-            samples.begins[t].copy_(self._begins)
-            noise = torch.randn_like(mean)
-            action = mean + std * noise
+            obs, critic_obs = self._see(t, seen)
+            mean = self.networks.actor(self._recall(obs, begins))
+            action = mean + deviation[t]
             step = self.env.step(action if bound is None else action.clamp(-bound, bound))
             samples.obs[t].copy_(obs)
             if samples.critic_obs is not samples.obs:
                 samples.critic_obs[t].copy_(critic_obs)
             samples.action[t].copy_(action)
             samples.mean[t].copy_(mean)
-            samples.log_prob[t].copy_(_log_prob(noise, std))
             self._keep_outcome(t, step)
-            self._take_in(step.obs)
+            seen, begins = step.obs, rollout.ended[t]
+        self._take_in(seen)
+        samples.begins[0].copy_(self._begins)
+        samples.begins[1:].copy_(rollout.ended[:-1])
+        self._begins.copy_(begins)
         self._old_std.copy_(std.expand_as(self._old_std))
 
-    def _see(self, t: int) -> tuple[Tensor, Tensor]:
+    def _see(self, t: int, obs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """The observations of step t as actor and critic see them."""
         if self.normalizer is not None:
-            for group, obs in self._obs.items():
-                self._raw[group][t].copy_(obs)
+            for group, raw in self._raw.items():
+                raw[t].copy_(obs[group])
             if self.config.normalizer_update == "step":
-                self._update_normalizers(self._obs)
-        return self._actor_input(self._obs), self._critic_input(self._obs)
+                self._update_normalizers(obs)
+        return self._actor_input(obs), self._critic_input(obs)
 
-    def _recall(self, obs: Tensor) -> Tensor:
+    def _recall(self, obs: Tensor, begins: Tensor) -> Tensor:
         """What the actor's network sees: the observation, or what the memory makes of it."""
         if self.networks.memory is None:
             return obs
         memory = self._memory["actor"]
-        features, after = self.networks.memory(obs, memory * (1.0 - self._begins)[:, None])
+        features, after = self.networks.memory(obs, memory * (1.0 - begins)[:, None])
         memory.copy_(after)
         return features
 
     def _keep_outcome(self, t: int, step: StepResult) -> None:
         rollout = self._rollout
         torch.mul(step.reward, self.config.reward_scale, out=rollout.reward[t])
-        rollout.ended[t].copy_(step.terminated | step.truncated)
-        self._begins.copy_(rollout.ended[t])
-        torch.logical_and(step.truncated, ~step.terminated, out=rollout.cut[t])
+        torch.logical_or(step.terminated, step.truncated, out=rollout.ended[t])
+        torch.gt(step.truncated, step.terminated, out=rollout.cut[t])  # true above false: by time alone
         if step.final_obs is not None and self.config.bootstrap == "final_obs":
             rollout.final_obs[t].copy_(self._critic_input(step.final_obs))
         self.statistics.add(step.episodes)
@@ -260,11 +268,17 @@ class PpoTrainer:
     # --- the update ---
 
     def _update(self) -> None:
+        """Estimate advantages, then descend."""
+        with tensor_cores(self._tf32):
+            self._estimate_advantages()
+            if self.normalizer is not None and self.config.normalizer_update == "rollout":
+                self._update_normalizers(self._raw)
+            self._optimize()
+            self._conclude()
+
+    def _optimize(self) -> None:
         """Several epochs of minibatches."""
         config, rollout = self.config, self._rollout
-        self._estimate_advantages()
-        if self.normalizer is not None and config.normalizer_update == "rollout":
-            self._update_normalizers(self._raw)
         self._sums.zero_()
         for epoch in range(config.num_epochs):
             if epoch == 0 or config.shuffle == "epoch":
@@ -274,7 +288,6 @@ class PpoTrainer:
                 self._descend(minibatch, number)
             self._adapt(self._kl / len(rollout.minibatches), "epoch")
         self._adapt(self._kl / len(rollout.minibatches), "iteration")
-        self._conclude()
 
     def _order(self) -> Tensor:
         """The samples in the order of the minibatches."""
@@ -286,47 +299,29 @@ class PpoTrainer:
 
     def _descend(self, batch: Samples, number: int) -> None:
         """One step of Adam down the clipped surrogate objective."""
-        config, networks, old_std = self.config, self.networks, self._old_std[number]
-        obs, critic_obs = self._inputs(batch, number)
-        with self._beside():
-            value_loss = self._value_loss(networks.value(critic_obs), batch)
-        std, mean, advantage = networks.std, networks.actor(obs), batch.advantage
-        if config.normalize_advantage == "minibatch":
-            advantage = self._standardized(advantage)
-
-        log_ratio = _log_prob((batch.action - mean) / std, std) - batch.log_prob
-        ratio = log_ratio.exp()
-        clipped = ratio.clamp(1.0 - config.clip_range, 1.0 + config.clip_range)
-        surrogate = -torch.min(advantage * ratio, advantage * clipped).mean()
-        entropy = (std.log() + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
-        self._beside.join()
-        loss = surrogate + config.value_coef * value_loss - config.entropy_coef * entropy
-        if config.bounds_coef:
-            bounds = (mean.abs() - config.bounds_margin).clamp(min=0.0).square().sum(dim=-1).mean()
-            loss = loss + config.bounds_coef * bounds
-        else:
-            bounds = torch.zeros_like(loss)
-
-        acted = config.kl_from == "rollout"
-        with torch.no_grad(), self._beside():
-            old, new = (batch.mean, old_std), (mean, std)
-            kl = _divergence(*old, *new) if acted else _divergence(*new, *old, eps=1e-5)
-            clip_fraction = ((ratio - 1.0).abs() > config.clip_range).float().mean()
-            self._sums += torch.stack((surrogate, value_loss, entropy, kl, clip_fraction, bounds))
-            self._shared_kl.copy_(kl)
-        self._gradient.zero_()
-        loss.backward()
-        self._beside.join()
+        judged = self._differentiate(self._parts.judge, batch, number)
+        self._sums += judged.metrics
         self.peers.average_(self._shared)
-        self._kl += self._shared_kl
-        if acted:
+        if self.config.kl_from == "rollout":
             self._adapt(self._shared_kl, "minibatch")
         self._clip_gradient()
         self._optimizer.step()
-        if not acted:
+        if self.config.kl_from == "last_pass":
             self._adapt(self._shared_kl, "minibatch")
-            batch.mean.copy_(mean.detach())
-            old_std.copy_(std.detach())
+            batch.mean.copy_(judged.mean)
+            self._old_std[number].copy_(judged.std)
+        if self.config.kl_grain != "minibatch":
+            self._kl += self._shared_kl
+
+    def _differentiate(self, judge: Callable[..., Judged], batch: Samples, number: int) -> Judged:
+        """Judge a minibatch; gradient and divergence are then where all processes can share them."""
+        obs, critic_obs = self._inputs(batch, number)
+        per_minibatch = self.config.normalize_advantage == "minibatch"
+        advantage = self._standardized(batch.advantage) if per_minibatch else batch.advantage
+        judged = judge(self.networks, self.config, batch, obs, critic_obs, advantage, self._old_std[number])
+        gradients = torch.autograd.grad(judged.loss, list(self.networks.parameters()))
+        torch.cat([*(part.flatten() for part in gradients), judged.metrics[KL : KL + 1]], out=self._shared)
+        return judged
 
     def _inputs(self, batch: Samples, number: int) -> tuple[Tensor, Tensor]:
         """What the networks see of a minibatch: with memories, they go through its environments' steps again."""
@@ -345,49 +340,39 @@ class PpoTrainer:
         ]
         return features[0], features[1]
 
-    def _value_loss(self, value: Tensor, batch: Samples) -> Tensor:
-        config = self.config
-        error = (value - batch.target).square()
-        if config.clip_value is not None:
-            most = config.clip_value_range or config.clip_range
-            clipped = batch.value + (value - batch.value).clamp(-most, most)
-            clipped_error = (clipped - batch.target).square()
-            error = torch.max(error, clipped_error) if config.clip_value == "larger" else clipped_error
-        return error.mean()
-
     def _adapt(self, kl: Tensor, grain: str) -> None:
-        """Move the learning rate to where the divergence is as desired, if that is the grain to do it at."""
-        desired = self.config.desired_kl
-        if desired is None or grain != self.config.kl_grain:
-            return
-        rate, low = self.learning_rate, self.config.learning_rate_range[0]
-        slower, faster = (rate / 1.5).clamp(min=low), (rate * 1.5).minimum(self._ceiling)
-        # a divergence from the rollout is 0 before the first step; one from the last pass is 0 all through the first
-        too_small = (kl < 0.5 * desired) & (kl > (0.0 if self.config.kl_from == "rollout" else -1.0))
-        rate.copy_(torch.where(kl > 2.0 * desired, slower, torch.where(too_small, faster, rate)))
+        """Adapt the learning rate, if that is the grain to do it at."""
+        if self.config.desired_kl is not None and grain == self.config.kl_grain:
+            self._parts.adapt_(self.learning_rate, self._ceiling, kl, self.config)
+
+    def _rehearse(self, parts: Parts) -> None:
+        """Call what an update is made of on every shape of a minibatch; nothing that counts is changed."""
+        with tensor_cores(self._tf32):
+            for number, minibatch in {len(b.target): (i, b) for i, b in enumerate(self._rollout.minibatches)}.values():
+                self._differentiate(parts.judge, minibatch, number)
+            if self.config.max_grad_norm is not None:
+                parts.clip_(self._gradient_parts, self.config.max_grad_norm)
+            if self.config.desired_kl is not None:
+                parts.adapt_(self.learning_rate.clone(), self._ceiling, self._shared_kl, self.config)
 
     def _clip_gradient(self) -> None:
-        most, end = self.config.max_grad_norm, self._actor_end
-        if most is None:
-            return
-        joint = self.config.clip_grad == "joint"
-        for part in (self._gradient,) if joint else (self._gradient[:end], self._gradient[end:]):
-            part.mul_((most / (part.norm() + 1e-6)).clamp(max=1.0))
+        if self.config.max_grad_norm is not None:
+            self._parts.clip_(self._gradient_parts, self.config.max_grad_norm)
 
     @torch.no_grad()
     def _conclude(self) -> None:
         """Put together what `iterate` reads."""
         updates = self.config.num_epochs * len(self._rollout.minibatches)
         last = torch.stack((self.networks.std.mean(), self.learning_rate, self._vector.isfinite().all().float()))
-        self._metrics[: len(_METRICS)].copy_(self._sums / updates)
-        self._metrics[len(_METRICS) : -1].copy_(last)
+        self._metrics[: len(METRICS)].copy_(self._sums / updates)
+        self._metrics[len(METRICS) : -1].copy_(last)
         self.peers.average_(self._metrics)
 
     # --- between rollout and update ---
 
     def _losses(self) -> dict[str, float]:
         *losses, std, learning_rate, finite, explained = self._metrics.tolist()
-        metrics = {f"Loss/{name}": value for name, value in zip(_METRICS, losses, strict=True)}
+        metrics = {f"Loss/{name}": value for name, value in zip(METRICS, losses, strict=True)}
         metrics |= {"Policy/mean_std": std, "Loss/learning_rate": learning_rate, "Loss/explained_variance": explained}
         for name in ("Loss/surrogate", "Loss/value", "Policy/mean_std"):
             if not math.isfinite(metrics[name]):
@@ -547,17 +532,6 @@ class PpoTrainer:
                 tensors.update({f"{name}.{key}": value for key, value in module.state_dict().items()})
         moments = {f"optimizer.{slot}": value for slot, value in self._optimizer.state[self._vector].items()}
         return {**tensors, **moments, "learning_rate": self.learning_rate}
-
-
-def _log_prob(noise: Tensor, std: Tensor) -> Tensor:
-    """Log-density of `mean + std * noise`. (n, a), (a,) -> (n,)"""
-    return -(0.5 * noise.square() + std.log() + 0.5 * math.log(2.0 * math.pi)).sum(dim=-1)
-
-
-def _divergence(mean: Tensor, std: Tensor, other_mean: Tensor, other_std: Tensor, eps: float = 0.0) -> Tensor:
-    """Mean of KL(N(mean, std) || N(other_mean, other_std)). (n, a), (a,), (n, a), (a,) -> ()"""
-    variances = (std.square() + (mean - other_mean).square()) / (2.0 * (other_std.square() + eps))
-    return ((other_std / std + eps).log() + variances - 0.5).sum(dim=-1).mean()
 
 
 def _joined(obs: Mapping[str, Tensor], groups: tuple[str, ...]) -> Tensor:

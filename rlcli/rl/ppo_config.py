@@ -126,6 +126,13 @@ class PpoConfig(AgentConfig):
     std: Literal["log", "scalar"] = "log"
     """Whether the logarithm of the deviation is learned, or the deviation itself."""
 
+    compile: bool | Literal["tuned"] | None = None
+    """Whether torch's compiler fuses what a minibatch computes; tuned: it also tries out matrix kernels, for half a
+    minute more the first time; null: true on a GPU, if the run is long enough for it."""
+    tf32: bool = True
+    """On a GPU, updates multiply matrices in TF32: sums are float32, factors have 10 bits of mantissa. Acting is always
+    float32."""
+
     @model_validator(mode="before")
     @classmethod
     def _dialect(cls, data: Any) -> Any:

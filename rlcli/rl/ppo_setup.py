@@ -9,6 +9,9 @@ from rlcli.errors import ConfigError
 from rlcli.rl.policy import PolicySpec
 from rlcli.rl.ppo_config import PpoConfig
 
+_WORTH_COMPILING = 40_000
+"""Minibatches of a run from which compiling pays on a GPU (docs/benchmarks.md)."""
+
 
 def policy_spec(env: VecEnv, config: PpoConfig) -> PolicySpec:
     """What the trained policy is made of."""
@@ -60,6 +63,21 @@ def minibatch_sizes(env: VecEnv, config: PpoConfig, total: int) -> list[int]:
         return sizes
     key = "num_minibatches" if config.minibatch_size is None else "minibatch_size"
     raise _problem(env, key, message, "more environments, more num_steps, or fewer minibatches")
+
+
+def compilation(config: PpoConfig, device: torch.device, steps_per_iteration: int) -> bool | str:
+    """Whether, and how, a compiler is to fuse the update: as asked for, else on a GPU where it pays in the budget."""
+    if config.compile is not None or device.type != "cuda":
+        return config.compile or False
+    limits = []
+    if config.max_iterations is not None:
+        limits.append(config.max_iterations)
+    if config.max_steps is not None:
+        limits.append(config.max_steps // steps_per_iteration)
+    parts = config.num_minibatches
+    if config.minibatch_size is not None:
+        parts = max(1, steps_per_iteration // config.minibatch_size)
+    return min(limits) * config.num_epochs * parts >= _WORTH_COMPILING
 
 
 def _problem(env: VecEnv, key: str, message: str, hint: str) -> ConfigError:

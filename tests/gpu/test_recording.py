@@ -8,6 +8,7 @@ from rlcli.envs.vec_env import make_env
 from rlcli.registry import find_task
 from rlcli.rl.capture import Recording
 from rlcli.rl.ppo import PpoTrainer
+from rlcli.rl.ppo_loss import Parts
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU, and there is none here")
 
@@ -105,18 +106,41 @@ def test_a_number_that_changes_from_step_to_step_is_named():
     assert "Counter.steps" in said[0]
 
 
-def test_training_records_rollout_and_update():
-    settings = {"scene.num_envs": 512, "agent.max_iterations": 8}
-    resolved = resolve(find_task("cartpole"), agent="ppo", device="cuda", flags=settings)
+def trainer_of(**settings):
+    resolved = resolve(
+        find_task("cartpole"), agent="ppo", device="cuda",
+        flags={"scene.num_envs": 512, "agent.max_iterations": 8, **settings},
+    )  # fmt: skip
     env = make_env(resolved, seed=1, device="cuda")
     trainer = PpoTrainer(env, resolved.agent, seed=1, device="cuda", torch_threads=1)
     trainer.start()
+    return trainer
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_training_records_rollout_and_update(compiled):
+    trainer = trainer_of(**{"agent.compile": compiled})
     reports = [trainer.iterate() for _ in range(8)]
     assert not any(report.notes for report in reports)
     assert all(report.metrics["Loss/learning_rate"] > 0 for report in reports)
     state = trainer.state()
     trainer.load(state)
     assert trainer.iterate().metrics["Train/mean_episode_length"] > 1.0
+    assert torch.get_float32_matmul_precision() == "highest"
+
+
+def test_a_compiled_minibatch_gives_the_gradient_of_the_plain_one():
+    trainer = trainer_of(**{"agent.compile": True, "agent.tf32": False})
+    trainer.iterate()
+    trainer._roll_out()
+    trainer._estimate_advantages()
+    trainer._rollout.arrange(trainer._order())
+    found = []
+    for judge in (trainer._parts.judge, Parts().judge):
+        metrics = trainer._differentiate(judge, trainer._rollout.minibatches[1], 1).metrics
+        found.append((metrics.clone(), trainer._shared.clone()))
+    assert trainer._parts.judge is not Parts().judge
+    torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-5)
 
 
 def test_a_task_with_ids_runs_eagerly_and_says_why():

@@ -338,7 +338,8 @@ def test_a_learner_that_turns_nonfinite_is_a_divergence(own, rate):
 @pytest.mark.parametrize("scope", ["joint", "separate"])
 def test_gradients_are_clipped_jointly_or_apart(own, scope):
     trainer = trainer_of(own, f"agent.clip_grad={scope}", "agent.max_grad_norm=0.5")
-    end, gradient = trainer._actor_end, trainer._gradient
+    gradient = trainer._gradient
+    end = len(gradient) - sum(p.numel() for n, p in trainer.networks.named_parameters() if n.startswith("critic"))
     gradient[:end], gradient[end:] = 0.001, 3.0
     before = gradient.clone()
     trainer._clip_gradient()
@@ -406,7 +407,7 @@ def test_all_values_where_masked_are_those_of_the_rows_alone(own):
 def addresses(trainer):
     held = {**trainer._learner(), **{f"obs.{k}": v for k, v in trainer._obs.items()}}
     held |= {f"actor.{name}": value for name, value in trainer.networks.actor.named_parameters()}
-    held |= {f"gradient.{name}": value.grad for name, value in trainer.networks.named_parameters()}
+    held["gradient"] = trainer._vector.grad
     held |= {f"normalizer.{name}": value for name, value in trainer.normalizer.state_dict().items()}
     held |= {"metrics": trainer._metrics, "samples": trainer._rollout.samples.value}
     return {name: value.data_ptr() for name, value in held.items()}
