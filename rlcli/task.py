@@ -53,8 +53,22 @@ Actuators: TypeAlias = Any
 """Actuators of `entity`. At run time: an index into actuator columns."""
 Command: TypeAlias = Any
 """A term of `commands:`. YAML: its name. At run time: the term, whose `.command` is (num_envs, k)."""
+ContactSensor: TypeAlias = Any
+"""A contact sensor of `scene.sensors`. YAML: its name. At run time: `rlcli.sim.sensors.ContactSensor`."""
+RaySensor: TypeAlias = Any
+"""A ray sensor of `scene.sensors`. YAML: its name. At run time: `rlcli.sim.sensors.RaySensor`."""
 Address: TypeAlias = Any
 """A number, or a list of numbers, of this configuration that may change while training goes on. YAML: its dotted key.
 At run time: a tensor on the environment's device; whoever reads the number reads what is written there."""
 Range: TypeAlias = tuple[float, float]
 """`[low, high]` with low <= high."""
+
+
+def reads_body_forces(term: Any) -> Any:
+    """Mark a term that reads `body_lin_acc_w`, `body_ang_acc_w` or `body_incoming_wrench_b` of an entity.
+
+    MuJoCo computes accelerations and forces of bodies only for models with a sensor that needs them; a task that uses
+    a term so marked gets one.
+    """
+    term.reads_body_forces = True
+    return term

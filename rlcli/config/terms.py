@@ -57,6 +57,7 @@ _TYPES: dict[str, Any] = {
     "Command": str,
     "Address": str,
     "Range": Range,
+    **dict.fromkeys(("ContactSensor", "RaySensor"), str),
     **dict.fromkeys(SELECTORS, Names),
 }
 _MDP = Path(__file__).resolve().parent.parent / "mdp"
