@@ -337,12 +337,11 @@ def joint_velocity_hinge_penalty(
 
 
 def applied_torque_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """How much more than they can actuators would have to give, summed [N or N m]. (num_envs,)
+    """How much of what actuators were to give their limits withhold, summed [N or N m]. (num_envs,)
 
-    By the present state and controls. Isaac Lab: of the last step, and of explicit actuators only.
+    MuJoCo's own actuators by the present state and controls. Isaac Lab: explicit actuators only, of the last substep.
     """
-    excess = entity.data.computed_effort.abs() - entity.data.joint_effort_limits
-    return excess[:, joints].clamp_(min=0.0).sum(dim=1)
+    return entity.data.withheld_effort[:, joints].sum(dim=1)
 
 
 def electrical_power_cost(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:

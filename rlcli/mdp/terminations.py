@@ -61,11 +61,11 @@ def joint_vel_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints:
 
 
 def joint_effort_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Some actuator would have to give more than it can. (num_envs,)
+    """Some actuator was to give more than it can. (num_envs,)
 
-    By the present state and controls. Isaac Lab: of the last step, and of explicit actuators only.
+    MuJoCo's own actuators by the present state and controls. Isaac Lab: explicit actuators only, of the last substep.
     """
-    return (entity.data.computed_effort.abs() > entity.data.joint_effort_limits)[:, joints].any(dim=1)
+    return (entity.data.withheld_effort[:, joints] > 0.0).any(dim=1)
 
 
 def illegal_contact(env: ManagedEnv, *, sensor: ContactSensor, threshold: float = 1.0) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 from rlcli.config.schema import EntityConfig
 from rlcli.errors import TaskError
 from rlcli.sim.engine import Engine, computes_body_forces
-from rlcli.sim.names import match
+from rlcli.sim.names import NameProblem, match
 from rlcli.sim.rotations import atan2, axis_x, length, multiply, rotate, rotate_inverse
 from rlcli.sim.scene import actuator_kind, joint_settings
 from rlcli.sim.selection import ALL, Columns, Selection
@@ -99,6 +99,8 @@ class Entity:
         self.dof_columns = torch.from_numpy(model.jnt_dofadr[self.joint_ids].astype(np.int64)).to(engine.device)
         self.root_body = int(self.body_ids[0]) if len(self.body_ids) else 0
         self.root_qpos, self.root_dof = self._root(model)
+        self.mocap = int(model.body_mocapid[self.root_body])
+        """Number of the mocap body that the root is; -1: none."""
         self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
         self._column_cache: dict[tuple, tuple[Columns, Columns]] = {}
         self.data = EntityData(self, sim)
@@ -150,7 +152,11 @@ class Entity:
         selection.write(self._qvel, values, self._columns(self.dof_columns, joints))
 
     def write_root_pose(self, selection: Selection, position: Tensor, quat: Tensor) -> None:
-        """Set the root's pose in its environment's frame. position (rows, 3) [m], quat (rows, 4) w, x, y, z"""
+        """Set the pose of a free or mocap root in its world. position (rows, 3) [m], quat (rows, 4) w, x, y, z"""
+        if self.mocap >= 0:
+            selection.write(self.engine.field("mocap_pos")[:, self.mocap], position)
+            selection.write(self.engine.field("mocap_quat")[:, self.mocap], quat)
+            return
         root, _ = self.floating()
         selection.write(self._qpos, torch.cat([position, quat], dim=1), slice(root, root + 7))
 
@@ -282,12 +288,16 @@ class EntityData:
     def root_pos_w(self) -> Tensor:
         """Root position. (num_envs, 3) [m]"""
         q = self._entity.root_qpos
+        if self._entity.mocap >= 0:
+            return self._sim.derived("mocap_pos")[:, self._entity.mocap]
         return self._sim.qpos[:, q : q + 3] if q is not None else self.default_root_state[:, :3]
 
     @property
     def root_quat_w(self) -> Tensor:
         """Root orientation (w, x, y, z). (num_envs, 4)"""
         q = self._entity.root_qpos
+        if self._entity.mocap >= 0:
+            return self._sim.derived("mocap_quat")[:, self._entity.mocap]
         return self._sim.qpos[:, q + 3 : q + 7] if q is not None else self.default_root_state[:, 3:7]
 
     @property
@@ -347,10 +357,10 @@ class EntityData:
 
     @property
     def computed_effort(self) -> Tensor:
-        """What actuators would put on the joints now, without limits on forces. (num_envs, k) [N or N m]
+        """What actuators would put on the joints without limits on forces. (num_envs, k) [N or N m]
 
-        By the present state and controls; for actuators on joints with a fixed gain, no or an affine bias and no
-        dynamics of their own (motor, position, velocity). Others count as 0.
+        Of actuator models, in the last substep. Of MuJoCo's actuators with a fixed gain, no or an affine bias and no
+        dynamics of their own (motor, position, velocity), by the present state and controls. Others count as 0.
         """
         return self._once("computed_effort", self._drives.computed)
 
@@ -361,6 +371,11 @@ class EntityData:
         [N or N m] From force limits of actuators and joints, and control limits of motors.
         """
         return self._once("joint_effort_limits", self._drives.limits)
+
+    @property
+    def withheld_effort(self) -> Tensor:
+        """How much less than `computed_effort` limits let through, >= 0. (num_envs, k) [N or N m]"""
+        return self._once("withheld_effort", self._drives.withheld)
 
     @property
     def body_pos_w(self) -> Tensor:
@@ -506,7 +521,12 @@ class EntityData:
         else:
             body = entity.root_body
             pose = np.concatenate([model.body_pos[body], model.body_quat[body]])
-        return torch.cat([torch.tensor(pose, dtype=torch.float32), torch.zeros(6)])
+        velocity = [*entity.config.init.lin_vel, *entity.config.init.ang_vel]
+        if entity.root_qpos is None and any(velocity):
+            raise NameProblem(
+                f"entity '{entity.name}' has no free root", "lin_vel and ang_vel are those of a free root"
+            )
+        return torch.tensor([*pose, *velocity], dtype=torch.float32)
 
 
 class _Drives:
@@ -547,6 +567,7 @@ class _Drives:
         self._driven[self._columns] = True
         self._no_range = torch.tensor([-math.inf, math.inf], device=device)
         self._clamped = (self._control_limited & ~self._is_motor)[:, None]
+        self._columns_of_models: list[tuple[ActuatorModel, Columns]] = []
 
     def computed(self) -> Tensor:
         """Efforts before limits. (num_envs, k)"""
@@ -556,7 +577,18 @@ class _Drives:
         low, high = torch.where(self._clamped, self._now("actuator_ctrlrange"), self._no_range).unbind(-1)
         control = entity.engine.field("ctrl")[:, self._ids].float().clamp(low, high)
         affine = torch.where(self._is_motor, 0.0, bias[..., 0] + bias[..., 1] * gear * q + bias[..., 2] * gear * v)
-        return self._by_joint(gear * (gain[..., 0] * control + affine))
+        efforts = self._by_joint(gear * (gain[..., 0] * control + affine))
+        for model, columns in self._models():
+            efforts[:, columns] = model.computed_effort
+        return efforts
+
+    def withheld(self) -> Tensor:
+        """What limits take away. (num_envs, k)"""
+        data = self._entity.data
+        beyond = (data.computed_effort.abs() - data.joint_effort_limits).clamp_(min=0.0)
+        for model, columns in self._models():
+            beyond[:, columns] = (model.computed_effort - model.applied_effort).abs_()
+        return beyond
 
     def limits(self) -> Tensor:
         """Largest efforts. (1 or num_envs, k)"""
@@ -564,9 +596,21 @@ class _Drives:
         largest = torch.where(self._force_limited, force.abs().amax(dim=-1), math.inf)
         control = (gain[..., None] * self._now("actuator_ctrlrange")).abs().amax(dim=-1)
         largest = torch.where(self._control_limited & self._is_motor, torch.minimum(largest, control), largest)
-        return torch.minimum(
+        limits = torch.minimum(
             torch.where(self._driven, self._by_joint(self._gear.abs() * largest), math.inf), self._joint_limits
         )
+        if self._entity.actuators:
+            limits = limits.expand(self._entity.engine.num_envs, -1).clone()
+        for model, columns in self._models():
+            limits[:, columns] = model.effort_limit
+        return limits
+
+    def _models(self) -> list[tuple[ActuatorModel, Columns]]:
+        """The entity's actuator models, which are made after it, with the joints that they drive."""
+        if len(self._columns_of_models) != len(self._entity.actuators):
+            device = self._entity.engine.device
+            self._columns_of_models = [(m, as_index(m.joints, device)) for m in self._entity.actuators]
+        return self._columns_of_models
 
     def _by_joint(self, values: Tensor) -> Tensor:
         total = torch.zeros(len(values), len(self._joint_limits), device=values.device)

@@ -244,3 +244,22 @@ def test_terms_say_what_does_not_fit_together(env):
             synced_feet_pairs=(("leg", "leg_br"), ("leg_fr", "leg_bl")))  # fmt: skip
     with pytest.raises(ValueError, match="3 values of std for 4 joints"):
         rewards.Posture(env, entity=env.entities["robot"], joints=slice(0, 4), std=[1.0, 2.0, 3.0])
+
+
+def test_what_an_actuator_model_withholds_is_its_own_limits(tmp_path):
+    """A PD controller of 30 N m/rad with a limit of 4 N m, 0.3 rad from its target: 9 N m asked, 5 withheld."""
+    robot = {"model": "arm.xml", "actuators": {"pd": {"kind": "pd", "joints": "swing", "stiffness": 30.0,
+                                                      "damping": 0.0, "effort_limit": 4.0}}}  # fmt: skip
+    rewards_of = {"limits": {"func": "applied_torque_limits", "weight": 1.0}}
+    task = {**SWING, "scene": {"num_envs": 3, "ground": None, "entities": {"robot": robot}}, "rewards": rewards_of,
+            "actions": {"torque": {"func": "joint_position", "use_default_offset": False}},
+            "observations": {"policy": {"pos": {"func": "joint_pos"}}},
+            "terminations": {**SWING["terminations"], "weak": {"func": "joint_effort_out_of_limit"}},
+            "sim": {"dt": 1e-5, "gravity": [0.0, 0.0, 0.0]}}  # fmt: skip
+    env = build(write(tmp_path / "swing", edited("{}", **task), arm_xml=PENDULUM), 3)
+    env.reset()
+    result = env.step(torch.tensor([[0.3], [0.1], [-0.2]]))
+    data = env.entities["robot"].data
+    assert result.reward.tolist() == pytest.approx([5.0 * 1e-5, 0.0, 2.0 * 1e-5], rel=1e-4)
+    assert result.terminated.tolist() == [True, False, True]
+    assert data.joint_effort_limits.tolist() == [[4.0]] * 3
