@@ -82,7 +82,7 @@ def out_of_bound(
     z: Range | None = None,
 ) -> Tensor:
     """The root is outside a box about its environment's origin [m]; no range, no bounds. (num_envs,)"""
-    outside = torch.zeros_like(env.termination_manager.terminated)
+    outside = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     place = entity.data.root_pos_w - env.origins
     for column, bounds in enumerate((x, y, z)):
         if bounds is not None:

@@ -4,8 +4,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
+import yaml
 from mdp_numbers import FEET, GRAVITY, TIP, states
-from worlds import CRITTER, build, write
+from worlds import CRITTER, build, dump, write
+
+from rlcli.config.terms import snake_case
 
 STEP_DT = 0.02
 EPISODE_S = 0.6
@@ -71,10 +74,12 @@ terminations:
 """
 
 
-def hand_made(folder, *overrides):
-    """An environment in the three states of `mdp_numbers`."""
-    files = {"walker_xml": WALKER, "arm_xml": ARM, "thing_xml": THING, "cabinet_xml": CABINET}
-    env = build(write(folder / "hand", TASK, **files), 3, *overrides)
+FILES = {"walker_xml": WALKER, "arm_xml": ARM, "thing_xml": THING, "cabinet_xml": CABINET}
+
+
+def hand_made(folder, *overrides, num_envs=3):
+    """Environments in the three states of `mdp_numbers`, in turn."""
+    env = build(write(folder / "hand", TASK, **FILES), num_envs, *overrides)
     env.reset()
     put(env)
     return env
@@ -82,14 +87,15 @@ def hand_made(folder, *overrides):
 
 def put(env):
     """Write the numbers into the engine and the managers."""
-    some, field = states(), env.engine.field
+    three, field = states(), env.engine.field
+    some = [three[i % 3] for i in range(env.num_envs)]
     model = env.engine.model
 
     def joint(name):
         j = model.joint(name)
         return int(j.qposadr[0]), int(j.dofadr[0])
 
-    env.engine.expand("opt.gravity").copy_(torch.tensor(GRAVITY))
+    env.engine.expand("opt.gravity").copy_(torch.tensor(GRAVITY)[torch.arange(env.num_envs) % 3])
     root, thing = joint("robot/root")[0], int(model.jnt_qposadr[model.body("object/box").jntadr[0]])
     for i, s in enumerate(some):
         qpos, qvel, ctrl = (torch.zeros(n, dtype=torch.float64) for n in (model.nq, model.nv, model.nu))
@@ -132,9 +138,10 @@ def stacked(values):
     return found if found.dtype == torch.bool else found.float()
 
 
-def sensors():
+def sensors(num_envs=3):
     """What contact and ray sensors, and commands, would hold, as the tensors that terms read."""
-    some = states()
+    three = states()
+    some = [three[i % 3] for i in range(num_envs)]
     feet = {name: stacked([getattr(s.feet, name) for s in some]) for name in vars(some[0].feet)}
     rays = {name: stacked([getattr(s.rays, name) for s in some]) for name in vars(some[0].rays)}
     commands = {name: SimpleNamespace(command=stacked([getattr(s, name) for s in some]))
@@ -161,3 +168,41 @@ def bound(env, kwargs, made):
         if name in given:
             given[name] = made[given[name]]
     return given
+
+
+def whole_task(rows, **sim):
+    """A task that uses rows of the table by their names and parameters, with real commands and sensors."""
+    task = yaml.safe_load(TASK)
+    task["sim"] |= sim
+    task["scene"]["ground"] = {"size": 50.0}
+    task["scene"]["sensors"] = {
+        "feet": {"kind": "contact", "bodies": FEET, "history": 2},
+        "rays": {"kind": "rays", "pattern": {"size": [0.2, 0.2], "resolution": 0.1}, "alignment": "yaw"},
+    }
+    box = {"x": [-0.3, 0.3], "y": [-0.3, 0.3]}
+    task["commands"] = {
+        "velocity": {"func": "uniform_velocity", "lin_vel_x": [-1, 1], "lin_vel_y": [-1, 1], "ang_vel_z": [-1, 1]},
+        "pose": {"func": "uniform_pose", "entity": "arm", "bodies": "fore", "z": [0.3, 0.6], "yaw": [-1, 1], **box},
+        "place": {"func": "uniform_pose2d", **box},
+        "world_pose": {"func": "uniform_pose", "entity": "arm", "bodies": "fore", "z": [0.3, 0.6], **box},
+    }
+    for command in task["commands"].values():
+        command["resampling_time_s"] = [0.1, 0.3]
+    task["events"] = {"start": {"func": "reset_joints_by_offset", "mode": "reset", "position": [-0.2, 0.2]}}
+    for section, terms in rows.items():
+        entries = {}
+        for number, (term, parameters, _) in enumerate(terms):
+            entries[f"{snake_case(term.__name__)}_{number}"] = {"func": snake_case(term.__name__), **parameters}
+        if section == "observations":
+            task[section] = {"policy": entries}
+        elif section == "rewards":
+            task[section] = {name: {"weight": 1.0, **entry} for name, entry in entries.items()}
+        else:
+            task[section] |= {name: {**entry, "time_out": False} for name, entry in entries.items()}
+    return dump(_lists(task))
+
+
+def _lists(value):
+    if isinstance(value, dict):
+        return {key: _lists(item) for key, item in value.items()}
+    return [_lists(item) for item in value] if isinstance(value, list | tuple) else value

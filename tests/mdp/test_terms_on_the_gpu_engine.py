@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from mdp_table import ROWS
-from mdp_worlds import bound, hand_made, sensors
+from mdp_table import OBSERVATIONS, REWARDS, ROWS, TERMINATIONS
+from mdp_worlds import FILES, bound, hand_made, sensors, whole_task
 from torch.utils._python_dispatch import TorchDispatchMode
 from worlds import build, edited, write
 
@@ -146,3 +146,30 @@ def test_steps_with_terms_of_forces_on_bodies_are_recorded(tmp_path):
     assert all(r.reward.isfinite().all() for r in results)
     assert results[-1].obs["policy"].abs().max() > 0.1
     assert observations.body_incoming_wrench.reads_body_forces
+
+
+def test_a_task_with_every_term_and_real_sensors_and_commands_is_recorded(tmp_path):
+    rows = {"observations": OBSERVATIONS, "rewards": REWARDS, "terminations": TERMINATIONS}
+    folder = write(tmp_path / "all", whole_task(rows, engine="warp"), **FILES)
+    env = build(folder, 3, "episode_length_s=0.1")
+    env.reset()
+    action = 0.3 * torch.ones(3, 4)
+    env.step(action)
+    with Recorded():
+        results = [env.step(action) for _ in range(12)]
+    env.check()
+    assert sum(int(r.episodes.mask.sum()) for r in results) >= 6
+    assert all(r.reward.isfinite().all() and r.obs["policy"].isfinite().all() for r in results)
+
+
+def test_a_task_with_every_term_lives_the_same_life_whatever_the_number_of_environments(tmp_path):
+    rows = {"observations": OBSERVATIONS, "rewards": REWARDS, "terminations": []}
+    folder = write(tmp_path / "all", whole_task(rows), **FILES)
+    few, many = build(folder, 2, "episode_length_s=0.1"), build(folder, 19, "episode_length_s=0.1")
+    first = [env.reset()["policy"] for env in (few, many)]
+    assert torch.equal(first[0], first[1][:2])
+    for step in range(12):
+        action = torch.full((19, 4), 0.3 * (-1) ** step)
+        left, right = few.step(action[:2]), many.step(action)
+        assert torch.equal(left.obs["policy"], right.obs["policy"][:2])
+        assert torch.equal(left.reward, right.reward[:2])
