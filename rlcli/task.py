@@ -62,3 +62,13 @@ Address: TypeAlias = Any
 At run time: a tensor on the environment's device; whoever reads the number reads what is written there."""
 Range: TypeAlias = tuple[float, float]
 """`[low, high]` with low <= high."""
+
+
+def reads_body_forces(term: Any) -> Any:
+    """Mark a term that reads `body_lin_acc_w`, `body_ang_acc_w` or `body_incoming_wrench_b` of an entity.
+
+    MuJoCo computes accelerations and forces of bodies only for models with a sensor that needs them; a task that uses
+    a term so marked gets one.
+    """
+    term.reads_body_forces = True
+    return term

@@ -394,7 +394,8 @@ class _Check:
         hint = did_you_mean(name, known)
         if hint is None and (other := self.vocabulary.other_section(section, name)):
             hint = f"'{name}' is a term of {other}"
-        self.problem(path, f"no {section.rstrip('s')} term '{name}'", hint or f"terms: {listing(known, 60)}")
+        what = section if section == "success" else section.removesuffix("s")
+        self.problem(path, f"no {what} term '{name}'", hint or f"terms: {listing(known, 60)}")
 
     def _params(self, data: Mapping[str, Any]) -> dict[str, Any] | None:
         """The parameters of a direct task, checked against the Params in its source."""

@@ -389,6 +389,8 @@ class JointConfig(StrictModel):
     """Position limits [m or rad]."""
     effort_limit: Positive | None = None
     """Largest force of the joint's actuator [N or N m]."""
+    velocity_limit: Positive | None = None
+    """Speed that terms judge by [m/s or rad/s]; the physics does not enforce it."""
     actuator: Literal["motor", "position", "velocity"] | None = None
     """Actuator to add where the MJCF has none of this kind; an action term adds what it needs by itself."""
     kp: Positive | None = None

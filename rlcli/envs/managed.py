@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +23,7 @@ from rlcli.managers.pipeline import Pipeline
 from rlcli.managers.reward import RewardManager
 from rlcli.managers.term import BoundTerm
 from rlcli.managers.termination import TerminationManager
+from rlcli.sim.engine import add_body_forces
 from rlcli.sim.scene import ActuatorNeed, Scene
 from rlcli.sim.selection import Selection
 
@@ -38,6 +39,8 @@ class ManagedEnv(VecEnv):
 
     def _prepare(self, scene: Scene) -> None:
         scene.add_actuators(self._actuator_needs())
+        if any(getattr(term, "reads_body_forces", False) for term in self._judging_terms()):
+            add_body_forces(scene.spec)
 
     def _bind(self) -> None:
         binder = self._binder
@@ -212,6 +215,18 @@ class ManagedEnv(VecEnv):
             ),
         ]
         return {**parts, **{"term." + ".".join(map(str, t.path)): t for t in terms if t.state_dict()}}
+
+    def _judging_terms(self) -> Iterator[Any]:
+        """The functions and classes behind observations, rewards, terminations and success, before they are bound."""
+        task = self.config
+        sections = {"rewards": task.rewards, "terminations": task.terminations, "success": {"success": task.success}}
+        groups = [("observations", group.terms) for group in task.observations.values()]
+        for section, configs in [*sections.items(), *groups]:
+            for config in configs.values():  # type: ignore[attr-defined]
+                if config is not None:
+                    signature = self.resolved.vocabulary.find(section, config.func)
+                    assert signature is not None  # phase 1 has looked it up
+                    yield self._binder.load(signature)
 
     def _actuator_needs(self) -> list[ActuatorNeed]:
         needs = []

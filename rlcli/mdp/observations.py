@@ -4,9 +4,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
-from rlcli.task import Entity, Joints
+from rlcli.mdp.measures import only, vector
+from rlcli.sim.rotations import atan2, conjugate, length, multiply, roll_pitch_yaw, rotate_inverse, unique, wrap_to_pi
+from rlcli.task import (
+    Bodies,
+    Command,
+    ContactSensor,
+    Entity,
+    Joints,
+    RaySensor,
+    Sensors,
+    Sites,
+    reads_body_forces,
+)
 
 if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
@@ -32,9 +45,21 @@ def joint_vel_rel(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints =
     return entity.data.joint_vel[:, joints] - entity.data.default_joint_vel[:, joints]
 
 
+def joint_pos_limit_normalized(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
+    """Joint positions, -1 at the lower and 1 at the upper soft limit; 0 for a joint without limits. (num_envs, k)"""
+    low, high = entity.data.soft_joint_pos_limits[joints].unbind(dim=1)
+    scaled = (2.0 * entity.data.joint_pos[:, joints] - low - high) / (high - low)
+    return torch.where(high - low < torch.inf, scaled, 0.0)
+
+
+def joint_effort(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
+    """Efforts of the actuators on the joints over the last substep, after their limits [N or N m]. (num_envs, k)"""
+    return entity.data.applied_effort[:, joints]
+
+
 def base_pos_z(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
-    """Height of the root [m]. (num_envs, 1)"""
-    return entity.data.root_pos_w[:, 2:3]
+    """Height of the root above its environment's origin [m]. (num_envs, 1)"""
+    return entity.data.root_pos_w[:, 2:3] - env.origins[:, 2:3]
 
 
 def base_lin_vel(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
@@ -52,6 +77,273 @@ def projected_gravity(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
     return entity.data.projected_gravity_b
 
 
+def root_pos_w(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
+    """Position of the root from its environment's origin, world frame [m]. (num_envs, 3)"""
+    return entity.data.root_pos_w - env.origins
+
+
+def root_quat_w(env: ManagedEnv, *, entity: Entity = "robot", make_quat_unique: bool = False) -> Tensor:
+    """Attitude of the root, a quaternion (w, x, y, z), world frame; made unique it has w >= 0. (num_envs, 4)"""
+    quat = entity.data.root_quat_w
+    return unique(quat) if make_quat_unique else quat
+
+
+def root_lin_vel_w(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
+    """Linear velocity of the root, world frame [m/s]. (num_envs, 3)"""
+    return entity.data.root_lin_vel_w
+
+
+def root_ang_vel_w(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
+    """Angular velocity of the root, world frame [rad/s]. (num_envs, 3)"""
+    return entity.data.root_ang_vel_w
+
+
+def base_yaw_roll(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
+    """Yaw and roll of the root [rad]. (num_envs, 2)"""
+    roll, _, yaw = roll_pitch_yaw(entity.data.root_quat_w)
+    return torch.stack([yaw, roll], dim=1)
+
+
+def base_roll_pitch(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
+    """Roll and pitch of the root [rad]. (num_envs, 2)"""
+    roll, pitch, _ = roll_pitch_yaw(entity.data.root_quat_w)
+    return torch.stack([roll, pitch], dim=1)
+
+
+def base_up_proj(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
+    """Cosine between the root's up axis and the way up: 1 upright, -1 on its head. (num_envs, 1)"""
+    return -entity.data.projected_gravity_b[:, 2:3]
+
+
+def base_heading_proj(env: ManagedEnv, *, entity: Entity = "robot", target: tuple[float, float, float]) -> Tensor:
+    """Part of the root's forward axis that points to `target`, horizontally: 1 where it faces it. (num_envs, 1)
+
+    target: a point [m] from the environment's origin.
+    """
+    way = vector(target, env.device)[:2] + env.origins[:, :2] - entity.data.root_pos_w[:, :2]
+    return (entity.data.forward_w[:, :2] * way).sum(dim=1, keepdim=True) / length(way).clamp_(min=1e-9)[:, None]
+
+
+def base_angle_to_target(env: ManagedEnv, *, entity: Entity = "robot", target: tuple[float, float, float]) -> Tensor:
+    """Angle from the root's heading to `target`, about the vertical [rad]. (num_envs, 1)
+
+    In [-pi, pi]; target: a point [m] from the environment's origin.
+    """
+    way = vector(target, env.device)[:2] + env.origins[:, :2] - entity.data.root_pos_w[:, :2]
+    return wrap_to_pi(atan2(way[:, 1], way[:, 0]) - entity.data.heading_w)[:, None]
+
+
+def body_pose_w(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
+    """Position from the environment's origin, in m, and quaternion (w, x, y, z) of each body. (num_envs, 7 k)"""
+    position = entity.data.body_pos_w[:, bodies] - env.origins[:, None]
+    return torch.cat([position, entity.data.body_quat_w[:, bodies]], dim=2).flatten(1)
+
+
+def body_projected_gravity_b(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
+    """Direction of gravity in each body's frame, length 1. (num_envs, 3 k)"""
+    quat = entity.data.body_quat_w[:, bodies]
+    return rotate_inverse(quat, entity.data.down_w[:, None].expand(-1, quat.shape[1], -1)).flatten(1)
+
+
+def body_state_b(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
+    """Position, quaternion, linear and angular velocity of each body, from the root, in its frame. (num_envs, 13 k)"""
+    data = entity.data
+    position = data.body_pos_w[:, bodies] - data.root_pos_w[:, None]
+    quat = data.root_quat_w[:, None].expand(-1, position.shape[1], -1)
+    parts = [
+        rotate_inverse(quat, position),
+        multiply(conjugate(quat), data.body_quat_w[:, bodies]),
+        rotate_inverse(quat, data.body_lin_vel_w[:, bodies]),
+        rotate_inverse(quat, data.body_ang_vel_w[:, bodies]),
+    ]
+    return torch.cat(parts, dim=2).flatten(1)
+
+
+@reads_body_forces
+def body_incoming_wrench(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
+    """Force and torque by which its parent holds each body, at its origin, in its frame [N, N m]. (num_envs, 6 k)
+
+    Of the last substep. Isaac Lab: `body_incoming_wrench`.
+    """
+    return entity.data.body_incoming_wrench_b[:, bodies].flatten(1)
+
+
 def last_action(env: ManagedEnv) -> Tensor:
     """The policy's last action, before scaling; zero at the start of an episode. (num_envs, a)"""
     return env.action_manager.action
+
+
+def generated_commands(env: ManagedEnv, *, command: Command) -> Tensor:
+    """What the policy is asked to do, as the term of `commands:` gives it. (num_envs, k)"""
+    return command.command
+
+
+def current_time_s(env: ManagedEnv) -> Tensor:
+    """Time since the episode began [s]. (num_envs, 1)"""
+    return env.episode_length_buf[:, None] * env.step_dt
+
+
+def remaining_time_s(env: ManagedEnv) -> Tensor:
+    """Time until the episode is cut off [s]. (num_envs, 1)"""
+    return (env.max_episode_length - env.episode_length_buf)[:, None] * env.step_dt
+
+
+def sensor_data(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
+    """Readings of sensors of the MJCF, each in its own unit, one after the other. (num_envs, k)
+
+    Those of forces and accelerations are of the last substep. mjlab: `builtin_sensor`.
+    """
+    return entity.data.sensordata[:, sensors]
+
+
+def imu_orientation(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
+    """Attitude that a `framequat` sensor of the MJCF reads, (w, x, y, z), world frame. (num_envs, 4)"""
+    return _reading(entity, sensors, 4, "framequat")
+
+
+def imu_projected_gravity(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
+    """Direction of gravity in the frame of a `framequat` sensor of the MJCF, length 1. (num_envs, 3)"""
+    return rotate_inverse(_reading(entity, sensors, 4, "framequat"), entity.data.down_w)
+
+
+def imu_ang_vel(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
+    """Angular velocity that a `gyro` of the MJCF reads, in its own frame [rad/s]. (num_envs, 3)"""
+    return _reading(entity, sensors, 3, "gyro")
+
+
+def imu_lin_acc(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
+    """Acceleration that an `accelerometer` of the MJCF reads, in its own frame [m/s^2]. (num_envs, 3)
+
+    Of the last substep; as of a real one: g upwards at rest, 0 in free fall.
+    """
+    return _reading(entity, sensors, 3, "accelerometer")
+
+
+def height_scan(env: ManagedEnv, *, sensor: RaySensor, offset: float = 0.5) -> Tensor:
+    """Height of the sensor above what each ray hits, less `offset` [m]. (num_envs, r)
+
+    A ray that hits nothing counts as having hit at its full length. Isaac Lab: infinite there.
+    """
+    return sensor.position[:, 2:3] - sensor.hits[:, :, 2] - offset
+
+
+def foot_height(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> Tensor:
+    """Height of sites above their environment's origin [m]. (num_envs, k)  mjlab: `foot_height`."""
+    return entity.data.site_pos_w[:, sites, 2] - env.origins[:, 2:3]
+
+
+def foot_air_time(env: ManagedEnv, *, sensor: ContactSensor) -> Tensor:
+    """How long each body of the sensor has been in the air [s]. (num_envs, k)  mjlab: `foot_air_time`."""
+    return sensor.air_time
+
+
+def foot_contact(env: ManagedEnv, *, sensor: ContactSensor) -> Tensor:
+    """1 where a body of the sensor is in contact. (num_envs, k)  mjlab: `foot_contact`."""
+    return sensor.found.float()
+
+
+def foot_contact_forces(env: ManagedEnv, *, sensor: ContactSensor) -> Tensor:
+    """Contact forces F, world frame, compressed to sign(F) log(1 + |F|) with F in N. (num_envs, 3 k)
+
+    mjlab: `foot_contact_forces`.
+    """
+    force = sensor.force.flatten(1)
+    return force.sign() * force.abs().log1p_()
+
+
+def fingers_contact_force_b(env: ManagedEnv, *, entity: Entity = "robot", sensor: ContactSensor) -> Tensor:
+    """Contact forces on the bodies of the sensor, in the root's frame [N]. (num_envs, 3 k)"""
+    quat = entity.data.root_quat_w[:, None].expand(-1, sensor.force.shape[1], -1)
+    return rotate_inverse(quat, sensor.force).flatten(1)
+
+
+def ee_pos(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> Tensor:
+    """Position of sites from the environment's origin, world frame [m]. (num_envs, 3 k)  Also `ee_frame_pos`."""
+    return (entity.data.site_pos_w[:, sites] - env.origins[:, None]).flatten(1)
+
+
+def ee_quat(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites, make_quat_unique: bool = True) -> Tensor:
+    """Attitude of sites (w, x, y, z), world frame; made unique they have w >= 0. (num_envs, 4 k)"""
+    quat = entity.data.site_quat_w[:, sites]
+    return (unique(quat) if make_quat_unique else quat).flatten(1)
+
+
+def ee_velocity(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> Tensor:
+    """Velocity of sites, in the root's frame [m/s]. (num_envs, 3 k)  mjlab: `ee_velocity`."""
+    velocity = entity.data.site_lin_vel_w[:, sites]
+    return rotate_inverse(entity.data.root_quat_w[:, None].expand(-1, velocity.shape[1], -1), velocity).flatten(1)
+
+
+def object_position_in_robot_root_frame(
+    env: ManagedEnv, *, entity: Entity = "robot", object: Entity = "object"
+) -> Tensor:
+    """Position of an object from the root of `entity`, in its frame [m]. (num_envs, 3)  Also `object_pos_b`."""
+    way = object.data.root_pos_w - entity.data.root_pos_w
+    return rotate_inverse(entity.data.root_quat_w, way)
+
+
+def object_quat_b(env: ManagedEnv, *, entity: Entity = "robot", object: Entity = "object") -> Tensor:
+    """Attitude of an object in the frame of the root of `entity` (w, x, y, z). (num_envs, 4)"""
+    return multiply(conjugate(entity.data.root_quat_w), object.data.root_quat_w)
+
+
+def rel_ee_object_distance(
+    env: ManagedEnv, *, entity: Entity = "robot", sites: Sites, object: Entity = "object"
+) -> Tensor:
+    """Way from a site of `entity` to the root of an object, world frame [m]. (num_envs, 3)"""
+    return object.data.root_pos_w - only(entity.data.site_pos_w[:, sites], "site")
+
+
+def ee_to_object_distance(
+    env: ManagedEnv, *, entity: Entity = "robot", sites: Sites, object: Entity = "object"
+) -> Tensor:
+    """Way from a site of `entity` to the root of an object, in the frame of the root of `entity` [m]. (num_envs, 3)
+
+    mjlab: `ee_to_object_distance`.
+    """
+    way = object.data.root_pos_w - only(entity.data.site_pos_w[:, sites], "site")
+    return rotate_inverse(entity.data.root_quat_w, way)
+
+
+class RelEeDrawerDistance:
+    """Way from a site of `entity` to a site, `handle`, of another entity, world frame [m]. (num_envs, 3)"""
+
+    def __init__(
+        self, env: ManagedEnv, *, entity: Entity = "robot", sites: Sites, cabinet: Entity = "cabinet", handle: str
+    ) -> None:
+        self._entity, self._sites = entity, sites
+        self._cabinet, self._handle = cabinet, cabinet.select("Sites", handle)[0]
+
+    def __call__(self) -> Tensor:
+        """(num_envs, 3)"""
+        handle = only(self._cabinet.data.site_pos_w[:, self._handle], "handle")
+        return handle - only(self._entity.data.site_pos_w[:, self._sites], "site")
+
+
+def object_to_goal_distance(
+    env: ManagedEnv, *, entity: Entity = "robot", object: Entity = "object", command: Command
+) -> Tensor:
+    """Way from an object to the goal of a pose command of `entity`, in its root's frame [m]. (num_envs, 3)
+
+    mjlab: `object_to_goal_distance`.
+    """
+    position = rotate_inverse(entity.data.root_quat_w, object.data.root_pos_w - entity.data.root_pos_w)
+    return command.command[:, :3] - position
+
+
+def goal_quat_diff(
+    env: ManagedEnv, *, object: Entity = "object", command: Command, make_quat_unique: bool = False
+) -> Tensor:
+    """Turn from the goal's attitude to the object's, world frame (w, x, y, z). (num_envs, 4)
+
+    The goal is columns 3 to 6 of the command, in the world frame.
+    """
+    quat = multiply(object.data.root_quat_w, conjugate(command.command[:, 3:7]))
+    return unique(quat) if make_quat_unique else quat
+
+
+def _reading(entity: Entity, sensors: Sensors, size: int, kind: str) -> Tensor:
+    values = entity.data.sensordata[:, sensors]
+    if values.shape[1] != size:
+        raise ValueError(f"needs one {kind} sensor, which has {size} columns; those selected have {values.shape[1]}")
+    return values

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from rlcli.sim.rotations import wrap_to_pi
-from rlcli.task import Entity, Joints
+from rlcli.mdp.measures import cosine, goal_in_world, only, vector
+from rlcli.sim.rotations import length, wrap_to_pi
+from rlcli.task import Bodies, Command, Entity, Joints, Sites
 
 if TYPE_CHECKING:
     from rlcli.envs.vec_env import VecEnv
@@ -27,3 +28,51 @@ def root_moves(
     """The root's velocity, projected on `direction` (world frame, of length 1), is above `speed` [m/s]. (num_envs,)"""
     x, y, z = entity.data.root_lin_vel_w.unbind(dim=1)
     return direction[0] * x + direction[1] * y + direction[2] * z > speed
+
+
+def root_upright(
+    env: VecEnv, *, entity: Entity = "robot", limit_angle: float, minimum_height: float | None = None
+) -> Tensor:
+    """The root's up axis is within `limit_angle` [rad] of the way up, and it is high enough [m]. (num_envs,)"""
+    upright = -entity.data.projected_gravity_b[:, 2] > cosine(limit_angle)
+    if minimum_height is None:
+        return upright
+    return upright & (entity.data.root_pos_w[:, 2] - env.origins[:, 2] > minimum_height)
+
+
+def root_near(env: VecEnv, *, entity: Entity = "robot", target: tuple[float, float, float], tolerance: float) -> Tensor:
+    """The root is within `tolerance` of `target`, a point from its environment's origin [m]. (num_envs,)"""
+    return length(entity.data.root_pos_w - env.origins - vector(target, env.device)) < tolerance
+
+
+def velocity_tracked(
+    env: VecEnv,
+    *,
+    entity: Entity = "robot",
+    command: Command,
+    linear_tolerance: float,
+    angular_tolerance: float,
+) -> Tensor:
+    """The root follows a velocity command to within [m/s] in the plane and [rad/s] about its up axis. (num_envs,)"""
+    data, asked = entity.data, command.command
+    linear = length(asked[:, :2] - data.root_lin_vel_b[:, :2]) < linear_tolerance
+    return linear & ((asked[:, 2] - data.root_ang_vel_b[:, 2]).abs() < angular_tolerance)
+
+
+def body_at_goal(
+    env: VecEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command, tolerance: float
+) -> Tensor:
+    """A body is within `tolerance` of the goal of a pose command of `entity` [m]. (num_envs,)"""
+    return length(only(entity.data.body_pos_w[:, bodies], "body") - goal_in_world(entity, command)) < tolerance
+
+
+def site_at_goal(env: VecEnv, *, entity: Entity = "robot", sites: Sites, command: Command, tolerance: float) -> Tensor:
+    """A site is within `tolerance` of the goal of a pose command of `entity` [m]. (num_envs,)"""
+    return length(only(entity.data.site_pos_w[:, sites], "site") - goal_in_world(entity, command)) < tolerance
+
+
+def object_at_goal(
+    env: VecEnv, *, entity: Entity = "robot", object: Entity = "object", command: Command, tolerance: float
+) -> Tensor:
+    """An object is within `tolerance` of the goal of a pose command of `entity` [m]. (num_envs,)"""
+    return length(object.data.root_pos_w - goal_in_world(entity, command)) < tolerance

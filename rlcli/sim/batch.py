@@ -98,6 +98,10 @@ class BatchEngine:
             raise ValueError(f"'{name}' cannot differ between worlds; {did_you_mean(name, MODEL_FIELDS) or ''}")
         return torch.from_numpy(self._batch.expand(name))
 
+    def expanded(self, name: str) -> Tensor | None:
+        """The same where somebody has asked for it before; None where all worlds share the model's value."""
+        return self.expand(name) if name in self._batch._expanded else None
+
     def set_constants(self) -> None:
         """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -51,6 +52,10 @@ class Engine(Protocol):
 
         After writing masses, inertias, positions and the like, call `set_constants`.
         """
+        ...
+
+    def expanded(self, name: str) -> Tensor | None:
+        """The same where somebody has asked for it before; None where all worlds share the model's value."""
         ...
 
     def set_constants(self) -> None:
@@ -154,6 +159,27 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
         raise DependencyError(f"the GPU engine needs mujoco-warp: {error}", hint='pip install "rlcli[gpu]"') from None
     room = capacity(model, config.contacts_per_env, config.constraints_per_env)
     return WarpEngine(model, num_envs, device, room, config.forces_after_reset)
+
+
+_BODY_FORCE_SENSORS = [
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}"))
+    for kind in ("ACCELEROMETER", "FORCE", "TORQUE", "FRAMELINACC", "FRAMEANGACC")
+]
+
+
+def computes_body_forces(model: mujoco.MjModel) -> bool:
+    """Whether a step computes `cacc`, `cfrc_int` and `cfrc_ext`: only for sensors that need them."""
+    return bool(np.isin(model.sensor_type, _BODY_FORCE_SENSORS).any())
+
+
+def add_body_forces(spec: mujoco.MjSpec) -> None:
+    """Have the model compute `cacc`, `cfrc_int` and `cfrc_ext`, with a sensor of nobody's."""
+    spec.add_sensor(
+        name="body_forces",
+        type=mujoco.mjtSensor.mjSENS_FRAMEANGACC,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        objname="world",
+    )
 
 
 def force_sensors(model: mujoco.MjModel) -> list[int]:

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from rlcli.config.schema import EntityConfig
 from rlcli.errors import TaskError
-from rlcli.sim.engine import Engine
+from rlcli.sim.engine import Engine, computes_body_forces
 from rlcli.sim.names import NameProblem, match
-from rlcli.sim.rotations import rotate, rotate_inverse
-from rlcli.sim.scene import actuator_kind
+from rlcli.sim.rotations import atan2, axis_x, length, multiply, rotate, rotate_inverse
+from rlcli.sim.scene import actuator_kind, joint_settings
 from rlcli.sim.selection import ALL, Columns, Selection
 
 if TYPE_CHECKING:
@@ -243,11 +243,22 @@ class EntityData:
         """Default joint velocities. (num_envs, k) [m/s or rad/s]"""
         self.default_root_state = self._default_root(model).to(device).expand(num_envs, -1).clone()
         """Default root pose and velocity: position, quat (w, x, y, z), linear, angular. (num_envs, 13)"""
-        self._gravity = torch.tensor(model.opt.gravity, dtype=torch.float32, device=device)
-        norm = self._gravity.norm()
-        self._down = (self._gravity / norm if norm > 0 else torch.tensor([0.0, 0.0, -1.0], device=device)).expand(
-            num_envs, -1
+        self.joint_vel_limits = torch.tensor(
+            [joint_settings(entity.config, name).velocity_limit or math.inf for name in entity.joint_names],
+            device=device,
         )
+        """Speed limit of each joint, `velocity_limit`, infinite where it has none. (k,) [m/s or rad/s]"""
+        self._gravity = torch.tensor(model.opt.gravity, dtype=torch.float32, device=device).expand(num_envs, -1)
+        self._down = _direction(self._gravity)
+        self._tree_root = torch.from_numpy(model.body_rootid[entity.body_ids].astype(np.int64)).to(device)
+        self._site_index = as_index(entity.site_ids.tolist(), device)
+        self._site_body = torch.from_numpy(model.site_bodyid[entity.site_ids].astype(np.int64)).to(device)
+        self._site_quat = torch.tensor(model.site_quat[entity.site_ids], dtype=torch.float32, device=device)
+        self._tree_root_of_sites = torch.from_numpy(
+            model.body_rootid[model.site_bodyid[entity.site_ids]].astype(np.int64)
+        ).to(device)
+        self._computes_body_forces = computes_body_forces(model)
+        self._drives = _Drives(entity)
 
     @property
     def joint_pos(self) -> Tensor:
@@ -312,9 +323,59 @@ class EntityData:
         return self._once("root_ang_vel_w", lambda: rotate(self.root_quat_w, self.root_ang_vel_b))
 
     @property
+    def root_com_lin_vel_w(self) -> Tensor:
+        """Velocity of the root body's centre of mass, world frame. (num_envs, 3) [m/s]"""
+        return self.body_com_lin_vel_w[:, 0]
+
+    @property
+    def forward_w(self) -> Tensor:
+        """The root's x axis, world frame. (num_envs, 3)"""
+        return self._once("forward_w", lambda: axis_x(self.root_quat_w))
+
+    @property
+    def heading_w(self) -> Tensor:
+        """Direction of the root's x axis in the horizontal plane, about z from the world's x. (num_envs,) [rad]"""
+        return self._once("heading_w", lambda: atan2(self.forward_w[:, 1], self.forward_w[:, 0]))
+
+    @property
+    def gravity_w(self) -> Tensor:
+        """Gravity, the environment's own where it differs between environments. (num_envs, 3) [m/s^2]"""
+        own = self._entity.engine.expanded("opt.gravity")
+        return self._gravity if own is None else self._once("gravity_w", lambda: own.float().view(-1, 3))
+
+    @property
+    def down_w(self) -> Tensor:
+        """Direction of gravity, length 1; -z where there is none. (num_envs, 3)"""
+        if self._entity.engine.expanded("opt.gravity") is None:
+            return self._down
+        return self._once("down_w", lambda: _direction(self.gravity_w))
+
+    @property
     def projected_gravity_b(self) -> Tensor:
         """Direction of gravity in the root's frame, length 1. (num_envs, 3)"""
-        return self._once("projected_gravity_b", lambda: rotate_inverse(self.root_quat_w, self._down))
+        return self._once("projected_gravity_b", lambda: rotate_inverse(self.root_quat_w, self.down_w))
+
+    @property
+    def computed_effort(self) -> Tensor:
+        """What actuators would put on the joints without limits on forces. (num_envs, k) [N or N m]
+
+        Of actuator models, in the last substep. Of MuJoCo's actuators with a fixed gain, no or an affine bias and no
+        dynamics of their own (motor, position, velocity), by the present state and controls. Others count as 0.
+        """
+        return self._once("computed_effort", self._drives.computed)
+
+    @property
+    def joint_effort_limits(self) -> Tensor:
+        """Largest effort of the actuators on each joint, infinite where nothing limits it. (1 or num_envs, k)
+
+        [N or N m] From force limits of actuators and joints, and control limits of motors.
+        """
+        return self._once("joint_effort_limits", self._drives.limits)
+
+    @property
+    def withheld_effort(self) -> Tensor:
+        """How much less than `computed_effort` limits let through, >= 0. (num_envs, k) [N or N m]"""
+        return self._once("withheld_effort", self._drives.withheld)
 
     @property
     def body_pos_w(self) -> Tensor:
@@ -327,9 +388,122 @@ class EntityData:
         return self._sim.derived("xquat")[:, self._body_index]
 
     @property
+    def body_com_pos_w(self) -> Tensor:
+        """Centres of mass of the bodies. (num_envs, bodies, 3) [m]"""
+        return self._sim.derived("xipos")[:, self._body_index]
+
+    @property
+    def body_ang_vel_w(self) -> Tensor:
+        """Angular velocities of the bodies, world frame. (num_envs, bodies, 3) [rad/s]"""
+        return self._sim.derived("cvel")[:, self._body_index, :3]
+
+    @property
+    def body_lin_vel_w(self) -> Tensor:
+        """Velocities of the bodies' frame origins, world frame. (num_envs, bodies, 3) [m/s]"""
+        return self._once("body_lin_vel_w", lambda: self._velocity_at(self.body_pos_w))
+
+    @property
+    def body_com_lin_vel_w(self) -> Tensor:
+        """Velocities of the bodies' centres of mass, world frame. (num_envs, bodies, 3) [m/s]"""
+        return self._once("body_com_lin_vel_w", lambda: self._velocity_at(self.body_com_pos_w))
+
+    @property
+    def body_lin_vel_b(self) -> Tensor:
+        """Velocities of the bodies' frame origins, each in its body's frame. (num_envs, bodies, 3) [m/s]"""
+        return self._once("body_lin_vel_b", lambda: rotate_inverse(self.body_quat_w, self.body_lin_vel_w))
+
+    @property
+    def body_ang_vel_b(self) -> Tensor:
+        """Angular velocities of the bodies, each in its body's frame. (num_envs, bodies, 3) [rad/s]"""
+        return self._once("body_ang_vel_b", lambda: rotate_inverse(self.body_quat_w, self.body_ang_vel_w))
+
+    @property
+    def body_ang_acc_w(self) -> Tensor:
+        """Angular accelerations over the last substep, world frame. (num_envs, bodies, 3) [rad/s^2]"""
+        return self._body_force("cacc")[:, self._body_index, :3]
+
+    @property
+    def body_lin_acc_w(self) -> Tensor:
+        """Accelerations of the bodies' frame origins over the last substep, world frame. (num_envs, bodies, 3) [m/s^2]
+
+        0 at rest, and that of gravity in free fall.
+        """
+
+        def compute() -> Tensor:
+            acceleration = self._body_force("cacc")[:, self._body_index]
+            angular, linear = acceleration[..., :3], acceleration[..., 3:]
+            at_origin = linear + torch.linalg.cross(angular, self._from_tree_com(self.body_pos_w))
+            turning = torch.linalg.cross(self.body_ang_vel_w, self.body_lin_vel_w)
+            return at_origin + turning + self.gravity_w[:, None]  # MuJoCo's accelerations are against gravity
+
+        return self._once("body_lin_acc_w", compute)
+
+    @property
+    def body_incoming_wrench_b(self) -> Tensor:
+        """Force and torque by which each body's parent holds it, in the body's frame. (num_envs, bodies, 6) [N, N m]
+
+        Of the last substep; the torque is about the body's frame origin.
+        """
+
+        def compute() -> Tensor:
+            wrench = self._body_force("cfrc_int")[:, self._body_index]
+            force = wrench[..., 3:]
+            torque = wrench[..., :3] - torch.linalg.cross(self._from_tree_com(self.body_pos_w), force)
+            quat = self.body_quat_w
+            return torch.cat([rotate_inverse(quat, force), rotate_inverse(quat, torque)], dim=-1)
+
+        return self._once("body_incoming_wrench_b", compute)
+
+    @property
+    def site_pos_w(self) -> Tensor:
+        """Site positions. (num_envs, sites, 3) [m]"""
+        return self._sim.derived("site_xpos")[:, self._site_index]
+
+    @property
+    def site_quat_w(self) -> Tensor:
+        """Site orientations (w, x, y, z). (num_envs, sites, 4)"""
+        return self._once(
+            "site_quat_w",
+            lambda: multiply(self._sim.derived("xquat")[:, self._site_body], self._site_quat),
+        )
+
+    @property
+    def site_ang_vel_w(self) -> Tensor:
+        """Angular velocities of the sites, world frame. (num_envs, sites, 3) [rad/s]"""
+        return self._sim.derived("cvel")[:, self._site_body, :3]
+
+    @property
+    def site_lin_vel_w(self) -> Tensor:
+        """Velocities of the sites, world frame. (num_envs, sites, 3) [m/s]"""
+
+        def compute() -> Tensor:
+            roots = self._tree_root_of_sites
+            arm = self.site_pos_w - self._sim.derived("subtree_com")[:, roots]
+            velocity = self._sim.derived("cvel")[:, self._site_body]
+            return velocity[..., 3:] + torch.linalg.cross(velocity[..., :3], arm)
+
+        return self._once("site_lin_vel_w", compute)
+
+    @property
     def sensordata(self) -> Tensor:
         """All sensor readings of the model, in the units of each sensor. (num_envs, nsensordata)"""
         return self._sim.derived("sensordata")
+
+    def _velocity_at(self, points: Tensor) -> Tensor:
+        """Velocity of a point of each body: MuJoCo gives that at the centre of mass of the body's tree."""
+        velocity = self._sim.derived("cvel")[:, self._body_index]
+        return velocity[..., 3:] + torch.linalg.cross(velocity[..., :3], self._from_tree_com(points))
+
+    def _from_tree_com(self, points: Tensor) -> Tensor:
+        return points - self._sim.derived("subtree_com")[:, self._tree_root]
+
+    def _body_force(self, name: str) -> Tensor:
+        if not self._computes_body_forces:
+            raise ValueError(
+                "reads accelerations or forces of bodies, which MuJoCo computes only where a sensor needs them: mark"
+                " the term with rlcli.task.reads_body_forces, or give the MJCF an accelerometer, force or torque sensor"
+            )
+        return self._sim.derived(name)
 
     def _once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
         stamp, value = self._cache.get(name, (-1, None))
@@ -353,6 +527,106 @@ class EntityData:
                 f"entity '{entity.name}' has no free root", "lin_vel and ang_vel are those of a free root"
             )
         return torch.tensor([*pose, *velocity], dtype=torch.float32)
+
+
+class _Drives:
+    """The actuators on an entity's joints whose force is gain x control + an affine function of the joint's state."""
+
+    def __init__(self, entity: Entity) -> None:
+        self._entity = entity
+        model, device = entity.engine.model, entity.engine.device
+        columns = {int(joint): column for column, joint in enumerate(entity.joint_ids)}
+        ids = [
+            a
+            for a in range(model.nu)
+            if int(model.actuator_trnid[a, 0]) in columns
+            and model.actuator_gear[a, 0]
+            and model.actuator_trntype[a] == int(mujoco.mjtTrn.mjTRN_JOINT)
+            and model.actuator_dyntype[a] == int(mujoco.mjtDyn.mjDYN_NONE)
+            and model.actuator_gaintype[a] == int(mujoco.mjtGain.mjGAIN_FIXED)
+            and model.actuator_biastype[a] in (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
+        ]
+        self._ids = torch.tensor(ids, dtype=torch.int64, device=device)
+        self._columns = torch.tensor([columns[int(model.actuator_trnid[a, 0])] for a in ids], device=device).long()
+        self._gear = torch.tensor(model.actuator_gear[ids, 0], dtype=torch.float32, device=device)
+        self._is_motor = torch.tensor(model.actuator_biastype[ids] == int(mujoco.mjtBias.mjBIAS_NONE), device=device)
+        self._constant = {
+            name: torch.tensor(getattr(model, name)[ids][None], dtype=torch.float32, device=device)
+            for name in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "actuator_ctrlrange")
+        }
+        self._force_limited, self._control_limited = (
+            torch.tensor(values[ids], dtype=torch.bool, device=device)
+            for values in (model.actuator_forcelimited, model.actuator_ctrllimited)
+        )
+        self._joint_limits = torch.full((len(columns),), math.inf, device=device)
+        limited = np.flatnonzero(model.jnt_actfrclimited[entity.joint_ids])
+        for column in limited:
+            high = np.abs(model.jnt_actfrcrange[entity.joint_ids[column]]).max()
+            self._joint_limits[int(column)] = float(high)
+        self._driven = torch.zeros(len(columns), dtype=torch.bool, device=device)
+        self._driven[self._columns] = True
+        self._no_range = torch.tensor([-math.inf, math.inf], device=device)
+        self._clamped = (self._control_limited & ~self._is_motor)[:, None]
+        self._columns_of_models: list[tuple[ActuatorModel, Columns]] = []
+
+    def computed(self) -> Tensor:
+        """Efforts before limits. (num_envs, k)"""
+        entity = self._entity
+        gear, q, v = self._gear, entity.data.joint_pos[:, self._columns], entity.data.joint_vel[:, self._columns]
+        gain, bias = self._now("actuator_gainprm"), self._now("actuator_biasprm")
+        low, high = torch.where(self._clamped, self._now("actuator_ctrlrange"), self._no_range).unbind(-1)
+        control = entity.engine.field("ctrl")[:, self._ids].float().clamp(low, high)
+        affine = torch.where(self._is_motor, 0.0, bias[..., 0] + bias[..., 1] * gear * q + bias[..., 2] * gear * v)
+        efforts = self._by_joint(gear * (gain[..., 0] * control + affine))
+        for model, columns in self._models():
+            efforts[:, columns] = model.computed_effort
+        return efforts
+
+    def withheld(self) -> Tensor:
+        """What limits take away. (num_envs, k)"""
+        data = self._entity.data
+        beyond = (data.computed_effort.abs() - data.joint_effort_limits).clamp_(min=0.0)
+        for model, columns in self._models():
+            beyond[:, columns] = (model.computed_effort - model.applied_effort).abs_()
+        return beyond
+
+    def limits(self) -> Tensor:
+        """Largest efforts. (1 or num_envs, k)"""
+        gain, force = self._now("actuator_gainprm")[..., 0], self._now("actuator_forcerange")
+        largest = torch.where(self._force_limited, force.abs().amax(dim=-1), math.inf)
+        control = (gain[..., None] * self._now("actuator_ctrlrange")).abs().amax(dim=-1)
+        largest = torch.where(self._control_limited & self._is_motor, torch.minimum(largest, control), largest)
+        limits = torch.minimum(
+            torch.where(self._driven, self._by_joint(self._gear.abs() * largest), math.inf), self._joint_limits
+        )
+        if self._entity.actuators:
+            limits = limits.expand(self._entity.engine.num_envs, -1).clone()
+        for model, columns in self._models():
+            limits[:, columns] = model.effort_limit
+        return limits
+
+    def _models(self) -> list[tuple[ActuatorModel, Columns]]:
+        """The entity's actuator models, which are made after it, with the joints that they drive."""
+        if len(self._columns_of_models) != len(self._entity.actuators):
+            device = self._entity.engine.device
+            self._columns_of_models = [(m, as_index(m.joints, device)) for m in self._entity.actuators]
+        return self._columns_of_models
+
+    def _by_joint(self, values: Tensor) -> Tensor:
+        total = torch.zeros(len(values), len(self._joint_limits), device=values.device)
+        return total.index_add_(1, self._columns, values)
+
+    def _now(self, name: str) -> Tensor:
+        own = self._entity.engine.expanded(name)
+        return self._constant[name] if own is None else own[:, self._ids].float()
+
+
+def _direction(gravity: Tensor) -> Tensor:
+    """Where gravity points, length 1; -z where there is none. (n, 3)"""
+    size = length(gravity)[:, None]
+    down = torch.zeros_like(gravity)
+    down[:, 2].fill_(-1.0)
+    return torch.where(size > 0.0, gravity / size, down)
 
 
 def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:

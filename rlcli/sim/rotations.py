@@ -13,21 +13,21 @@ from torch import Tensor
 
 
 def rotate(quat: Tensor, vector: Tensor) -> Tensor:
-    """Vector in the parent frame of a vector given in the quaternion's frame. (n, 4), (n, 3) -> (n, 3)"""
-    w, axis = quat[:, :1], quat[:, 1:]
+    """Vector in the parent frame of a vector given in the quaternion's frame. (..., 4), (..., 3) -> (..., 3)"""
+    w, axis = quat[..., :1], quat[..., 1:]
     twice = 2.0 * torch.linalg.cross(axis, vector)
     return vector + w * twice + torch.linalg.cross(axis, twice)
 
 
 def rotate_inverse(quat: Tensor, vector: Tensor) -> Tensor:
-    """Vector in the quaternion's frame of a vector given in the parent frame. (n, 4), (n, 3) -> (n, 3)"""
-    w, axis = quat[:, :1], quat[:, 1:]
+    """Vector in the quaternion's frame of a vector given in the parent frame. (..., 4), (..., 3) -> (..., 3)"""
+    w, axis = quat[..., :1], quat[..., 1:]
     twice = 2.0 * torch.linalg.cross(axis, vector)
     return vector - w * twice + torch.linalg.cross(axis, twice)
 
 
 def multiply(left: Tensor, right: Tensor) -> Tensor:
-    """Hamilton product: first `right`, then `left`. (n, 4), (n, 4) -> (n, 4)"""
+    """Hamilton product: first `right`, then `left`. (..., 4), (..., 4) -> (..., 4)"""
     w1, x1, y1, z1 = left.unbind(-1)
     w2, x2, y2, z2 = right.unbind(-1)
     return torch.stack(
@@ -42,8 +42,50 @@ def multiply(left: Tensor, right: Tensor) -> Tensor:
 
 
 def conjugate(quat: Tensor) -> Tensor:
-    """The rotation back. (n, 4) -> (n, 4)"""
+    """The rotation back. (..., 4) -> (..., 4)"""
     return torch.cat([quat[..., :1], -quat[..., 1:]], dim=-1)
+
+
+def unique(quat: Tensor) -> Tensor:
+    """The same rotation with w >= 0. (..., 4) -> (..., 4)"""
+    return torch.where(quat[..., :1] < 0.0, -quat, quat)
+
+
+def axis_x(quat: Tensor) -> Tensor:
+    """The quaternion's x axis in the parent frame. (..., 4) -> (..., 3)"""
+    w, x, y, z = quat.unbind(-1)
+    return torch.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)], dim=-1)
+
+
+def axis_y(quat: Tensor) -> Tensor:
+    """The quaternion's y axis in the parent frame. (..., 4) -> (..., 3)"""
+    w, x, y, z = quat.unbind(-1)
+    return torch.stack([2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)], dim=-1)
+
+
+def axis_z(quat: Tensor) -> Tensor:
+    """The quaternion's z axis in the parent frame. (..., 4) -> (..., 3)"""
+    w, x, y, z = quat.unbind(-1)
+    return torch.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)], dim=-1)
+
+
+def roll_pitch_yaw(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Angles of `from_euler`: roll and yaw in [-pi, pi], pitch in [-pi/2, pi/2] [rad]. (..., 4) -> (...) each"""
+    w, x, y, z = quat.unbind(-1)
+    roll = atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = torch.asin((2.0 * (w * y - z * x)).clamp_(-1.0, 1.0))
+    return roll, pitch, atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def turn_between(left: Tensor, right: Tensor) -> Tensor:
+    """Angle of the rotation that takes one attitude to the other, in [0, pi] [rad]. (..., 4), (..., 4) -> (...)"""
+    difference = multiply(conjugate(left), right)
+    return 2.0 * atan2(length(difference[..., 1:]), difference[..., 0].abs())
+
+
+def length(vector: Tensor) -> Tensor:
+    """Euclidean length. (..., k) -> (...)"""
+    return vector.square().sum(dim=-1).sqrt_()
 
 
 def rotation_vector(quat: Tensor) -> Tensor:
@@ -89,11 +131,6 @@ def yaw_only(quat: Tensor) -> Tensor:
     half = 0.5 * heading(quat)
     zero = torch.zeros_like(half)
     return torch.stack([torch.cos(half), zero, zero, torch.sin(half)], dim=-1)
-
-
-def unique(quat: Tensor) -> Tensor:
-    """The one of the two quaternions of a rotation whose w is not negative. (n, 4) -> (n, 4)"""
-    return torch.where(quat[:, :1] < 0.0, -quat, quat)
 
 
 def wrap_to_pi(angle: Tensor) -> Tensor:

@@ -108,6 +108,7 @@ class WarpEngine:
         self._start_inputs: dict[str, Tensor] = {}
         self._last_derived: dict[str, Tensor] = {}
         self._derived: set[int] = set()
+        self._overwritten: dict[str, wp.array] = {}
         self._forces_after_reset = forces_after_reset
         force_columns = force_sensors(model)
         self._sensor_stages = {_FORCE} if force_columns else set()
@@ -154,6 +155,8 @@ class WarpEngine:
             if name in _INPUTS:  # nobody has written to it yet
                 self._start_inputs[name] = self._fields[name].view(self.num_envs, -1).clone()
             self._derived |= self._stages(name)
+            if name in ("cacc", "cfrc_int"):  # the velocity stage uses their memory for its own accelerations
+                self._overwritten[name] = wp.empty_like(array)
             self._graphs.clear()
             if self._stages(name):
                 with self._launching():
@@ -178,6 +181,10 @@ class WarpEngine:
             self._expanded[name] = wp.to_torch(wide)
             self._graphs.clear()
         return self._expanded[name]
+
+    def expanded(self, name: str) -> Tensor | None:
+        """The same where somebody has asked for it before; None where all worlds share the model's value."""
+        return self._expanded.get(name)
 
     def set_constants(self) -> None:
         """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
@@ -386,7 +393,11 @@ class WarpEngine:
         m, d = self._model, self._data
         if _VELOCITY in self._derived:
             mjw.fwd_position(m, d, factorize=False)
+            for name, kept in self._overwritten.items():
+                wp.copy(kept, getattr(d, name))
             mjw.fwd_velocity(m, d)
+            for name, kept in self._overwritten.items():
+                wp.copy(getattr(d, name), kept)
             if "sensordata" in self._fields:
                 mjw.sensor_pos(m, d)
                 mjw.sensor_vel(m, d)

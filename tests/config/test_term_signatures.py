@@ -6,6 +6,7 @@ import sys
 import pytest
 from pydantic import ValidationError
 from small_task import TASK
+from worlds import PENDULUM_TASK, build, edited, pendulum
 
 from rlcli.config.load import resolve
 from rlcli.config.terms import SECTIONS, Vocabulary, builtin_terms, params_model, read_params, read_terms, snake_case
@@ -252,3 +253,9 @@ def test_a_direct_task_has_no_manager_terms(problems_of):
     text = DIRECT.replace("{gain: 2.0}", "{count: 1}") + "rewards: {alive: {func: is_alive, weight: 1.0}}\n"
     (message,) = problems_of(text, files={"task": CLASS})
     assert "rewards: a direct task has no rewards terms; its class does this" in message
+
+
+def test_an_unknown_success_condition_is_called_by_its_section(tmp_path):
+    task = edited(PENDULUM_TASK, success={"func": "joints_nera", "tolerance": 0.1})
+    with pytest.raises(ConfigError, match="no success term 'joints_nera'; did you mean 'joints_near'"):
+        build(pendulum(tmp_path, task))

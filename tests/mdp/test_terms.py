@@ -1,4 +1,4 @@
-"""Every term of the vocabulary against a state whose values are worked out here."""
+"""Events on a state whose values are worked out here, and terms that remember."""
 
 from math import acos, cos, pi, sin, sqrt
 
@@ -8,154 +8,15 @@ import torch
 from worlds import CRITTER_TASK, build, critter, edited
 
 from rlcli.errors import TaskError
-from rlcli.mdp import events, observations, rewards, success, terminations
+from rlcli.mdp import events, rewards, terminations
 from rlcli.sim.selection import IdSelection
 
-PITCH = 0.6
-POS = [0.1, -0.2, 0.3, -1.2]
-VEL = [1.0, -2.0, 3.0, -4.0]
-LIN = [1.0, 0.0, 0.5]  # world frame
-ANG = [0.1, 0.2, 0.3]  # body frame
-ACTION = [0.5, -0.5, 1.0, 0.0]
-PREVIOUS = [0.5, 0.5, 0.0, 0.0]
 LIMIT = pi / 3
-# turned by PITCH about y: x' = cos x - sin z, z' = sin x + cos z takes world to body
-LIN_B = [cos(PITCH) * 1.0 - sin(PITCH) * 0.5, 0.0, sin(PITCH) * 1.0 + cos(PITCH) * 0.5]
-DOWN_B = [sin(PITCH), 0.0, -cos(PITCH)]
-
-
-@pytest.fixture(scope="module")
-def env(tmp_path_factory):
-    env = build(critter(tmp_path_factory.mktemp("terms")), 2)
-    env.reset()
-    qpos, qvel = env.engine.field("qpos"), env.engine.field("qvel")
-    qpos[0] = torch.tensor([1.0, 2.0, 0.5, cos(PITCH / 2), 0.0, sin(PITCH / 2), 0.0, *POS], dtype=torch.float64)
-    qvel[0] = torch.tensor([*LIN, *ANG, *VEL], dtype=torch.float64)
-    env.sim.refresh()
-    env.action_manager.action[0] = torch.tensor(ACTION)
-    env.action_manager.prev_action[0] = torch.tensor(PREVIOUS)
-    return env
-
-
-def kwargs_of(env, kwargs):
-    entity = env.entities["robot"]
-    made = dict(kwargs)
-    if "joints" in made:
-        made["joints"] = entity.select("Joints", made["joints"])[0]
-    if made.pop("entity", True):
-        made["entity"] = entity
-    return made
-
-
-ALL = {"joints": ".*"}
-OBSERVATIONS = [
-    (observations.joint_pos, ALL, POS),
-    (observations.joint_pos, {"joints": ["hip_br", "hip_fl"]}, [-1.2, 0.1]),
-    (observations.joint_vel, {"joints": ["hip_bl", "hip_f."]}, [3.0, 1.0, -2.0]),
-    (observations.joint_pos_rel, ALL, [0.0, -0.1, 0.2, -1.1]),
-    (observations.joint_vel_rel, ALL, VEL),
-    (observations.base_pos_z, {}, [0.5]),
-    (observations.base_lin_vel, {}, LIN_B),
-    (observations.base_ang_vel, {}, ANG),
-    (observations.projected_gravity, {}, DOWN_B),
-    (observations.last_action, {"entity": False}, ACTION),
-]
-
-HEADING = cos(PITCH)  # the horizontal part of the nose's direction, for a target straight ahead
-REWARDS = [
-    (rewards.joint_pos_target_l2, {"joints": ["hip_br", "hip_fl"], "target": 0.5}, 1.7**2 + 0.4**2),
-    (rewards.joint_vel_l1, ALL, 10.0),
-    (rewards.joint_vel_l1, {"joints": ["hip_br", "hip_fl"]}, 5.0),
-    (rewards.joint_vel_l2, ALL, 1 + 4 + 9 + 16),
-    (rewards.joint_pos_limits, ALL, 1.2 - LIMIT),
-    (rewards.joint_pos_limits_penalty_ratio, {**ALL, "threshold": 0.25, "gear_ratio": 2.0},
-     2.0 * ((0.3 / LIMIT - 0.25) / 0.75 + (1.2 / LIMIT - 0.25) / 0.75)),
-    (rewards.power_consumption, {**ALL, "gear_ratio": 2.0}, 2.0 * (0.5 + 1.0 + 3.0 + 0.0)),
-    (rewards.action_rate_l2, {"entity": False}, 0 + 1 + 1 + 0),
-    (rewards.action_l2, {"entity": False}, 0.25 + 0.25 + 1.0),
-    (rewards.lin_vel_z_l2, {}, LIN_B[2] ** 2),
-    (rewards.ang_vel_xy_l2, {}, 0.01 + 0.04),
-    (rewards.flat_orientation_l2, {}, sin(PITCH) ** 2),
-    (rewards.upright_posture_bonus, {"threshold": cos(PITCH) - 0.01}, 1.0),
-    (rewards.upright_posture_bonus, {"threshold": cos(PITCH) + 0.01}, 0.0),
-    (rewards.move_to_target_bonus, {"threshold": 0.9, "target": (11.0, 2.0, 0.0)}, HEADING / 0.9),
-    (rewards.move_to_target_bonus, {"threshold": 0.8, "target": (11.0, 2.0, 7.0)}, 1.0),
-    (rewards.move_to_target_bonus, {"threshold": 0.9, "target": (4.0, 6.0, 0.0)}, HEADING * 0.6 / 0.9),
-    (rewards.move_to_target_bonus, {"threshold": 0.9, "target": (-9.0, 2.0, 0.0)}, -HEADING / 0.9),
-]  # fmt: skip
-
-TERMINATIONS = [
-    (terminations.joint_pos_out_of_manual_limit, {**ALL, "bounds": (-1.3, 0.31)}, False),
-    (terminations.joint_pos_out_of_manual_limit, {**ALL, "bounds": (-1.3, 0.29)}, True),
-    (terminations.joint_pos_out_of_manual_limit, {**ALL, "bounds": (-1.1, 1.0)}, True),
-    (terminations.joint_pos_out_of_manual_limit, {"joints": ["hip_fl"], "bounds": (-1.1, 1.0)}, False),
-    (terminations.joint_pos_out_of_limit, ALL, True),
-    (terminations.joint_pos_out_of_limit, {"joints": ["hip_fl", "hip_bl"]}, False),
-    (terminations.joint_vel_out_of_manual_limit, {**ALL, "max_velocity": 3.9}, True),
-    (terminations.joint_vel_out_of_manual_limit, {**ALL, "max_velocity": 4.1}, False),
-    (terminations.bad_orientation, {"limit_angle": PITCH + 0.01}, False),
-    (terminations.bad_orientation, {"limit_angle": PITCH - 0.01}, True),
-    (terminations.root_height_below_minimum, {"minimum_height": 0.49}, False),
-    (terminations.root_height_below_minimum, {"minimum_height": 0.51}, True),
-    (success.joints_near, {"joints": ["hip_fl", "hip_bl"], "target": 0.2, "tolerance": 0.11}, True),
-    (success.joints_near, {"joints": ["hip_fl", "hip_bl"], "target": 0.2, "tolerance": 0.09}, False),
-    (success.joints_near, {"joints": ["hip_fl"], "target": 0.1 + 2 * pi, "tolerance": 0.01}, True),
-    (success.root_moves, {"speed": LIN[0] - 0.01}, True),
-    (success.root_moves, {"speed": LIN[0] + 0.01}, False),
-    (success.root_moves, {"speed": 0.6 * LIN[0] + 0.8 * LIN[2] - 0.01, "direction": (0.6, 0.0, 0.8)}, True),
-    (success.root_moves, {"speed": 0.6 * LIN[0] + 0.8 * LIN[2] + 0.01, "direction": (0.6, 0.0, 0.8)}, False),
-]
-
-
-@pytest.mark.parametrize(("term", "kwargs", "expected"), OBSERVATIONS)
-def test_an_observation_term(env, term, kwargs, expected):
-    value = term(env, **kwargs_of(env, kwargs))
-    assert value.dtype == torch.float32
-    assert value.shape == (2, len(expected))
-    assert value[0].tolist() == pytest.approx(expected, abs=1e-6)
-
-
-@pytest.mark.parametrize(("term", "kwargs", "expected"), REWARDS)
-def test_a_reward_term(env, term, kwargs, expected):
-    value = term(env, **kwargs_of(env, kwargs))
-    assert value.shape == (2,)
-    assert float(value[0]) == pytest.approx(expected, rel=1e-5, abs=1e-6)
-
-
-@pytest.mark.parametrize(("term", "kwargs", "expected"), TERMINATIONS)
-def test_a_termination_or_success_term(env, term, kwargs, expected):
-    value = term(env, **kwargs_of(env, kwargs))
-    assert value.dtype == torch.bool
-    assert value.shape == (2,)
-    assert bool(value[0]) is expected
-
-
-def test_every_term_of_the_vocabulary_has_a_test():
-    import inspect
-
-    tabled = {row[0].__name__ for row in OBSERVATIONS + REWARDS + TERMINATIONS}
-    elsewhere = {"is_alive", "is_terminated", "time_out", "joint_acc_l2", "joint_torques_l2", "ProgressReward"}
-    for module in (observations, rewards, terminations, success):
-        terms = {
-            name for name, value in vars(module).items()
-            if getattr(value, "__module__", None) == module.__name__ and not name.startswith("_")
-            and (inspect.isfunction(value) or inspect.isclass(value))
-        }  # fmt: skip
-        assert terms <= tabled | elsewhere, terms - tabled - elsewhere
-
-
-def test_terms_do_not_write_to_the_state(env):
-    before = env.sim.qpos.clone(), env.sim.qvel.clone(), env.action_manager.action.clone()
-    for term, kwargs, _ in [*OBSERVATIONS, *REWARDS, *TERMINATIONS]:
-        term(env, **kwargs_of(env, kwargs))
-    assert torch.equal(before[0], env.sim.qpos)
-    assert torch.equal(before[1], env.sim.qvel)
-    assert torch.equal(before[2], env.action_manager.action)
 
 
 @pytest.mark.parametrize("turns", [-3, -1, 0, 1, 2])
 @pytest.mark.parametrize("angle", [0.0, 0.4, -0.4, pi])
-def test_a_wrapped_joint_position_counts_the_same_after_whole_turns(env, turns, angle):
+def test_a_wrapped_joint_position_counts_the_same_after_whole_turns(turns, angle):
     from rlcli.sim.rotations import wrap_to_pi
 
     wrapped = float(wrap_to_pi(torch.tensor([angle + 2 * pi * turns]))[0])
@@ -163,15 +24,14 @@ def test_a_wrapped_joint_position_counts_the_same_after_whole_turns(env, turns, 
     assert -pi - 1e-6 < wrapped <= pi + 1e-6
 
 
-def test_bad_orientation_sees_a_robot_on_its_back(env):
+def test_bad_orientation_sees_a_robot_on_its_back(tmp_path):
+    env = build(critter(tmp_path), 2)
+    env.reset()
     robot = env.entities["robot"]
-    saved = env.sim.qpos.clone()
     env.engine.field("qpos")[1, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
     env.sim.refresh()
     assert bool(terminations.bad_orientation(env, entity=robot, limit_angle=acos(-0.999))[1])
     assert robot.data.projected_gravity_b[1].tolist() == pytest.approx([0, 0, 1])
-    env.engine.field("qpos")[:] = saved.double()
-    env.sim.refresh()
 
 
 def test_acceleration_and_torque_are_those_of_the_last_substep(tmp_path):

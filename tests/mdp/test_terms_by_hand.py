@@ -1,0 +1,265 @@
+"""Every term of the library gives what is worked out by hand, in environments that differ in everything."""
+
+import ast
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from mdp_numbers import states
+from mdp_table import OBSERVATIONS, REWARDS, ROWS, SUCCESS, TERMINATIONS
+from mdp_worlds import bound, hand_made, put, sensors
+from worlds import build, edited, write
+
+import rlcli.mdp
+from rlcli.config.terms import builtin_terms
+from rlcli.errors import ConfigError
+from rlcli.mdp import observations, rewards
+from rlcli.task import reads_body_forces
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory):
+    return hand_made(tmp_path_factory.mktemp("hand"))
+
+
+def value_of(env, term, kwargs):
+    given = bound(env, kwargs, sensors())
+    return term(env, **given)() if inspect.isclass(term) else term(env, **given)
+
+
+def name_of(row):
+    return row[0].__name__
+
+
+@pytest.mark.parametrize(("term", "kwargs", "expected"), OBSERVATIONS, ids=map(name_of, OBSERVATIONS))
+def test_an_observation(env, term, kwargs, expected):
+    value = value_of(env, term, kwargs)
+    by_hand = np.array([expected(s) for s in states()])
+    assert value.dtype == torch.float32
+    assert value.shape == by_hand.shape
+    np.testing.assert_allclose(value.numpy(), by_hand, atol=3e-6)
+
+
+@pytest.mark.parametrize(("term", "kwargs", "expected"), REWARDS, ids=map(name_of, REWARDS))
+def test_a_reward(env, term, kwargs, expected):
+    value = value_of(env, term, kwargs)
+    assert value.shape == (3,)
+    np.testing.assert_allclose(value.float().numpy(), [expected(s) for s in states()], rtol=2e-5, atol=3e-6)
+
+
+JUDGED = [*TERMINATIONS, *SUCCESS]
+
+
+@pytest.mark.parametrize(("term", "kwargs", "expected"), JUDGED, ids=map(name_of, JUDGED))
+def test_a_termination_or_success(env, term, kwargs, expected):
+    value = value_of(env, term, kwargs)
+    assert value.dtype == torch.bool
+    assert value.tolist() == [bool(expected(s)) for s in states()]
+
+
+@pytest.mark.parametrize("row", ROWS, ids=map(name_of, ROWS))
+def test_the_numbers_tell_environments_apart(row):
+    """A row whose value is the same everywhere would show little, but for one that is 0 by nature."""
+    values = np.array([np.broadcast_to(row[2](s), np.shape(row[2](s))) for s in states()], dtype=float)
+    same = np.allclose(values, values[0])
+    assert not same or name_of(row) in {"ProgressReward", "time_out", "joint_pos_limit_normalized"}
+
+
+FORCES = {"body_lin_acc_l2", "body_incoming_wrench"}
+"""Terms of forces on bodies: worked out on a pendulum, below."""
+
+
+def test_every_term_of_the_library_is_worked_out_by_hand():
+    tabled = {"observations": OBSERVATIONS, "rewards": REWARDS, "terminations": TERMINATIONS, "success": SUCCESS}
+    for section, rows in tabled.items():
+        named = {name_of(row) for row in rows} | FORCES
+        terms = {signature.attribute for signature in builtin_terms(section).values()}
+        assert terms, section
+        assert terms <= named, terms - named
+
+
+def test_every_docstring_begins_with_what_the_term_is_and_says_its_shape():
+    for section in ("observations", "rewards", "terminations", "success"):
+        for node in ast.parse((Path(rlcli.mdp.__path__[0]) / f"{section}.py").read_text()).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                text = ast.get_docstring(node)
+                assert "(num_envs," in text, node.name
+
+
+def test_terms_do_not_write_to_what_they_read(env):
+    read = ("qpos", "qvel", "qacc", "qfrc_actuator", "sensordata", "xpos", "xquat", "cvel", "site_xpos", "ctrl")
+    watched = {name: env.engine.field(name).clone() for name in read}
+    made = sensors()
+    before = [{k: v.clone() for k, v in vars(part).items() if torch.is_tensor(v)} for part in made.values()]
+    data = env.entities["robot"].data
+    cached = [data.body_lin_vel_w.clone(), data.site_lin_vel_w.clone(), data.projected_gravity_b.clone()]
+    for term, kwargs, _ in ROWS:
+        given = bound(env, kwargs, made)
+        _ = term(env, **given)() if inspect.isclass(term) else term(env, **given)
+    assert all(torch.equal(values, env.engine.field(name)) for name, values in watched.items())
+    for part, was in zip(made.values(), before, strict=True):
+        assert all(torch.equal(getattr(part, key), value) for key, value in was.items())
+    now = [data.body_lin_vel_w, data.site_lin_vel_w, data.projected_gravity_b]
+    assert all(torch.equal(a, b) for a, b in zip(cached, now, strict=True))
+
+
+PENDULUM = """
+<mujoco><worldbody><body name="base"><geom size="0.05" mass="1"/>
+  <body name="arm" pos="0.2 0 0"><joint name="swing" axis="0 1 0"/>
+    <inertial pos="0.5 0 0" mass="2" diaginertia="0.01 0.04 0.04"/>
+  </body></body></worldbody></mujoco>
+"""
+SWING = {
+    "decimation": 1, "episode_length_s": 1.0, "sim": {"dt": 1e-5, "integrator": "euler"},
+    "scene": {"num_envs": 3, "ground": None, "entities": {"robot": {"model": "arm.xml"}}},
+    "actions": {"torque": {"func": "joint_effort"}},
+    "observations": {"policy": {"wrench": {"func": "body_incoming_wrench", "bodies": "arm"}}},
+    "rewards": {"acc": {"func": "body_lin_acc_l2", "weight": 1.0, "bodies": ["arm", "base"]}},
+    "terminations": {"time_out": {"func": "time_out", "time_out": True}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("engine", ["batch", "warp"])
+def test_the_wrench_at_a_joint_and_accelerations_are_newtons(tmp_path, engine):
+    """A pendulum of 2 kg, 0.5 m from its joint; the angle is below the horizontal."""
+    env = build(write(tmp_path / "swing", edited("{}", **SWING), arm_xml=PENDULUM), 3, f"sim.engine={engine}")
+    env.reset()
+    angle, rate, g, m, length = np.array([0.0, 0.4, -1.0]), np.array([0.0, 3.0, -2.0]), 9.81, 2.0, 0.5
+    env.engine.field("qpos")[:, 0] = torch.tensor(angle).to(env.engine.field("qpos").dtype)
+    env.engine.field("qvel")[:, 0] = torch.tensor(rate).to(env.engine.field("qvel").dtype)
+    wrench = env.step(torch.zeros(3, 1)).obs["policy"].numpy()
+    turning = m * g * length * np.cos(angle) / (0.04 + m * length**2)
+    along, across = np.stack([np.cos(angle), -np.sin(angle)]), np.stack([-np.sin(angle), -np.cos(angle)])  # x, z
+    centre = length * (turning * across - rate**2 * along)
+    force = m * (centre + np.array([[0.0], [g]]))
+    # in the arm's frame x lies along it, and z points up, against `across`
+    np.testing.assert_allclose(wrench[:, 0], (force * along).sum(axis=0), rtol=2e-4, atol=5e-3)
+    np.testing.assert_allclose(wrench[:, 2], -(force * across).sum(axis=0), rtol=2e-4, atol=5e-3)
+    np.testing.assert_allclose(wrench[:, [1, 3, 4, 5]], 0.0, atol=2e-2)  # a free hinge holds no torque about y
+    robot = env.entities["robot"]
+    np.testing.assert_allclose(robot.data.body_lin_acc_w[:, 1].numpy(), 0.0, atol=5e-3)
+    np.testing.assert_allclose(robot.data.body_ang_acc_w[:, 1, 1].numpy(), turning, rtol=2e-4, atol=5e-3)
+
+
+FALLING = '<mujoco><worldbody><body name="b"><freejoint/><geom size="0.1" mass="1"/><body name="out" pos="0.3 0 0"><joint name="j" axis="0 0 1" armature="1000"/><geom size="0.01" mass="0.001"/></body></body></worldbody></mujoco>'  # noqa: E501
+
+
+@pytest.mark.parametrize("engine", ["batch", "warp"])
+def test_a_falling_and_spinning_body_accelerates_by_gravity_and_its_edge_inwards_too(tmp_path, engine):
+    task = {**SWING, "observations": {"policy": {"z": {"func": "base_pos_z"}}},
+            "rewards": {"acc": {"func": "body_lin_acc_l2", "weight": 1.0, "bodies": "b"}}}  # fmt: skip
+    env = build(write(tmp_path / "fall", edited("{}", **task), arm_xml=FALLING), 3, f"sim.engine={engine}")
+    env.reset()
+    env.engine.field("qvel")[:, 5] = torch.tensor([0.0, 2.0, -4.0]).to(env.engine.field("qvel").dtype)
+    result = env.step(torch.zeros(3, 1))
+    acceleration = env.entities["robot"].data.body_lin_acc_w.numpy()
+    out = 0.3 * 1.0 / 1.001  # from the common centre of mass
+    np.testing.assert_allclose(acceleration[:, 0, 2], -9.81, rtol=1e-4)
+    inward = np.array([0.0, 4.0, 16.0])
+    np.testing.assert_allclose(acceleration[:, 1, 0], -out * inward, atol=2e-3)
+    expected = 9.81**2 + ((0.3 - out) * inward) ** 2
+    np.testing.assert_allclose(result.reward.numpy(), expected * env.step_dt, rtol=1e-3)
+
+
+def test_forces_of_bodies_without_a_sensor_for_them_are_refused_with_what_to_do(tmp_path):
+    code = "def mine(env, *, entity: Entity = 'robot'):\n    return entity.data.body_lin_acc_w[:, 0, 0]\n"
+    task = {**SWING, "observations": {"policy": {"pos": {"func": "joint_pos"}}},
+            "rewards": {"x": {"func": "mine", "weight": 1.0}}}  # fmt: skip
+    folder = write(tmp_path / "swing", edited("{}", **task), arm_xml=PENDULUM,
+                   terms_py="from rlcli.task import Entity, reads_body_forces\n" + code)  # fmt: skip
+    with pytest.raises(ConfigError, match=r"rewards.x.*reads_body_forces.*accelerometer"):
+        build(folder)
+    (folder / "terms.py").write_text("from rlcli.task import Entity, reads_body_forces\n@reads_body_forces\n" + code)
+    assert reads_body_forces(len_like) is len_like
+
+
+def len_like(env):
+    return env
+
+
+def test_action_acceleration_is_the_second_difference_and_starts_anew_with_an_episode(env):
+    put(env)
+    term = rewards.ActionAccL2(env)
+    manager = env.action_manager
+    history = [torch.zeros(3, 4), torch.zeros(3, 4)]
+    for step in range(4):
+        action = torch.full((3, 4), float(step**2))
+        manager.prev_action.copy_(history[-1])
+        manager.action.copy_(action)
+        expected = 4 * (step**2 - 2 * float(history[-1][0, 0]) + float(history[-2][0, 0])) ** 2
+        assert term().tolist() == [expected] * 3
+        history.append(action)
+    everyone = env._everyone()
+    state = term.state_dict()
+    term.reset(everyone)
+    manager.prev_action.zero_()
+    manager.action.fill_(1.0)
+    assert term().tolist() == [4.0] * 3
+    term.load_state_dict(state)
+    assert term().tolist() == [4 * (1 - 0 + 4) ** 2] * 3
+    put(env)
+
+
+def test_a_swing_is_judged_by_its_highest_point_when_the_foot_comes_down(env):
+    put(env)
+    made = sensors()
+    term = rewards.FeetSwingHeight(env, **bound(env, {
+        "entity": "robot", "sites": ["leg_fl_tip", "leg_fr_tip", "leg_bl_tip", "leg_br_tip"], "sensor": "feet",
+        "command": "place", "target_height": 0.5}, made))  # fmt: skip
+    feet = made["feet"]
+    feet.first_contact[:], feet.found[:] = False, False
+    qpos, high = env.engine.field("qpos"), {}
+    for lift in (0.0, 0.7, 0.1):  # up and down again
+        qpos[1, 2] = states()[1].pos[2] + lift
+        env.engine.forward(env._everyone())
+        env.sim.refresh()
+        assert term().tolist() == [0.0] * 3
+        high[lift] = env.entities["robot"].data.site_pos_w[1, 1:, 2] - 0.25
+    feet.first_contact[1], feet.found[1] = True, True
+    peaks = [max(0.0, *(float(values[i]) for values in high.values())) for i in range(4)]
+    assert float(term()[1]) == pytest.approx(sum((peak / 0.5 - 1) ** 2 for peak in peaks), rel=1e-5)
+    feet.first_contact[1], feet.found[1] = False, False
+    assert float(term()[1]) == 0.0, "begun anew"
+    put(env)
+
+
+def test_terms_say_what_does_not_fit_together(env):
+    made = sensors()
+    with pytest.raises(ValueError, match="3 elements, the sensor has 4"):
+        rewards.feet_slide(env, **bound(env, {"entity": "robot", "bodies": "leg_[fb]l|torso", "sensor": "feet"}, made))
+    with pytest.raises(ValueError, match="exactly one site, and 4"):
+        rewards.object_ee_distance(env, std=1.0, **bound(
+            env, {"entity": "robot", "sites": "leg.*", "object": "object"}, made))  # fmt: skip
+    with pytest.raises(ValueError, match="one framequat sensor, which has 4 columns; those selected have 3"):
+        observations.imu_orientation(env, **bound(env, {"entity": "robot", "sensors": "gyro"}, made))
+    with pytest.raises(ValueError, match="no termination 'fel'; terminations: time_out, fell, low"):
+        rewards.IsTerminatedTerm(env, terms=["fel"])
+    with pytest.raises(ValueError, match="no body 'leg'; its bodies: leg_fl, leg_fr"):
+        rewards.GaitReward(env, std=1.0, max_err=1.0, velocity_threshold=1.0, **bound(
+            env, {"entity": "robot", "sensor": "feet", "command": "velocity"}, made),
+            synced_feet_pairs=(("leg", "leg_br"), ("leg_fr", "leg_bl")))  # fmt: skip
+    with pytest.raises(ValueError, match="3 values of std for 4 joints"):
+        rewards.Posture(env, entity=env.entities["robot"], joints=slice(0, 4), std=[1.0, 2.0, 3.0])
+
+
+def test_what_an_actuator_model_withholds_is_its_own_limits(tmp_path):
+    """A PD controller of 30 N m/rad with a limit of 4 N m, 0.3 rad from its target: 9 N m asked, 5 withheld."""
+    robot = {"model": "arm.xml", "actuators": {"pd": {"kind": "pd", "joints": "swing", "stiffness": 30.0,
+                                                      "damping": 0.0, "effort_limit": 4.0}}}  # fmt: skip
+    rewards_of = {"limits": {"func": "applied_torque_limits", "weight": 1.0}}
+    task = {**SWING, "scene": {"num_envs": 3, "ground": None, "entities": {"robot": robot}}, "rewards": rewards_of,
+            "actions": {"torque": {"func": "joint_position", "use_default_offset": False}},
+            "observations": {"policy": {"pos": {"func": "joint_pos"}}},
+            "terminations": {**SWING["terminations"], "weak": {"func": "joint_effort_out_of_limit"}},
+            "sim": {"dt": 1e-5, "gravity": [0.0, 0.0, 0.0]}}  # fmt: skip
+    env = build(write(tmp_path / "swing", edited("{}", **task), arm_xml=PENDULUM), 3)
+    env.reset()
+    result = env.step(torch.tensor([[0.3], [0.1], [-0.2]]))
+    data = env.entities["robot"].data
+    assert result.reward.tolist() == pytest.approx([5.0 * 1e-5, 0.0, 2.0 * 1e-5], rel=1e-4)
+    assert result.terminated.tolist() == [True, False, True]
+    assert data.joint_effort_limits.tolist() == [[4.0]] * 3

@@ -1,0 +1,175 @@
+"""Every term runs recorded on a GPU: it reads nothing back, makes no tensor of Python's numbers, and agrees."""
+
+import contextlib
+import copy
+import inspect
+from types import SimpleNamespace
+
+import pytest
+import torch
+from mdp_table import OBSERVATIONS, REWARDS, ROWS, TERMINATIONS
+from mdp_worlds import FILES, bound, hand_made, sensors, whole_task
+from torch.utils._python_dispatch import TorchDispatchMode
+from worlds import build, edited, write
+
+from rlcli.mdp import observations, rewards
+from rlcli.sim.entity import Entity
+
+torch.set_num_threads(1)
+WAITS = {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "item", "unique", "_unique2"}
+"""Operations whose result the host must have before it goes on."""
+COPIES = {"lift_fresh", "lift", "from_file"}
+"""Operations that bring numbers of the host onto the device."""
+
+
+class Recorded(TorchDispatchMode):
+    """Refuses what a CUDA graph cannot record."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.overloadpacket.__name__
+        assert name not in WAITS | COPIES, name
+        if name in ("index", "index_put", "index_put_"):
+            masks = [i for i in args[1] if i is not None and i.dtype in (torch.bool, torch.uint8)]
+            assert not masks, f"{name} with a mask is a search"
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory):
+    return [hand_made(tmp_path_factory.mktemp(engine), f"sim.engine={engine}") for engine in ("batch", "warp")]
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0].__name__)
+def test_a_term_can_be_recorded_and_gives_the_cpu_engines_value(both, row):
+    term, kwargs, _ = row
+    values = []
+    for env in both:
+        given = bound(env, kwargs, sensors())
+        call = term(env, **given) if inspect.isclass(term) else lambda env=env, given=given: term(env, **given)
+        first = call().clone()
+        env.sim.stamp += 1  # nothing is remembered from the first call
+        with Recorded() if env.engine.asynchronous else contextlib.nullcontext():
+            again = call()
+        assert torch.equal(first, again) or term is rewards.ActionAccL2
+        values.append(first.float())
+    torch.testing.assert_close(*values, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0].__name__)
+def test_a_term_gives_an_environment_the_same_bits_whatever_their_number(both, row):
+    term, kwargs, _ = row
+    env = both[0]
+    given = bound(env, kwargs, sensors())
+    value = (term(env, **given)() if inspect.isclass(term) else term(env, **given)).clone()
+    again = []
+    for count in (1, 2, 37):  # the same arithmetic on rows that are repeated
+        repeated = _Repeated(env, count)
+        given = bound(repeated, kwargs, {name: repeated.of(part) for name, part in sensors().items()})
+        again.append((term(repeated, **given)() if inspect.isclass(term) else term(repeated, **given)).clone())
+        assert len(again[-1]) == 3 * count
+        assert (again[-1].view(count, *value.shape) == value).all()
+
+
+class _Repeated:
+    """The environment with all rows of its state repeated."""
+
+    def __init__(self, env, count):
+        self.count, self.num_envs = count, env.num_envs * count
+        self.config, self.device, self.step_dt = env.config, env.device, env.step_dt
+        self.max_episode_length = env.max_episode_length
+        self.origins, self.episode_length_buf = self._rows(env.origins), self._rows(env.episode_length_buf)
+        manager = env.termination_manager
+        self.termination_manager = SimpleNamespace(
+            terminated=self._rows(manager.terminated), time_outs=self._rows(manager.time_outs),
+            fired={name: self._rows(fired) for name, fired in manager.fired.items()},
+        )  # fmt: skip
+        self.action_manager = SimpleNamespace(
+            action=self._rows(env.action_manager.action), prev_action=self._rows(env.action_manager.prev_action)
+        )
+        engine = SimpleNamespace(
+            model=env.engine.model, num_envs=self.num_envs, device=env.device,
+            field=lambda name: self._rows(env.engine.field(name)),
+            expanded=lambda name: None if env.engine.expanded(name) is None else self._rows(env.engine.expanded(name)),
+        )  # fmt: skip
+        self.sim = SimpleNamespace(
+            engine=engine, qpos=self._rows(env.sim.qpos), qvel=self._rows(env.sim.qvel), stamp=0,
+            derived=lambda name: self._rows(env.sim.derived(name)),
+        )  # fmt: skip
+        self.entities = {name: Entity(name, e.config, engine, self.sim) for name, e in env.entities.items()}
+
+    def _rows(self, values):
+        return values.repeat(self.count, *[1] * (values.dim() - 1))
+
+    def of(self, part):
+        new = copy.copy(part)
+        for name, values in vars(part).items():
+            if torch.is_tensor(values):
+                setattr(new, name, self._rows(values))
+        return new
+
+
+def test_the_detector_sees_what_a_graph_cannot_record():
+    values = torch.arange(4.0)
+    readings = [
+        lambda: values[values > 1],
+        lambda: float(values.sum()),
+        lambda: (values > 1).nonzero(),
+        lambda: values + torch.tensor([1.0, 2.0, 3.0, 4.0]),
+    ]
+    for reading in readings:
+        with pytest.raises(AssertionError), Recorded():
+            reading()
+
+
+FORCES = """
+decimation: 2
+episode_length_s: 0.1
+sim: {dt: 0.005, engine: warp}
+scene: {num_envs: 3, entities: {robot: {model: box.xml}}}
+actions: {push: {func: joint_effort}}
+observations: {policy: {wrench: {func: body_incoming_wrench}}}
+rewards: {acc: {func: body_lin_acc_l2, weight: 1.0}}
+terminations: {time_out: {func: time_out, time_out: true}}
+"""
+BOX = """<mujoco><worldbody><body name="b" pos="0 0 0.1"><freejoint/><geom size="0.1" mass="1"/>
+<body name="arm"><joint name="j" axis="0 1 0"/><geom size="0.01" pos="0 0 0.3" mass="0.1"/></body></body></worldbody>
+</mujoco>"""
+
+
+def test_steps_with_terms_of_forces_on_bodies_are_recorded(tmp_path):
+    env = build(write(tmp_path / "box", edited(FORCES), box_xml=BOX))
+    env.reset()
+    action = torch.ones(3, 1)
+    env.step(action)
+    with Recorded():
+        results = [env.step(action) for _ in range(12)]
+    assert all(r.reward.isfinite().all() for r in results)
+    assert results[-1].obs["policy"].abs().max() > 0.1
+    assert observations.body_incoming_wrench.reads_body_forces
+
+
+def test_a_task_with_every_term_and_real_sensors_and_commands_is_recorded(tmp_path):
+    rows = {"observations": OBSERVATIONS, "rewards": REWARDS, "terminations": TERMINATIONS}
+    folder = write(tmp_path / "all", whole_task(rows, engine="warp"), **FILES)
+    env = build(folder, 3, "episode_length_s=0.1")
+    env.reset()
+    action = 0.3 * torch.ones(3, 4)
+    env.step(action)
+    with Recorded():
+        results = [env.step(action) for _ in range(12)]
+    env.check()
+    assert sum(int(r.episodes.mask.sum()) for r in results) >= 6
+    assert all(r.reward.isfinite().all() and r.obs["policy"].isfinite().all() for r in results)
+
+
+def test_a_task_with_every_term_lives_the_same_life_whatever_the_number_of_environments(tmp_path):
+    rows = {"observations": OBSERVATIONS, "rewards": REWARDS, "terminations": []}
+    folder = write(tmp_path / "all", whole_task(rows), **FILES)
+    few, many = build(folder, 2, "episode_length_s=0.1"), build(folder, 19, "episode_length_s=0.1")
+    first = [env.reset()["policy"] for env in (few, many)]
+    assert torch.equal(first[0], first[1][:2])
+    for step in range(12):
+        action = torch.full((19, 4), 0.3 * (-1) ** step)
+        left, right = few.step(action[:2]), many.step(action)
+        assert torch.equal(left.obs["policy"], right.obs["policy"][:2])
+        assert torch.equal(left.reward, right.reward[:2])
