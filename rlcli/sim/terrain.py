@@ -117,8 +117,8 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, material: str) -> None:
     flat = span < 1e-9
     if flat:
         body.add_geom(
-            name=f"//{BODY}/flat", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, _THICK], pos=[0.0, 0.0, lowest - _THICK],
-            material=material, friction=friction,
+            name=f"//{BODY}/flat", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, _THICK],
+            pos=[0.0, 0.0, lowest - _THICK], material=material, friction=friction,
         )  # fmt: skip
     else:
         spec.add_hfield(
