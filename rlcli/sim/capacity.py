@@ -80,8 +80,11 @@ def _pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
     families = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
     excluded = {int(s) for s in model.exclude_signature}
     found = []
+    moves = weld[model.geom_bodyid] > 0
+    moving = np.flatnonzero(moves)
     for a in range(model.ngeom):
-        for b in range(a + 1, model.ngeom):
+        # of two that stand still none touches the other, and a terrain may have thousands
+        for b in range(a + 1, model.ngeom) if moves[a] else moving[moving > a]:
             one, two = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
             bits = (model.geom_contype[a] & model.geom_conaffinity[b]) | (
                 model.geom_contype[b] & model.geom_conaffinity[a]
@@ -102,8 +105,29 @@ def _sample(model: mujoco.MjModel) -> tuple[int, int]:
     for _ in range(_TRIALS):
         mujoco.mj_resetData(model, data)
         data.qvel[:] = rng.normal(0.0, 1.0, model.nv)
+        _scatter(model, data, rng)
         for _ in range(_STEPS):
             data.ctrl[:] = rng.uniform(-1.0, 1.0, model.nu)
             mujoco.mj_step(model, data)
             contacts, rows = max(contacts, data.ncon), max(rows, data.nefc)
     return contacts, rows
+
+
+def _scatter(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator) -> None:
+    """Put free roots somewhere else on a height field: an environment may start anywhere on it."""
+    fields = np.flatnonzero(model.geom_type == int(_G.mjGEOM_HFIELD))
+    if not len(fields):
+        return
+    geom = int(fields[0])
+    field = int(model.geom_dataid[geom])
+    rows, columns, start = (int(a[field]) for a in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
+    row, column = int(rng.integers(rows)), int(rng.integers(columns))
+    half_x, half_y, top, _ = model.hfield_size[field]
+    shift = model.geom_pos[geom] + [
+        half_x * (2.0 * column / (columns - 1) - 1.0),
+        half_y * (2.0 * row / (rows - 1) - 1.0),
+        top * model.hfield_data[start + row * columns + column],
+    ]
+    for joint in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
+        address = int(model.jnt_qposadr[joint])
+        data.qpos[address : address + 3] += shift

@@ -117,8 +117,8 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, material: str) -> None:
     flat = span < 1e-9
     if flat:
         body.add_geom(
-            name=f"{BODY}/flat", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, _THICK], pos=[0.0, 0.0, lowest - _THICK],
-            material=material, friction=friction,
+            name=f"//{BODY}/flat", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, _THICK],
+            pos=[0.0, 0.0, lowest - _THICK], material=material, friction=friction,
         )  # fmt: skip
     else:
         spec.add_hfield(
@@ -129,7 +129,7 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, material: str) -> None:
             userdata=ground.heights.T.astype(np.float32).ravel(),
         )
         body.add_geom(
-            name=f"{BODY}/heights", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=BODY, pos=[0.0, 0.0, lowest],
+            name=f"//{BODY}/heights", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=BODY, pos=[0.0, 0.0, lowest],
             material=material, friction=friction,
         )  # fmt: skip
     floor = min(lowest, 0.0) - _THICK
@@ -138,7 +138,7 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, material: str) -> None:
         size = [(block.high[i] - block.low[i]) / 2 for i in (0, 1)]
         middle = [(block.high[i] + block.low[i]) / 2 for i in (0, 1)]
         body.add_geom(
-            name=f"{BODY}/box_{number}", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*size, (block.top - floor) / 2],
+            name=f"//{BODY}/box_{number}", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*size, (block.top - floor) / 2],
             pos=[*middle, (block.top + floor) / 2], material=material, friction=friction,
         )  # fmt: skip
 

@@ -5,7 +5,10 @@ import subprocess
 import sys
 
 import pytest
+import torch
+import yaml
 from fenced import REPOSITORY, blocks, run_commands, success_rate, write_files
+from worlds import CRITTER, CRITTER_TASK, build, edited, write
 
 import rlcli.errors
 from rlcli.testing import CHECKS
@@ -29,6 +32,23 @@ def test_the_task_of_a_page_checks_trains_and_learns(page, folder, tmp_path):
     output = run_commands(found, tmp_path)
     assert f"./{folder}: 0 errors, 0 warnings" in output
     assert success_rate(output) > 0.9
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_the_scenes_of_the_page_build_and_run(number, tmp_path):
+    found = [b for b in blocks(DOCS / "write-a-task.md", "## Scenes", "## Check it") if b.language == "yaml"]
+    assert len(found) == 3
+    part = yaml.safe_load(found[number].text)
+    part["scene"]["entities"]["robot"]["joints"] = {".*": {"kp": 20.0, "kv": 0.5}}  # the critter has no servos
+    task = edited(CRITTER_TASK, **part)
+    env = build(write(tmp_path / "task", task, quadruped_xml=CRITTER), 3)
+    env.reset()
+    env.step(torch.zeros(3, 4))
+    entities, sensors = part["scene"]["entities"], part["scene"].get("sensors", {})
+    assert list(env.entities) == list(entities)
+    assert list(env.sensors) == list(sensors)
+    assert [sensor.names[0] for sensor in env.sensors.values()] == ["leg_fl", "ray_0", "ray_0"][: len(sensors)]
+    assert (env.terrain is None) == ("terrain" not in part["scene"])
 
 
 @pytest.mark.slow

@@ -139,3 +139,20 @@ def test_enough_room_is_no_error():
         engine.step(1)
         engine.diverged()
     assert engine.noted() == []
+
+
+def test_room_on_a_height_field_is_what_is_needed_anywhere_on_it():
+    """Over the origin gapes a pit, in which nothing touches anything for a long time; 20 feet stand about it."""
+    heights = np.ones((41, 41))
+    heights[16:25, 16:25] = 0.0
+    spec = mujoco.MjSpec()
+    spec.add_hfield(name="land", nrow=41, ncol=41, size=[20.0, 20.0, 10.0, 1.0], userdata=heights.ravel())
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="land", pos=[0.0, 0.0, -10.0])
+    body = spec.worldbody.add_body(name="table", pos=[0.0, 0.0, 0.1])
+    body.add_freejoint()
+    for foot in range(20):
+        place = [0.2 * (foot % 5), 0.2 * (foot // 5), 0.0]
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0.0, 0.0], pos=place)
+    model = spec.compile()
+    assert needed(model, 100, shake=0.0)[0] == 0
+    assert capacity(model).contacts >= 60

@@ -40,6 +40,7 @@ TASK = {
     "terminations": {"time_out": {"func": "time_out", "time_out": True}},
 }
 ENGINES = pytest.mark.parametrize("engine", ["batch", "warp"])
+MANY_STEPS = pytest.mark.parametrize("engine", ["batch", pytest.param("warp", marks=pytest.mark.slow)])
 
 
 def boxes(tmp_path, sensors, *overrides, num_envs=3, **changes):
@@ -63,7 +64,7 @@ def contact(**settings):
 # --- contact ---
 
 
-@ENGINES
+@MANY_STEPS
 def test_the_force_is_that_on_the_body_in_the_world_frame(tmp_path, engine):
     env = boxes(tmp_path, {
         "low": contact(entity="low", bodies="box"),
@@ -73,7 +74,7 @@ def test_the_force_is_that_on_the_body_in_the_world_frame(tmp_path, engine):
         "low_high": contact(entity="low", bodies="box", against={"entity": "high"}),
         "high_low": contact(entity="high", bodies="box", against={"entity": "low", "bodies": "box"}),
     }, f"sim.engine={engine}")  # fmt: skip
-    rest(env)
+    rest(env, 25)
     g = 9.81
     up = {"low": 2 * g, "high": g, "low_ground": 3 * g, "high_ground": 0.0, "low_high": -g, "high_low": g}
     for name, force in up.items():
@@ -82,10 +83,10 @@ def test_the_force_is_that_on_the_body_in_the_world_frame(tmp_path, engine):
         assert env.sensors[name].found.tolist() == [[force != 0.0]] * 3, name
 
 
-@ENGINES
+@MANY_STEPS
 def test_a_pushed_box_feels_friction_against_its_motion(tmp_path, engine):
     env = boxes(tmp_path, {"low": contact(entity="low", bodies="box", against="ground")}, f"sim.engine={engine}")
-    rest(env, 20)
+    rest(env, 5)
     env.engine.field("xfrc_applied").view(3, -1)[:, 6:7] = 4.0  # along x, on the first body after the world
     rest(env, 5)
     torch.testing.assert_close(env.sensors["low"].force[:, 0, 0], torch.full((3,), -4.0), atol=0.05, rtol=0)
@@ -126,7 +127,7 @@ def test_forces_against_several_bodies_are_their_sum(tmp_path):
     assert float(env.sensors["all"].force[0, 0, 2]) < -5.0
 
 
-@ENGINES
+@MANY_STEPS
 def test_air_and_contact_times_count_steps(tmp_path, engine):
     """The box starts 0.2 m above the ground: sqrt(2 h / g) = 0.202 s of fall, steps of 0.02 s."""
     entities = {"low": {"pos": [0.0, 0.0, 0.2]}, "high": {"pos": [9.0, 0.0, 0.0]}}
@@ -375,7 +376,7 @@ def test_both_engines_tell_the_same(tmp_path):
     for env in (host, device):
         env.reset(seed=1)
     # contact forces multiply rounding errors: compare the first steps, in which the legs touch down
-    for action in actions(6, 4, 4):
+    for action in actions(4, 4, 4):
         one, other = host.step(0.3 * action).obs["policy"], device.step(0.3 * action).obs["policy"]
         torch.testing.assert_close(one, other, atol=0.2, rtol=0.02)
         torch.testing.assert_close(one[:, 12:], other[:, 12:], atol=1e-3, rtol=0)

@@ -25,7 +25,7 @@ TASK = {
     "rewards": {"alive": {"func": "is_alive", "weight": 1.0}},
     "terminations": {"time_out": {"func": "time_out", "time_out": True}},
 }
-ENGINES = pytest.mark.parametrize("engine", ["batch", "warp"])
+ENGINES = pytest.mark.parametrize("engine", ["batch", pytest.param("warp", marks=pytest.mark.slow)])
 
 
 def scene(tmp_path, entities, *overrides, num_envs=2, **changes):
