@@ -50,7 +50,7 @@ class Scene:
     """A scene under construction; `spec` is open to a direct task's `set_up_scene` until it is compiled."""
 
     def __init__(self, config: SceneConfig, sim: SimConfig, root: Path) -> None:
-        self.config = config
+        self.config = config.model_copy(update={"entities": dict(config.entities)})
         self.sim = sim
         self.root = root.resolve()
         self.spec = mujoco.MjSpec()
@@ -129,6 +129,11 @@ class Scene:
                 SceneProblem((*path, "model"), f"'{entity.model}' is not a valid MJCF: {_one_line(error)}")
             )
             return
+        self.attach(name, entity, child)
+
+    def attach(self, name: str, entity: EntityConfig, child: mujoco.MjSpec) -> None:
+        """Add an entity to the scene; `child` is its model, which `entity.model` need not name."""
+        self.config.entities[name] = entity
         _name_all(child)
         if name == next(iter(self.config.entities)):
             for option in _OPTIONS:
