@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.config import oige
-from rlcli.config.layers import read
 from rlcli.errors import DependencyError, TaskError, did_you_mean, listing
 from rlcli.task import API_VERSION, TaskSpec
 
@@ -205,8 +204,9 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
     if not config.is_file():
         found = listing(sorted(p.name for p in root.iterdir())) if root.is_dir() else "no such folder"
         raise TaskError(f"'{folder}' is not a task: it has no {file} ({found})")
-    if oige.is_oige_file(config):
-        return _oige_task(root, config)
+    name = oige.task_name(config)
+    if name is not None:
+        return _oige_task(root, config, name)
     terms, task = root / "terms.py", root / "task.py"
     return TaskSource(
         name=root.name,
@@ -230,21 +230,23 @@ def _oige_config(root: Path) -> Path | None:
     return found[0] if found else None
 
 
-def _oige_task(root: Path, config: Path) -> TaskSource:
-    name = str(read(config).data.get("name") or config.stem)
+def _oige_task(root: Path, config: Path, name: str) -> TaskSource:
+    file: Path | None
     try:
         file, class_name = oige.find_class(root, name)
     except LookupError as problem:
-        raise TaskError(f"'{config}' is not a task: {problem.args[0]}") from None
+        if next(root.rglob("*.py"), None) is not None:
+            raise TaskError(f"'{config}' is not a task: {problem.args[0]}") from None
+        file, class_name = None, f"{name}Task"  # the YAML can be checked without
     return TaskSource(
-        name=name,
+        name=root.name if config.name == "task.yaml" else config.stem,
         root=root,
         config=config,
         distribution=None,
         version=None,
         term_files=(),
         term_modules=(),
-        task=f"{file}:{class_name}",
+        task=f"{file or root / 'task.py'}:{class_name}",
         task_file=file,
     )
 

@@ -154,6 +154,18 @@ def is_oige_file(file: FilePath) -> bool:
         return False
 
 
+def task_name(file: FilePath) -> str | None:
+    """The name of a task of OmniIsaacGymEnvs, in its own form or imported; None for another task's file."""
+    try:
+        data = read(file).data
+    except ConfigError:
+        return None
+    imported = _mapping(data.get("oige"))
+    if not imported and not is_oige(data):
+        return None
+    return str((imported or data).get("name") or file.stem)
+
+
 def translate(
     document: Document, label: str, *, class_file: FilePath | None, class_name: str | None, agent_file: FilePath | None
 ) -> Translation:
@@ -231,6 +243,9 @@ class _Translator:
             elif key not in _TOP:
                 near = did_you_mean(key, _TOP) or f"keys: {listing(_TOP)}"
                 self._problem((key,), f"unknown key '{key}'", near)
+        for key in ("rl", "ctrl", "randomize"):
+            if key in task:
+                self._note((key,), "task")
         if "physics_engine" in task:
             self._note(("physics_engine",), "ignored", "physics runs in MuJoCo")
         if "name" in task:
@@ -386,10 +401,16 @@ class _Translator:
 def summary(notes: list[Note] | tuple[Note, ...]) -> list[str]:
     """The notes in a few lines, one a status."""
     lines = []
-    for status, said in (("mapped", "mapped"), ("approximated", "approximated"), ("ignored", "ignored")):
-        keys = dict.fromkeys(note.key for note in notes if note.status == status)
-        if keys:
-            lines.append(f"{said}: {', '.join(keys)}")
+    for status in ("mapped", "approximated", "ignored"):
+        parents: dict[str, list[str]] = {}
+        for note in notes:
+            if note.status == status:
+                parent, _, key = note.key.rpartition(".")
+                if key not in parents.setdefault(parent, []):
+                    parents[parent].append(key)
+        groups = [f"{parent}.{{{', '.join(keys)}}}" if parent else ", ".join(keys) for parent, keys in parents.items()]
+        if groups:
+            lines.append(f"{status}: {', '.join(groups)}")
     return lines
 
 
