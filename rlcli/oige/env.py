@@ -108,6 +108,8 @@ class OigeEnv(DirectEnv):
     def _build(self) -> None:
         for view in self.handle.world.scene.views.values():
             view.bind(self)
+        if self.engine.model.nsensor:
+            self.engine.field("sensordata")  # asked for before the first reset: forces of a start state are 0
         if hasattr(self.task, "_max_episode_length"):
             length = self.task._max_episode_length
             if self._length_is_a_guess():
