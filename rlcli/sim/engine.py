@@ -57,8 +57,8 @@ class Engine(Protocol):
         """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
         ...
 
-    def step(self, nstep: int) -> None:
-        """Advance every world by `nstep` physics steps."""
+    def step(self, nstep: int, *, derive: bool = True) -> None:
+        """Advance every world by `nstep` physics steps; without `derive` the derived fields stay behind."""
         ...
 
     def diverged(self) -> Tensor | None:
@@ -82,6 +82,27 @@ class Engine(Protocol):
 
     def select(self, mask: Tensor, seed: int, counters: Tensor) -> Selection | None:
         """The worlds where `mask` holds, with their random streams; None where that is known to be nobody."""
+        ...
+
+    def rays(
+        self,
+        points: Tensor,
+        directions: Tensor,
+        *,
+        groups: tuple[int, ...] | None = None,
+        exclude: int = -1,
+        selection: Selection | None = None,
+    ) -> Tensor:
+        """Distances from points to the first geom along unit directions, -1 where there is none. (rows, rays) float32
+
+        Args:
+            points: world frame [m]; a row for every world, or for those of the selection as it reads fields.
+                (rows, rays, 3) float32
+            directions: of length 1. (rows, rays, 3) float32
+            groups: of the geoms that are seen; None: all.
+            exclude: a body whose geoms are not.
+            selection: the worlds; None: all.
+        """
         ...
 
     def watch(self, values: Tensor, what: str) -> None:

@@ -65,6 +65,9 @@ _CONSTANTS = (
 """Model fields that `set_const` derives from others."""
 
 
+_Groups = wp.types.vector(length=mujoco.mjNGROUP, dtype=float)
+
+
 class WarpEngine:
     """Many worlds of one model on a GPU.
 
@@ -112,7 +115,8 @@ class WarpEngine:
             self._sensor_stages.add(_VELOCITY)
         self._force_columns = as_index(force_columns, self.device)
         self._expanded: dict[str, Tensor] = {}
-        self._graphs: dict[int, Any] = {}
+        self._graphs: dict[tuple[int, bool], Any] = {}
+        self._rays: dict[tuple[int, int], tuple[wp.array, wp.array, wp.array]] = {}
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         with wp.ScopedDevice(self._device), _on_torch_stream(self.device):
             self._model, self._data = self._put(model, capacity)
@@ -184,16 +188,16 @@ class WarpEngine:
         with self._launching():
             mjw.set_const(self._model, self._data)
 
-    def step(self, nstep: int) -> None:
-        """Advance every world by `nstep` physics steps, and compute what is bound of the derived fields."""
+    def step(self, nstep: int, *, derive: bool = True) -> None:
+        """Advance every world by `nstep` physics steps; without `derive` the derived fields stay behind."""
         with self._launching():
             if self.device.type != "cuda" or torch.cuda.is_current_stream_capturing():
-                self._advance(nstep)
-            elif nstep in self._graphs:
-                wp.capture_launch(self._graphs[nstep])
+                self._advance(nstep, derive)
+            elif (nstep, derive) in self._graphs:
+                wp.capture_launch(self._graphs[nstep, derive])
             else:
-                self._advance(nstep)  # compiles
-                self._graphs[nstep] = self._capture(nstep)
+                self._advance(nstep, derive)  # compiles
+                self._graphs[nstep, derive] = self._capture(nstep, derive)
 
     def diverged(self) -> Tensor:
         """Worlds that the last step drove out of bounds; they are back in the state before it, at rest. (num_envs,)
@@ -259,6 +263,28 @@ class WarpEngine:
     def select(self, mask: Tensor, seed: int, counters: Tensor) -> MaskSelection:
         """The worlds where `mask` holds; whether there are any is known to the device alone."""
         return MaskSelection(mask, seed, counters)
+
+    def rays(
+        self,
+        points: Tensor,
+        directions: Tensor,
+        *,
+        groups: tuple[int, ...] | None = None,
+        exclude: int = -1,
+        selection: Selection | None = None,
+    ) -> Tensor:
+        """Distances from points to the first geom along unit directions, -1 where there is none. (num_envs, rays)"""
+        self.field("geom_xpos")  # current from now on
+        shape = (self.num_envs, points.shape[1])
+        distance = torch.empty(shape, device=self.device)
+        with self._launching():
+            excluded, geom, normal = self._ray_buffers(points.shape[1], exclude)
+            seen = _Groups(*(-1.0 if groups is None else float(g in groups) for g in range(mujoco.mjNGROUP)))
+            pnt, vec = (wp.from_torch(v.expand(*shape, 3).contiguous(), dtype=wp.vec3) for v in (points, directions))
+            mjw.rays(
+                self._model, self._data, pnt, vec, seen, True, excluded, wp.from_torch(distance), geom, normal
+            )  # fmt: skip
+        return distance
 
     def watch(self, values: Tensor, what: str) -> None:
         """Have the device note if a value is not finite; `noted` tells."""
@@ -349,10 +375,11 @@ class WarpEngine:
         with wp.ScopedDevice(self._device):
             yield
 
-    def _advance(self, nstep: int) -> None:
+    def _advance(self, nstep: int, derive: bool) -> None:
         for _ in range(nstep):
             mjw.step(self._model, self._data)
-        self._derive()
+        if derive:
+            self._derive()
 
     def _derive(self) -> None:
         """Bring the derived fields that somebody reads up to the state; those of forces are the last substep's."""
@@ -398,16 +425,27 @@ class WarpEngine:
         flat = [wp.from_torch(values.view(self.num_envs, -1)) for values in (now, last)]
         wp.launch(kernel, dim=flat[0].shape, inputs=[wp.from_torch(mask), *flat], device=self._device)
 
+    def _ray_buffers(self, rays: int, exclude: int) -> tuple[wp.array, wp.array, wp.array]:
+        """What a cast needs beside the rays, made once: the body each ray ignores, geoms and normals that are hit."""
+        if (rays, exclude) not in self._rays:
+            shape = (self.num_envs, rays)
+            self._rays[rays, exclude] = (
+                wp.full(rays, exclude, dtype=int),
+                wp.empty(shape, dtype=int),
+                wp.empty(shape, dtype=wp.vec3),
+            )
+        return self._rays[rays, exclude]
+
     def _before_forward(self) -> dict[str, Tensor]:
         """Copies of what a forward pass would overwrite, and which is the last substep's."""
         return {
             name: self._fields[name].clone() for name in (*self._of_substep(), "qacc_warmstart") if name in self._fields
         }
 
-    def _capture(self, nstep: int) -> Any:
+    def _capture(self, nstep: int, derive: bool) -> Any:
         stream = wp.Stream(self._device)  # torch's default stream cannot be recorded
         with wp.ScopedStream(stream), wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
-            self._advance(nstep)
+            self._advance(nstep, derive)
         return capture.graph
 
     def _put(self, model: mujoco.MjModel, capacity: Capacity) -> tuple[mjw.Model, mjw.Data]:

@@ -32,6 +32,8 @@ from rlcli.testing.subject import (
 def names(subject: Subject) -> Iterator[Finding]:
     """Every name in the YAML resolves; joints, actuators and bodies of the models have names."""
     for entity, config in subject.resolved.task.scene.entities.items():
+        if config.model is None:
+            continue  # a shape has the names that rlcli gives it
         spec = mujoco.MjSpec.from_file(str(subject.source.root / config.model))
         scalar = [joint for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]  # a root needs no name
         for word, elements in (("joint", scalar), ("actuator", list(spec.actuators)), ("body", spec.bodies[1:])):
@@ -176,8 +178,8 @@ def _raw(env: VecEnv) -> Iterator[tuple[str, Tensor, int | None]]:
         return
     manager = env.observation_manager
     for group in manager.groups:
-        for term, size in manager.sizes(group):
-            yield f"observations.{group}.{term.name}", term.call(), size
+        for pipeline in manager.pipelines(group):
+            yield f"observations.{group}.{pipeline.term.name}", pipeline.term.call(), pipeline.width
     for section, terms in (("rewards", env.reward_manager.terms), ("terminations", env.termination_manager.terms)):
         for term in terms:
             yield f"{section}.{term.name}", term.call(), None
