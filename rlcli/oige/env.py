@@ -144,9 +144,9 @@ class OigeEnv(DirectEnv):
         found = {}
         for name, value in flat.items():
             if isinstance(value, Tensor) and value.numel():
-                found[name] = float(value.float().mean())
+                found[f"Task/{name}"] = float(value.float().mean())
             elif isinstance(value, int | float):
-                found[name] = float(value)
+                found[f"Task/{name}"] = float(value)
         return found
 
     def _act(self, action: Tensor) -> None:

@@ -31,6 +31,7 @@ class Prim:
         self.prim_path = path
         self.child: mujoco.MjSpec | None = None
         self.label = ""
+        self.shape = False
         self.pos: tuple[float, ...] = (0.0, 0.0, 0.0)
         self.quat: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
         self.settings: dict[str, Any] = {}
@@ -123,9 +124,10 @@ class Stage:
 
     def attach(self, scene: Scene, joint_forces: bool) -> None:
         """Turn every prim into an entity of the scene; with sensors of joint forces where a task reads them."""
-        for prim in self.prims.values():
+        # robots before shapes: the options of the scene are those of its first model; a frame has none
+        for prim in sorted(self.prims.values(), key=lambda prim: prim.shape):
             if prim.child is None:
-                continue  # a frame
+                continue
             _apply(prim, prim.child)
             if joint_forces:
                 _add_force_sensors(prim.child)
@@ -301,7 +303,7 @@ class _Shape(XFormPrim):
         if self._mass is not None:
             geom.mass = float(self._mass)
         geom.density = float(self._density) if self._density is not None else 1000.0
-        self.prim.child, self.prim.label = child, type(self).__name__
+        self.prim.child, self.prim.label, self.prim.shape = child, type(self).__name__, True
         self.prim.settings["collisions"] = self.solid
 
 

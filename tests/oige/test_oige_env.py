@@ -33,7 +33,7 @@ def test_a_task_runs_with_its_import_lines_alone_changed(env):
     assert result.obs["policy"].shape == (4, 4)
     assert env.task.world.is_playing()
     assert env.task._env._world.is_playing()
-    assert set(env.extras()) == {"angle"}
+    assert set(env.extras()) == {"Task/angle"}
 
 
 def test_running_into_the_length_of_an_episode_truncates_and_failing_terminates(env):
