@@ -19,6 +19,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
+from rlcli.config import oige
 from rlcli.errors import DependencyError, TaskError, did_you_mean, listing
 from rlcli.task import API_VERSION, TaskSpec
 
@@ -115,7 +116,10 @@ def find_task(name: str) -> TaskSource:
         TaskError: unknown, ambiguous, broken, or built for a newer rlcli.
     """
     if name in (".", "..") or any(mark in name for mark in ("/", os.sep)):
-        return folder_task(Path(name))
+        path = Path(name)
+        if path.suffix == ".yaml" and path.is_file() and oige.is_oige_file(path):
+            return folder_task(path.parent, path.name)
+        return folder_task(path)
     try:
         entry = find_entry(TASKS, name, what="task")
     except TaskError:
@@ -187,14 +191,22 @@ def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
 
 
 def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
-    """A folder with a `task.yaml`, and optionally `terms.py` and `task.py` (a class `Task`)."""
+    """A folder with a `task.yaml`, and optionally `terms.py` and `task.py` (a class `Task`).
+
+    Or with a YAML in the form of OmniIsaacGymEnvs, whatever its name, and the Python file of the task's class.
+    """
     root = folder.resolve()
     config = root / file
+    if file == "task.yaml" and root.is_dir() and not config.is_file():
+        config = _oige_config(root) or config
     if root.is_file():
         raise TaskError(f"'{folder}' is a file, not a task's folder", hint=f"did you mean '{folder.parent}'?")
     if not config.is_file():
         found = listing(sorted(p.name for p in root.iterdir())) if root.is_dir() else "no such folder"
         raise TaskError(f"'{folder}' is not a task: it has no {file} ({found})")
+    name = oige.task_name(config)
+    if name is not None:
+        return _oige_task(root, config, name)
     terms, task = root / "terms.py", root / "task.py"
     return TaskSource(
         name=root.name,
@@ -206,6 +218,36 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
         term_modules=(str(terms),) if terms.is_file() else (),
         task=f"{task}:Task" if task.is_file() else None,
         task_file=task if task.is_file() else None,
+    )
+
+
+def _oige_config(root: Path) -> Path | None:
+    """The one YAML of a folder that has OmniIsaacGymEnvs' form; None if there is none."""
+    found = [file for file in sorted(root.glob("*.yaml")) if oige.is_oige_file(file)]
+    if len(found) > 1:
+        names = listing(f"{root.name}/{file.name}" for file in found)
+        raise TaskError(f"'{root}' holds several tasks", hint=f"name one file: {names}")
+    return found[0] if found else None
+
+
+def _oige_task(root: Path, config: Path, name: str) -> TaskSource:
+    file: Path | None
+    try:
+        file, class_name = oige.find_class(root, name)
+    except LookupError as problem:
+        if next(root.rglob("*.py"), None) is not None:
+            raise TaskError(f"'{config}' is not a task: {problem.args[0]}") from None
+        file, class_name = None, f"{name}Task"  # the YAML can be checked without
+    return TaskSource(
+        name=root.name if config.name == "task.yaml" else config.stem,
+        root=root,
+        config=config,
+        distribution=None,
+        version=None,
+        term_files=(),
+        term_modules=(),
+        task=f"{file or root / 'task.py'}:{class_name}",
+        task_file=file,
     )
 
 
@@ -272,11 +314,28 @@ def load_module(name: str) -> Any:
             module = importlib.util.module_from_spec(spec)
             sys.modules[alias] = module
             try:
-                spec.loader.exec_module(module)
+                with _neighbours(file.resolve().parent):
+                    spec.loader.exec_module(module)
             except BaseException:
                 del sys.modules[alias]
                 raise
         return sys.modules[alias]
+
+
+@contextlib.contextmanager
+def _neighbours(folder: Path) -> Iterator[None]:
+    """A file of a task folder may import the files beside it, which two tasks may call the same."""
+    before = set(sys.modules)
+    sys.path.insert(0, str(folder))
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
+        for name in set(sys.modules) - before:
+            place = getattr(sys.modules[name], "__file__", None)
+            if place and Path(place).is_relative_to(folder) and not name.startswith("rlcli_folder_task_"):
+                del sys.modules[name]
 
 
 def _wanted() -> set[str] | None:

@@ -15,7 +15,7 @@ LAYERS = [
     {"errors", "task", "trainers", "random", "machine"},
     {"config", "registry", "probe"},
     {"sim"},
-    {"managers", "mdp", "envs"},
+    {"managers", "mdp", "envs", "oige"},
     {"rl", "viewer", "adapters", "testing", "pytest_plugin"},
     {"cli"},
 ]

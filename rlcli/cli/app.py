@@ -25,6 +25,7 @@ COMMANDS = {
     "eval": "eval",
     "export": "export",
     "check": "check",
+    "import": "import_task",
 }
 """Command -> module of `rlcli.cli` that registers it."""
 

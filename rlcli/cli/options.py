@@ -44,6 +44,17 @@ def flags(**values: Any) -> Mapping[str, Any]:
     return {key.replace("__", "."): value for key, value in values.items() if value is not None}
 
 
+def tell_notes(resolved: Any) -> None:
+    """Say what became of the keys of a task in another tool's form; -v says it of each."""
+    from rlcli.cli.console import console
+    from rlcli.config.oige import summary
+
+    for line in summary(resolved.notes):
+        console.info(line)
+    for note in resolved.notes:
+        console.detail(str(note))
+
+
 def draw_seed(seed: int) -> int:
     """The seed, drawn if it is -1."""
     if seed != -1:

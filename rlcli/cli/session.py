@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.cli.console import console
-from rlcli.cli.options import flags
+from rlcli.cli.options import flags, tell_notes
 
 POLICIES = ("trained", "zero", "random")
 
@@ -66,6 +66,7 @@ def open_session(
         assert task is not None
         resolved = resolve(find_task(task), play=True, config_file=config, overrides=overrides, flags=values)
     check(resolved)
+    tell_notes(resolved)
     return _build(resolved, run, folder, policy, stochastic, seed)
 
 

@@ -30,6 +30,7 @@ from rlcli.cli.options import (
     choose_device,
     draw_seed,
     flags,
+    tell_notes,
 )
 
 if TYPE_CHECKING:
@@ -107,6 +108,7 @@ def command(
             overrides=overrides or [],
             flags={**flags(scene__num_envs=num_envs), **budget},
         )
+        tell_notes(resolved)
         _require_parallel(resolved, gpus or 1)
         device = _fitting(resolved, device, wanted)
     if gpus is not None and gpus > 1 and not distributed.launched():

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Agent, ConfigFile, Debug, Json, Overrides
+from rlcli.cli.options import Agent, ConfigFile, Debug, Json, Overrides, tell_notes
 from rlcli.errors import TaskError
 from rlcli.registry import TaskSource, find_task, folder_task, task_of_file
 
@@ -38,6 +38,7 @@ def command(
         small = resolve(source, agent=agent, config_file=config, overrides=given, flags={"scene.num_envs": 2})
         make_env(small).reset(seed=0)
         checked = "files and model"
+    tell_notes(resolved)
     console.data(f"{source.label}: valid ({checked})")
     if unchecked:
         console.warn(f"not checked, their trainer is not installed: agents {', '.join(unchecked)}")

@@ -14,8 +14,9 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from rlcli.config import messages
+from rlcli.config import messages, oige
 from rlcli.config.layers import Layers, Origin, marked, parse_override, read
+from rlcli.config.rl_games import Note
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.terms import SECTIONS, SignatureError, Vocabulary, params_model, read_params
@@ -42,6 +43,8 @@ class Resolved:
     trainer: TrainerSpec | None
     layers: Layers
     vocabulary: Vocabulary
+    notes: tuple[Note, ...] = ()
+    """What became of each key of a file in another tool's form; empty for a file in rlcli's own."""
 
     def place(self, path: Path) -> str:
         """Where a path was written, for a message."""
@@ -97,7 +100,7 @@ def resolve(
     origin = marked(extra, str(config_file), "config")
     changes = check.changes(overrides, flags or {})
 
-    check.layers.merge(document.data, marked(document, source.label, "task"))
+    notes = check.read_task(document)
     check.layers.merge(_only(extra.data, _APART), origin)
     name = check.choose_agent(agent, device, changes)
     if "agent" in extra.data:
@@ -117,7 +120,7 @@ def resolve(
         raise ConfigError(check.problems)
     if check.missing is not None:
         raise check.missing
-    return Resolved(source, task, agent_config, name, trainer, check.layers, check.vocabulary)
+    return Resolved(source, task, agent_config, name, trainer, check.layers, check.vocabulary, notes)
 
 
 def check_all(source: TaskSource, *, config_file: FilePath | None = None, overrides: Sequence[str] = ()) -> list[str]:
@@ -129,8 +132,9 @@ def check_all(source: TaskSource, *, config_file: FilePath | None = None, overri
     Raises:
         ConfigError: with the problems of all agents, in training and in play.
     """
-    document = read(source.config, source.label)
-    agents = document.data.get("agents")
+    check = _Check(source)
+    check.read_task(read(source.config, source.label))
+    agents = check.layers.get(("agents",))
     names = [name for name in agents if name != "default"] if isinstance(agents, dict) else []
     problems: list[Problem] = []
     unchecked: list[str] = []
@@ -191,6 +195,25 @@ class _Check:
         self.problems.append(Problem(self.layers.place(path), messages.dotted(path), message, hint))
 
     # --- layers ---
+
+    def read_task(self, document: Document) -> tuple[Note, ...]:
+        """Merge the task's file, in whichever form it is; what became of the keys of another tool's form."""
+        if not oige.is_oige(document.data):
+            self.layers.merge(document.data, marked(document, self.source.label, "task"))
+            return ()
+        source = self.source
+        class_name = source.task.rpartition(":")[2] if source.task else None
+        found = oige.translate(
+            document,
+            source.label,
+            class_file=source.task_file,
+            class_name=class_name,
+            agent_file=oige.agent_file(source.config),
+        )
+        self.layers.merge(found.data, found.origin)
+        if found.agents_origin is not None:
+            self.layers.merge(found.agents, found.agents_origin)
+        return tuple(found.notes)
 
     def changes(self, overrides: Iterable[str], flags: Mapping[str, Any]) -> list[Change]:
         """What the command line changes, overrides before flags."""
@@ -353,7 +376,9 @@ class _Check:
 
     def _validate(self, model: type[BaseModel], data: Any, at: Path) -> BaseModel | None:
         try:
-            return model.model_validate_json(json.dumps(data))
+            # a task of OmniIsaacGymEnvs makes its entities in set_up_scene
+            context = {"open_scene": bool(self.layers.get(("oige",)))}
+            return model.model_validate_json(json.dumps(data), context=context)
         except ValidationError as error:
             self.problems += messages.problems(error, model, data, self.layers.place, at, self.homes)
             return None
@@ -433,6 +458,9 @@ class _Check:
             self.problem(("observations",), "needs a group 'policy' with at least one term")
 
     def _require_direct(self, data: Mapping[str, Any]) -> None:
+        for path, target in oige.MOVED.items() if data.get("oige") else ():
+            if self.layers.get(("oige", *path)) is not None:
+                self.problem(("oige", *path), "this key has another place here", f"set {target}")
         for section in SECTIONS:
             if section != "success" and data.get(section):
                 self.problem((section,), f"a direct task has no {section} terms; its class does this")

@@ -21,7 +21,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
-from pydantic_core import CoreSchema, core_schema
+from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 _FRACTION = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*/\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*\Z")
 
@@ -770,10 +770,17 @@ class SceneConfig(StrictModel):
     """Uneven ground, shared by all environments, each at its own place on it."""
     lights: LightsConfig = LightsConfig(dome=DomeLightConfig())
     """Lights."""
-    entities: Annotated[dict[str, EntityConfig], Field(min_length=1)]
+    entities: Annotated[dict[str, EntityConfig], Field(json_schema_extra={"minProperties": 1})]
     """Name -> robot or object."""
     sensors: dict[str, SensorConfig] = {}
     """Name -> contact or ray sensor, for terms that ask for one. Sensors of the MJCF need no entry here."""
+
+    @field_validator("entities")
+    @classmethod
+    def _not_empty(cls, value: dict[str, EntityConfig], info: ValidationInfo) -> dict[str, EntityConfig]:
+        if not value and not (info.context or {}).get("open_scene"):
+            raise PydanticKnownError("too_short", {"field_type": "Dictionary", "min_length": 1, "actual_length": 0})
+        return value
 
 
 class TaskConfig(StrictModel):
@@ -813,6 +820,8 @@ class TaskConfig(StrictModel):
     """Reward of the step in which an environment diverged; null: that of its last finite state, terminated."""
     params: dict[str, Any] = {}
     """Parameters of a direct task, checked by the task's own Params."""
+    oige: dict[str, Any] = {}
+    """A task of OmniIsaacGymEnvs: what its class reads as `_task_cfg`, beside what the keys above say."""
     clip_actions: Positive | None = None
     """Direct tasks: actions are clamped to +-this before pre_physics_step."""
     clip_observations: Positive | None = None

@@ -117,7 +117,18 @@ class DirectEnv(VecEnv):
     """Runs a `DirectTask` in the environment loop."""
 
     def _prepare(self, scene: Scene) -> None:
-        source, config = self.resolved.source, self.config
+        task_class = self._task_class()
+        try:
+            params = task_class.Params.model_validate(self.config.params)
+        except ValueError as error:
+            raise ConfigError([self.resolved.problem(("params",), " ".join(str(error).split()))]) from None
+        self.task: DirectTask = task_class(self, params)
+        self.task.set_up_scene(scene)
+        scene.add_motors()
+
+    def _task_class(self) -> type[DirectTask]:
+        """The task's class, imported."""
+        source = self.resolved.source
         assert source.task is not None
         try:
             task_class = load_object(source.task)
@@ -129,13 +140,7 @@ class DirectEnv(VecEnv):
             ) from error
         if not (isinstance(task_class, type) and issubclass(task_class, DirectTask)):
             raise TaskError(f"task '{source.name}' is broken: {source.task} is not a DirectTask")
-        try:
-            params = task_class.Params.model_validate(config.params)
-        except ValueError as error:
-            raise ConfigError([self.resolved.problem(("params",), " ".join(str(error).split()))]) from None
-        self.task: DirectTask = task_class(self, params)
-        self.task.set_up_scene(scene)
-        scene.add_motors()
+        return task_class
 
     def _build(self) -> None:
         for view in self.views:

@@ -543,7 +543,7 @@ class VecEnv(ABC):
         self.engine = open_engine(model, self.num_envs, config.sim, device=str(self.device))
         self.sim = SimData(self.engine)
         self.entities: dict[str, Entity] = {}
-        for name, entity in config.scene.entities.items():
+        for name, entity in scene.config.entities.items():  # a direct task may have added some
             try:
                 self.entities[name] = Entity(name, entity, self.engine, self.sim)
             except NameProblem as problem:
@@ -621,6 +621,10 @@ def make_env(resolved: Resolved, *, seed: int = 42, device: str = "cpu") -> VecE
         from rlcli.envs.managed import ManagedEnv
 
         return ManagedEnv(resolved, seed=seed, device=device)
+    if resolved.task.oige:
+        from rlcli.oige.env import OigeEnv
+
+        return OigeEnv(resolved, seed=seed, device=device)
     from rlcli.envs.direct import DirectEnv
 
     return DirectEnv(resolved, seed=seed, device=device)

@@ -93,7 +93,7 @@ class Scene:
     """A scene under construction; `spec` is open to a direct task's `set_up_scene` until it is compiled."""
 
     def __init__(self, config: SceneConfig, sim: SimConfig, root: Path) -> None:
-        self.config = config
+        self.config = config.model_copy(update={"entities": dict(config.entities)})
         self.sim = sim
         self.root = root.resolve()
         self.spec = mujoco.MjSpec()
@@ -159,6 +159,11 @@ class Scene:
         child = self._load(name, entity) if entity.model is not None else _shape(entity)
         if child is None:
             return
+        self.attach(name, entity, child)
+
+    def attach(self, name: str, entity: EntityConfig, child: mujoco.MjSpec) -> None:
+        """Add an entity to the scene; `child` is its model, which `entity.model` need not name."""
+        self.config.entities[name] = entity
         _name_all(child)
         models = [other for other, config in self.config.entities.items() if config.model is not None]
         if name == next(iter(models), None):
