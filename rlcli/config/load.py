@@ -14,11 +14,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from rlcli.config import messages
+from rlcli.config import messages, python
 from rlcli.config.layers import Layers, Origin, marked, parse_override, read
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
-from rlcli.config.terms import SECTIONS, SignatureError, Vocabulary, params_model, read_params
+from rlcli.config.terms import SECTIONS, Signature, SignatureError, Vocabulary, params_model, read_params
 from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing
 from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, load_entry
 from rlcli.trainers import TrainerSpec
@@ -42,6 +42,8 @@ class Resolved:
     trainer: TrainerSpec | None
     layers: Layers
     vocabulary: Vocabulary
+    notes: tuple[str, ...] = ()
+    """What there is to say about how a configuration of another framework was understood."""
 
     def place(self, path: Path) -> str:
         """Where a path was written, for a message."""
@@ -92,7 +94,7 @@ def resolve(
         DependencyError: if that is all, but the agent's trainer is not installed.
     """
     check = _Check(source)
-    document = read(source.config, source.label)
+    document = check.document()
     extra = read(config_file) if config_file else Document({})
     origin = marked(extra, str(config_file), "config")
     changes = check.changes(overrides, flags or {})
@@ -117,7 +119,7 @@ def resolve(
         raise ConfigError(check.problems)
     if check.missing is not None:
         raise check.missing
-    return Resolved(source, task, agent_config, name, trainer, check.layers, check.vocabulary)
+    return Resolved(source, task, agent_config, name, trainer, check.layers, check.vocabulary, tuple(check.notes))
 
 
 def check_all(source: TaskSource, *, config_file: FilePath | None = None, overrides: Sequence[str] = ()) -> list[str]:
@@ -129,7 +131,7 @@ def check_all(source: TaskSource, *, config_file: FilePath | None = None, overri
     Raises:
         ConfigError: with the problems of all agents, in training and in play.
     """
-    document = read(source.config, source.label)
+    document = _Check(source).document()
     agents = document.data.get("agents")
     names = [name for name in agents if name != "default"] if isinstance(agents, dict) else []
     problems: list[Problem] = []
@@ -154,6 +156,7 @@ def extensions(source: TaskSource) -> tuple[Vocabulary, type[BaseModel] | None]:
         ConfigError: if that source cannot be read.
     """
     check = _Check(source)
+    check.document()
     check.read_terms()
     params = check.params_model()
     if check.problems:
@@ -185,6 +188,18 @@ class _Check:
     problems: list[Problem] = field(default_factory=list)
     missing: DependencyError | None = None
     homes: messages.Homes = field(default_factory=dict)
+    functions: dict[str, Signature] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def document(self) -> Document:
+        """What the task's file holds; a configuration in Python also brings its functions."""
+        if self.source.python is None and self.source.value is None:
+            return read(self.source.config, self.source.label)
+        task = python.load(self.source)
+        self.functions, self.notes = task.terms, task.notes
+        if self.source.config.suffix == ".py":
+            return Document(task.data)
+        return read(self.source.config, self.source.label)  # a run's record of it
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> None:
         """Note a problem at a path."""
@@ -362,6 +377,7 @@ class _Check:
         """Read the signatures of the task's own terms."""
         try:
             self.vocabulary = Vocabulary.of(self.source.term_files)
+            self.vocabulary.own.update(self.functions)
         except SyntaxError as error:
             self.problems.append(_not_python(error))
 

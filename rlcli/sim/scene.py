@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 
 from rlcli.config.schema import EntityConfig, JointConfig, LightsConfig, SceneConfig, SimConfig
-from rlcli.errors import ConfigError, Problem
+from rlcli.errors import ConfigError, Problem, TaskError
+from rlcli.registry import model_file
 from rlcli.sim.names import NameProblem, match
 
 _INTEGRATORS = {
@@ -106,8 +107,12 @@ class Scene:
 
     def _attach(self, name: str, entity: EntityConfig) -> None:
         path = ("scene", "entities", name)
-        file = (self.root / entity.model).resolve()
-        if not file.is_relative_to(self.root):
+        try:
+            file = model_file(self.root, entity.model).resolve()
+        except TaskError as error:
+            self.problems.append(SceneProblem((*path, "model"), error.message, error.hint))
+            return
+        if ":" not in entity.model and not file.is_relative_to(self.root):
             self.problems.append(
                 SceneProblem((*path, "model"), f"'{entity.model}' lies outside the task's folder {self.root}")
             )
