@@ -279,6 +279,8 @@ def _created(
     from rlcli.rl.loggers import check_loggers
     from rlcli.rl.run import create_run, environment_record, find_checkpoint
 
+    for note in resolved.notes:
+        console.info(note)
     loggers = check_loggers(logger)
     initial = None
     if init_from is not None:

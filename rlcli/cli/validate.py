@@ -38,6 +38,8 @@ def command(
         small = resolve(source, agent=agent, config_file=config, overrides=given, flags={"scene.num_envs": 2})
         make_env(small).reset(seed=0)
         checked = "files and model"
+    for note in resolved.notes:
+        console.info(note)
     console.data(f"{source.label}: valid ({checked})")
     if unchecked:
         console.warn(f"not checked, their trainer is not installed: agents {', '.join(unchecked)}")
@@ -48,6 +50,7 @@ def command(
         deep=deep,
         agent=resolved.agent_name,
         unchecked_agents=unchecked,
+        notes=list(resolved.notes),
     )
 
 

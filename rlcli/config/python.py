@@ -1,7 +1,7 @@
 """A configuration that is built in Python, as the same plain data that a YAML file holds.
 
 The object is a `TaskConfig` (or the mapping that one is made of), something that makes one, or a configuration of
-another framework that knows how it is written as one: it has a method `__rlcli_task__() -> PythonTask`. Terms are
+another framework that knows how it is written as one: it has a method `__rlcli_task__(root) -> PythonTask`. Terms are
 names or functions; a function that is no term of `rlcli.mdp` joins the task's own terms under its name.
 """
 
@@ -48,11 +48,11 @@ def load(source: TaskSource) -> PythonTask:
         ConfigError: if the object is not a configuration.
     """
     if source.value is not None:
-        return to_task(source.value, source.label)
+        return to_task(source.value, source.label, source.root)
     assert source.python is not None
     try:
         value, agents = _find(source)
-        task = to_task(value, source.label)
+        task = to_task(value, source.label, source.root)
         for name, agent in agents.items():
             _add_agent(task, name, agent)
     except ValidationError as error:
@@ -64,7 +64,7 @@ def load(source: TaskSource) -> PythonTask:
     return task
 
 
-def to_task(value: Any, label: str) -> PythonTask:
+def to_task(value: Any, label: str, root: FilePath) -> PythonTask:
     """A configuration object as plain data.
 
     Raises:
@@ -72,11 +72,11 @@ def to_task(value: Any, label: str) -> PythonTask:
     """
     if hasattr(value, "__rlcli_task__"):
         value = value() if isinstance(value, type) else value
-        made = value.__rlcli_task__()
+        made = value.__rlcli_task__(root)
         task = made if isinstance(made, PythonTask) else PythonTask(made)
     else:
         if callable(value) and not isinstance(value, BaseModel):
-            return to_task(value(), label)
+            return to_task(value(), label, root)
         task = PythonTask(value)
     if not isinstance(task.data, TaskConfig | Mapping):
         found = f"expected a TaskConfig, found a {type(task.data).__name__}"
@@ -85,11 +85,11 @@ def to_task(value: Any, label: str) -> PythonTask:
     return task
 
 
-def agent_data(value: Any) -> dict[str, Any]:
-    """An agent's settings as plain data: a mapping, a trainer's model, or an object with `__rlcli_agent__()`."""
+def agent_data(value: Any, notes: list[str]) -> dict[str, Any]:
+    """An agent's settings as plain data: a mapping, a trainer's model, or an object with `__rlcli_agent__(notes)`."""
     value = value() if isinstance(value, type) else value
     if hasattr(value, "__rlcli_agent__"):
-        value = value.__rlcli_agent__()
+        value = value.__rlcli_agent__(notes)
     plain = _Reader({}, "agent").plain(value, ())
     if not isinstance(plain, dict):
         raise TypeError(f"expected an agent's settings, found a {type(value).__name__}")
@@ -234,8 +234,7 @@ def _add_agent(task: PythonTask, name: str, agent: Any) -> None:
         return
     agents = task.data.setdefault("agents", {})
     agents.setdefault("default", name)
-    agents[name] = agent_data(agent)
-    task.notes += getattr(agent, "__rlcli_notes__", list)() if not isinstance(agent, type) else []
+    agents[name] = agent_data(agent, task.notes)
 
 
 def _problems(error: ValidationError, label: str) -> list[Problem]:
