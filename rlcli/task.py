@@ -54,5 +54,10 @@ Sensors: TypeAlias = Any
 """MJCF sensors of `entity`. At run time: an index into sensor-data columns."""
 Actuators: TypeAlias = Any
 """Actuators of `entity`. At run time: an index into actuator columns."""
+Command: TypeAlias = Any
+"""A term of `commands:`. YAML: its name. At run time: the term, whose `.command` is (num_envs, k)."""
+Address: TypeAlias = Any
+"""A number, or a list of numbers, of this configuration that may change while training goes on. YAML: its dotted key.
+At run time: a tensor on the environment's device; whoever reads the number reads what is written there."""
 Range: TypeAlias = tuple[float, float]
 """`[low, high]` with low <= high."""

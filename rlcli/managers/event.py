@@ -18,6 +18,7 @@ class EventManager:
     """Interval timers run an environment each; they start anew with its episode."""
 
     def __init__(self, terms: list[BoundTerm], num_envs: int, step_dt: float, device: torch.device) -> None:
+        self.terms = terms
         by_mode: dict[str, list[BoundTerm]] = {"startup": [], "reset": [], "interval": []}
         for term in terms:
             by_mode[term.config.mode].append(term)  # type: ignore[attr-defined]

@@ -113,11 +113,19 @@ def apply_external_force_torque(
     selection.write(wrench, drawn.flatten(1), columns)
 
 
-@functools.lru_cache
-def _bounds(device: torch.device, *ranges: Range) -> tuple[Tensor, Tensor]:
+def _bounds(device: torch.device, *ranges: Range | Tensor) -> tuple[Tensor, Tensor]:
     """Lower and upper ends of several ranges, for draws of shape (rows, ranges, k). (ranges, 1) each"""
-    low, high = torch.tensor(ranges, device=device).split(1, dim=1)
+    if any(isinstance(ends, Tensor) for ends in ranges):  # a curriculum moves them
+        both = torch.stack([ends if isinstance(ends, Tensor) else _fixed(device, ends)[0] for ends in ranges])
+    else:
+        both = _fixed(device, *ranges)
+    low, high = both.split(1, dim=1)
     return low, high
+
+
+@functools.lru_cache
+def _fixed(device: torch.device, *ranges: Range) -> Tensor:
+    return torch.tensor(ranges, device=device)
 
 
 def _wrench_columns(entity: Entity, bodies: Bodies) -> Tensor:

@@ -57,8 +57,8 @@ class Engine(Protocol):
         """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
         ...
 
-    def step(self, nstep: int) -> None:
-        """Advance every world by `nstep` physics steps."""
+    def step(self, nstep: int, *, derive: bool = True) -> None:
+        """Advance every world by `nstep` physics steps; without `derive` the derived fields stay behind."""
         ...
 
     def diverged(self) -> Tensor | None:
