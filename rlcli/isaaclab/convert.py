@@ -30,6 +30,8 @@ class Report:
     entries: dict[Key, tuple[str, str]] = field(default_factory=dict)
     """Key -> mapped, approximated or ignored, and why."""
     problems: list[Problem] = field(default_factory=list)
+    stubs: dict[str, tuple[str, dict[str, Any]]] = field(default_factory=dict)
+    """Functions that only their author has: name -> section and parameters."""
 
     def lines(self, prefix: str = "") -> list[str]:
         """What a user should know: everything that is not simply mapped."""
@@ -112,8 +114,14 @@ class Node:
                 self.report.entries[(*self.key, name)] = ("mapped", "")
 
 
-def task(data: Mapping[str, Any], report: Report, root: Path, defaults: Any = None) -> dict[str, Any]:
-    """The task that settings of a `ManagerBasedRLEnvCfg` describe."""
+def task(
+    data: Mapping[str, Any],
+    report: Report,
+    root: Path,
+    defaults: Any = None,
+    models: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """The task that settings of a `ManagerBasedRLEnvCfg` describe; `models` name an MJCF for entities."""
     top = Node(data, (), report)
     made: dict[str, Any] = {
         "decimation": top.need("decimation"),
@@ -121,7 +129,7 @@ def task(data: Mapping[str, Any], report: Report, root: Path, defaults: Any = No
         "sim": _sim(top.node("sim")),
         "viewer": _viewer(top.node("viewer")),
     }
-    scene = SceneReader(top.node("scene"), root)
+    scene = SceneReader(top.node("scene"), root, models)
     made["scene"] = scene.read()
     convert = Terms(scene, report)
     convert.driven(top.node("actions"))
@@ -130,7 +138,7 @@ def task(data: Mapping[str, Any], report: Report, root: Path, defaults: Any = No
     for section in ("events", "rewards", "terminations", "curriculum"):
         made[section] = {name: convert.term(section, node) for name, node in top.node(section).nodes()}
     made["commands"] = {name: convert.command(node) for name, node in top.node("commands").nodes()}
-    scene.finish(made["scene"], convert.joints_driven)
+    scene.finish(convert.joints_driven)
     for section in ("events", "curriculum", "commands"):
         if not made[section]:
             del made[section]
@@ -140,6 +148,7 @@ def task(data: Mapping[str, Any], report: Report, root: Path, defaults: Any = No
     top.skip("recorders", "teleop_devices", "xr", "is_finite_horizon")
     if "seed" in top:
         top.say("ignored", "seed", "--seed says it")
+    report.stubs = convert.stubs
     report.finish(data, defaults)
     return {key: value for key, value in made.items() if value is not None}
 
@@ -258,8 +267,9 @@ def _viewer(node: Node) -> dict[str, Any]:
 class SceneReader:
     """Assets, lights, ground and sensors; models are opened to know the names in them."""
 
-    def __init__(self, node: Node, root: Path) -> None:
+    def __init__(self, node: Node, root: Path, models: Mapping[str, str] | None = None) -> None:
         self.node, self.root, self.report = node, root, node.report
+        self._given = dict(models or {})
         self.entities: dict[str, dict[str, Any]] = {}
         self.prims: dict[str, str] = {}
         """Entity -> the last part of its prim path."""
@@ -307,10 +317,10 @@ class SceneReader:
             made["sensors"] = self.sensors
         return made
 
-    def finish(self, made: dict[str, Any], driven: dict[str, set[str]]) -> None:
+    def finish(self, driven: Mapping[str, Mapping[str, str]]) -> None:
         """Joint settings, once it is known which joints the actions drive. What the MJCF says already is left out."""
         for name, entity in self.entities.items():
-            joints = self._joint_settings(name, driven.get(name, set()))
+            joints = self._joint_settings(name, driven.get(name, {}))
             if joints:
                 entity["joints"] = joints
 
@@ -343,12 +353,13 @@ class SceneReader:
         prim = str(item.data.get("prim_path") or "")
         self.prims[name] = prim.rstrip("/").rsplit("/", 1)[-1]
         path = spawn.get("usd_path", spawn.get("asset_path")) if spawn else None
+        path = self._given.get(name, path)
         if not isinstance(path, str):
             shape = _kind(spawn.data.get("func")) if spawn else "nothing"
             what = f"is made of {shape}; give it a model: spawn=UsdFileCfg(usd_path='{name}.xml')"
             self.report.problem(item.key, what)
             return
-        assert spawn is not None
+        spawn = spawn or item.node("spawn")
         try:
             model = assets.mjcf_of(path)
         except TaskError as error:
@@ -467,7 +478,7 @@ class SceneReader:
             entity["actuators"] = models
         self._drives[name] = drives
 
-    def _joint_settings(self, name: str, driven: set[str]) -> dict[str, Any]:
+    def _joint_settings(self, name: str, driven: Mapping[str, str]) -> dict[str, Any]:
         model: dict[str, Any] = self._models.get(name) or {"joint": []}
         joints: dict[str, dict[str, Any]] = {}
         for pattern, values in self._drives.get(name, []):
@@ -476,8 +487,15 @@ class SceneReader:
         for pattern, values in joints.items():
             matched = [n for n in model["joint"] if re.fullmatch(pattern, n)]
             stiffness = values.pop("stiffness", 0.0)
-            if stiffness:
+            kinds = {driven.get(n, "") for n in matched}
+            if stiffness and kinds == {"effort"}:
+                values = {"stiffness": stiffness, **values}
+                why = "a spring about the MJCF's rest position, beside the effort"
+                self.report.entries[("scene", name, "actuators", pattern, "stiffness")] = ("approximated", why)
+            elif stiffness:
                 values = {"actuator": "position", "kp": stiffness, "kv": values.pop("damping", 0.0), **values}
+            elif kinds == {"velocity"} and values.get("damping"):
+                values = {"actuator": "velocity", "kv": values.pop("damping"), **values}
             if matched:
                 for key in ("damping", "armature", "friction_loss"):
                     if key in values and all(model[key][n] == values[key] for n in matched):
@@ -621,7 +639,8 @@ class Terms:
 
     def __init__(self, scene: SceneReader, report: Report) -> None:
         self.scene, self.report = scene, report
-        self.joints_driven: dict[str, set[str]] = {}
+        self.joints_driven: dict[str, dict[str, str]] = {}
+        """Entity -> joint -> effort, velocity or position."""
         self.stubs: dict[str, tuple[str, dict[str, Any]]] = {}
         """Functions that are known by name alone: name -> section and parameters."""
 
@@ -630,10 +649,12 @@ class Terms:
         for _, item in actions.nodes():
             wanted = item.data.get("joint_names")
             entity = str(item.data.get("asset_name"))
+            kind = _kind(item.data.get("class_type"))
+            what = next((word for word in ("effort", "velocity") if word in kind.lower()), "position")
             for pattern in [wanted] if isinstance(wanted, str) else wanted or []:
                 for joint in self.scene.names(entity, "joint") or []:
                     if re.fullmatch(pattern, joint):
-                        self.joints_driven.setdefault(entity, set()).add(joint)
+                        self.joints_driven.setdefault(entity, {})[joint] = what
 
     def action(self, node: Node) -> dict[str, Any]:
         """An action term."""
@@ -657,6 +678,14 @@ class Terms:
                 made["joints"] = self.scene.ordered(entity, "joint", value, preserve, (*node.key, key))
             elif key == "body_name":
                 made["bodies"] = value
+            elif key in ("open_command_expr", "close_command_expr"):
+                made[key.removesuffix("_expr")] = {str(k): _float(v) for k, v in dict(value).items()}
+            elif key == "controller" and isinstance(value, Mapping):
+                made |= self._controller(node.node(key))
+            elif key == "body_offset":
+                offset = node.node(key)
+                made["offset_pos"] = [_float(v) for v in offset.get("pos", (0.0, 0.0, 0.0))]
+                made["offset_quat"] = [_float(v) for v in offset.get("rot", (1.0, 0.0, 0.0, 0.0))]
             elif value is None or (key in known and not known[key].required and _same(value, known[key].default)):
                 continue  # as it is without it
             elif key in known:
@@ -666,6 +695,15 @@ class Terms:
             else:
                 node.say("ignored", key, f"'{name}' has no such setting")
         return made
+
+    def _controller(self, node: Node) -> dict[str, Any]:
+        """The settings of differential inverse kinematics."""
+        node.skip("class_type")
+        made = {"mode": node.get("command_type", "pose"), "relative": bool(node.get("use_relative_mode", False))}
+        if node.get("ik_method", "dls") != "dls":
+            node.say("approximated", "ik_method", "damped least squares")
+        given = node.get("ik_params") or {}
+        return made | ({"damping": _float(given["lambda_val"])} if "lambda_val" in given else {})
 
     def _affine(self, key: str, value: Any, joints: Any) -> Any:
         if key == "clip" and isinstance(value, Mapping) and len(value) == 1:
@@ -736,6 +774,8 @@ class Terms:
         ours, entry = self._find(section, name)
         made: dict[str, Any]
         if ours is not None and name is not None:
+            if isinstance(function, str) and not function.startswith(_THEIRS):
+                self.report.entries[(*node.key, "func")] = ("approximated", f"taken for the built-in '{ours}'")
             signature = builtin_terms(section)[ours]
             made = {"func": ours} | self._common(section, node)
             made |= self._params(signature, entry, params)
@@ -860,6 +900,8 @@ class Terms:
             self.report.problem((*node.key, "func"), f"no {section.rstrip('s')} term '{name}'", near)
             return {"func": str(name), **common}
         values = {key: params.get(key) for key in params.data}
+        if isinstance(function, str):
+            return {"func": self._stub(section, function, values, node)} | common | self.stubs[_short(function)][1]
         entities = frozenset(key for key, value in values.items() if is_entity(value))
         made: dict[str, Any] = {}
         for key, value in values.items():
@@ -870,12 +912,35 @@ class Terms:
                     self.report.problem((*params.key, key), str(error))
             else:
                 made[key_of(key)] = _numbers(value)
-        if isinstance(function, str):
-            short = function.rpartition(":")[2].rpartition(".")[2] or function
-            self.stubs[short] = (section, made)
-            self.report.entries[(*node.key, "func")] = ("to do", f"write '{short}' in terms.py")
-            return {"func": short, **common, **made}
         return {"func": own_term(function, section, entities, tuple(values)), **common, **made}
+
+    def _stub(self, section: str, function: str, values: Mapping[str, Any], node: Node) -> str:
+        """Note a function whose code is not here, with parameters in rlcli's form."""
+        made: dict[str, Any] = {}
+        for key, value in values.items():
+            if not is_entity(value):
+                made[key] = _numbers(value)
+            elif "entity" in made:
+                made[key.removesuffix("_cfg")] = value["name"]
+            else:
+                made["entity"] = value["name"]
+                for kind, name in (("joint", "joints"), ("body", "bodies")):
+                    names = value.get(f"{kind}_names")
+                    if names is not None:
+                        preserve = bool(value.get("preserve_order"))
+                        made[name] = self.scene.ordered(value["name"], kind, names, preserve, node.key)
+        short = _short(function)
+        self.stubs[short] = (section, made)
+        self.report.entries[(*node.key, "func")] = ("to do", f"write '{short}' in terms.py")
+        return short
+
+
+def _short(function: str) -> str:
+    return function.rpartition(":")[2].rpartition(".")[2] or function.rpartition(":")[2]
+
+
+_THEIRS = ("isaaclab", "omni.isaac.lab", "mdp.")
+"""How the modules begin whose functions the table knows."""
 
 
 def is_entity(value: Any) -> bool:

@@ -193,6 +193,25 @@ class BinaryJointVelocityActionCfg(BinaryJointActionCfg):
 
 
 @configclass
+class DifferentialInverseKinematicsActionCfg(ActionTermCfg):
+    """Joint positions that move a body to a pose."""
+
+    @configclass
+    class OffsetCfg:
+        """Where the moved frame sits in the body's."""
+
+        pos: Any = (0.0, 0.0, 0.0)
+        rot: Any = (1.0, 0.0, 0.0, 0.0)
+
+    class_type: Any = "DifferentialInverseKinematicsAction"
+    joint_names: Any = MISSING
+    body_name: str = MISSING
+    body_offset: Any = None
+    scale: Any = 1.0
+    controller: Any = MISSING
+
+
+@configclass
 class NullCommandCfg(CommandTermCfg):
     """Nothing is asked."""
 
