@@ -17,7 +17,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from rlcli.config.schema import TaskConfig
+from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.terms import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
 from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, listing
 from rlcli.registry import TaskSource, import_file, load_object
@@ -113,6 +113,8 @@ class _Reader:
     def plain(self, value: Any, path: tuple[str | int, ...]) -> Any:
         if isinstance(value, BaseModel):
             given = {name: getattr(value, name) for name in type(value).model_fields if name in value.model_fields_set}
+            if isinstance(value, AgentConfig):
+                given["algorithm"] = value.algorithm  # which model the settings are read with
             return self.plain({**given, **(value.model_extra or {})}, path)
         if isinstance(value, Mapping):
             return {str(key): self.plain(item, (*path, str(key))) for key, item in value.items()}
