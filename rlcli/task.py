@@ -54,6 +54,10 @@ Sensors: TypeAlias = Any
 """MJCF sensors of `entity`. At run time: an index into sensor-data columns."""
 Actuators: TypeAlias = Any
 """Actuators of `entity`. At run time: an index into actuator columns."""
+ContactSensor: TypeAlias = Any
+"""A contact sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.sensors.ContactSensor`."""
+RaySensor: TypeAlias = Any
+"""A ray sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.sensors.RaySensor`."""
 Command: TypeAlias = Any
 """A term of `commands:`. YAML: its name. At run time: the term, whose `.command` is (num_envs, k)."""
 Address: TypeAlias = Any

@@ -354,6 +354,10 @@ class SceneReader:
         self.prims[name] = prim.rstrip("/").rsplit("/", 1)[-1]
         path = spawn.get("usd_path", spawn.get("asset_path")) if spawn else None
         path = self._given.get(name, path)
+        shape = _SHAPES.get(_kind(spawn.data.get("func"))) if spawn and path is None else None
+        if spawn and shape:
+            self.entities[name] = self._shape(item, spawn, shape)
+            return
         if not isinstance(path, str):
             shape = _kind(spawn.data.get("func")) if spawn else "nothing"
             what = f"is made of {shape}; give it a model: spawn=UsdFileCfg(usd_path='{name}.xml')"
@@ -387,6 +391,31 @@ class SceneReader:
             entity["soft_joint_pos_limit_factor"] = _float(factor)
         self._actuators(name, entity, item.node("actuators"))
         self.entities[name] = entity
+
+    def _shape(self, item: Node, spawn: Node, shape: str) -> dict[str, Any]:
+        """A single geom; a rigid object moves freely, an asset stands."""
+        size = spawn.get("size") or [spawn.get(key) for key in ("radius", "height") if spawn.get(key) is not None]
+        made: dict[str, Any] = {"shape": shape, "size": [_float(v) for v in size]}
+        rigid, mass = spawn.data.get("rigid_props") or {}, spawn.node("mass_props")
+        if rigid.get("kinematic_enabled"):
+            made["mocap"] = True
+        elif _kind(item.data.get("class_type")) == "RigidObject" or rigid:
+            made["free"] = True
+        for key in ("mass", "density"):
+            if mass.get(key):
+                made[key] = _float(mass.get(key))
+        if "physics_material" in spawn:
+            friction = self._friction(spawn.node("physics_material"))
+            made |= {} if friction is None else {"friction": friction}
+        look = spawn.node("visual_material")
+        if look.get("diffuse_color") is not None:
+            made["color"] = [_float(v) for v in look.get("diffuse_color")]
+        init = item.node("init_state")
+        made["pos"] = [_float(v) for v in init.get("pos", (0.0, 0.0, 0.0))]
+        made["quat"] = [_float(v) for v in init.get("rot", (1.0, 0.0, 0.0, 0.0))]
+        spawn.skip("func", "visible", "semantic_tags", "copy_from_source", "activate_contact_sensors", "axis")
+        spawn.skip("visual_material_path", "physics_material_path", "visual_material", "collision_props")
+        return made
 
     def _open(self, name: str, model: str, key: Key) -> None:
         import mujoco
@@ -562,9 +591,65 @@ class SceneReader:
         if kind == "plane":
             item.skip("terrain_generator", "max_init_terrain_level")
             return {"size": 100.0, **extra}
-        item.say("approximated", "terrain_generator", "a plane; write scene.terrain in rlcli's own terms")
-        item.skip("max_init_terrain_level")
-        return {"size": 100.0, **extra}
+        generator = item.node("terrain_generator")
+        if kind != "generator" or not generator.data:
+            item.say("approximated", "terrain_type", "a plane")
+            return {"size": 100.0, **extra}
+        made["terrain"] = self._generated(generator) | extra
+        start = item.get("max_init_terrain_level")
+        if start is not None:
+            made["terrain"]["max_start_level"] = start
+        return None
+
+    def _generated(self, node: Node) -> dict[str, Any]:
+        """A generator of patches, as height fields."""
+        made: dict[str, Any] = {
+            "kind": "generator",
+            "rows": node.get("num_rows", 1),
+            "columns": node.get("num_cols", 1),
+            "patch": [_float(v) for v in node.get("size", (8.0, 8.0))],
+            "border": _float(node.get("border_width", 0.0)),
+            "resolution": _float(node.get("horizontal_scale", 0.1)),
+            "difficulty": [_float(v) for v in node.get("difficulty_range", (0.0, 1.0))],
+            "curriculum": bool(node.get("curriculum", False)),
+            "sub_terrains": {},
+        }
+        if node.get("seed") is not None:
+            made["seed"] = node.get("seed")
+        node.skip("class_type", "color_scheme", "use_cache", "cache_dir", "vertical_scale", "slope_threshold")
+        node.skip("border_height")
+        for name, patch in node.node("sub_terrains").nodes():
+            made["sub_terrains"][name] = self._patch(patch)
+        return made
+
+    def _patch(self, node: Node) -> dict[str, Any]:
+        """One kind of ground, by the name of the function that makes it."""
+        name = _kind(node.get("function"))
+        made: dict[str, Any] = {"proportion": _float(node.get("proportion", 1.0))}
+        node.skip(
+            "size", "horizontal_scale", "vertical_scale", "slope_threshold", "border_width", "flat_patch_sampling"
+        )
+        kind = _PATCHES.get(name)
+        if kind is None:
+            known = f"known are {listing(_PATCHES)}"
+            self.report.entries[node.key] = ("approximated", f"flat: '{name}' has no counterpart; {known}")
+            return {"kind": "flat", **made}
+        inverted = "inverted" in name or bool(node.data.get("inverted"))
+        node.skip("inverted")
+        made["kind"] = kind
+        if kind != "flat" and kind not in ("noise", "waves") and "platform_width" in node:
+            made["platform"] = _float(node.get("platform_width"))
+        ranges = {"slope": "slope_range", "waves": "amplitude_range", "stairs": "step_height_range"}
+        ranges |= {"obstacles": "obstacle_height_range", "grid": "grid_height_range", "noise": "noise_range"}
+        ours = {"slope": "slope", "waves": "amplitude", "stairs": "step_height"}.get(kind, "height")
+        if kind in ranges and ranges[kind] in node:
+            made[ours] = [_float(v) for v in node.get(ranges[kind])]
+        for theirs, key in _PATCH_KEYS.get(kind, {}).items():
+            if theirs in node:
+                made[key] = _numbers(node.get(theirs))
+        if kind in ("slope", "stairs") and inverted:
+            made["inverted"] = True
+        return made
 
     def _sensor(self, kind: str, item: Node) -> None:
         item.skip("class_type", "debug_vis", "visualizer_cfg", "track_pose", "max_contact_data_count_per_prim")
@@ -939,6 +1024,31 @@ def _short(function: str) -> str:
     return function.rpartition(":")[2].rpartition(".")[2] or function.rpartition(":")[2]
 
 
+_SHAPES = {
+    "spawn_cuboid": "box",
+    "spawn_sphere": "sphere",
+    "spawn_cylinder": "cylinder",
+    "spawn_capsule": "capsule",
+}
+_PATCHES = {
+    "flat_terrain": "flat",
+    "random_uniform_terrain": "noise",
+    "pyramid_sloped_terrain": "slope",
+    "wave_terrain": "waves",
+    "discrete_obstacles_terrain": "obstacles",
+    "stepping_stones_terrain": "stones",
+    "pyramid_stairs_terrain": "stairs",
+    "inverted_pyramid_stairs_terrain": "stairs",
+    "random_grid_terrain": "grid",
+}
+_PATCH_KEYS = {
+    "noise": {"downsampled_scale": "spacing"},
+    "waves": {"num_waves": "count"},
+    "obstacles": {"obstacle_width_range": "width", "num_obstacles": "count"},
+    "stones": {"stone_width_range": "width", "stone_distance_range": "gap"},
+    "stairs": {"step_width": "step_width"},
+    "grid": {"grid_width": "cell"},
+}
 _THEIRS = ("isaaclab", "omni.isaac.lab", "mdp.")
 """How the modules begin whose functions the table knows."""
 

@@ -299,7 +299,7 @@ class _Actions(_Manager):
 
     def get_term(self, name: str) -> Any:
         """An action term; `processed_actions` is what it commands."""
-        return next(term.instance for term in self._manager.terms if term.name == name)
+        return _named(self._manager.terms, name, "action")
 
 
 class _Terminations(_Manager):
@@ -320,7 +320,7 @@ class _Commands(_Manager):
 
     def get_term(self, name: str) -> Any:
         """A command term."""
-        return next(term.instance for term in self._manager.terms if term.name == name)
+        return _named(self._manager.terms, name, "command")
 
 
 class ManagerBasedRLEnv(gymnasium.Env):
@@ -467,6 +467,13 @@ def facade_of(managed: VecEnv) -> ManagerBasedRLEnv:
     if "_isaaclab" not in vars(managed):
         vars(managed)["_isaaclab"] = ManagerBasedRLEnv._of(managed)
     return vars(managed)["_isaaclab"]
+
+
+def _named(terms: Any, name: str, what: str) -> Any:
+    found = {term.name: term.instance for term in terms}
+    if name not in found:
+        raise NameProblem(f"no {what} '{name}'; there are {listing(found)}")
+    return found[name]
 
 
 def _find(wanted: Any, among: Any, names: list[str], what: str, preserve_order: bool) -> tuple[list[int], list[str]]:

@@ -33,6 +33,31 @@ def every_term():
     task["events"]["scene"] = {"func": "reset_scene_to_default", "mode": "reset"}
     task["events"]["offset"] = {"func": "reset_joints_by_offset", "mode": "reset", "joints": ["hip_fl", "hip_br"],
                                 "position": [-0.1, 0.1], "velocity": [-0.1, 0.1]}  # fmt: skip
+    task["commands"] = {
+        "walk": {"func": "uniform_velocity", "resampling_time_s": [0.04, 0.08], "lin_vel_x": [-1.0, 1.0],
+                 "ang_vel_z": [-1.0, 1.0], "heading": [-3.0, 3.0], "rel_standing": 0.2},
+        "run": {"func": "normal_velocity", "resampling_time_s": [0.04, 0.08], "mean": [1.0, 0.0, 0.0],
+                "std": [0.1, 0.1, 0.1], "zero_prob": [0.0, 0.5, 0.5]},
+        "pose": {"func": "uniform_pose", "resampling_time_s": [0.04, 0.08], "bodies": ["torso"], "x": [0.0, 1.0],
+                 "y": [0.0, 0.0], "z": [0.0, 0.0]},
+        "place": {"func": "uniform_pose2d", "resampling_time_s": [0.04, 0.08], "x": [0.0, 1.0], "y": [0.0, 1.0]},
+    }  # fmt: skip
+    task["observations"]["policy"]["pos"] |= {
+        "modifiers": [{"kind": "digital_filter", "a": [0.5], "b": [0.5]}, {"kind": "integrator"},
+                      {"kind": "clip", "bounds": [-9.0, 9.0]}, {"kind": "scale", "factor": 2.0}],
+        "noise": {"kind": "gaussian", "std": 0.1}, "bias": {"kind": "uniform"},
+        "delay": {"steps": [0, 2], "redraw": 0.5}, "history": 3,
+    }  # fmt: skip
+    task["curriculum"] = {
+        "weight": {"func": "stages", "address": "rewards.alive.weight", "steps": [3], "values": [2.0]},
+        "push": {"func": "interpolate", "address": "events.push.linear_velocity", "end": 10,
+                 "to": [[-2.0, 2.0], [-2.0, 2.0], [0.0, 0.0]]},
+    }  # fmt: skip
+    task["scene"]["entities"]["robot"]["actuators"] = {
+        "front": {"joints": ["hip_f."], "stiffness": 20.0, "damping": 0.5, "delay": [0, 2]},
+        "rear": {"joints": ["hip_br"], "kind": "dc_motor", "stiffness": 20.0, "saturation_effort": 9.0,
+                 "velocity_limit": 20.0},
+    }  # fmt: skip
     task["rewards"]["target"] = {"func": "joint_pos_target_l2", "weight": -0.1, "target": 0.0}
     task["rewards"].pop("power")  # one joint a column of the action: here two actions drive the same joint
     task["terminations"] |= {
@@ -71,6 +96,31 @@ def test_a_step_of_a_task_with_every_kind_of_term_reads_nothing_back(tmp_path):
         result = env.step(torch.zeros(4, env.layout.action_size))
     assert result.terminated[1]
     assert env.divergences == 1
+
+
+@pytest.mark.slow  # kernels for height fields take a minute to compile
+def test_a_step_on_a_terrain_with_sensors_reads_nothing_back(tmp_path):
+    task = yaml.safe_load(every_term())
+    sub_terrains = {"hills": {"kind": "noise"}, "stairs": {"kind": "stairs", "boxes": True}}
+    task["scene"]["terrain"] = {"kind": "generator", "rows": 2, "columns": 2, "sub_terrains": sub_terrains}
+    task["scene"]["sensors"] = {
+        "feet": {"kind": "contact", "bodies": "leg_.*", "history": 2, "against": "ground", "force_threshold": 1.0},
+        "scan": {"kind": "rays", "pattern": {"size": [0.4, 0.4], "resolution": 0.2}, "alignment": "yaw"},
+    }
+    task["scene"]["entities"]["gate"] = {"shape": "box", "size": [0.1, 1.0, 1.0], "pos": [9.0, 0, 0.5], "mocap": True}
+    task["observations"]["policy"] |= {"feet": {"func": "sensed"}}
+    task["curriculum"] = {"levels": {"func": "terrain_levels", "least": 0.1}}
+    terms = """
+import torch
+from rlcli.task import ContactSensor, RaySensor
+
+def sensed(env, *, feet: ContactSensor = "feet", scan: RaySensor = "scan"):
+    \"\"\"What both sensors say. (num_envs, k)\"\"\"
+    return torch.cat([feet.force_history.flatten(1), feet.air_time, feet.first_contact.float(), scan.distance], dim=1)
+"""
+    folder = write(tmp_path / "critter", dump(task), critter_xml=CRITTER, terms_py=terms)
+    env = build(folder, 4, "episode_length_s=0.1")
+    assert watched_steps(env, 14) >= 4
 
 
 def test_the_detector_sees_a_mask_and_a_number_read_back():

@@ -36,6 +36,10 @@ CRITTER_CFG = ArticulationCfg(
 )
 
 
+def asked(env, command_name: str):
+    return env.command_manager.get_command(command_name)
+
+
 def level(env, env_ids, gain: float):
     return gain * len(env_ids)
 
@@ -75,7 +79,7 @@ class ObservationsCfg:
     class PolicyCfg(ObsGroup):
         ang_vel = ObsTerm(func=mdp.base_ang_vel, noise=Unoise(n_min=-0.2, n_max=0.2), clip=(-10, 10))
         gravity = ObsTerm(func=mdp.projected_gravity)
-        command = ObsTerm(func=mdp.generated_commands, params={"command_name": "base_velocity"})
+        command = ObsTerm(func=asked, params={"command_name": "base_velocity"})
         joint_pos = ObsTerm(func=mdp.joint_pos_rel, noise=Unoise(n_min=-0.01, n_max=0.01), scale=2.0)
         actions = ObsTerm(func=mdp.last_action, history_length=2)
 
@@ -111,7 +115,10 @@ class EventCfg:
 class RewardsCfg:
     flat = RewTerm(func=mdp.flat_orientation_l2, weight=-2.0)
     rate = RewTerm(func=mdp.action_rate_l2, weight=-0.01)
-    acc = RewTerm(func=mdp.joint_acc_l2, weight=-2.5e-7, params={"asset_cfg": SceneEntityCfg("robot", joint_names=["hip_.*"])})
+    acc = RewTerm(
+        func=mdp.joint_acc_l2, weight=-2.5e-7,
+        params={"asset_cfg": SceneEntityCfg("robot", joint_names=["hip_.*"])},
+    )
     removed = None
 
 

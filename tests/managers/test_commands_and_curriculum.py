@@ -1,5 +1,6 @@
 """Commands and the curriculum: timers, draws, metrics, and numbers that change by their address."""
 
+import itertools
 import math
 
 import pytest
@@ -50,7 +51,7 @@ def test_commands_are_drawn_within_their_ranges_and_held_between_draws(tmp_path)
     changed = (seen[1:] != seen[:-1]).any(dim=2)
     for env_id in range(64):
         at = [0, *(changed[:, env_id].nonzero()[:, 0] + 1).tolist()]
-        gaps = [b - a for a, b in zip(at, at[1:], strict=False)]
+        gaps = [b - a for a, b in itertools.pairwise(at)]
         assert gaps
         assert all(5 <= gap <= 10 for gap in gaps)  # 0.1 to 0.2 s at 0.02 s
 
