@@ -5,7 +5,7 @@ Every name is here, and in the submodule that has its name in Isaac Lab: `from r
 `from rlcli.isaaclab.utils import configclass`.
 """
 
-from rlcli.isaaclab import mdp, sim
+from rlcli.isaaclab import mdp, sim, terrains
 from rlcli.isaaclab import sim as sim_utils
 from rlcli.isaaclab.actuators import (
     ActuatorBaseCfg,

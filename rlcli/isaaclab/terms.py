@@ -124,7 +124,10 @@ class _Bound:
 
     def __call__(self, selection: Selection | None = None) -> Any:
         if selection is not None:
-            return self.term(self._env, selection.env_ids(), **self._params)
+            value = self.term(self._env, selection.env_ids(), **self._params)
+            return (
+                next(iter(value.values()), None) if isinstance(value, dict) else value
+            )  # of several to log, the first
         value = self.term(self._env, **self._params)
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
 

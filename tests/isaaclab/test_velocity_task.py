@@ -196,7 +196,7 @@ def test_every_section_is_translated(velocity):
 
 
 def test_it_runs_and_its_curriculum_acts(velocity):
-    env = make_env(resolve(velocity()))
+    env = make_env(resolve(velocity(("self.episode_length_s = 20.0", "self.episode_length_s = 1.0"))))
     obs = env.reset(seed=0)
     assert obs["policy"].shape == (4, 3 + 3 + 3 + 4 + 2 * 4)
     assert obs["critic"].shape == (4, 3 + 3 + 3 + 4 + 2 * 4 + 3)
@@ -204,6 +204,8 @@ def test_it_runs_and_its_curriculum_acts(velocity):
     for _ in range(120):
         step = env.step(torch.randn(4, 4, generator=generator))
         assert step.obs["critic"].isfinite().all()
+    assert env.extras()["Curriculum/flat"] == pytest.approx(-0.05)
+    assert env.extras()["Curriculum/level"] in (2.0, 4.0, 6.0, 8.0)  # of the environments that ended last, twice each
 
 
 def test_preserve_order_keeps_the_order_written(velocity):
@@ -235,3 +237,92 @@ def test_a_command_or_reward_that_is_not_there_is_named(velocity):
         make_env(resolve(velocity(('{"command_name": "base_velocity"}', '{"command_name": "base_veloc"}'))))
     with pytest.raises(ConfigError, match=r"rewards\.rat"):
         make_env(resolve(velocity(('"term_name": "rate"', '"term_name": "rat"'))))
+
+
+SENSORS = """
+    contact = ContactSensorCfg(prim_path="{ENV_REGEX_NS}/Robot/leg_.*", history_length=3, track_air_time=True)
+    scan = RayCasterCfg(
+        prim_path="{ENV_REGEX_NS}/Robot/torso", offset=RayCasterCfg.OffsetCfg(pos=(0.0, 0.0, 20.0)),
+        ray_alignment="yaw", pattern_cfg=patterns.GridPatternCfg(resolution=0.1, size=[0.4, 0.2]),
+        mesh_prim_paths=["/World/ground"],
+    )
+    ball = RigidObjectCfg(
+        prim_path="{ENV_REGEX_NS}/Ball",
+        spawn=sim_utils.SphereCfg(
+            radius=0.1, rigid_props=sim_utils.RigidBodyPropertiesCfg(), mass_props=sim_utils.MassPropertiesCfg(mass=0.5)
+        ),
+        init_state=RigidObjectCfg.InitialStateCfg(pos=(3.0, 0.0, 2.0)),
+    )
+    sun = None
+"""
+OWN = """
+
+def touched(env, sensor_cfg: SceneEntityCfg, threshold: float):
+    sensor = env.scene.sensors[sensor_cfg.name]
+    forces = sensor.data.net_forces_w_history[:, :, sensor_cfg.body_ids].norm(dim=-1)
+    air = sensor.data.current_air_time[:, sensor_cfg.body_ids]
+    assert forces.shape[1:] == (3, 2)
+    assert air.shape[1] == 2
+    return (forces.max(dim=1)[0] > threshold).sum(dim=1).float()
+
+
+def scanned(env, sensor_cfg: SceneEntityCfg):
+    sensor = env.scene[sensor_cfg.name]
+    return sensor.data.pos_w[:, 2:3] - sensor.data.ray_hits_w[..., 2]
+
+
+def ball_height(env, asset_cfg: SceneEntityCfg = SceneEntityCfg("ball")):
+    return env.scene[asset_cfg.name].data.root_pos_w[:, 2:3]
+
+
+def level("""
+FINE = (
+    ("ImplicitActuatorCfg,\n", "ImplicitActuatorCfg, ContactSensorCfg, RayCasterCfg, RigidObjectCfg, patterns,\n"),
+    ("    sun = None\n", SENSORS),
+    ("\n\ndef level(", OWN),
+    (
+        "    removed = None",
+        '    touched = RewTerm(func=touched, weight=1.0, params={"threshold": 0.01, "sensor_cfg":'
+        ' SceneEntityCfg("contact", body_names="leg_f.*")})',
+    ),
+    (
+        "        gravity = ObsTerm(",
+        '        ball = ObsTerm(func=ball_height)\n        scan = ObsTerm(func=scanned, params={"sensor_cfg":'
+        ' SceneEntityCfg("scan")})\n        gravity = ObsTerm(',
+    ),
+)
+
+
+def test_sensors_and_objects_are_seen_as_in_isaac_lab(velocity):
+    env = make_env(resolve(velocity(*FINE)))
+    obs = env.reset(seed=0)["policy"]
+    assert torch.equal(obs[:, 3:4], torch.full((4, 1), 2.0))  # the ball, before it falls
+    assert torch.allclose(obs[:, 4:19].mean(dim=1), env.entities["robot"].data.root_pos_w[:, 2] + 20.0, atol=1e-4)
+    rewards = []
+    for _ in range(40):
+        step = env.step(torch.zeros(4, 4))
+        rewards.append(env.reward_manager._values[-1].clone())
+    fallen = step.obs["policy"][:, 3]
+    assert float(fallen.max()) < 2.0 - 0.1
+    assert float(torch.stack(rewards).max()) == pytest.approx(2.0 * env.step_dt)  # both front feet on the ground
+
+
+def test_a_generated_terrain_keeps_its_patches(velocity):
+    generator = (
+        'terrain_type="generator", max_init_terrain_level=1, terrain_generator=TerrainGeneratorCfg(size=(4.0, 4.0),'
+        ' border_width=2.0, num_rows=3, num_cols=2, curriculum=True, sub_terrains={"slope":'
+        " terrains.HfPyramidSlopedTerrainCfg(proportion=0.4, slope_range=(0.0, 0.3), platform_width=1.5),"
+        ' "rough": terrains.HfRandomUniformTerrainCfg(proportion=0.6, noise_range=(0.01, 0.05), noise_step=0.01)})'
+    )
+    imports = ("TerrainImporterCfg,\n", "TerrainGeneratorCfg, TerrainImporterCfg, terrains,\n")
+    task = resolve(velocity(imports, ('terrain_type="plane"', generator)))
+    terrain = task.task.scene.terrain
+    assert task.task.scene.ground is None
+    assert (terrain.rows, terrain.columns, terrain.patch, terrain.max_start_level) == (3, 2, (4.0, 4.0), 1)
+    assert terrain.friction == 0.8
+    slope, rough = terrain.sub_terrains["slope"], terrain.sub_terrains["rough"]
+    assert (slope.kind, slope.proportion, slope.slope, slope.platform) == ("slope", 0.4, (0.0, 0.3), 1.5)
+    assert (rough.kind, rough.height) == ("noise", (0.01, 0.05))
+    env = make_env(task)
+    env.reset(seed=0)
+    assert env.step(torch.zeros(4, 4)).reward.isfinite().all()
