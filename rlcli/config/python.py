@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path as FilePath
@@ -23,6 +23,7 @@ from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, listing
 from rlcli.registry import TaskSource, import_file, load_object
 
 _OWN = "rlcli.mdp."
+_AGENTS = "agents/*.py"
 
 
 @dataclass(slots=True)
@@ -178,13 +179,17 @@ def _find(source: TaskSource) -> tuple[Any, dict[str, Any]]:
             names = [n for n in vars(value) if not n.startswith("_")]
             raise TaskError(f"{place} has no '{part}'", hint=f"it has {listing(names)}")
         value = getattr(value, part)
-    return value, agents or _beside(module)
+    if agents or not hasattr(value, "__rlcli_task__"):
+        return value, agents
+    folder = FilePath(place).parent
+    return value, _beside([module]) or _beside(map(import_file, sorted(folder.glob(_AGENTS))))
 
 
-def _beside(module: Any) -> dict[str, Any]:
-    """The agents that stand beside a configuration in its module, where nothing says which belong to it."""
+def _beside(modules: Iterable[Any]) -> dict[str, Any]:
+    """The agents that stand beside a configuration in its module, or in the `agents` folder next to it."""
     found = {
         name: item
+        for module in modules
         for name, item in vars(module).items()
         if hasattr(item, "__rlcli_agent__") and not str(getattr(item, "__module__", "")).startswith("rlcli.")
     }

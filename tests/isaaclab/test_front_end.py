@@ -89,6 +89,15 @@ def test_the_runner_is_the_ppo_agent_in_rsl_rls_dialect(package):
     assert {key: agent["rsl-rl"][key] for key in wanted} == wanted
 
 
+def test_files_without_a_package_find_each_other_and_the_agents_folder(package):
+    folder = package("other")
+    (folder / "__init__.py").unlink()
+    resolved = resolve(find_task(f"{folder / 'cartpole_env_cfg.py'}:CartpoleEnvCfg"))
+    assert resolved.agent_name == "rsl-rl"
+    assert resolved.agent.num_steps == 16
+    assert resolved.task.rewards["pole_pos"].params["asset_cfg"].joint_names == ["cart_to_pole"]
+
+
 def test_the_environment_is_made_from_the_class_and_by_gymnasium(package):
     import gymnasium
 
@@ -315,7 +324,7 @@ def test_settings_without_a_counterpart_are_named(cfg):
     notes = "\n".join(resolve(cfg(*changes)).notes)
     assert "ignored: scene.robot.spawn.rigid_props" in notes
     assert "ignored: sim.physx" in notes
-    assert resolve(cfg()).notes == ()
+    assert [note for note in resolve(cfg()).notes if not note.startswith("ignored: agent.")] == []
 
 
 def test_a_package_with_several_tasks_asks_which(package):
