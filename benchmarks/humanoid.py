@@ -36,11 +36,23 @@ def limb(name: str, at: str, joints: list[tuple[str, str, str]], length: float, 
     return text + closing
 
 
-LEG = [("yaw", "0 0 1", "-60 60"), ("roll", "1 0 0", "-30 30"), ("pitch", "0 1 0", "-120 45"),
-       ("knee", "0 1 0", "0 140"), ("ankle_pitch", "0 1 0", "-50 40"), ("ankle_roll", "1 0 0", "-20 20")]  # fmt: skip
-ARM = [("shoulder_pitch", "0 1 0", "-170 150"), ("shoulder_roll", "1 0 0", "-90 90"),
-       ("shoulder_yaw", "0 0 1", "-90 90"), ("elbow", "0 1 0", "-120 10"), ("wrist_roll", "1 0 0", "-90 90"), ("wrist_pitch", "0 1 0", "-80 80"),
-       ("wrist_yaw", "0 0 1", "-80 80")]  # fmt: skip
+LEG = [
+    ("yaw", "0 0 1", "-60 60"),
+    ("roll", "1 0 0", "-30 30"),
+    ("pitch", "0 1 0", "-120 45"),
+    ("knee", "0 1 0", "0 140"),
+    ("ankle_pitch", "0 1 0", "-50 40"),
+    ("ankle_roll", "1 0 0", "-20 20"),
+]
+ARM = [
+    ("shoulder_pitch", "0 1 0", "-170 150"),
+    ("shoulder_roll", "1 0 0", "-90 90"),
+    ("shoulder_yaw", "0 0 1", "-90 90"),
+    ("elbow", "0 1 0", "-120 10"),
+    ("wrist_roll", "1 0 0", "-90 90"),
+    ("wrist_pitch", "0 1 0", "-80 80"),
+    ("wrist_yaw", "0 0 1", "-80 80"),
+]
 WAIST = [("yaw", "0 0 1", "-80 80"), ("roll", "1 0 0", "-30 30"), ("pitch", "0 1 0", "-30 30")]
 FOOT = '<geom name="{0}_foot" type="box" size="0.09 0.04 0.015" pos="0.03 0 -0.035" mass="0.4"/>'
 

@@ -5,6 +5,7 @@ Distributions are read one by one, so that a broken one costs its own row and no
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import hashlib
 import importlib
@@ -63,10 +64,16 @@ class TaskSource:
     term_modules: tuple[str, ...]
     task: str | None
     task_file: Path | None
+    python: str | None = None
+    """`module:attribute`, `file.py:attribute` or a package's folder that holds the configuration, if Python does."""
+    agents: tuple[tuple[str, str], ...] = ()
+    """Further agents of a configuration in Python: (name, `module:attribute`)."""
+    value: Any = None
+    """The configuration itself, where it exists in memory only."""
 
     @property
     def label(self) -> str:
-        """How messages name the YAML file."""
+        """How messages name the file."""
         try:
             return str(self.config.relative_to(Path.cwd()))
         except ValueError:
@@ -75,12 +82,13 @@ class TaskSource:
     def record(self) -> dict[str, str | None]:
         """What a run stores to find the task again."""
         folder = None if self.distribution else str(self.root)
-        return {
+        record = {
             "name": self.name,
             "distribution": self.distribution,
             "version": self.version,
             "folder": folder,
         }
+        return record | ({"python": self.python} if self.python and folder else {})
 
 
 def catalog(group: str = TASKS) -> tuple[list[Entry], list[Broken]]:
@@ -108,13 +116,16 @@ def catalog(group: str = TASKS) -> tuple[list[Entry], list[Broken]]:
 
 
 def find_task(name: str) -> TaskSource:
-    """A task by name, by `distribution:name`, or by the path of a folder with a `task.yaml`.
+    """A task by name, by `distribution:name`, by the path of its folder, or, in Python, as `file.py:attribute`.
 
     A name is looked up among the installed tasks first: a folder of the same name needs a slash, `./cartpole`.
 
     Raises:
         TaskError: unknown, ambiguous, broken, or built for a newer rlcli.
     """
+    place, _, attribute = name.rpartition(":")
+    if place.endswith(".py") or (attribute and os.sep not in attribute and "/" in place and Path(place).is_dir()):
+        return python_task(name)
     if name in (".", "..") or any(mark in name for mark in ("/", os.sep)):
         path = Path(name)
         if path.suffix == ".yaml" and path.is_file() and oige.is_oige_file(path):
@@ -173,7 +184,8 @@ def package_folder(entry: Entry) -> Path | None:
 def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
     """The files of a task in an installed package."""
     root = _folder(spec.package, entry)
-    config = root / spec.config
+    in_python = ":" in spec.config
+    config = _module_file(spec.config.partition(":")[0], entry) if in_python else root / spec.config
     if not config.is_file():
         raise TaskError(f"task '{entry.qualified}' is broken: {config} does not exist")
     task_module = spec.task.partition(":")[0] if spec.task else None
@@ -187,13 +199,49 @@ def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
         term_modules=spec.terms,
         task=spec.task,
         task_file=_module_file(task_module, entry) if task_module else None,
+        python=spec.config if in_python else None,
+        agents=tuple(spec.agents.items()),
+    )
+
+
+def python_task(reference: str, name: str | None = None) -> TaskSource:
+    """A task whose configuration is a Python object: `file.py:attribute`, or a package's `folder` or `folder:ID`.
+
+    Of a package the configuration is the `TASK` of its `task.py`, or what it registered with gymnasium (as `ID`).
+
+    Raises:
+        TaskError: if there is no such file.
+    """
+    place, _, attribute = reference.rpartition(":")
+    path = Path(place if place and not Path(reference).exists() else reference).resolve()
+    attribute = attribute if path != Path(reference).resolve() else ""
+    if path.is_dir():
+        file, label = path / "__init__.py", attribute or path.name
+    else:
+        file, label = path, path.stem
+    if not file.is_file():
+        raise TaskError(f"there is no file '{file}'")
+    if file == path and not attribute:
+        raise TaskError(f"'{reference}' does not say which object", hint=f"{reference}:TASK, for example")
+    return TaskSource(
+        name=name or re.sub(r"[^A-Za-z0-9_.-]", "-", label),
+        root=file.parent,
+        config=file,
+        distribution=None,
+        version=None,
+        term_files=(),
+        term_modules=(),
+        task=None,
+        task_file=None,
+        python=f"{path}:{attribute}" if attribute else str(path),
     )
 
 
 def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
     """A folder with a `task.yaml`, and optionally `terms.py` and `task.py` (a class `Task`).
 
-    Or with a YAML in the form of OmniIsaacGymEnvs, whatever its name, and the Python file of the task's class.
+    Or with a YAML in the form of OmniIsaacGymEnvs, whatever its name, and the Python file of the task's class. Without
+    either the configuration is in Python: `TASK` in `task.py`, or what the package registers.
     """
     root = folder.resolve()
     config = root / file
@@ -201,6 +249,11 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
         config = _oige_config(root) or config
     if root.is_file():
         raise TaskError(f"'{folder}' is a file, not a task's folder", hint=f"did you mean '{folder.parent}'?")
+    if not config.is_file() and file == "task.yaml":
+        if _defines(root / "task.py", "TASK"):
+            return python_task(f"{root / 'task.py'}:TASK", root.name)
+        if (root / "__init__.py").is_file() and b"register(" in (root / "__init__.py").read_bytes():
+            return python_task(str(root))
     if not config.is_file():
         found = listing(sorted(p.name for p in root.iterdir())) if root.is_dir() else "no such folder"
         raise TaskError(f"'{folder}' is not a task: it has no {file} ({found})")
@@ -336,6 +389,86 @@ def _neighbours(folder: Path) -> Iterator[None]:
             place = getattr(sys.modules[name], "__file__", None)
             if place and Path(place).is_relative_to(folder) and not name.startswith("rlcli_folder_task_"):
                 del sys.modules[name]
+
+
+def model_file(root: Path, model: str) -> Path:
+    """Where a task in `root` finds a model: in its own folder, or as `TASK:FILE` in that of an installed task.
+
+    Raises:
+        TaskError: if there is no such task, or the file is not in its folder.
+    """
+    task, _, file = model.rpartition(":")
+    if not task:
+        return root / model
+    home = installed_task(find_entry(TASKS, task, what="task")).root
+    if not (home / file).resolve().is_relative_to(home.resolve()):
+        raise TaskError(f"'{file}' lies outside the folder {home} of task '{task}'")
+    return home / file
+
+
+def import_file(file: Path) -> Any:
+    """Import a file as part of the package that its folder is, so that its relative imports work.
+
+    Modules beside a file of no package are importable too, as for a script.
+    """
+    with _stdout_to_stderr():
+        top = file.parent
+        while (top.parent / "__init__.py").is_file() and (top / "__init__.py").is_file():
+            top = top.parent
+        name = _package(top)
+        inner = file.parent.relative_to(top).parts + (() if file.stem == "__init__" else (file.stem,))
+        sys.path.append(str(top))
+        try:
+            return importlib.import_module(".".join((name, *inner)))
+        finally:
+            sys.path.remove(str(top))
+
+
+def _package(folder: Path) -> str:
+    """The name under which a folder is a package: its own, unless that is taken."""
+    digest = hashlib.blake2b(str(folder).encode(), digest_size=8).hexdigest()
+    alias = f"rlcli_folder_{digest}"
+    name = alias
+    if folder.name.isidentifier():
+        known = sys.modules.get(folder.name)
+        mine = known is not None and str(folder) in list(getattr(known, "__path__", ()))
+        if mine or (known is None and importlib.util.find_spec(folder.name) is None):
+            name = folder.name
+    if name in sys.modules:
+        return name
+    start = folder / "__init__.py"
+    if start.is_file():
+        spec = importlib.util.spec_from_file_location(name, start, submodule_search_locations=[str(folder)])
+    else:
+        spec = ModuleSpec(name, None, is_package=True)
+        spec.submodule_search_locations = [str(folder)]
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    if spec.loader is not None and start.is_file():
+        sys.path.append(str(folder))
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            for known_name in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
+                del sys.modules[known_name]
+            raise
+        finally:
+            sys.path.remove(str(folder))
+    return name
+
+
+def _defines(file: Path, name: str) -> bool:
+    """Whether a Python file has a top-level assignment or definition of this name."""
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (OSError, SyntaxError, ValueError):
+        return False
+    for node in tree.body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        if getattr(node, "name", None) == name or any(isinstance(t, ast.Name) and t.id == name for t in targets):
+            return True
+    return False
 
 
 def _wanted() -> set[str] | None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 API_VERSION = 1
@@ -18,9 +19,10 @@ class TaskSpec:
     Attributes:
         package: the package that the YAML and the models lie in, usually `__name__`.
         summary: one line for `list-tasks`.
-        config: the YAML file, relative to the package.
+        config: the YAML file, relative to the package; or `module:attribute`, a `TaskConfig` built in Python.
         task: the direct task class as `module:Class`; None for a manager-based task.
         terms: modules whose functions the YAML may name, searched before `rlcli.mdp`.
+        agents: further agents of a configuration in Python: name -> `module:attribute`.
         api: the `API_VERSION` the task was written for.
     """
 
@@ -29,6 +31,7 @@ class TaskSpec:
     config: str = "task.yaml"
     task: str | None = None
     terms: tuple[str, ...] = ()
+    agents: Mapping[str, str] = field(default_factory=dict)
     api: int = API_VERSION
 
     def __post_init__(self) -> None:

@@ -16,7 +16,7 @@ LAYERS = [
     {"config", "registry", "probe"},
     {"sim"},
     {"managers", "mdp", "envs", "oige"},
-    {"rl", "viewer", "adapters", "testing", "pytest_plugin"},
+    {"rl", "viewer", "adapters", "testing", "pytest_plugin", "isaaclab"},
     {"cli"},
 ]
 ANYWHERE = {"rlcli", "rlcli.__main__"}

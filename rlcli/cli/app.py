@@ -25,9 +25,11 @@ COMMANDS = {
     "eval": "eval",
     "export": "export",
     "check": "check",
-    "import": "import_task",
 }
 """Command -> module of `rlcli.cli` that registers it."""
+
+GROUPS = {"import": "import_"}
+"""Command that has commands of its own -> module of `rlcli.cli` with their `app`."""
 
 _SETTINGS = {
     "help_option_names": ["-h", "--help"],
@@ -63,6 +65,10 @@ def build() -> typer.Typer:
             continue
         command = importlib.import_module(f"rlcli.cli.{module}").command
         app.command(name, context_settings=_SETTINGS)(command)
+    for name, module in GROUPS.items():
+        if name not in {group.name for group in app.registered_groups}:
+            group = importlib.import_module(f"rlcli.cli.{module}").app
+            app.add_typer(group, name=name, context_settings=_SETTINGS)
     return app
 
 

@@ -47,7 +47,7 @@ def flags(**values: Any) -> Mapping[str, Any]:
 def tell_notes(resolved: Any) -> None:
     """Say what became of the keys of a task in another tool's form; -v says it of each."""
     from rlcli.cli.console import console
-    from rlcli.config.oige import summary
+    from rlcli.config.notes import summary
 
     for line in summary(resolved.notes):
         console.info(line)

@@ -49,6 +49,7 @@ def command(
         deep=deep,
         agent=resolved.agent_name,
         unchecked_agents=unchecked,
+        notes=[str(note) for note in resolved.notes],
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rlcli.config.rl_games import Note
+from rlcli.config.notes import Note
 
 
 @dataclass(slots=True)

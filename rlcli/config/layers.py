@@ -141,6 +141,8 @@ def marked(document: Document, name: str, layer: str, at: Path = ()) -> Callable
         full = at + path
         while full not in document.marks and full:
             full = full[:-1]
+        if not document.marks:  # built in Python
+            return Origin(layer, name)
         line, column = document.marks.get(full, (1, 1))
         return Origin(layer, f"{name}:{line}:{column}")
 

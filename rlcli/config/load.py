@@ -14,12 +14,12 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from rlcli.config import messages, oige
+from rlcli.config import messages, oige, python
 from rlcli.config.layers import Layers, Origin, marked, parse_override, read
-from rlcli.config.rl_games import Note
+from rlcli.config.notes import Note
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
-from rlcli.config.terms import SECTIONS, SignatureError, Vocabulary, params_model, read_params
+from rlcli.config.terms import SECTIONS, Signature, SignatureError, Vocabulary, params_model, read_params
 from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing
 from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, load_entry
 from rlcli.trainers import TrainerSpec
@@ -44,7 +44,7 @@ class Resolved:
     layers: Layers
     vocabulary: Vocabulary
     notes: tuple[Note, ...] = ()
-    """What became of each key of a file in another tool's form; empty for a file in rlcli's own."""
+    """What became of each key of a configuration in another tool's form; empty for one in rlcli's own."""
 
     def place(self, path: Path) -> str:
         """Where a path was written, for a message."""
@@ -95,12 +95,12 @@ def resolve(
         DependencyError: if that is all, but the agent's trainer is not installed.
     """
     check = _Check(source)
-    document = read(source.config, source.label)
+    document = check.document()
     extra = read(config_file) if config_file else Document({})
     origin = marked(extra, str(config_file), "config")
     changes = check.changes(overrides, flags or {})
 
-    notes = check.read_task(document)
+    check.read_task(document)
     check.layers.merge(_only(extra.data, _APART), origin)
     name = check.choose_agent(agent, device, changes)
     if "agent" in extra.data:
@@ -120,7 +120,7 @@ def resolve(
         raise ConfigError(check.problems)
     if check.missing is not None:
         raise check.missing
-    return Resolved(source, task, agent_config, name, trainer, check.layers, check.vocabulary, notes)
+    return Resolved(source, task, agent_config, name, trainer, check.layers, check.vocabulary, tuple(check.notes))
 
 
 def check_all(source: TaskSource, *, config_file: FilePath | None = None, overrides: Sequence[str] = ()) -> list[str]:
@@ -133,7 +133,7 @@ def check_all(source: TaskSource, *, config_file: FilePath | None = None, overri
         ConfigError: with the problems of all agents, in training and in play.
     """
     check = _Check(source)
-    check.read_task(read(source.config, source.label))
+    check.read_task(check.document())
     agents = check.layers.get(("agents",))
     names = [name for name in agents if name != "default"] if isinstance(agents, dict) else []
     problems: list[Problem] = []
@@ -158,6 +158,7 @@ def extensions(source: TaskSource) -> tuple[Vocabulary, type[BaseModel] | None]:
         ConfigError: if that source cannot be read.
     """
     check = _Check(source)
+    check.document()
     check.read_terms()
     params = check.params_model()
     if check.problems:
@@ -189,6 +190,18 @@ class _Check:
     problems: list[Problem] = field(default_factory=list)
     missing: DependencyError | None = None
     homes: messages.Homes = field(default_factory=dict)
+    functions: dict[str, Signature] = field(default_factory=dict)
+    notes: list[Note] = field(default_factory=list)
+
+    def document(self) -> Document:
+        """What the task's file holds; a configuration in Python also brings its functions."""
+        if self.source.python is None and self.source.value is None:
+            return read(self.source.config, self.source.label)
+        task = python.load(self.source)
+        self.functions, self.notes = task.terms, task.notes
+        if self.source.config.suffix == ".py":
+            return Document(task.data)
+        return read(self.source.config, self.source.label)  # a run's record of it
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> None:
         """Note a problem at a path."""
@@ -196,11 +209,11 @@ class _Check:
 
     # --- layers ---
 
-    def read_task(self, document: Document) -> tuple[Note, ...]:
-        """Merge the task's file, in whichever form it is; what became of the keys of another tool's form."""
+    def read_task(self, document: Document) -> None:
+        """Merge the task's file, in whichever form it is."""
         if not oige.is_oige(document.data):
             self.layers.merge(document.data, marked(document, self.source.label, "task"))
-            return ()
+            return
         source = self.source
         class_name = source.task.rpartition(":")[2] if source.task else None
         found = oige.translate(
@@ -213,7 +226,7 @@ class _Check:
         self.layers.merge(found.data, found.origin)
         if found.agents_origin is not None:
             self.layers.merge(found.agents, found.agents_origin)
-        return tuple(found.notes)
+        self.notes += found.notes
 
     def changes(self, overrides: Iterable[str], flags: Mapping[str, Any]) -> list[Change]:
         """What the command line changes, overrides before flags."""
@@ -387,6 +400,7 @@ class _Check:
         """Read the signatures of the task's own terms."""
         try:
             self.vocabulary = Vocabulary.of(self.source.term_files)
+            self.vocabulary.own.update(self.functions)
         except SyntaxError as error:
             self.problems.append(_not_python(error))
 

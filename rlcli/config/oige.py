@@ -16,7 +16,7 @@ from typing import Any
 from rlcli.config import oige_randomization, rl_games
 from rlcli.config.hydra import evaluate
 from rlcli.config.layers import Origin, marked, read
-from rlcli.config.rl_games import Note, Status
+from rlcli.config.notes import Note, Status
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 
@@ -396,22 +396,6 @@ class _Translator:
 
     def _problem(self, path: Path, message: str, hint: str | None = None) -> None:
         self.problems.append(Problem(self._where(path), ".".join(str(step) for step in path), message, hint))
-
-
-def summary(notes: list[Note] | tuple[Note, ...]) -> list[str]:
-    """The notes in a few lines, one a status."""
-    lines = []
-    for status in ("mapped", "approximated", "ignored"):
-        parents: dict[str, list[str]] = {}
-        for note in notes:
-            if note.status == status:
-                parent, _, key = note.key.rpartition(".")
-                if key not in parents.setdefault(parent, []):
-                    parents[parent].append(key)
-        groups = [f"{parent}.{{{', '.join(keys)}}}" if parent else ", ".join(keys) for parent, keys in parents.items()]
-        if groups:
-            lines.append(f"{status}: {', '.join(groups)}")
-    return lines
 
 
 def relative(prim_path: str) -> str:

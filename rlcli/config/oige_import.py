@@ -12,7 +12,7 @@ from rlcli.config import oige
 from rlcli.config.dump import to_yaml
 from rlcli.config.imported import Imported
 from rlcli.config.layers import read
-from rlcli.config.rl_games import Note
+from rlcli.config.notes import Note
 from rlcli.errors import ConfigError, Problem, TaskError, UsageError
 
 _IMPORT = re.compile(r"^(\s*)from\s+(?:omni|pxr|omniisaacgymenvs)(?:\.[\w.]+)?\s+import\s+(.*)$")

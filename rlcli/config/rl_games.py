@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from rlcli.config.hydra import evaluate
 from rlcli.config.layers import Origin, marked
+from rlcli.config.notes import Note, Status
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
-
-Status = Literal["mapped", "approximated", "ignored", "task"]
 
 _DIRECT = {
     "gamma": "gamma",
@@ -56,21 +55,6 @@ _HANDLED = (
     "minibatch_size",
 )  # fmt: skip
 _ACTIVATIONS = ("elu", "relu", "tanh", "silu")
-
-
-@dataclass(frozen=True, slots=True)
-class Note:
-    """What became of a key of a file in another tool's form."""
-
-    where: str
-    key: str
-    status: Status
-    text: str = ""
-
-    def __str__(self) -> str:
-        """One line."""
-        said = "read by the task's class" if self.status == "task" else self.status
-        return f"{self.where}: {self.key}: {said}{f': {self.text}' if self.text else ''}"
 
 
 @dataclass(slots=True)

@@ -58,6 +58,18 @@ def _rotation(value: tuple[float, float, float, float]) -> tuple[float, float, f
     return value
 
 
+class _Function:
+    """Lets a term's function stand for its name in a configuration that is built in Python."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        name = core_schema.str_schema(strict=True)
+        either = core_schema.union_schema([name, core_schema.callable_schema()])
+        return core_schema.json_or_python_schema(json_schema=name, python_schema=either)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"type": "string"}
+
+
 def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
     if math.hypot(*value) < 1e-6:
         raise ValueError("a direction must not be zero; straight down is [0, 0, -1]")
@@ -88,8 +100,8 @@ class TermConfig(StrictModel):
 
     model_config = ConfigDict(extra="allow")
 
-    func: str
-    """Name of the function, looked up in the task's own terms, then in rlcli.mdp."""
+    func: Annotated[str, _Function()]
+    """Name of the function, looked up in the task's own terms, then in rlcli.mdp; in Python also the function."""
 
     @property
     def params(self) -> dict[str, Any]:
@@ -462,7 +474,7 @@ class EntityConfig(StrictModel):
     """A robot or object: an MJCF file attached to the scene under the entity's name, or a single shape."""
 
     model: str | None = None
-    """MJCF file, relative to the task's folder."""
+    """MJCF file, relative to the task's folder; `TASK:FILE` is one of an installed task, as `cartpole:cartpole.xml`."""
     shape: Literal["box", "sphere", "cylinder", "capsule", "plane"] | None = None
     """Instead of a model: a body `body` with one geom `geom`."""
     size: list[Positive] | None = None

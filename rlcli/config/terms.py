@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import ast
 import functools
+import inspect
 import re
+import textwrap
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Union
 
@@ -90,6 +92,8 @@ class Signature:
     summary: str
     parameters: tuple[Parameter, ...]
     error: str | None = None
+    target: Any = None
+    """What to call, where a configuration in Python holds it; None: `attribute` of the file."""
 
 
 @dataclass(slots=True)
@@ -142,6 +146,27 @@ def read_terms(file: Path) -> dict[str, Signature]:
                 name = snake_case(node.name)
                 terms[name] = _signature(node, init, name, file)
     return terms
+
+
+def signature_of(term: Any, name: str) -> Signature:
+    """The signature of a term given as an object: a function or class in `rlcli.mdp`'s form.
+
+    Raises:
+        SignatureError: if it is not in that form, or its source cannot be read.
+    """
+    try:
+        file, source = inspect.getsourcefile(term), inspect.getsource(term)
+        node = ast.parse(textwrap.dedent(source)).body[0]
+    except (OSError, TypeError, SyntaxError, IndexError):
+        raise SignatureError("its source cannot be read; define it at the top of a file") from None
+    call: ast.stmt | None = node
+    if isinstance(node, ast.ClassDef):
+        call = next((n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"), None)
+    if not isinstance(node, ast.FunctionDef | ast.ClassDef) or not isinstance(call, ast.FunctionDef):
+        raise SignatureError("a term is a function (env, *, ...), or a class whose __init__ takes (self, env, *, ...)")
+    if not _takes_env(call.args, 1 if isinstance(node, ast.ClassDef) else 0):
+        raise SignatureError("its first parameter must be 'env'")
+    return replace(_signature(node, call, name, Path(file or "?")), target=term)
 
 
 def read_params(file: Path, class_name: str) -> type[StrictModel] | None:

@@ -11,14 +11,16 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import torch
 from torch import Tensor
 
-from rlcli.config.load import Resolved
-from rlcli.config.schema import InitialStateConfig
+from rlcli.config.load import Resolved, resolve
+from rlcli.config.python import source_of
+from rlcli.config.schema import InitialStateConfig, TaskConfig
 from rlcli.errors import DivergedError
 from rlcli.machine import require_device
 from rlcli.managers.term import Binder
@@ -615,8 +617,12 @@ def _finite_pairs(pairs: tuple[tuple[float, float], ...] | None) -> list[list[fl
     return [[x if math.isfinite(x) else None for x in pair] for pair in pairs or ()] or None
 
 
-def make_env(resolved: Resolved, *, seed: int = 42, device: str = "cpu") -> VecEnv:
-    """The environment of a resolved task, in the task's own workflow."""
+def make_env(task: Resolved | TaskConfig, *, seed: int = 42, device: str = "cpu", root: Path | None = None) -> VecEnv:
+    """The environment of a task, in the task's own workflow.
+
+    `task` is a resolved one, or a `TaskConfig` built in Python, whose models lie in `root` (by default here).
+    """
+    resolved = task if isinstance(task, Resolved) else resolve(source_of(task, root))
     if resolved.source.task is None:
         from rlcli.envs.managed import ManagedEnv
 

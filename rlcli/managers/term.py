@@ -121,6 +121,8 @@ class Binder:
         Raises:
             TaskError: if its module does not import.
         """
+        if signature.target is not None:
+            return signature.target
         source = self.resolved.source
         if signature.file in source.term_files:
             module = source.term_modules[source.term_files.index(signature.file)]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.config.load import Resolved, resolve
 from rlcli.errors import CheckpointError, TaskError
-from rlcli.registry import TaskSource, find_task, folder_task
+from rlcli.registry import TaskSource, find_task, folder_task, python_task
 from rlcli.rl.checkpoint import Checkpoint
 from rlcli.rl.policy import Policy, load_policy
 from rlcli.rl.run import Run
@@ -26,7 +26,9 @@ def source_of(run: Run) -> TaskSource:
     """
     record = run.record["task"]
     try:
-        if record.get("folder"):
+        if record.get("python"):
+            source = python_task(str(record["python"]), str(record["name"]))
+        elif record.get("folder"):
             file = Path(str(record.get("file") or "task.yaml")).name
             source = folder_task(Path(str(record["folder"])), file)
         else:

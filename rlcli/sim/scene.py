@@ -19,7 +19,8 @@ from rlcli.config.schema import (
     SceneConfig,
     SimConfig,
 )
-from rlcli.errors import ConfigError, Problem, did_you_mean, listing
+from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
+from rlcli.registry import model_file
 from rlcli.sim.names import NameProblem, match
 from rlcli.sim.terrain import BODY as TERRAIN
 from rlcli.sim.terrain import Ground, add_ground, make_ground, misfits
@@ -185,8 +186,12 @@ class Scene:
         """The MJCF of an entity; None if it cannot be read."""
         path = ("scene", "entities", name)
         assert entity.model is not None
-        file = (self.root / entity.model).resolve()
-        if not file.is_relative_to(self.root):
+        try:
+            file = model_file(self.root, entity.model).resolve()
+        except TaskError as error:
+            self.problems.append(SceneProblem((*path, "model"), error.message, error.hint))
+            return None
+        if ":" not in entity.model and not file.is_relative_to(self.root):
             self.problems.append(
                 SceneProblem((*path, "model"), f"'{entity.model}' lies outside the task's folder {self.root}")
             )

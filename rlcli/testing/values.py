@@ -16,6 +16,7 @@ from rlcli.config.load import resolve
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DivergedError, listing
+from rlcli.registry import model_file
 from rlcli.testing.subject import (
     NUM_ENVS,
     STEPS,
@@ -34,7 +35,7 @@ def names(subject: Subject) -> Iterator[Finding]:
     for entity, config in subject.resolved.task.scene.entities.items():
         if config.model is None:
             continue  # a shape has the names that rlcli gives it
-        spec = mujoco.MjSpec.from_file(str(subject.source.root / config.model))
+        spec = mujoco.MjSpec.from_file(str(model_file(subject.source.root, config.model)))
         scalar = [joint for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]  # a root needs no name
         for word, elements in (("joint", scalar), ("actuator", list(spec.actuators)), ("body", spec.bodies[1:])):
             unnamed = [element for element in elements if not element.name]

@@ -52,6 +52,15 @@ def test_the_scenes_of_the_page_build_and_run(number, tmp_path):
 
 
 @pytest.mark.slow
+def test_the_examples_for_isaac_labs_users_train_as_written(tmp_path):
+    found = blocks(DOCS / "from-isaac-lab.md")
+    write_files(found, tmp_path)
+    output = run_commands(found, tmp_path)
+    assert "swing_env_cfg.py: valid (files and model)" in output
+    assert "episodes" in output
+
+
+@pytest.mark.slow
 def test_the_readmes_task_of_your_own_works_as_written(tmp_path):
     found = blocks(README, "## A task of your own", "## Licence")
     write_files(found, tmp_path)

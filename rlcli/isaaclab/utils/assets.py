@@ -1,0 +1,6 @@
+"""Where Isaac Lab's models lie; only the ends of such paths matter here."""
+
+NUCLEUS_ASSET_ROOT_DIR = "nucleus"
+NVIDIA_NUCLEUS_DIR = f"{NUCLEUS_ASSET_ROOT_DIR}/NVIDIA"
+ISAAC_NUCLEUS_DIR = f"{NUCLEUS_ASSET_ROOT_DIR}/Isaac"
+ISAACLAB_NUCLEUS_DIR = f"{ISAAC_NUCLEUS_DIR}/IsaacLab"
