@@ -51,5 +51,15 @@ Sensors: TypeAlias = Any
 """MJCF sensors of `entity`. At run time: an index into sensor-data columns."""
 Actuators: TypeAlias = Any
 """Actuators of `entity`. At run time: an index into actuator columns."""
+Geoms: TypeAlias = Any
+"""Geoms of `entity`. At run time: an index into the names of its geoms."""
+Tendons: TypeAlias = Any
+"""Tendons of `entity`. At run time: an index into the names of its tendons."""
+Pairs: TypeAlias = Any
+"""Contact pairs of `entity`. At run time: an index into the names of its pairs."""
 Range: TypeAlias = tuple[float, float]
 """`[low, high]` with low <= high."""
+ScheduledRange: TypeAlias = Any
+"""A `Range` of which an end may follow a schedule. At run time: what `rlcli.mdp.ranges.Ranges` takes."""
+ScheduledPair: TypeAlias = Any
+"""The same without an order: `[low, high]` or `[mean, std]`, as the term's `distribution` says."""

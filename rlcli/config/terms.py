@@ -24,6 +24,8 @@ from rlcli.config.schema import (
     ObservationConfig,
     Range,
     RewardConfig,
+    ScheduledPair,
+    ScheduledRange,
     StrictModel,
     SuccessConfig,
     TermConfig,
@@ -40,7 +42,7 @@ SECTIONS: dict[str, type[TermConfig]] = {
 }
 """Section of the YAML -> what its terms have in common."""
 
-SELECTORS = ("Joints", "Bodies", "Sites", "Sensors", "Actuators")
+SELECTORS = ("Joints", "Bodies", "Sites", "Sensors", "Actuators", "Geoms", "Tendons", "Pairs")
 """Aliases of `rlcli.task` that pick elements of the term's `entity`."""
 
 _TYPES: dict[str, Any] = {
@@ -51,6 +53,8 @@ _TYPES: dict[str, Any] = {
     "None": None,
     "Entity": str,
     "Range": Range,
+    "ScheduledRange": ScheduledRange,
+    "ScheduledPair": ScheduledPair,
     **dict.fromkeys(SELECTORS, Names),
 }
 _MDP = Path(__file__).resolve().parent.parent / "mdp"
@@ -115,7 +119,8 @@ class Vocabulary:
 @functools.cache
 def builtin_terms(section: str) -> dict[str, Signature]:
     """The terms of `rlcli.mdp` for a section of the YAML."""
-    return read_terms(_MDP / f"{section}.py")
+    terms = read_terms(_MDP / f"{section}.py")
+    return {**read_terms(_MDP / "randomization.py"), **terms} if section == "events" else terms
 
 
 def read_terms(file: Path) -> dict[str, Signature]:

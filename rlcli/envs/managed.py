@@ -30,6 +30,12 @@ class ManagedEnv(VecEnv):
 
     def _prepare(self, scene: Scene) -> None:
         scene.add_actuators(self._actuator_needs())
+        for config in self.config.events.values():
+            assert config is not None
+            signature = self.resolved.vocabulary.find("events", config.func)
+            prepare = None if signature is None else getattr(self._binder.load(signature), "prepare", None)
+            if prepare is not None:
+                prepare(scene.spec, config.params)
 
     def _bind(self) -> None:
         binder = self._binder
@@ -44,7 +50,9 @@ class ManagedEnv(VecEnv):
         n, device = self.num_envs, self.device
         self.action_manager = ActionManager(self._actions, n, device)
         self.termination_manager = TerminationManager(self._terminations, n, device)
-        self.event_manager = EventManager(self._events, n, self.step_dt, device)
+        self.event_manager = EventManager(self._events, n, self.step_dt, device, self.engine.set_constants)
+        if self.event_manager.derives:
+            self.engine.set_constants()  # makes room for them; from here on all of them are derived in one way
         self.event_manager.startup(self._everyone())
         reward_dt = self.step_dt if self.config.reward_dt_scaling else 1.0
         self.reward_manager = RewardManager(self._rewards, n, reward_dt, device, self.config.divergence_reward)
@@ -101,8 +109,11 @@ class ManagedEnv(VecEnv):
         returns, terms = self.reward_manager.episode(ended)
         return returns, terms, self.termination_manager.causes(ended)
 
+    def _start_over(self) -> None:
+        self.event_manager.start_over(self._everyone())
+
     def _restart_workflow(self, selection: Selection) -> None:
-        self.event_manager.reset(selection)
+        self.event_manager.reset(selection, self._steps)
         self.action_manager.reset(selection)
         self.reward_manager.reset(selection)
         self.termination_manager.reset(selection)
@@ -141,6 +152,7 @@ class ManagedEnv(VecEnv):
         }
         terms = [
             *self.action_manager.terms,
+            *self.event_manager.terms,
             *self.termination_manager.terms,
             *self.reward_manager.terms,
             *(term for group in self.observation_manager.groups.values() for term in group.terms),

@@ -264,6 +264,11 @@ class VecEnv(ABC):
         return int(self._steps)
 
     @property
+    def steps(self) -> Tensor:
+        """The same on the device, for terms: reading it there does not wait. () int64"""
+        return self._steps
+
+    @property
     def divergences(self) -> int:
         """Environments whose simulation diverged, ever."""
         return self.engine.divergences
@@ -479,6 +484,8 @@ class VecEnv(ABC):
                 self.entities[name] = Entity(name, blank, self.engine, self.sim)
         self._set_default(model)
         self.views = scene.views
+        self.origins = torch.zeros(self.num_envs, 3, device=self.device)
+        """Where each environment's start place lies in its world. (num_envs, 3) [m]"""
         self.env_origins = grid(self.num_envs, config.scene.env_spacing).to(self.device)
 
     def _set_default(self, model: mujoco.MjModel) -> None:

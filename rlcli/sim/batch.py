@@ -92,16 +92,20 @@ class BatchEngine:
             self._fields[name] = bound
         return self._fields[name]
 
+    def can_expand(self, name: str) -> bool:
+        """Whether a model field may differ between worlds."""
+        return name in MODEL_FIELDS
+
     def expand(self, name: str) -> Tensor:
         """A model field with a value for every world."""
         if name not in MODEL_FIELDS:
             raise ValueError(f"'{name}' cannot differ between worlds; {did_you_mean(name, MODEL_FIELDS) or ''}")
         return torch.from_numpy(self._batch.expand(name))
 
-    def set_constants(self) -> None:
+    def set_constants(self, selection: Selection | None = None) -> None:
         """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
         try:
-            self._batch.set_const()
+            self._batch.set_const(None if selection is None else _ids(selection).astype(np.int32))
         except SimulationError as error:
             raise _engine_error(error) from None
         self._own_constants = True

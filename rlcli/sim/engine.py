@@ -46,6 +46,10 @@ class Engine(Protocol):
         """
         ...
 
+    def can_expand(self, name: str) -> bool:
+        """Whether a model field may differ between worlds."""
+        ...
+
     def expand(self, name: str) -> Tensor:
         """A model field with a value for every world, live and writable. (num_envs, ...)
 
@@ -53,8 +57,11 @@ class Engine(Protocol):
         """
         ...
 
-    def set_constants(self) -> None:
-        """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
+    def set_constants(self, selection: Selection | None = None) -> None:
+        """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones.
+
+        Of the selected worlds, or of all; an `asynchronous` engine always does it for all.
+        """
         ...
 
     def step(self, nstep: int) -> None:

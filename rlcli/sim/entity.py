@@ -40,6 +40,10 @@ class SimData:
         self.qpos = self._copies[0][:, : qpos.shape[1]]
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
+        self.gravity: Tensor | None = None
+        """Gravity of every world, where it differs between them. (num_envs, 3) [m/s^2]"""
+        self.joint_ranges: Tensor | None = None
+        """Position limits of the model's joints in every world, where they differ. (num_envs, njnt, 2) [m or rad]"""
         self._derived: dict[str, tuple[int, Tensor]] = {}
 
     def refresh(self) -> None:
@@ -83,12 +87,18 @@ class Entity:
         self.site_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_SITE, model.nsite)
         self.sensor_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor)
         self.actuator_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu)
+        self.geom_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_GEOM, model.ngeom)
+        self.tendon_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_TENDON, model.ntendon)
+        self.pair_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_PAIR, model.npair)
         self.names: dict[str, list[str]] = {
             "Joints": _names(model, name, mujoco.mjtObj.mjOBJ_JOINT, self.joint_ids),
             "Bodies": _names(model, name, mujoco.mjtObj.mjOBJ_BODY, self.body_ids),
             "Sites": _names(model, name, mujoco.mjtObj.mjOBJ_SITE, self.site_ids),
             "Sensors": _names(model, name, mujoco.mjtObj.mjOBJ_SENSOR, self.sensor_ids),
             "Actuators": _names(model, name, mujoco.mjtObj.mjOBJ_ACTUATOR, self.actuator_ids),
+            "Geoms": _names(model, name, mujoco.mjtObj.mjOBJ_GEOM, self.geom_ids),
+            "Tendons": _names(model, name, mujoco.mjtObj.mjOBJ_TENDON, self.tendon_ids),
+            "Pairs": _names(model, name, mujoco.mjtObj.mjOBJ_PAIR, self.pair_ids),
         }
         self.joint_names = self.names["Joints"]
         self.qpos_columns = torch.from_numpy(model.jnt_qposadr[self.joint_ids].astype(np.int64)).to(engine.device)
@@ -224,6 +234,9 @@ class EntityData:
         soft = torch.stack([middle - half, middle + half], dim=1)
         self.soft_joint_pos_limits = torch.where(limited[:, None], soft, infinite)
         """The limits, drawn in by `soft_joint_pos_limit_factor`. (k, 2) [m or rad]"""
+        self._limited = limited
+        self._joint_index = as_index(entity.joint_ids.tolist(), device)
+        self._infinite = infinite
         position, velocity = (values.to(device) for values in default_joint_state(entity))
         self.default_joint_pos = position.expand(num_envs, -1).clone()
         """Default joint positions. (num_envs, k) [m or rad]"""
@@ -298,7 +311,29 @@ class EntityData:
     @property
     def projected_gravity_b(self) -> Tensor:
         """Direction of gravity in the root's frame, length 1. (num_envs, 3)"""
-        return self._once("projected_gravity_b", lambda: rotate_inverse(self.root_quat_w, self._down))
+        return self._once("projected_gravity_b", lambda: rotate_inverse(self.root_quat_w, self.down_w))
+
+    @property
+    def down_w(self) -> Tensor:
+        """Direction of gravity, world frame, length 1; straight down where there is none. (num_envs, 3)"""
+        gravity = self._sim.gravity
+        return self._down if gravity is None else self._once("down_w", lambda: _direction(gravity.float()))
+
+    def joint_limits(self, soft: bool = False) -> tuple[Tensor, Tensor]:
+        """Lower and upper position limits as they are now, infinite where there is none. (num_envs or 1, k) each
+
+        `joint_pos_limits` are those of the configuration; these follow a randomisation.
+        """
+        ranges = self._sim.joint_ranges
+        if ranges is None:
+            low, high = (self.soft_joint_pos_limits if soft else self.joint_pos_limits).unbind(dim=1)
+            return low[None], high[None]
+        low, high = self._once("joint_ranges", lambda: ranges[:, self._joint_index].float()).unbind(dim=2)
+        if soft:
+            half = 0.5 * self._entity.config.soft_joint_pos_limit_factor * (high - low)
+            middle = 0.5 * (low + high)
+            low, high = middle - half, middle + half
+        return torch.where(self._limited, low, self._infinite[0]), torch.where(self._limited, high, self._infinite[1])
 
     @property
     def body_pos_w(self) -> Tensor:
@@ -332,6 +367,15 @@ class EntityData:
             body = entity.root_body
             pose = np.concatenate([model.body_pos[body], model.body_quat[body]])
         return torch.cat([torch.tensor(pose, dtype=torch.float32), torch.zeros(6)])
+
+
+def _direction(vectors: Tensor) -> Tensor:
+    x, y, z = vectors.unbind(dim=1)  # one by one: the sum over a row must not depend on how many rows there are
+    norm = torch.sqrt(x * x + y * y + z * z)
+    unit = vectors / norm.clamp(min=1e-12)[:, None]
+    down = torch.zeros_like(vectors)
+    down[:, 2] = -1.0
+    return torch.where((norm > 0.0)[:, None], unit, down)
 
 
 def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:
