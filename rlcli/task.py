@@ -57,6 +57,11 @@ Tendons: TypeAlias = Any
 """Tendons of `entity`. At run time: an index into the names of its tendons."""
 Pairs: TypeAlias = Any
 """Contact pairs of `entity`. At run time: an index into the names of its pairs."""
+Command: TypeAlias = Any
+"""A term of `commands:`. YAML: its name. At run time: the term, whose `.command` is (num_envs, k)."""
+Address: TypeAlias = Any
+"""A number, or a list of numbers, of this configuration that may change while training goes on. YAML: its dotted key.
+At run time: a tensor on the environment's device; whoever reads the number reads what is written there."""
 Range: TypeAlias = tuple[float, float]
 """`[low, high]` with low <= high."""
 ScheduledRange: TypeAlias = Any

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from rlcli.config import messages, strict_yaml
 from rlcli.config.layers import Origin
 from rlcli.config.load import Resolved
-from rlcli.config.schema import TaskConfig
+from rlcli.config.schema import ObservationGroupConfig, TaskConfig
 from rlcli.config.strict_yaml import Path
 from rlcli.config.terms import SECTIONS, SignatureError, Vocabulary, params_model
 
@@ -104,7 +104,8 @@ def json_schema(vocabulary: Vocabulary, params: type[BaseModel] | None = None) -
             choices.append(entry)
         term: dict[str, Any] = {"anyOf": [*choices, {"type": "null"}]}
         if section == "observations":
-            term = {"type": "object", "additionalProperties": term}
+            settings = standing_alone(ObservationGroupConfig)["properties"]
+            term = {"type": "object", "properties": settings, "additionalProperties": term}
         if section != "success":
             term = {"type": "object", "additionalProperties": term}
         schema["properties"][section] = {**term, "description": TaskConfig.model_fields[section].description}

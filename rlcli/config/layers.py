@@ -157,11 +157,16 @@ def parse_override(text: str) -> tuple[Path, Any]:
     match = _OVERRIDE.fullmatch(text)
     if match is None:
         raise ConfigError([Problem(where, "", "is not of the form key.path=value")])
-    path = tuple(quoted or plain for quoted, plain in _KEY.findall(match[1]))
+    path = parse_address(match[1])
     try:
         return path, strict_yaml.load_value(match[match.lastindex or 0])
     except YamlError as error:
         raise ConfigError([Problem(where, ".".join(path), error.message)]) from None
+
+
+def parse_address(text: str) -> tuple[str, ...]:
+    """`rewards.alive.weight` -> its keys; a key that holds a dot is quoted."""
+    return tuple(quoted or plain for quoted, plain in _KEY.findall(text))
 
 
 def _index(target: list[Any], step: str | int, taken: Path) -> int:

@@ -428,7 +428,7 @@ class _Check:
                 self.problem((section,), "a manager-based task needs at least one term here")
         groups = data.get("observations", {})
         policy = groups.get("policy", {}) if isinstance(groups, dict) else None
-        if isinstance(policy, dict) and not any(policy.values()):
+        if isinstance(policy, dict) and not any(isinstance(term, dict) for term in policy.values()):
             self.problem(("observations",), "needs a group 'policy' with at least one term")
 
     def _require_direct(self, data: Mapping[str, Any]) -> None:
@@ -471,8 +471,10 @@ def _filled(task: TaskConfig, terms: Mapping[Path, TermConfig | None], params: d
         if section == "success":
             update[section] = terms.get((section,))
         elif section == "observations":
-            groups = task.observations
-            update[section] = {g: _kept(terms, (section, g), names) for g, names in groups.items()}
+            update[section] = {
+                name: group.model_copy(update=_kept(terms, (section, name), group.terms), deep=False)
+                for name, group in task.observations.items()
+            }
         else:
             update[section] = _kept(terms, (section,), getattr(task, section))
     return task.model_copy(update=update)

@@ -191,17 +191,161 @@ class EventConfig(TermConfig):
         return self
 
 
-class ObservationConfig(TermConfig):
-    """An observation term; its columns are clipped, then scaled."""
+Columns = Number | Annotated[list[Number], Field(min_length=1)]
+"""One number for all columns of a term, or one each."""
 
+
+class _NoiseConfig(StrictModel):
+    operation: Literal["add", "scale", "set"] = "add"
+    """add: value + draw; scale: value x draw; set: the draw alone."""
+
+
+class UniformNoiseConfig(_NoiseConfig):
+    """Uniform noise."""
+
+    kind: Literal["uniform"]
+    low: Columns = -1.0
+    """Lower end of each draw, in the term's unit (a factor, to scale)."""
+    high: Columns = 1.0
+    """Upper end."""
+
+
+class GaussianNoiseConfig(_NoiseConfig):
+    """Gaussian noise."""
+
+    kind: Literal["gaussian"]
+    mean: Columns = 0.0
+    """Mean of each draw, in the term's unit (a factor, to scale)."""
+    std: Columns = 1.0
+    """Standard deviation."""
+
+
+class ConstantNoiseConfig(_NoiseConfig):
+    """The same value in every step."""
+
+    kind: Literal["constant"]
+    value: Columns = 0.0
+    """What is added, multiplied or set, in the term's unit (a factor, to scale)."""
+
+
+NoiseConfig = Annotated[UniformNoiseConfig | GaussianNoiseConfig | ConstantNoiseConfig, Field(discriminator="kind")]
+
+
+class ScaleModifierConfig(StrictModel):
+    """value x factor."""
+
+    kind: Literal["scale"]
+    factor: Columns
+    """Factor."""
+
+
+class BiasModifierConfig(StrictModel):
+    """value + offset."""
+
+    kind: Literal["bias"]
+    offset: Columns
+    """What is added, in the term's unit."""
+
+
+class ClipModifierConfig(StrictModel):
+    """The value within bounds."""
+
+    kind: Literal["clip"]
+    bounds: Range
+    """[low, high], in the term's unit."""
+
+
+class DigitalFilterModifierConfig(StrictModel):
+    """y[i] = sum_j b[j] x[i-j] - sum_j a[j] y[i-1-j], with zeros before an episode's first step."""
+
+    kind: Literal["digital_filter"]
+    a: list[Number] = []
+    """Weights of past outputs, the last one first; none for a filter without feedback."""
+    b: Annotated[list[Number], Field(min_length=1)]
+    """Weights of the input of this step and of those before."""
+
+
+class IntegratorModifierConfig(StrictModel):
+    """Integral over the episode by the trapezoidal rule."""
+
+    kind: Literal["integrator"]
+
+
+ModifierConfig = Annotated[
+    ScaleModifierConfig
+    | BiasModifierConfig
+    | ClipModifierConfig
+    | DigitalFilterModifierConfig
+    | IntegratorModifierConfig,
+    Field(discriminator="kind"),
+]
+
+
+class DelayConfig(StrictModel):
+    """What the policy sees is some steps old; in an episode's first steps it is the first value."""
+
+    steps: Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0, le=1000)]], AfterValidator(_ordered)]
+    """[low, high] environment steps, drawn an environment at the start of each episode; both ends included."""
+    redraw: Annotated[float, Field(ge=0, le=1), _Fraction()] = 0.0
+    """Chance that an environment draws its delay anew in a step."""
+
+
+class ObservationConfig(TermConfig):
+    """An observation term: value, modifiers, noise, bias, clip, scale, delay, history, in this order."""
+
+    modifiers: list[ModifierConfig] = []
+    """What is done to the value first, in order."""
+    noise: NoiseConfig | None = None
+    """Drawn anew in every step."""
+    bias: NoiseConfig | None = None
+    """Drawn at the start of every episode, from nothing but its own distribution: it does not drift."""
     clip: Range | None = None
     """[low, high] limits."""
-    scale: Number | list[Number] | None = None
+    scale: Columns | None = None
     """Factor, one for all columns or one each."""
+    delay: DelayConfig | None = None
+    """How old what is seen is."""
+    history: Count | None = None
+    """Steps kept: columns of the oldest first; an episode begins with its first value in all of them."""
+
+
+class ObservationGroupConfig(StrictModel):
+    """A group of observation terms, side by side in order; further keys are its terms."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, ObservationConfig | None] = Field(init=False)
+
+    enable_corruption: bool = True
+    """false: the terms' noise, bias and delay are left out."""
+    history: Count | None = None
+    """History of every term, over the terms' own; null leaves it to them."""
+
+    @property
+    def terms(self) -> dict[str, ObservationConfig | None]:
+        """The terms by name, in order."""
+        return dict(self.__pydantic_extra__ or {})
 
 
 class ActionConfig(TermConfig):
     """An action term; it takes its columns of the policy's output."""
+
+
+class CommandConfig(TermConfig):
+    """Something that the policy is asked to do, drawn anew from time to time."""
+
+    resampling_time_s: Range
+    """[low, high] time until the next draw [s], drawn an environment; each episode begins with a new one."""
+
+    @field_validator("resampling_time_s")
+    @classmethod
+    def _some_time(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[0] <= 0:
+            raise ValueError("resampling_time_s must be above 0")
+        return value
+
+
+class CurriculumConfig(TermConfig):
+    """Something that changes while training goes on."""
 
 
 class SuccessConfig(TermConfig):
@@ -316,6 +460,42 @@ class JointConfig(StrictModel):
     """Gain of a velocity actuator, or damping of a position actuator [N s/m or N m s/rad]."""
 
 
+ByJoint = NotNegative | dict[str, NotNegative]
+"""One number for all joints, or name or regex -> number, which must name every joint once."""
+
+
+class ActuatorConfig(StrictModel):
+    """A model of what drives joints, in place of the MJCF's actuators; it is computed before every physics step."""
+
+    joints: Names
+    """Joints that it drives: names or regexes, in this order."""
+    kind: Literal["pd", "dc_motor"] = "pd"
+    """pd: a PD controller with an effort limit; dc_motor: one behind a motor with a torque-speed curve."""
+    stiffness: ByJoint = 0.0
+    """Gain on the position error [N/m or N m/rad]."""
+    damping: ByJoint = 0.0
+    """Gain on the velocity error [N s/m or N m s/rad]."""
+    effort_limit: ByJoint | None = None
+    """Largest effort [N or N m]; null: none."""
+    saturation_effort: Positive | None = None
+    """Stall torque of a dc_motor [N or N m]."""
+    velocity_limit: Positive | None = None
+    """No-load speed of a dc_motor [m/s or rad/s]."""
+    delay: Annotated[
+        tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0, le=1000)]], AfterValidator(_ordered)
+    ] = (0, 0)
+    """[low, high] physics steps until a command arrives, ends included, drawn an environment at an episode's start."""
+
+    @model_validator(mode="after")
+    def _motor(self) -> ActuatorConfig:
+        curve = (self.saturation_effort is not None, self.velocity_limit is not None)
+        if self.kind == "dc_motor" and not all(curve):
+            raise ValueError("a dc_motor needs saturation_effort and velocity_limit")
+        if self.kind == "pd" and any(curve):
+            raise ValueError("saturation_effort and velocity_limit belong to kind dc_motor")
+        return self
+
+
 class InitialStateConfig(StrictModel):
     """The default state of an entity, which resets start from."""
 
@@ -336,6 +516,8 @@ class EntityConfig(StrictModel):
     """Orientation (w, x, y, z)."""
     joints: dict[str, JointConfig] = {}
     """Joint name or regex -> what to change; where two match, the later one wins key by key."""
+    actuators: dict[str, ActuatorConfig] = {}
+    """Name -> actuator model; joints that none of them drives keep MuJoCo's actuators."""
     init: InitialStateConfig = InitialStateConfig()
     """Default joint state; a joint not named starts at the MJCF's qpos0, at rest."""
     soft_joint_pos_limit_factor: Annotated[float, Field(gt=0, le=1), _Fraction()] = 1.0
@@ -374,14 +556,18 @@ class TaskConfig(StrictModel):
     """Camera of videos and windows."""
     actions: dict[str, ActionConfig | None] = {}
     """Action terms, in the order of the policy's output; null removes one."""
-    observations: dict[str, dict[str, ObservationConfig | None]] = {}
-    """Groups of observation terms, in order; the policy reads the group `policy`."""
+    commands: dict[str, CommandConfig | None] = {}
+    """Command terms."""
+    observations: dict[str, ObservationGroupConfig] = {}
+    """Groups of observation terms; the policy reads the group `policy`."""
     events: dict[str, EventConfig | None] = {}
     """Event terms."""
     rewards: dict[str, RewardConfig | None] = {}
     """Reward terms."""
     terminations: dict[str, TerminationConfig | None] = {}
     """Termination terms."""
+    curriculum: dict[str, CurriculumConfig | None] = {}
+    """Curriculum terms."""
     success: SuccessConfig | None = None
     """What makes an episode a success in `eval`."""
     reward_dt_scaling: bool = True

@@ -18,6 +18,8 @@ from pydantic import ConfigDict, Field, create_model
 
 from rlcli.config.schema import (
     ActionConfig,
+    CommandConfig,
+    CurriculumConfig,
     EventConfig,
     Names,
     Number,
@@ -34,10 +36,12 @@ from rlcli.config.schema import (
 
 SECTIONS: dict[str, type[TermConfig]] = {
     "actions": ActionConfig,
+    "commands": CommandConfig,
     "observations": ObservationConfig,
     "events": EventConfig,
     "rewards": RewardConfig,
     "terminations": TerminationConfig,
+    "curriculum": CurriculumConfig,
     "success": SuccessConfig,
 }
 """Section of the YAML -> what its terms have in common."""
@@ -52,6 +56,8 @@ _TYPES: dict[str, Any] = {
     "str": str,
     "None": None,
     "Entity": str,
+    "Command": str,
+    "Address": str,
     "Range": Range,
     "ScheduledRange": ScheduledRange,
     "ScheduledPair": ScheduledPair,
@@ -187,7 +193,7 @@ def annotation_type(node: ast.expr) -> Any:
     """The YAML type of an annotation.
 
     Raises:
-        SignatureError: for anything but float, int, bool, str, Literal, tuple, list, `X | None` and the aliases.
+        SignatureError: for anything but float, int, bool, str, Literal, tuple, list, dict, `X | None` and the aliases.
     """
     if isinstance(node, ast.Constant) and node.value is None:
         return None
@@ -205,13 +211,15 @@ def annotation_type(node: ast.expr) -> Any:
             return Literal[tuple(_literal(item) for item in items)]
         if outer == "list" and len(items) == 1:
             return list[annotation_type(items[0])]  # type: ignore[misc]
+        if outer == "dict" and len(items) == 2 and _last_name(items[0]) == "str":
+            return dict[str, annotation_type(items[1])]  # type: ignore[misc]
         if outer == "tuple":
             if len(items) == 2 and isinstance(items[1], ast.Constant) and items[1].value is ...:
                 return tuple[annotation_type(items[0]), ...]  # type: ignore[misc]
             return tuple[tuple(annotation_type(item) for item in items)]  # type: ignore[misc]
     raise SignatureError(
         f"annotation '{ast.unparse(node)}' is not one that YAML can express; use float, int, bool, str, Literal, tuple,"
-        f" list, X | None, Range, Entity or {' / '.join(SELECTORS)}"
+        f" list, dict[str, X], X | None, Range, Entity, Command, Address or {' / '.join(SELECTORS)}"
     )
 
 
@@ -292,7 +300,7 @@ def _alias(node: ast.expr) -> str | None:
     if isinstance(node, ast.BinOp):
         return _alias(node.left) or _alias(node.right)
     name = _last_name(node)
-    return name if name in SELECTORS or name == "Entity" else None
+    return name if name in (*SELECTORS, "Entity", "Command", "Address") else None
 
 
 def _quoted(text: str) -> ast.expr:

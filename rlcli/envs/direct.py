@@ -163,6 +163,7 @@ class DirectEnv(VecEnv):
         names, size = task.observation_names, task.num_observations
         units = task.observation_units if len(task.observation_units) == size else ("",) * size
         clip, action_clip = _around_zero(self.config.clip_observations), _around_zero(self.config.clip_actions)
+        action_clips = None if action_clip is None else (action_clip,) * task.num_actions
         terms: tuple[TermLayout, ...] = (TermLayout("obs_buf", size, clip=clip),)
         if len(names) == size:
             terms = tuple(TermLayout(name, 1, unit=unit, clip=clip) for name, unit in zip(names, units, strict=True))
@@ -171,7 +172,7 @@ class DirectEnv(VecEnv):
             groups["critic"] = (TermLayout("states_buf", task.num_states, clip=clip),)
         return Layout(
             groups,
-            (TermLayout("actions", task.num_actions, task.action_names, clip=action_clip),),
+            (TermLayout("actions", task.num_actions, task.action_names, clip=action_clips),),
             self.step_dt,
             self.physics_dt,
             self.config.decimation,
@@ -186,9 +187,9 @@ class DirectEnv(VecEnv):
         found = {}
         for name, value in self.task.extras.items():
             if isinstance(value, Tensor) and value.numel():
-                found[name] = float(value.float().mean())
+                found[f"Task/{name}"] = float(value.float().mean())
             elif isinstance(value, int | float):
-                found[name] = float(value)
+                found[f"Task/{name}"] = float(value)
         return found
 
     def _start_over(self) -> None:

@@ -1,4 +1,4 @@
-"""The manager-based workflow: actions, observations, events, rewards and terminations as lists of small terms."""
+"""The manager-based workflow: every concern of the MDP is a list of small terms, run by a manager."""
 
 from __future__ import annotations
 
@@ -8,13 +8,18 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
+from rlcli.config.schema import ObservationConfig
 from rlcli.config.terms import SELECTORS
 from rlcli.envs.vec_env import Layout, TermLayout, VecEnv
 from rlcli.managers.action import ActionManager, CommandMap
+from rlcli.managers.command import CommandManager
+from rlcli.managers.curriculum import CurriculumManager
 from rlcli.managers.event import EventManager
 from rlcli.managers.observation import ObservationManager, Watch
+from rlcli.managers.pipeline import Pipeline
 from rlcli.managers.reward import RewardManager
 from rlcli.managers.term import BoundTerm
 from rlcli.managers.termination import TerminationManager
@@ -26,7 +31,10 @@ _UNIT = re.compile(r"\[([^\]]+)\]")
 
 
 class ManagedEnv(VecEnv):
-    """A manager-based task. A step: actions, physics, terminations, rewards, resets, events, observations."""
+    """A manager-based task.
+
+    A step: actions, physics, terminations, rewards, curriculum and resets, commands, interval events, observations.
+    """
 
     def _prepare(self, scene: Scene) -> None:
         scene.add_actuators(self._actuator_needs())
@@ -39,15 +47,19 @@ class ManagedEnv(VecEnv):
 
     def _bind(self) -> None:
         binder = self._binder
+        self._commands = binder.bind_all("commands")  # first: terms of other sections refer to them
         self._actions = binder.bind_all("actions")
         self._events = binder.bind_all("events")
         self._terminations = binder.bind_all("terminations")
         self._rewards = binder.bind_all("rewards")
         self._observations = {group: binder.bind_group(group) for group in self.config.observations}
+        self._curriculum = binder.bind_all("curriculum")
 
     def _build(self) -> None:
         # in this order: a term's first value may use what stands before it
-        n, device = self.num_envs, self.device
+        self._everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        n, device, live = self.num_envs, self.device, self._binder.live
+        self.command_manager = CommandManager(self._commands, n, self.step_dt, device, live)
         self.action_manager = ActionManager(self._actions, n, device)
         self.termination_manager = TerminationManager(self._terminations, n, device)
         self.event_manager = EventManager(self._events, n, self.step_dt, device, self.engine.set_constants)
@@ -55,12 +67,23 @@ class ManagedEnv(VecEnv):
             self.engine.set_constants()  # makes room for them; from here on all of them are derived in one way
         self.event_manager.startup(self._everyone())
         reward_dt = self.step_dt if self.config.reward_dt_scaling else 1.0
-        self.reward_manager = RewardManager(self._rewards, n, reward_dt, device, self.config.divergence_reward)
-        self.observation_manager = ObservationManager(self._observations, n, device, self._watch())
+        self.reward_manager = RewardManager(self._rewards, n, reward_dt, device, live, self.config.divergence_reward)
+        self.observation_manager = ObservationManager(
+            self._observations,
+            self.config.observations,
+            n,
+            self.step_dt,
+            device,
+            self._everyone_now,
+            live,
+            self._watch(),
+        )
+        self.curriculum_manager = CurriculumManager(self._curriculum, live, device)
 
     def holders(self) -> list[Any]:
         """The terms that are objects."""
-        bound = [*self._actions, *self._events, *self._terminations, *self._rewards]
+        bound = [*self._commands, *self._actions, *self._events, *self._terminations, *self._rewards]
+        bound += self._curriculum
         terms = [*bound, *(term for group in self._observations.values() for term in group)]
         return [term.instance for term in terms if not isinstance(term.instance, functools.partial)]
 
@@ -69,23 +92,29 @@ class ManagedEnv(VecEnv):
 
     def _layout(self) -> Layout:
         observations = {
-            group: tuple(self._observation_layout(term, size) for term, size in self.observation_manager.sizes(group))
+            group: tuple(self._observation_layout(pipeline) for pipeline in self.observation_manager.pipelines(group))
             for group in self.config.observations
         }
         actions = tuple(_action_layout(term) for term in self.action_manager.terms)
         return Layout(observations, actions, self.step_dt, self.physics_dt, self.config.decimation)
 
-    def _observation_layout(self, term: BoundTerm, size: int) -> TermLayout:
-        signature = self.resolved.vocabulary.find("observations", term.config.func)
+    def _observation_layout(self, pipeline: Pipeline) -> TermLayout:
+        term, config = pipeline.term, pipeline.term.config
+        assert isinstance(config, ObservationConfig)
+        signature = self.resolved.vocabulary.find("observations", config.func)
         unit = _UNIT.search(signature.summary) if signature is not None else None
-        scale = term.config.scale  # type: ignore[attr-defined]
+        scale = config.scale
         return TermLayout(
             term.name,
-            size,
+            pipeline.size,
             tuple(next(iter(term.elements.values()), [])),
             unit[1] if unit else "",
-            scale=None if scale is None else tuple(scale) if isinstance(scale, list) else (scale,) * size,
-            clip=term.config.clip,  # type: ignore[attr-defined]
+            scale=None
+            if scale is None
+            else (tuple(scale) if isinstance(scale, list) else (scale,) * pipeline.width) * pipeline.history,
+            clip=config.clip,
+            history=pipeline.history,
+            modifiers=tuple(modifier.model_dump(mode="json") for modifier in config.modifiers),
         )
 
     def _act(self, action: Tensor) -> None:
@@ -96,6 +125,7 @@ class ManagedEnv(VecEnv):
         reward = self.reward_manager.compute()
         if diverged is not None:
             self.reward_manager.replace_diverged(diverged, reward)
+        self.command_manager.measure()
         return reward, terminated, truncated
 
     def _explain(self, what: str) -> None:
@@ -112,19 +142,36 @@ class ManagedEnv(VecEnv):
     def _start_over(self) -> None:
         self.event_manager.start_over(self._everyone())
 
+    def _metrics_of(self, ended: Selection) -> dict[str, Tensor]:
+        return self.command_manager.episode(ended)
+
+    def _conclude(self, ended: Selection) -> None:
+        self.curriculum_manager.compute(ended)
+
     def _restart_workflow(self, selection: Selection) -> None:
         self.event_manager.reset(selection, self._steps)
         self.action_manager.reset(selection)
+        self.command_manager.reset(selection)
         self.reward_manager.reset(selection)
         self.termination_manager.reset(selection)
         self.observation_manager.reset(selection)
 
     def _between(self) -> None:
-        if not self.event_manager.has_intervals:
+        self.curriculum_manager.advance(self._steps)
+        if not self.event_manager.has_intervals and not self.command_manager.terms:
             return
-        steps = self._steps.expand(self.num_envs).contiguous()
         running = (self.episode_length_buf > 0).long()  # no time has passed for those just reset
-        self.event_manager.interval(lambda mask: self.engine.select(mask, self.seed, steps), running, self._written)
+        self.command_manager.compute(self._now, running)
+        self.event_manager.interval(self._now, running, self._written)
+
+    def _everyone_now(self) -> Selection:
+        everyone = self._now(self._everywhere)
+        assert everyone is not None
+        return everyone
+
+    def _now(self, mask: Tensor) -> Selection | None:
+        """A selection that draws from the step's own counter."""
+        return self.engine.select(mask, self.seed, self._steps.expand(self.num_envs).contiguous())
 
     def _written(self, selection: Selection) -> None:
         self.engine.forward(selection)
@@ -132,6 +179,13 @@ class ManagedEnv(VecEnv):
 
     def _observe(self) -> dict[str, Tensor]:
         return self.observation_manager.compute()
+
+    def _observe_again(self) -> dict[str, Tensor]:
+        return self.observation_manager.again()
+
+    def extras(self) -> dict[str, float]:
+        """What the curriculum's terms gave last."""
+        return self.curriculum_manager.values()
 
     def _workflow_state(self) -> dict[str, Tensor]:
         state: dict[str, Tensor] = {}
@@ -144,8 +198,11 @@ class ManagedEnv(VecEnv):
             prefix = f"{name}."
             part.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
 
-    def _parts(self) -> dict[str, ActionManager | EventManager | RewardManager]:
-        parts: dict = {
+    def _parts(self) -> dict[str, Any]:
+        parts: dict[str, Any] = {
+            "command": self.command_manager,
+            "observation": self.observation_manager,
+            "curriculum": self.curriculum_manager,
             "action": self.action_manager,
             "event": self.event_manager,
             "reward": self.reward_manager,
@@ -155,7 +212,13 @@ class ManagedEnv(VecEnv):
             *self.event_manager.terms,
             *self.termination_manager.terms,
             *self.reward_manager.terms,
-            *(term for group in self.observation_manager.groups.values() for term in group.terms),
+            *self.command_manager.terms,
+            *self.curriculum_manager.terms,
+            *(
+                pipeline.term
+                for group in self.config.observations
+                for pipeline in self.observation_manager.pipelines(group)
+            ),
         ]
         return {**parts, **{"term." + ".".join(map(str, t.path)): t for t in terms if t.state_dict()}}
 

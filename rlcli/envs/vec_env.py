@@ -10,7 +10,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import mujoco
@@ -22,6 +22,7 @@ from rlcli.config.schema import InitialStateConfig
 from rlcli.errors import DivergedError
 from rlcli.machine import require_device
 from rlcli.managers.term import Binder
+from rlcli.sim.actuators import ActuatorModel
 from rlcli.sim.engine import open_engine
 from rlcli.sim.entity import Entity, SimData, is_finite
 from rlcli.sim.names import NameProblem
@@ -47,6 +48,8 @@ class Episodes:
     """Ended by time alone. (n,) bool"""
     success: Tensor | None
     """Met the task's success condition; None where the task has none. (n,) bool"""
+    metrics: dict[str, Tensor] = field(default_factory=dict)
+    """`command/metric` -> its mean over the episode. (n,) each"""
     mask: Tensor | None = None
     """A GPU gives a row for every environment, valid until the next step, and which of them count. (num_envs,) bool;
     None: all rows do."""
@@ -64,6 +67,7 @@ class Episodes:
             {name: values[rows] for name, values in self.causes.items()},
             self.truncated[rows],
             None if self.success is None else self.success[rows],
+            {name: values[rows] for name, values in self.metrics.items()},
         )
 
 
@@ -96,12 +100,17 @@ class TermLayout:
     unit: str = ""
     scale: tuple[float, ...] | None = None
     """Factor of each column; None: not scaled, or (an action) in the task's own way."""
-    clip: tuple[float, float] | None = None
-    """Limits: of an observation before it is scaled, of an action after scale and offset."""
+    clip: tuple[float, float] | tuple[tuple[float, float], ...] | None = None
+    """Limits: of an observation's columns before they are scaled; of an action's, each its own, after scale and
+    offset."""
     offset: tuple[float, ...] | None = None
     """What is added to each column of an action after scaling."""
     limits: tuple[tuple[float, float], ...] | None = None
     """What the actuator of each column of an action can take, infinite where it has no limit."""
+    history: int = 1
+    """Steps that an observation holds, columns of the oldest first."""
+    modifiers: tuple[dict[str, Any], ...] = ()
+    """What is done to an observation's value before it is clipped, as the YAML says it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,15 +142,18 @@ class Layout:
                 "elements": list(t.elements),
                 "unit": t.unit,
                 "scale": None if t.scale is None else list(t.scale),
-                "clip": None if t.clip is None else list(t.clip),
             }
 
+        def observation(t: TermLayout) -> dict[str, Any]:
+            clip = None if t.clip is None else list(t.clip)
+            return {**term(t), "clip": clip, "history": t.history, "modifiers": list(t.modifiers)}
+
         def action(t: TermLayout) -> dict[str, Any]:
-            limits = [[x if math.isfinite(x) else None for x in pair] for pair in t.limits or ()]
-            return {**term(t), "offset": None if t.offset is None else list(t.offset), "limits": limits or None}
+            bounds = {"clip": _finite_pairs(t.clip), "limits": _finite_pairs(t.limits)}  # type: ignore[arg-type]
+            return {**term(t), "offset": None if t.offset is None else list(t.offset), **bounds}
 
         return {
-            "observations": {group: [term(t) for t in items] for group, items in self.observations.items()},
+            "observations": {group: [observation(t) for t in items] for group, items in self.observations.items()},
             "actions": [action(t) for t in self.actions],
             "step_dt": self.step_dt,
             "dt": self.dt,
@@ -204,6 +216,7 @@ class VecEnv(ABC):
         self.engine.attach()
         self._start_over()
         self._restart(self._everyone())
+        self._between()
         return self._observe()
 
     def step(self, action: Tensor) -> StepResult:
@@ -239,6 +252,7 @@ class VecEnv(ABC):
             if self.final_obs_of == "finished" or self._maybe(truncated & ~terminated):
                 final_obs = self._final()
             episodes = self._episodes(ended, finished, terminated, truncated)
+            self._conclude(ended)
             self._restart(ended)
         self._between()
         obs = self._observe()
@@ -282,7 +296,7 @@ class VecEnv(ABC):
         self._playing = not paused
 
     def extras(self) -> dict[str, float]:
-        """Further numbers that the task wants logged, by name; as of the last step."""
+        """Further numbers to log, by the metric's name; as of the last step."""
         return {}
 
     def close(self) -> None:
@@ -303,9 +317,15 @@ class VecEnv(ABC):
             "success_hold": self._success_hold.clone(),
         }
         engine = {f"engine.{name}": value for name, value in self.engine.state_dict().items()}
+        models = {
+            f"actuator.{name}.{key}": value
+            for name, model in self._actuators.items()
+            for key, value in model.state_dict().items()
+        }
         return {
             **own,
             **engine,
+            **models,
             **{f"workflow.{name}": value for name, value in self._workflow_state().items()},
         }
 
@@ -317,9 +337,11 @@ class VecEnv(ABC):
         self.seed = int(state["seed"])
         self._success_hold.copy_(state["success_hold"])
         self.engine.load_state_dict(_below(state, "engine."))
+        for name, model in self._actuators.items():
+            model.load_state_dict(_below(state, f"actuator.{name}."))
         self.sim.refresh()
         self._load_workflow_state(_below(state, "workflow."))
-        return self._observe()
+        return self._observe_again()
 
     # --- the workflow's part ---
 
@@ -362,6 +384,17 @@ class VecEnv(ABC):
     def _observe(self) -> dict[str, Tensor]:
         """Observations of the state as it is."""
 
+    def _observe_again(self) -> dict[str, Tensor]:
+        """The observations that were made of the state that has just been taken back."""
+        return self._observe()
+
+    def _metrics_of(self, ended: Selection) -> dict[str, Tensor]:
+        """Means over the episodes that end. (n,) each"""
+        return {}
+
+    def _conclude(self, ended: Selection) -> None:
+        """Called with the environments whose episode ends, before anything of it is forgotten."""
+
     def _explain(self, what: str) -> None:
         """Called with what is not finite: raise a DivergedError that names the term, if it can be named."""
 
@@ -383,7 +416,13 @@ class VecEnv(ABC):
 
     def _simulate(self) -> Tensor | None:
         start = time.perf_counter()
-        self.engine.step(self.config.decimation)
+        if not self._actuators:
+            self.engine.step(self.config.decimation)
+        else:
+            for left in reversed(range(self.config.decimation)):
+                for actuator in self._actuators.values():
+                    actuator.compute()
+                self.engine.step(1, derive=left == 0)
         self.seconds["physics"] += time.perf_counter() - start
         diverged = self.engine.diverged()
         if diverged is not None and not self.engine.asynchronous:
@@ -418,12 +457,15 @@ class VecEnv(ABC):
             causes,
             timed_out,
             success,
+            self._metrics_of(ended),
             finished if self.engine.asynchronous else None,
         )
 
     def _restart(self, selection: Selection) -> None:
         self.engine.reset(selection)
         self.sim.refresh_rows(selection)  # a reset event or reset_idx reads the default state, not the last episode's
+        for actuator in self._actuators.values():
+            actuator.reset(selection)
         self._restart_workflow(selection)
         selection.write(self.episode_length_buf, 0)
         selection.write(self._success_hold, 0.0)
@@ -482,11 +524,26 @@ class VecEnv(ABC):
                 self._binder.problems.append(resolved.problem(path, str(problem), problem.hint))
                 blank = entity.model_copy(update={"init": InitialStateConfig()})  # to go on to the other problems
                 self.entities[name] = Entity(name, blank, self.engine, self.sim)
+        self._actuators: dict[str, ActuatorModel] = {}
+        """`entity.name` -> actuator model, in the order of the configuration."""
+        for built in self.entities.values():
+            self._add_actuators(built)
         self._set_default(model)
         self.views = scene.views
         self.origins = torch.zeros(self.num_envs, 3, device=self.device)
         """Where each environment's start place lies in its world. (num_envs, 3) [m]"""
         self.env_origins = grid(self.num_envs, config.scene.env_spacing).to(self.device)
+
+    def _add_actuators(self, entity: Entity) -> None:
+        for name, config in entity.config.actuators.items():
+            try:
+                model = ActuatorModel(name, config, entity)
+            except NameProblem as problem:
+                path = ("scene", "entities", entity.name, "actuators", name)
+                self._binder.problems.append(self.resolved.problem(path, str(problem), problem.hint))
+                continue
+            entity.actuators.append(model)
+            self._actuators[f"{entity.name}.{name}"] = model
 
     def _set_default(self, model: mujoco.MjModel) -> None:
         qpos, qvel = torch.tensor(model.qpos0), torch.zeros(model.nv, dtype=torch.float64)
@@ -513,6 +570,11 @@ def grid(num_envs: int, spacing: float) -> Tensor:
     index = torch.arange(num_envs)
     xy = torch.stack([index // rows, index % rows], dim=1).float() - (rows - 1) / 2
     return torch.cat([xy * spacing, torch.zeros(num_envs, 1)], dim=1)
+
+
+def _finite_pairs(pairs: tuple[tuple[float, float], ...] | None) -> list[list[float | None]] | None:
+    """As JSON, which has no infinity."""
+    return [[x if math.isfinite(x) else None for x in pair] for pair in pairs or ()] or None
 
 
 def make_env(resolved: Resolved, *, seed: int = 42, device: str = "cpu") -> VecEnv:

@@ -22,8 +22,8 @@ class CommandMap:
     """One a column."""
     offset: tuple[float, ...]
     """One a column, in the command's unit."""
-    clip: tuple[float, float] | None
-    """The term's own limits, in the command's unit."""
+    clip: tuple[tuple[float, float], ...] | None
+    """The term's own limits of each column, in the command's unit."""
     limits: tuple[tuple[float, float], ...]
     """What each column's actuator can take, in the command's unit; infinite where it has no limit."""
 

@@ -1,14 +1,18 @@
-"""Observations: groups of terms, each term clipped, then scaled, then written to its columns."""
+"""Observations: groups of terms side by side, each run through its pipeline of noise, clip, scale, delay, history."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.errors import ConfigError, DivergedError, Problem
+from rlcli.config.schema import ObservationGroupConfig
+from rlcli.errors import DivergedError
+from rlcli.managers.live import LiveValues
+from rlcli.managers.pipeline import Draws, Pipeline
 from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.sim.entity import is_finite
 from rlcli.sim.selection import Selection
@@ -16,77 +20,138 @@ from rlcli.sim.selection import Selection
 
 @dataclass(slots=True)
 class _Group:
-    terms: list[BoundTerm]
-    sizes: list[int]
+    pipelines: list[Pipeline]
     buffers: list[Tensor]
     views: list[list[Tensor]]
-    adjust: list[Callable[[Tensor], None] | None]
     next: int = 0
 
 
 Watch = Callable[[Tensor, str], None]
 """Notes, without waiting for a device, if values are not finite: (values, what they are)."""
 
+_FINAL = np.uint64(0x46494E414C)
+"""The last observation of an episode draws apart, so that the first of the next one is not seen with its noise."""
+
 
 class ObservationManager:
-    """Computes every group into one of three buffers in turn, so that consecutive observations share no memory."""
+    """Computes every group into one of three buffers in turn, so that consecutive observations share no memory.
+
+    Args:
+        groups: the bound terms of each group.
+        configs: the groups' settings.
+        step_dt: control period [s].
+        now: gives all environments, drawing by the step's counter.
+        live: what a curriculum moves.
+        watch: notes what is not finite; None checks at once.
+    """
 
     def __init__(
         self,
         groups: dict[str, list[BoundTerm]],
+        configs: Mapping[str, ObservationGroupConfig],
         num_envs: int,
+        step_dt: float,
         device: torch.device,
+        now: Callable[[], Selection],
+        live: LiveValues,
         watch: Watch | None = None,
     ) -> None:
         self.num_envs = num_envs
-        self._watch = watch
-        self.groups = {name: self._group(terms, device) for name, terms in groups.items()}
+        self._device, self._step_dt, self._live, self._now, self._watch = device, step_dt, live, now, watch
+        self.groups = {name: self._group(terms, configs[name]) for name, terms in groups.items()}
         self._final = {name: torch.zeros_like(group.buffers[0]) for name, group in self.groups.items()}
-        self._final_views = {name: _split(self._final[name], group.sizes) for name, group in self.groups.items()}
+        self._final_views = {name: _split(self._final[name], group.pipelines) for name, group in self.groups.items()}
+        self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
 
     def compute(self) -> dict[str, Tensor]:
         """Observations of the state as it is. (num_envs, d) each"""
-        result = {}
+        result, draws = {}, self._draws(np.uint64(0))
         for name, group in self.groups.items():
             group.next = (group.next + 1) % len(group.buffers)
-            self._fill(group, group.views[group.next])
+            self._fill(group, group.views[group.next], draws, advance=True)
             result[name] = group.buffers[group.next]
             self._require_finite(name, group, result[name])
+        self._fresh.zero_()
         return result
 
     def compute_final(self) -> dict[str, Tensor]:
         """The same into a buffer of its own; nothing that has a memory moves on."""
+        draws = self._draws(_FINAL)
         for name, group in self.groups.items():
-            self._fill(group, self._final_views[name])
+            self._fill(group, self._final_views[name], draws, advance=False)
             self._require_finite(name, group, self._final[name])
         return self._final
 
+    def again(self) -> dict[str, Tensor]:
+        """The observations that `compute` gave last, after `load_state_dict`."""
+        result, draws = {}, self._draws(np.uint64(0))
+        for name, group in self.groups.items():
+            if not _remembers(group):
+                self._fill(group, group.views[group.next], draws, advance=True)
+            result[name] = group.buffers[group.next]
+        return result
+
     def reset(self, selection: Selection) -> None:
-        """Tell terms with memory."""
+        """New episodes begin: histories and delays start from their first value."""
+        selection.write(self._fresh, True)
         for group in self.groups.values():
-            for term in group.terms:
-                term.reset(selection)
+            for pipeline in group.pipelines:
+                pipeline.term.reset(selection)
+                pipeline.reset(selection)
 
-    def sizes(self, group: str) -> list[tuple[BoundTerm, int]]:
-        """The terms of a group with their columns."""
-        return list(zip(self.groups[group].terms, self.groups[group].sizes, strict=True))
+    def pipelines(self, group: str) -> list[Pipeline]:
+        """The terms of a group with what is done to them."""
+        return self.groups[group].pipelines
 
-    def _fill(self, group: _Group, views: list[Tensor]) -> None:
-        for term, view, adjust in zip(group.terms, views, group.adjust, strict=True):
-            view.copy_(term.call())
-            if adjust is not None:
-                adjust(view)
+    def state_dict(self) -> dict[str, Tensor]:
+        """What pipelines carry from step to step, and the last observations of the groups that do."""
+        state = {name: tensor.clone() for name, tensor in self._tensors().items()}
+        for name, group in self.groups.items():
+            if _remembers(group):
+                state[f"last.{name}"] = group.buffers[group.next].clone()
+        return state
 
-    def _group(self, terms: list[BoundTerm], device: torch.device) -> _Group:
-        sizes = []
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `state_dict` gave."""
+        for name, tensor in self._tensors().items():
+            tensor.copy_(state[name])
+        for name, group in self.groups.items():
+            if _remembers(group):
+                group.buffers[group.next].copy_(state[f"last.{name}"])
+        self._fresh.zero_()
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {
+            f"{name}.{pipeline.term.name}.{key}": tensor
+            for name, group in self.groups.items()
+            for pipeline in group.pipelines
+            for key, tensor in pipeline.tensors().items()
+        }
+
+    def _draws(self, salt: np.uint64) -> Draws:
+        everyone: list[Selection] = []  # made when somebody draws, once a step
+
+        def draws(stream: np.uint64) -> Selection:
+            if not everyone:
+                everyone.append(self._now())
+            return everyone[0].stream(stream ^ salt)
+
+        return draws
+
+    def _fill(self, group: _Group, views: list[Tensor], draws: Draws, *, advance: bool) -> None:
+        for pipeline, view in zip(group.pipelines, views, strict=True):
+            pipeline.write(view, draws, self._fresh, advance)
+
+    def _group(self, terms: list[BoundTerm], config: ObservationGroupConfig) -> _Group:
+        pipelines = []
         for term in terms:
             value = first_value(term)
             width = value.shape[1] if isinstance(value, Tensor) and value.dim() == 2 else 1
             check_shape(term, value, (self.num_envs, width), "observations")
-            sizes.append(width)
-        buffers = [torch.zeros(self.num_envs, sum(sizes), device=device) for _ in range(3)]
-        adjust = [_adjustment(term, size, device) for term, size in zip(terms, sizes, strict=True)]
-        return _Group(terms, sizes, buffers, [_split(buffer, sizes) for buffer in buffers], adjust)
+            pipelines.append(Pipeline(term, width, config, self.num_envs, self._step_dt, self._device, self._live))
+        size = sum(pipeline.size for pipeline in pipelines)
+        buffers = [torch.zeros(self.num_envs, size, device=self._device) for _ in range(3)]
+        return _Group(pipelines, buffers, [_split(buffer, pipelines) for buffer in buffers])
 
     def _require_finite(self, name: str, group: _Group, values: Tensor) -> None:
         if self._watch is not None:
@@ -94,33 +159,19 @@ class ObservationManager:
             return
         if is_finite(values):
             return
-        for term, view in zip(group.terms, _split(values, group.sizes), strict=True):
+        for pipeline, view in zip(group.pipelines, _split(values, group.pipelines), strict=True):
             bad = ~view.isfinite().all(dim=1)
             if bool(bad.any()):
-                first = int(bad.nonzero()[0, 0])
+                term, first = pipeline.term, int(bad.nonzero()[0, 0])
                 raise DivergedError(
                     f"observation '{name}.{term.name}' ({term.config.func}) is not finite in {int(bad.sum())}"
                     f" environments, first in environment {first}"
                 )
 
 
-def _split(buffer: Tensor, sizes: list[int]) -> list[Tensor]:
-    return list(buffer.split(sizes, dim=1))
+def _remembers(group: _Group) -> bool:
+    return any(pipeline.has_memory for pipeline in group.pipelines)
 
 
-def _adjustment(term: BoundTerm, size: int, device: torch.device) -> Callable[[Tensor], None] | None:
-    clip, scale = term.config.clip, term.config.scale  # type: ignore[attr-defined]
-    if clip is None and scale is None:
-        return None
-    factor = torch.tensor(1.0 if scale is None else scale, device=device)
-    if factor.dim() == 1 and len(factor) != size:
-        path = ".".join(map(str, (*term.path, "scale")))
-        raise ConfigError([Problem("observations", path, f"has {len(factor)} values for {size} columns")])
-
-    def adjust(view: Tensor) -> None:
-        if clip is not None:
-            view.clamp_(*clip)
-        if scale is not None:
-            view.mul_(factor)
-
-    return adjust
+def _split(buffer: Tensor, pipelines: list[Pipeline]) -> list[Tensor]:
+    return list(buffer.split([pipeline.size for pipeline in pipelines], dim=1))

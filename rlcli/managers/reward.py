@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import DivergedError
+from rlcli.managers.live import LiveValues
 from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.managers.termination import DIVERGED
 from rlcli.sim.selection import Selection
 
 
 class RewardManager:
-    """Terms with weight 0 are not called.
+    """Terms whose weight is 0 and stays so are not called.
 
     Where a `divergence_reward` is configured, what it paid is kept as a term of its own.
     """
@@ -25,26 +26,29 @@ class RewardManager:
         num_envs: int,
         dt: float,
         device: torch.device,
+        live: LiveValues,
         divergence_reward: float | None = None,
     ) -> None:
         self.terms = terms
-        self._factors = [term.config.weight * dt for term in terms]  # type: ignore[attr-defined]
+        self._dt = dt
+        weights = [live.get((*term.path, "weight"), term.config.weight) for term in terms]  # type: ignore[attr-defined]
         self._values = torch.zeros(len(terms), num_envs, device=device)
         self._sums = torch.zeros(len(terms), num_envs, device=device)
         self._sums_by_env = self._sums.t()
         self._rows = list(self._values.unbind(0))
         self._divergence_reward = divergence_reward
         self._divergence_sums = torch.zeros(num_envs, device=device)
+        self._moved = [(row, weight) for row, weight in zip(self._rows, weights, strict=True) if _moves(weight)]
         self._active = [
-            (term.call, row, factor)
-            for term, row, factor in zip(terms, self._rows, self._factors, strict=True)
-            if factor != 0.0
+            (term.call, row, 1.0 if _moves(weight) else weight * dt)
+            for term, row, weight in zip(terms, self._rows, weights, strict=True)
+            if _moves(weight) or weight * dt != 0.0
         ]
         self._totals = [torch.zeros(num_envs, device=device) for _ in range(3)]
         self._next = 0
         self._fused = device.type == "cuda"
-        for term, factor in zip(terms, self._factors, strict=True):
-            if factor != 0.0:
+        for term, weight in zip(terms, weights, strict=True):
+            if _moves(weight) or weight != 0.0:
                 check_shape(term, first_value(term), (num_envs,), "rewards")
 
     def compute(self) -> Tensor:
@@ -55,6 +59,8 @@ class RewardManager:
         """
         for call, row, factor in self._active:
             torch.mul(call(), factor, out=row)
+        for row, weight in self._moved:
+            row.mul_(weight * self._dt)
         self._next = (self._next + 1) % len(self._totals)
         if self._fused:
             total = torch.sum(self._values, dim=0, out=self._totals[self._next])
@@ -112,3 +118,8 @@ class RewardManager:
         """Take back what `state_dict` gave."""
         self._sums.copy_(state["sums"])
         self._divergence_sums.copy_(state["divergence_sums"])
+
+
+def _moves(weight: float | Tensor) -> bool:
+    """Whether a curriculum changes a weight."""
+    return isinstance(weight, Tensor)

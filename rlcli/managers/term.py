@@ -16,6 +16,7 @@ from rlcli.config.schema import TermConfig
 from rlcli.config.strict_yaml import Path
 from rlcli.config.terms import SELECTORS, Signature
 from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
+from rlcli.managers.live import LiveValues
 from rlcli.random import stream
 from rlcli.registry import load_module
 from rlcli.sim.names import NameProblem
@@ -42,6 +43,10 @@ class BoundTerm:
         """The object of a class term; the function of a function term."""
         return self.call
 
+    def error(self, message: str, *keys: str) -> ConfigError:
+        """What is wrong with the term, or with a key of it."""
+        return ConfigError([Problem(str(self.path[0]), ".".join(map(str, (*self.path, *keys))), message)])
+
     def reset(self, selection: Any) -> None:
         """Tell a term with memory that these environments start a new episode."""
         if hasattr(self.call, "reset"):
@@ -64,6 +69,9 @@ class Binder:
         self.env = env
         self.resolved = resolved
         self.problems: list[Problem] = []
+        self.live = LiveValues(resolved.task, env.device)
+        self._commands: dict[str, BoundTerm] = {}
+        self._open_addresses()
 
     def bind(self, section: str, path: Path, config: TermConfig) -> BoundTerm | None:
         """A bound term, or None if something in it does not resolve."""
@@ -85,11 +93,14 @@ class Binder:
         """The terms of a section, in order."""
         configs = getattr(self.resolved.task, section)
         bound = [self.bind(section, (section, name), config) for name, config in configs.items()]
-        return [term for term in bound if term is not None]
+        terms = [term for term in bound if term is not None]
+        if section == "commands":
+            self._commands = {term.name: term for term in terms}
+        return terms
 
     def bind_group(self, group: str) -> list[BoundTerm]:
         """The terms of an observation group, in order."""
-        configs = self.resolved.task.observations[group]
+        configs = self.resolved.task.observations[group].terms
         bound = [self.bind("observations", ("observations", group, name), c) for name, c in configs.items() if c]
         return [term for term in bound if term is not None]
 
@@ -139,6 +150,16 @@ class Binder:
                     return None, elements
                 params[parameter.name] = entity
         for parameter in signature.parameters:
+            name = parameter.name
+            if parameter.alias == "Command":
+                params[name] = self._command(path, name, params[name])
+                good = good and params[name] is not None
+            elif parameter.alias == "Address":
+                params[name] = self._opened.get((*path, name))
+                good = good and params[name] is not None
+            else:
+                params[name] = self.live.get((*path, name), params[name])
+        for parameter in signature.parameters:
             if parameter.alias in SELECTORS and params[parameter.name] is not None:
                 try:
                     index, names = params["entity"].select(parameter.alias, params[parameter.name])
@@ -148,6 +169,29 @@ class Binder:
                     continue
                 params[parameter.name], elements[parameter.name] = index, names
         return (params if good else None), elements
+
+    def _open_addresses(self) -> None:
+        """Find what the curriculum changes before anybody binds to it."""
+        self._opened: dict[Path, Tensor] = {}
+        for name, config in self.resolved.task.curriculum.items():
+            signature = self.resolved.vocabulary.find("curriculum", config.func) if config is not None else None
+            for parameter in signature.parameters if signature is not None else ():
+                if parameter.alias == "Address":
+                    path = ("curriculum", name)
+                    assert config is not None
+                    try:
+                        self._opened[*path, parameter.name] = self.live.open(config.params[parameter.name])
+                    except NameProblem as problem:
+                        self._problem(path, parameter.name, str(problem), problem.hint)
+
+    def _command(self, path: Path, parameter: str, name: str) -> Any:
+        if name in self._commands:
+            return self._commands[name].instance
+        names = [command for command, config in self.resolved.task.commands.items() if config is not None]
+        if name not in names:  # else its own problem has been said
+            have = f"commands: {listing(names)}" if names else "the task has no commands: section"
+            self._problem(path, parameter, f"no command '{name}'", did_you_mean(name, names) or have)
+        return None
 
     def _problem(self, path: Path, parameter: str, message: str, hint: str | None) -> None:
         self.problems.append(self.resolved.problem((*path, parameter), message, hint))

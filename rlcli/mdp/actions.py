@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import mujoco
 import numpy as np
@@ -12,19 +12,25 @@ import torch
 from torch import Tensor
 
 from rlcli.managers.action import CommandMap
-from rlcli.sim.entity import as_index
-from rlcli.sim.names import NameProblem
-from rlcli.sim.selection import Columns
-from rlcli.task import Entity, Joints, Range
+from rlcli.sim.actuators import JointCommand
+from rlcli.sim.kinematics import Jacobian
+from rlcli.sim.names import NameProblem, match
+from rlcli.sim.rotations import conjugate, multiply, rotate, rotation_vector
+from rlcli.sim.selection import Columns, Selection, one_column
+from rlcli.task import Bodies, Entity, Joints, Range
 
 if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
 
 
+ByJoint = float | dict[str, float]
+
+
 class _JointAction:
-    """raw x scale + offset, then clip, then the actuators of `joints`, in exactly the order written."""
+    """raw x scale + offset, then clip, then what drives `joints`, in exactly the order written."""
 
     actuator: ClassVar[str]
+    """What the scene gives joints that nothing of the kind drives."""
     unit: str
 
     def __init__(
@@ -32,34 +38,28 @@ class _JointAction:
         env: ManagedEnv,
         entity: Entity,
         joints: Columns,
-        scale: float,
-        offset: Tensor | float,
-        clip: Range | None,
+        scale: ByJoint | Tensor,
+        offset: Tensor | ByJoint,
+        clip: Range | dict[str, Range] | None,
     ) -> None:
-        columns = torch.arange(len(entity.joint_names), device=env.device)[joints].tolist()
-        driven = dict(entity.actuators_of(self.actuator))
+        self._entity, self._joints = entity, joints
+        columns = torch.arange(len(entity.joint_names))[joints if isinstance(joints, slice) else joints.cpu()].tolist()
         self.elements = tuple(entity.joint_names[c] for c in columns)
-        missing = [name for name, c in zip(self.elements, columns, strict=True) if c not in driven]
-        if missing:
-            raise NameProblem(f"no {self.actuator} actuator drives {', '.join(missing)}")
-        self.actuators = actuators = [driven[c] for c in columns]
+        self._drive = JointCommand(entity, self.actuator, columns)
+        self.actuators = self._drive.actuators
         self.size = len(columns)
-        self._scale, self._offset, self._clip = scale, offset, clip
-        gear = torch.tensor(entity.engine.model.actuator_gear[actuators, 0], dtype=torch.float32, device=env.device)
-        self._factor = 1.0 / gear if self.actuator == "motor" else gear
-        self._geared = bool((gear != 1.0).any())
-        self._limits = _command_limits(entity.engine.model, actuators, self.actuator)
-        self._ctrl = entity.engine.field("ctrl")
-        self._columns = as_index(actuators, env.device)
-        # consecutive controls: a view of the engine's own, made once
-        self._target = self._ctrl[:, self._columns] if isinstance(self._columns, slice) else None
+        self._scale, self._offset = self._by_joint(scale, 1.0, env), self._by_joint(offset, 0.0, env)
+        self._clip = self._bounds(clip, env)
+        self._limits = _command_limits(entity.engine.model, self.actuators, self.actuator)
         self.command = torch.zeros(env.num_envs, self.size, device=env.device)
         """What reaches the actuators, before their own limits. (num_envs, size)"""
 
     def command_map(self) -> CommandMap:
         """What `process` computes, and the limits of the actuators behind it."""
-        offset = self._offset[0].tolist() if isinstance(self._offset, Tensor) else [self._offset] * self.size
-        return CommandMap((self._scale,) * self.size, tuple(offset), self._clip, self._limits)
+        scale = [self._scale] * self.size if isinstance(self._scale, float) else _row(self._scale)
+        offset = [self._offset] * self.size if isinstance(self._offset, float) else _row(self._offset)
+        clip = None if self._clip is None else tuple(zip(*(_row(end) for end in self._clip), strict=True))
+        return CommandMap(tuple(scale), tuple(offset), clip, self._limits)
 
     def process(self, action: Tensor) -> None:
         """Write the controls of this step. (num_envs, size)"""
@@ -68,11 +68,26 @@ class _JointAction:
             self.command += self._offset
         if self._clip is not None:
             self.command.clamp_(*self._clip)
-        command = self.command * self._factor if self._geared else self.command
-        if self._target is not None:
-            self._target.copy_(command)
-        else:
-            self._ctrl[:, self._columns] = command.to(self._ctrl.dtype)
+        self._drive.write(self.command)
+
+    def _by_joint(self, value: ByJoint | Tensor, default: float, env: ManagedEnv) -> float | Tensor:
+        """A number, or one for each column; a mapping leaves joints that it does not name at `default`."""
+        if not isinstance(value, dict):
+            return value
+        values = torch.full((self.size,), default)
+        for pattern, number in value.items():
+            values[match(pattern, self.elements, "joint")] = number
+        return values.to(env.device)
+
+    def _bounds(self, clip: Range | dict[str, Range] | None, env: ManagedEnv) -> tuple[Tensor, Tensor] | None:
+        if clip is None:
+            return None
+        ends = {".*": clip} if not isinstance(clip, dict) else clip
+        low = self._by_joint({pattern: pair[0] for pattern, pair in ends.items()}, -math.inf, env)
+        high = self._by_joint({pattern: pair[1] for pattern, pair in ends.items()}, math.inf, env)
+        assert isinstance(low, Tensor)
+        assert isinstance(high, Tensor)
+        return low, high
 
 
 class JointEffort(_JointAction):
@@ -87,9 +102,9 @@ class JointEffort(_JointAction):
         *,
         entity: Entity = "robot",
         joints: Joints = ".*",
-        scale: float = 1.0,
-        offset: float = 0.0,
-        clip: Range | None = None,
+        scale: float | dict[str, float] = 1.0,
+        offset: float | dict[str, float] = 0.0,
+        clip: Range | dict[str, Range] | None = None,
     ) -> None:
         super().__init__(env, entity, joints, scale, offset, clip)
 
@@ -109,19 +124,312 @@ class JointPosition(_JointAction):
         *,
         entity: Entity = "robot",
         joints: Joints = ".*",
-        scale: float = 1.0,
-        offset: float = 0.0,
+        scale: float | dict[str, float] = 1.0,
+        offset: float | dict[str, float] = 0.0,
         use_default_offset: bool = True,
-        clip: Range | None = None,
+        clip: Range | dict[str, Range] | None = None,
     ) -> None:
-        default = entity.data.default_joint_pos[:, joints] + offset if use_default_offset else offset
-        super().__init__(env, entity, joints, scale, default, clip)
+        super().__init__(env, entity, joints, scale, offset, clip)
+        if use_default_offset:
+            self._offset = entity.data.default_joint_pos[:, joints] + self._offset
 
 
-def _command_limits(model: mujoco.MjModel, actuators: list[int], kind: str) -> tuple[tuple[float, float], ...]:
+class JointVelocity(_JointAction):
+    """Targets of velocity actuators: raw x scale + offset [m/s or rad/s]. Isaac Lab: JointVelocityAction."""
+
+    actuator = "velocity"
+    unit = "m/s or rad/s"
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        joints: Joints = ".*",
+        scale: float | dict[str, float] = 1.0,
+        offset: float | dict[str, float] = 0.0,
+        use_default_offset: bool = True,
+        clip: Range | dict[str, Range] | None = None,
+    ) -> None:
+        super().__init__(env, entity, joints, scale, offset, clip)
+        if use_default_offset:
+            self._offset = entity.data.default_joint_vel[:, joints] + self._offset
+
+
+class _OfTheState(_JointAction):
+    """A joint action whose command depends on more than this step's action: an export leaves it to the robot's side."""
+
+    command_map = None  # type: ignore[assignment]
+
+    def process(self, action: Tensor) -> None:
+        """Write the controls of this step. (num_envs, size)"""
+        self.command.copy_(self._target(action))
+        if self._clip is not None:
+            self.command.clamp_(*self._clip)
+        self._drive.write(self.command)
+
+    def _target(self, action: Tensor) -> Tensor:
+        raise NotImplementedError
+
+
+class RelativeJointPosition(_OfTheState):
+    """Targets of position actuators: the joint's position of this step + raw x scale [m or rad].
+
+    Isaac Lab: RelativeJointPositionAction.
+    """
+
+    actuator = "position"
+    unit = "m or rad"
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        joints: Joints = ".*",
+        scale: float | dict[str, float] = 1.0,
+        clip: Range | dict[str, Range] | None = None,
+    ) -> None:
+        super().__init__(env, entity, joints, scale, 0.0, clip)
+
+    def _target(self, action: Tensor) -> Tensor:
+        return self._entity.data.joint_pos[:, self._joints] + action * self._scale
+
+
+class JointPositionToLimits(_OfTheState):
+    """Targets of position actuators: raw x scale, within [-1, 1], stretched over the soft limits [m or rad].
+
+    With `rescale_to_limits: false` it is the target itself, kept within the limits. Isaac Lab:
+    JointPositionToLimitsAction.
+    """
+
+    actuator = "position"
+    unit = "m or rad"
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        joints: Joints = ".*",
+        scale: float | dict[str, float] = 1.0,
+        rescale_to_limits: bool = True,
+        clip: Range | dict[str, Range] | None = None,
+    ) -> None:
+        super().__init__(env, entity, joints, scale, 0.0, clip)
+        self._rescale = rescale_to_limits
+        limits = entity.data.soft_joint_pos_limits[joints]
+        if rescale_to_limits and not bool(limits.isfinite().all()):
+            unlimited = self.elements[int((~limits.isfinite().all(dim=-1)).nonzero()[0, 0])]
+            raise NameProblem(
+                f"joint '{unlimited}' has no limits to stretch over", "give it a range, or another action"
+            )
+
+    def _target(self, action: Tensor) -> Tensor:
+        low, high = self._entity.data.soft_joint_pos_limits[self._joints].unbind(-1)
+        raw = action * self._scale
+        if not self._rescale:
+            return raw.clamp(low, high)
+        return 0.5 * (raw.clamp(-1.0, 1.0) * (high - low) + high + low)
+
+
+class EmaJointPositionToLimits(JointPositionToLimits):
+    """The same, averaged over time: alpha x new target + (1 - alpha) x the target before, from the joint's position.
+
+    Isaac Lab: EMAJointPositionToLimitsAction.
+    """
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        joints: Joints = ".*",
+        scale: float | dict[str, float] = 1.0,
+        rescale_to_limits: bool = True,
+        alpha: float | dict[str, float] = 1.0,
+        clip: Range | dict[str, Range] | None = None,
+    ) -> None:
+        super().__init__(env, entity=entity, joints=joints, scale=scale, rescale_to_limits=rescale_to_limits, clip=clip)
+        self._alpha = self._by_joint(alpha, 1.0, env)
+        self._before = torch.zeros_like(self.command)
+        self._fresh = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
+
+    def _target(self, action: Tensor) -> Tensor:
+        low, high = self._entity.data.soft_joint_pos_limits[self._joints].unbind(-1)
+        before = torch.where(self._fresh[:, None], self._entity.data.joint_pos[:, self._joints], self._before)
+        target = (self._alpha * super()._target(action) + (1.0 - self._alpha) * before).clamp(low, high)
+        self._before.copy_(target)
+        self._fresh.zero_()
+        return target
+
+    def reset(self, selection: Selection) -> None:
+        """New episodes average from where their joints start."""
+        selection.write(self._fresh, True)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The target before."""
+        return {"before": self._before.clone(), "fresh": self._fresh.clone()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state_dict` gave."""
+        self._before.copy_(state["before"])
+        self._fresh.copy_(state["fresh"])
+
+
+class _BinaryJoint(_JointAction):
+    """One column opens or closes several joints: open where it is not negative."""
+
+    command_map = None  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        entity: Entity,
+        joints: Columns,
+        open_command: dict[str, float],
+        close_command: dict[str, float],
+        threshold: float,
+    ) -> None:
+        super().__init__(env, entity, joints, 1.0, 0.0, None)
+        self._open, self._close = (self._all(c, w, env) for c, w in ((open_command, "open"), (close_command, "close")))
+        self._threshold = threshold
+        self.elements, self.size = (",".join(self.elements),), 1
+
+    def process(self, action: Tensor) -> None:
+        """Write the controls of this step. (num_envs, 1)"""
+        self.command.copy_(torch.where(action < self._threshold, self._close, self._open))
+        self._drive.write(self.command)
+
+    def _all(self, command: dict[str, float], which: str, env: ManagedEnv) -> Tensor:
+        values = self._by_joint(command, math.nan, env)
+        assert isinstance(values, Tensor)
+        if bool(values.isnan().any()):
+            name = self.elements[int(values.isnan().nonzero()[0, 0])]
+            raise NameProblem(f"{which}_command has no value for joint '{name}'")
+        return values
+
+
+class BinaryJointPosition(_BinaryJoint):
+    """A gripper by position: `open_command` where raw >= threshold, else `close_command` [m or rad].
+
+    Isaac Lab: BinaryJointPositionAction, and AbsBinaryJointPositionAction with its threshold.
+    """
+
+    actuator = "position"
+    unit = "m or rad"
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        joints: Joints,
+        open_command: dict[str, float],
+        close_command: dict[str, float],
+        threshold: float = 0.0,
+    ) -> None:
+        super().__init__(env, entity, joints, open_command, close_command, threshold)
+
+
+class BinaryJointVelocity(_BinaryJoint):
+    """A gripper by velocity: `open_command` where raw >= threshold, else `close_command` [m/s or rad/s].
+
+    Isaac Lab: BinaryJointVelocityAction.
+    """
+
+    actuator = "velocity"
+    unit = "m/s or rad/s"
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        joints: Joints,
+        open_command: dict[str, float],
+        close_command: dict[str, float],
+        threshold: float = 0.0,
+    ) -> None:
+        super().__init__(env, entity, joints, open_command, close_command, threshold)
+
+
+class DifferentialInverseKinematics(_OfTheState):
+    """Joint position targets that move a body's frame to a pose, by damped least squares [m or rad].
+
+    dq = J^T (J J^T + damping^2 I)^-1 e, with J the body's geometric Jacobian and e the error of its pose in the root's
+    frame, once a step. `mode` position takes 3 columns, pose 7 (position, quaternion w x y z), or 6 if `relative`
+    (position, axis times angle): relative ones are x scale and added to where the body is. The pose is that of a point
+    `offset_pos`, `offset_quat` in the body's frame. Isaac Lab: DifferentialInverseKinematicsAction (ik_method dls).
+    """
+
+    actuator = "position"
+    unit = "m or rad"
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        joints: Joints = ".*",
+        bodies: Bodies,
+        mode: Literal["position", "pose"] = "pose",
+        relative: bool = False,
+        scale: float = 1.0,
+        damping: float = 0.01,
+        offset_pos: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        offset_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+        clip: Range | dict[str, Range] | None = None,
+    ) -> None:
+        super().__init__(env, entity, joints, scale, 0.0, clip)
+        self._body = one_column(bodies, len(entity.body_ids), "bodies")
+        self._mode, self._relative, self._damping = mode, relative, damping
+        self._point = torch.tensor(offset_pos, device=env.device)
+        self._turn = torch.tensor(offset_quat, device=env.device)
+        columns = [entity.joint_names.index(name) for name in self.elements]
+        self._jacobian = Jacobian(entity, columns, self._body)
+        self.joint_names = self.elements
+        parts = ["x", "y", "z"] + ([] if mode == "position" else ["rx", "ry", "rz"] if relative else list("wijk"))
+        self.elements, self.size = tuple(parts), len(parts)
+
+    def _target(self, action: Tensor) -> Tensor:
+        data = self._entity.data
+        quat = data.body_quat_w[:, self._body]
+        arm = rotate(quat, self._point.expand(len(quat), 3))
+        position, quat = data.body_pos_w[:, self._body] + arm, multiply(quat, self._turn.expand(len(quat), 4))
+        error = self._error(action * self._scale, position, quat)
+        jacobian = self._jacobian(position)[:, : error.shape[1]]
+        square = jacobian @ jacobian.mT + self._damping**2 * torch.eye(error.shape[1], device=error.device)
+        step = jacobian.mT @ torch.linalg.solve_ex(square, error[:, :, None])[0]
+        return data.joint_pos[:, self._joints] + step[:, :, 0]
+
+    def _error(self, asked: Tensor, position: Tensor, quat: Tensor) -> Tensor:
+        """What is left to the asked pose, world frame: position, and axis times angle. (num_envs, 3 or 6)"""
+        root = self._entity.data
+        if self._relative:
+            move = rotate(root.root_quat_w, asked[:, :3])
+            if self._mode == "position":
+                return move
+            return torch.cat([move, rotate(root.root_quat_w, asked[:, 3:])], dim=1)
+        move = root.root_pos_w + rotate(root.root_quat_w, asked[:, :3]) - position
+        if self._mode == "position":
+            return move
+        wanted = multiply(root.root_quat_w, torch.nn.functional.normalize(asked[:, 3:], dim=1))
+        return torch.cat([move, rotation_vector(multiply(wanted, conjugate(quat)))], dim=1)
+
+
+def _row(values: Tensor) -> list[float]:
+    """What all environments share of a setting. (k,) or (num_envs, k)"""
+    return (values[0] if values.dim() == 2 else values).tolist()
+
+
+def _command_limits(model: mujoco.MjModel, actuators: list[int | None], kind: str) -> tuple[tuple[float, float], ...]:
     """Commands beyond which each actuator gives no more: its control range, and what bounds a motor's force."""
     limits = []
     for a in actuators:
+        if a is None:  # a model limits efforts, not commands
+            limits.append((-math.inf, math.inf))
+            continue
         gain, gear, joint = model.actuator_gainprm[a, 0], model.actuator_gear[a, 0], model.actuator_trnid[a, 0]
         low, high = model.actuator_ctrlrange[a] if model.actuator_ctrllimited[a] else (-math.inf, math.inf)
         if not gain or not gear:

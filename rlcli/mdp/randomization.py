@@ -51,7 +51,8 @@ class _Draw:
         lowest: float | None = None,
     ) -> None:
         self._env = env
-        pairs = list(range) if isinstance(range, list) else [range]
+        many = range.dim() == 2 if isinstance(range, Tensor) else isinstance(range, list)
+        pairs: list[Pair] = list(range) if many else [range]  # type: ignore
         if len(pairs) not in (1, shape[1]):
             raise NameProblem(f"range has {len(pairs)} pairs for {shape[1]} axes", "one pair for all, or one for each")
         _check(pairs, distribution)
@@ -81,7 +82,7 @@ class _Draw:
 
 
 def _check(pairs: list[Pair], distribution: str) -> None:
-    for pair in pairs:
+    for pair in (pair.tolist() if isinstance(pair, Tensor) else pair for pair in pairs):
         before = [end.begin if isinstance(end, Schedule) else end for end in pair]
         after = [end.end if isinstance(end, Schedule) else end for end in pair]
         for first, second in (before, after):

@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -45,8 +45,8 @@ _RANDOM = 256
 Run = Callable[[Tensor], dict[str, Tensor]]
 
 
-class ObservationColumns(BaseModel):
-    """Columns of `obs`, as the checkpoint's layout has them."""
+class _Columns(BaseModel):
+    """Columns of a term, as the checkpoint's layout has them."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -55,21 +55,30 @@ class ObservationColumns(BaseModel):
     elements: list[str]
     unit: str
     scale: list[float] | None
-    clip: tuple[float, float] | None
 
     @model_validator(mode="after")
-    def _widths(self) -> ObservationColumns:
-        for key in ("scale", "offset", "limits"):
-            values = getattr(self, key, None)
+    def _widths(self) -> Self:
+        own = ("offset", "clip", "limits") if isinstance(self, ActionColumns) else ()
+        for key in ("scale", *own):
+            values = getattr(self, key)
             if values is not None and len(values) != self.size:
                 raise ValueError(f"{key} has {len(values)} values for {self.size} columns")
         return self
 
 
-class ActionColumns(ObservationColumns):
+class ObservationColumns(_Columns):
+    """Columns of an observation term; with a history those of the oldest step first."""
+
+    clip: tuple[float, float] | None
+    history: int = Field(ge=1)
+    modifiers: list[dict[str, Any]]
+
+
+class ActionColumns(_Columns):
     """Columns of `action` and of `command`. Without a scale the command is the action, within `clip`."""
 
     offset: list[float] | None
+    clip: list[tuple[float | None, float | None]] | None
     limits: list[tuple[float | None, float | None]] | None
 
 
@@ -109,8 +118,9 @@ class Deployed(nn.Module):
         self.scaled = any(term.scale is not None for term in actions)
         self.register_buffer("scale", _row(term.scale or [1.0] * term.size for term in actions))
         self.register_buffer("offset", _row(term.offset or [0.0] * term.size for term in actions))
-        clip = [[_finite(term.clip)] * term.size for term in actions]
-        limits = [[_finite(pair) for pair in term.limits or [(None, None)] * term.size] for term in actions]
+        free = [(None, None)]
+        clip = [[_finite(pair) for pair in term.clip or free * term.size] for term in actions]
+        limits = [[_finite(pair) for pair in term.limits or free * term.size] for term in actions]
         for name, pairs in (("clip", clip), ("limits", limits)):
             bounds = _row(pairs)
             self.register_buffer(name, bounds.T.contiguous() if bool(bounds.isfinite().any()) else None)
@@ -186,8 +196,9 @@ def describe(checkpoint: Checkpoint, policy: Policy, layout: LayoutRecord) -> di
             "name": "obs",
             "shape": ["batch", spec.observation_size],
             "dtype": "float32",
-            "meaning": f"the environment's observation group '{spec.group}': each term's value, clipped to `clip`, then"
-            " times `scale`, side by side in the order of `observations`; nothing else is done to it outside",
+            "meaning": f"the environment's observation group '{spec.group}': each term's value after its `modifiers`,"
+            " clipped to `clip`, then times `scale`; its last `history` steps, the oldest first; side by side in the"
+            " order of `observations`; nothing else is done to it outside",
         },
         "outputs": {
             "action": {
@@ -204,7 +215,7 @@ def describe(checkpoint: Checkpoint, policy: Policy, layout: LayoutRecord) -> di
             },
         },
         "observations": [
-            {**term.model_dump(mode="json"), "columns": columns, "history": 1}
+            {**term.model_dump(mode="json"), "columns": columns}
             for term, columns in zip(terms, _columns(terms), strict=True)
         ],
         "actions": [
@@ -216,7 +227,7 @@ def describe(checkpoint: Checkpoint, policy: Policy, layout: LayoutRecord) -> di
             for term, columns in zip(layout.actions, _columns(layout.actions), strict=True)
         ],
         "applied": {
-            "before_obs": ["observations.clip", "observations.scale"],
+            "before_obs": ["observations.modifiers", "observations.clip", "observations.scale"],
             "inside": [*(["normalizer"] if normalized else []), "action_bound"],
             "between_action_and_command": ["actions.scale", "actions.offset", "actions.clip", "actions.limits"],
         },

@@ -99,7 +99,7 @@ def _fields(record: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     return fields
 
 
-_CONTRACT = ("name", "size", "elements", "scale", "offset", "clip")
+_CONTRACT = ("name", "size", "elements", "scale", "offset", "clip", "history", "modifiers")
 """Of a term: what a policy was trained with. Units are words, and limits belong to the machine that is driven."""
 
 
@@ -117,7 +117,9 @@ def _text(term: Mapping[str, Any] | None) -> str:
     if "size" not in term:
         return str(term["name"])
     elements = ", ".join(term.get("elements", []))
-    factors = [f"{key} {_rounded(term[key])}" for key in ("scale", "offset", "clip") if term.get(key)]
+    factors = [f"{key} {_rounded(term[key])}" for key in ("scale", "offset", "clip", "modifiers") if term.get(key)]
+    if term.get("history", 1) > 1:
+        factors.append(f"history {term['history']}")
     return ", ".join([f"{term['name']} ({term['size']}{': ' + elements if elements else ''})", *factors])
 
 

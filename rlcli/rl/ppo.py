@@ -128,7 +128,7 @@ class PpoTrainer:
             update = collected.elapsed_time(learned) / 1e3
             seconds = {"rollout": total - update, "update": update}
         notes, self._notes[:] = list(self._notes), []
-        task = {f"Task/{name}": value for name, value in self.env.extras().items() if math.isfinite(value)}
+        task = {name: value for name, value in self.env.extras().items() if math.isfinite(value)}
         return Report({**self.statistics.flush(), **task, **losses}, seconds, notes)
 
     def _now(self) -> Any:

@@ -136,7 +136,7 @@ class Sb3Trainer:
             "policy": collected - begin - step,
             "update": updated - collected,
         }
-        task = {f"Task/{name}": value for name, value in self.env.extras().items() if math.isfinite(value)}
+        task = {name: value for name, value in self.env.extras().items() if math.isfinite(value)}
         return Report({**self.statistics.flush(), **task, **metrics}, seconds)
 
     def policy(self) -> Policy:

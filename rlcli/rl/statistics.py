@@ -16,8 +16,9 @@ class EpisodeStatistics:
     """Gathers the episodes of an iteration; returns and lengths are means over the last iterations with 100 episodes.
 
     `Episode_Reward/<term>` is the mean episodic sum over the episode's full length in seconds (Isaac Lab's
-    definition); `Episode_Termination/<term>` the share of episodes at whose end the term had fired. Sums are kept where
-    the episodes are, so that adding them never waits for a device.
+    definition); `Episode_Termination/<term>` the share of episodes at whose end the term had fired;
+    `Metrics/<command>/<metric>` the mean of episodes' means. Sums are kept where the episodes are, so that adding them
+    never waits for a device.
     """
 
     WINDOW = 100
@@ -33,6 +34,7 @@ class EpisodeStatistics:
         if episodes is None:
             return
         values = {"return": episodes.returns, **{f"term.{k}": v for k, v in episodes.reward_terms.items()}}
+        values |= {f"metric.{k}": v for k, v in episodes.metrics.items()}
         facts = {f"cause.{k}": v for k, v in episodes.causes.items()}
         if episodes.success is not None:
             facts["success"] = episodes.success
@@ -97,5 +99,6 @@ class EpisodeStatistics:
             return {}
         scale = 1.0 / (count * self._episode_length_s)
         shares = {f"Episode_Reward/{n.removeprefix('term.')}": v * scale for n, v in sums.items() if n[:5] == "term."}
-        causes = {n.removeprefix("cause."): v / count for n, v in sums.items() if n.startswith("cause.")}
-        return {**shares, **{f"Episode_Termination/{name}": share for name, share in causes.items()}}
+        causes = {f"Episode_Termination/{n.removeprefix('cause.')}": v for n, v in sums.items() if n[:6] == "cause."}
+        metrics = {f"Metrics/{n.removeprefix('metric.')}": v for n, v in sums.items() if n[:7] == "metric."}
+        return {**shares, **{name: total / count for name, total in {**causes, **metrics}.items()}}

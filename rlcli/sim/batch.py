@@ -110,10 +110,10 @@ class BatchEngine:
             raise _engine_error(error) from None
         self._own_constants = True
 
-    def step(self, nstep: int) -> None:
-        """Advance every world by `nstep` physics steps."""
+    def step(self, nstep: int, *, derive: bool = True) -> None:
+        """Advance every world by `nstep` physics steps; without `derive` the derived fields stay behind."""
         try:
-            self._batch.step(nstep=nstep, stage=self._step_stage)
+            self._batch.step(nstep=nstep, stage=self._step_stage if derive else _NONE)
         except SimulationError as error:
             raise _engine_error(error) from None
 

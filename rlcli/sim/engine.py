@@ -64,8 +64,8 @@ class Engine(Protocol):
         """
         ...
 
-    def step(self, nstep: int) -> None:
-        """Advance every world by `nstep` physics steps."""
+    def step(self, nstep: int, *, derive: bool = True) -> None:
+        """Advance every world by `nstep` physics steps; without `derive` the derived fields stay behind."""
         ...
 
     def diverged(self) -> Tensor | None:

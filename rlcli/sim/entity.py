@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import mujoco
 import numpy as np
@@ -18,6 +18,9 @@ from rlcli.sim.names import match
 from rlcli.sim.rotations import rotate, rotate_inverse
 from rlcli.sim.scene import actuator_kind
 from rlcli.sim.selection import ALL, Columns, Selection
+
+if TYPE_CHECKING:
+    from rlcli.sim.actuators import ActuatorModel
 
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 Value = TypeVar("Value")
@@ -79,6 +82,7 @@ class Entity:
         self.name = name
         self.config = config
         self.engine = engine
+        self.sim = sim
         model = engine.model
         self.joint_ids = _ids(
             model, name, mujoco.mjtObj.mjOBJ_JOINT, model.njnt, lambda j: model.jnt_type[j] in _SCALAR
@@ -108,6 +112,8 @@ class Entity:
         self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
         self._column_cache: dict[tuple, tuple[Columns, Columns]] = {}
         self.data = EntityData(self, sim)
+        self.actuators: list[ActuatorModel] = []
+        """Models that drive joints between physics steps; filled once the entity stands."""
 
     @property
     def is_floating(self) -> bool:

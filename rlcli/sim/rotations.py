@@ -41,6 +41,20 @@ def multiply(left: Tensor, right: Tensor) -> Tensor:
     )
 
 
+def conjugate(quat: Tensor) -> Tensor:
+    """The rotation back. (n, 4) -> (n, 4)"""
+    return torch.cat([quat[..., :1], -quat[..., 1:]], dim=-1)
+
+
+def rotation_vector(quat: Tensor) -> Tensor:
+    """Axis times angle, the angle in [0, pi] [rad]. (n, 4) -> (n, 3)"""
+    w, axis = torch.where(quat[:, :1] < 0.0, -quat, quat).split([1, 3], dim=1)
+    x, y, z = axis.unbind(1)
+    sine = (x * x + y * y + z * z).sqrt()[:, None]
+    angle = 2.0 * atan2(sine, w)
+    return axis * torch.where(sine < 1e-6, 2.0, angle / sine.clamp(min=1e-6))  # the limit of a small angle
+
+
 def from_euler(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
     """Quaternion of a rotation about x, then y, then z, all fixed axes [rad]. (n,) each -> (n, 4)"""
     cr, sr = torch.cos(0.5 * roll), torch.sin(0.5 * roll)
@@ -69,6 +83,24 @@ def atan2(y: Tensor, x: Tensor) -> Tensor:
     x = x + 1e-30  # neither 0 nor -0, so that the quotient is a number at the origin too
     behind = (x < 0.0).mul(math.pi).copysign_(y)
     return torch.atan(y / x).add_(behind)
+
+
+def heading(quat: Tensor) -> Tensor:
+    """Angle of the x axis about the world's z axis, from its x axis, in [-pi, pi] [rad]. (n, 4) -> (n,)"""
+    w, x, y, z = quat.unbind(-1)
+    return atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def yaw_only(quat: Tensor) -> Tensor:
+    """The turn about the world's z axis alone, towards the same heading. (n, 4) -> (n, 4)"""
+    half = 0.5 * heading(quat)
+    zero = torch.zeros_like(half)
+    return torch.stack([torch.cos(half), zero, zero, torch.sin(half)], dim=-1)
+
+
+def unique(quat: Tensor) -> Tensor:
+    """The one of the two quaternions of a rotation whose w is not negative. (n, 4) -> (n, 4)"""
+    return torch.where(quat[:, :1] < 0.0, -quat, quat)
 
 
 def wrap_to_pi(angle: Tensor) -> Tensor:

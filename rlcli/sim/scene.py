@@ -76,8 +76,11 @@ class Scene:
                 continue  # the term's own binding says so
             names = [joint.name.removeprefix(f"{need.entity}/") for joint in self._joints(need.entity)]
             try:
+                models = self.config.entities[need.entity].actuators.values()
+                modelled = {names[p] for model in models for p in match(model.joints, names, "joint")}
                 for position in match(need.joints, names, "joint"):
-                    self._actuate(need.entity, names[position], need.kind)
+                    if names[position] not in modelled:
+                        self._actuate(need.entity, names[position], need.kind)
             except NameProblem:
                 continue  # likewise
 
@@ -143,6 +146,7 @@ class Scene:
             warnings.simplefilter("ignore")
             self.spec.attach(child, prefix=f"{name}/", frame=frame)
         self._override_joints(name, entity, degrees=bool(child.compiler.degree))
+        self._model_actuators(name, entity)
 
     def _override_joints(self, name: str, entity: EntityConfig, *, degrees: bool) -> None:
         joints = self._joints(name)
@@ -160,6 +164,29 @@ class Scene:
                 self._tune(joints[position].name, change)
                 if change.actuator is not None:
                     self._actuate(name, names[position], change.actuator)
+
+    def _model_actuators(self, name: str, entity: EntityConfig) -> None:
+        """Give the joints of actuator models a motor each, without limits of its own, in place of what they have."""
+        names = [joint.name.removeprefix(f"{name}/") for joint in self._joints(name)]
+        owner: dict[str, str] = {}
+        for key, config in entity.actuators.items():
+            path = ("scene", "entities", name, "actuators", key)
+            try:
+                joints = [names[position] for position in match(config.joints, names, "joint")]
+            except NameProblem as problem:
+                self.problems.append(SceneProblem((*path, "joints"), str(problem), problem.hint))
+                continue
+            for joint in joints:
+                if joint in owner:
+                    message = f"joint '{joint}' is driven by '{owner[joint]}' already"
+                    self.problems.append(SceneProblem((*path, "joints"), message))
+                    continue
+                owner[joint] = key
+                target = f"{name}/{joint}"
+                for actuator in [a for a in self.spec.actuators if a.target == target]:
+                    self.spec.delete(actuator)
+                motor = self.spec.add_actuator(name=target, target=target, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+                motor.set_to_motor()
 
     def _tune(self, joint: str, change: JointConfig) -> None:
         """Gains and limits of the actuators that the joint has."""

@@ -20,6 +20,18 @@ Columns: TypeAlias = slice | Tensor
 ALL = slice(None)
 
 
+def one_column(columns: Columns, count: int, parameter: str) -> int:
+    """The one column that an index into `count` columns stands for.
+
+    Raises:
+        ValueError: if it stands for several.
+    """
+    found = torch.arange(count)[columns if isinstance(columns, slice) else columns.cpu()].tolist()
+    if len(found) != 1:
+        raise ValueError(f"'{parameter}' stands for {len(found)} elements, and this term needs one")
+    return found[0]
+
+
 class Selection(Protocol):
     """Rows are the selected environments, in order; `shape` is that of one row's draw."""
 

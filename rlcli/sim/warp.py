@@ -114,7 +114,7 @@ class WarpEngine:
             self._sensor_stages.add(_VELOCITY)
         self._force_columns = as_index(force_columns, self.device)
         self._expanded: dict[str, Tensor] = {}
-        self._graphs: dict[int, Any] = {}
+        self._graphs: dict[tuple[int, bool], Any] = {}
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         with wp.ScopedDevice(self._device), _on_torch_stream(self.device):
             self._model, self._data = self._put(model, capacity)
@@ -191,16 +191,16 @@ class WarpEngine:
         with self._launching():
             mjw.set_const(self._model, self._data)
 
-    def step(self, nstep: int) -> None:
-        """Advance every world by `nstep` physics steps, and compute what is bound of the derived fields."""
+    def step(self, nstep: int, *, derive: bool = True) -> None:
+        """Advance every world by `nstep` physics steps; without `derive` the derived fields stay behind."""
         with self._launching():
             if self.device.type != "cuda" or torch.cuda.is_current_stream_capturing():
-                self._advance(nstep)
-            elif nstep in self._graphs:
-                wp.capture_launch(self._graphs[nstep])
+                self._advance(nstep, derive)
+            elif (nstep, derive) in self._graphs:
+                wp.capture_launch(self._graphs[nstep, derive])
             else:
-                self._advance(nstep)  # compiles
-                self._graphs[nstep] = self._capture(nstep)
+                self._advance(nstep, derive)  # compiles
+                self._graphs[nstep, derive] = self._capture(nstep, derive)
 
     def diverged(self) -> Tensor:
         """Worlds that the last step drove out of bounds; they are back in the state before it, at rest. (num_envs,)
@@ -356,10 +356,11 @@ class WarpEngine:
         with wp.ScopedDevice(self._device):
             yield
 
-    def _advance(self, nstep: int) -> None:
+    def _advance(self, nstep: int, derive: bool) -> None:
         for _ in range(nstep):
             mjw.step(self._model, self._data)
-        self._derive()
+        if derive:
+            self._derive()
 
     def _derive(self) -> None:
         """Bring the derived fields that somebody reads up to the state; those of forces are the last substep's."""
@@ -414,10 +415,10 @@ class WarpEngine:
             name: self._fields[name].clone() for name in (*self._of_substep(), "qacc_warmstart") if name in self._fields
         }
 
-    def _capture(self, nstep: int) -> Any:
+    def _capture(self, nstep: int, derive: bool) -> Any:
         stream = wp.Stream(self._device)  # torch's default stream cannot be recorded
         with wp.ScopedStream(stream), wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
-            self._advance(nstep)
+            self._advance(nstep, derive)
         return capture.graph
 
     def _put(self, model: mujoco.MjModel, capacity: Capacity) -> tuple[mjw.Model, mjw.Data]:

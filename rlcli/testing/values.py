@@ -176,8 +176,8 @@ def _raw(env: VecEnv) -> Iterator[tuple[str, Tensor, int | None]]:
         return
     manager = env.observation_manager
     for group in manager.groups:
-        for term, size in manager.sizes(group):
-            yield f"observations.{group}.{term.name}", term.call(), size
+        for pipeline in manager.pipelines(group):
+            yield f"observations.{group}.{pipeline.term.name}", pipeline.term.call(), pipeline.width
     for section, terms in (("rewards", env.reward_manager.terms), ("terminations", env.termination_manager.terms)):
         for term in terms:
             yield f"{section}.{term.name}", term.call(), None

@@ -147,7 +147,7 @@ SCHEMA = {
     },
     "observations": [
         {"name": str, "size": int, "elements": list, "unit": str, "scale": (list, type(None)),
-         "clip": (list, type(None)), "columns": list, "history": int}
+         "clip": (list, type(None)), "columns": list, "history": int, "modifiers": list}
     ],
     "actions": [
         {"name": str, "size": int, "elements": list, "unit": str, "scale": (list, type(None)),
@@ -209,7 +209,7 @@ def test_metadata_of_a_managed_task_names_joints_units_scales_and_limits(exporte
     wrist, elbow, shoulder = metadata["actions"]
     assert [term["elements"] for term in (wrist, elbow, shoulder)] == [["wrist"], ["elbow"], ["shoulder"]]
     assert wrist["limits"] == [[-2.0, 2.0]]  # the joint's actuatorfrcrange
-    assert wrist["clip"] == [-3.0, 3.0]
+    assert wrist["clip"] == [[-3.0, 3.0]] * wrist["size"]
     assert elbow["unit"] == "m or rad"
     assert elbow["offset"] == pytest.approx([0.35])  # the default pose and what the YAML adds
     assert elbow["limits"] == [[-0.5, 0.75]]
@@ -222,7 +222,7 @@ def test_metadata_of_a_direct_task_says_that_the_command_is_the_tasks_affair(exp
     (actions,) = metadata["actions"]
     assert actions["command"] == "task"
     assert actions["scale"] is None
-    assert actions["clip"] == [-1.0, 1.0]
+    assert actions["clip"] == [[-1.0, 1.0]]
     assert actions["elements"] == ["slider_to_cart"]
     assert [(term["name"], term["unit"]) for term in metadata["observations"]] == [
         ("cart_pos", "m"), ("cart_vel", "m/s"), ("pole_pos", "rad"), ("pole_vel", "rad/s"),

@@ -24,7 +24,7 @@ def layout_of(task, *overrides):
     [
         ("actions.joint_effort.scale=50", "scale [50]"),
         ("actions.joint_effort.offset=1", "offset [1]"),
-        ("actions.joint_effort.clip=[-90,90]", "clip [-90, 90]"),
+        ("actions.joint_effort.clip=[-90,90]", "clip [[-90, 90]]"),
         ("observations.policy.joint_pos_rel.scale=2", "scale [2, 2]"),
         ("observations.policy.joint_vel_rel.clip=[-5,5]", "clip [-5, 5]"),
         ("decimation=4", "0.0333"),

@@ -1,0 +1,129 @@
+"""Commands: what the policy is asked to do. Each environment draws its own, at the start of an episode and in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rlcli.managers.live import LiveValues
+from rlcli.managers.term import BoundTerm
+from rlcli.sim.selection import Selection
+
+Select = Callable[[Tensor], Selection | None]
+
+
+class CommandTerm(Protocol):
+    """A command term is a class `Name(env, *, ...)`.
+
+    It may have a method `metrics() -> dict[str, Tensor]` (num_envs,) of how well the command is followed; their means
+    over an episode are logged. And `reset(selection)`, `state_dict`, `load_state_dict` for what else it carries.
+    """
+
+    command: Tensor
+    """What is asked, in a tensor that stays the same. (num_envs, k)"""
+
+    def resample(self, selection: Selection) -> None:
+        """Draw new commands for the selected environments."""
+        ...
+
+    def update(self) -> None:
+        """Called once a step, after resampling: let the command follow the state (a heading, a frame)."""
+        ...
+
+
+class CommandManager:
+    """Keeps the timers, and the sums of the metrics over an episode."""
+
+    def __init__(
+        self, terms: list[BoundTerm], num_envs: int, step_dt: float, device: torch.device, live: LiveValues
+    ) -> None:
+        self.terms = terms
+        self._by_name = {term.name: term for term in terms}
+        self._step_dt = step_dt
+        self._times = [
+            live.get((*term.path, "resampling_time_s"), term.config.resampling_time_s)  # type: ignore[attr-defined]
+            for term in terms
+        ]
+        # counted in whole steps: subtracting step_dt again and again drifts
+        self._steps_left = torch.zeros(len(terms), num_envs, dtype=torch.int64, device=device)
+        self._measured = [
+            (f"{term.name}/{name}", term, name)
+            for term in terms
+            if hasattr(term.instance, "metrics")
+            for name in term.instance.metrics()
+        ]
+        self._sums = torch.zeros(num_envs, len(self._measured), device=device)
+        self._steps = torch.zeros(num_envs, device=device)
+
+    def get_command(self, name: str) -> Tensor:
+        """The command of a term. (num_envs, k)"""
+        return self._by_name[name].instance.command
+
+    def get_term(self, name: str) -> CommandTerm:
+        """A command term."""
+        return self._by_name[name].instance
+
+    def measure(self) -> None:
+        """Add up how well this step followed its commands, before anything is drawn anew."""
+        if not self._measured:
+            return
+        metrics = {id(term): term.instance.metrics() for _, term, _ in self._measured}
+        self._sums += torch.stack([metrics[id(term)][name] for _, term, name in self._measured], dim=1)
+        self._steps += 1.0
+
+    def episode(self, ended: Selection) -> dict[str, Tensor]:
+        """Means of the metrics over the episodes that end. (n,) each"""
+        if not self._measured:
+            return {}
+        means = ended.peek(self._sums) / ended.peek(self._steps).clamp(min=1.0)[:, None]
+        return {name: column for (name, _, _), column in zip(self._measured, means.unbind(1), strict=True)}
+
+    def reset(self, selection: Selection) -> None:
+        """New episodes begin with new commands."""
+        selection.write(self._sums, 0.0)
+        selection.write(self._steps, 0.0)
+        for number, term in enumerate(self.terms):
+            term.reset(selection)
+            self._resample(number, selection, _FIRST)
+
+    def compute(self, select: Select, running: Tensor) -> None:
+        """Let one step pass where an episode is `running` (1 or 0), and draw anew where time is up.
+
+        `select` draws from the step's own counter.
+        """
+        for number, term in enumerate(self.terms):
+            left = self._steps_left[number]
+            left -= running
+            due = select(left <= 0)
+            if due is not None:
+                self._resample(number, due, _NEXT)
+            term.instance.update()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Timers, sums, and the commands."""
+        commands = {f"command.{term.name}": term.instance.command.clone() for term in self.terms}
+        own = {"steps_left": self._steps_left, "sums": self._sums, "steps": self._steps}
+        return {**{name: tensor.clone() for name, tensor in own.items()}, **commands}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `state_dict` gave."""
+        self._steps_left.copy_(state["steps_left"])
+        self._sums.copy_(state["sums"])
+        self._steps.copy_(state["steps"])
+        for term in self.terms:
+            term.instance.command.copy_(state[f"command.{term.name}"])
+
+    def _resample(self, number: int, selection: Selection, when: np.uint64) -> None:
+        term, (low, high) = self.terms[number], self._times[number]
+        drawn = selection.stream(term.stream ^ when)
+        steps = drawn.uniform(low, high).double() / self._step_dt
+        selection.write(self._steps_left[number], (steps * (1.0 - 1e-6)).ceil_().long())
+        term.instance.resample(drawn)
+
+
+# Two streams: an episode's first command is drawn by the episode's number, the later ones by the step's.
+_FIRST, _NEXT = np.uint64(0x434D_4446_5253), np.uint64(0x434D_444E_5854)

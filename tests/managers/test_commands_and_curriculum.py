@@ -1,0 +1,232 @@
+"""Commands and the curriculum: timers, draws, metrics, and numbers that change by their address."""
+
+import itertools
+import math
+
+import pytest
+import torch
+import yaml
+from worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, dump, pendulum, run
+
+from rlcli.errors import ConfigError
+
+VELOCITY = {"func": "uniform_velocity", "resampling_time_s": [0.1, 0.2], "lin_vel_x": [-1.0, 1.0],
+            "lin_vel_y": [-0.5, 0.5], "ang_vel_z": [-2.0, 2.0]}  # fmt: skip
+
+
+def walker(tmp_path, num_envs=4, *overrides, curriculum=None, events=None, **command):
+    task = yaml.safe_load(CRITTER_TASK)
+    task["commands"] = {"velocity": {**VELOCITY, **command}}
+    task["observations"]["policy"]["asked"] = {"func": "generated_commands", "command": "velocity"}
+    task["terminations"] = {"time_out": {"func": "time_out", "time_out": True}}
+    if curriculum:
+        task["curriculum"] = curriculum
+    task["events"] |= events or {}
+    terms = (
+        "from rlcli.task import Command\n"
+        "def generated_commands(env, *, command: Command):\n"
+        "    return command.command\n"
+    )
+    return build(critter(tmp_path, dump(task), terms_py=terms), num_envs, *overrides)
+
+
+def commands(env, steps):
+    """The commands that the policy acts under, in each step. (steps, num_envs, 3)"""
+    env.reset()
+    seen = []
+    for _ in range(steps):
+        seen.append(env.command_manager.get_command("velocity").clone())
+        env.step(torch.zeros(env.num_envs, env.layout.action_size))
+    return torch.stack(seen)
+
+
+def test_commands_are_drawn_within_their_ranges_and_held_between_draws(tmp_path):
+    env = walker(tmp_path, 64)
+    seen = commands(env, 29)
+    for column, (low, high) in enumerate([(-1.0, 1.0), (-0.5, 0.5), (-2.0, 2.0)]):
+        values = seen[:, :, column]
+        assert values.min() >= low
+        assert values.max() <= high
+        assert values.std() == pytest.approx((high - low) / 12**0.5, rel=0.2)
+    changed = (seen[1:] != seen[:-1]).any(dim=2)
+    for env_id in range(64):
+        at = [0, *(changed[:, env_id].nonzero()[:, 0] + 1).tolist()]
+        gaps = [b - a for a, b in itertools.pairwise(at)]
+        assert gaps
+        assert all(5 <= gap <= 10 for gap in gaps)  # 0.1 to 0.2 s at 0.02 s
+
+
+def test_an_episode_begins_with_a_new_command_and_its_timer_with_it(tmp_path):
+    env = walker(tmp_path, 8, "commands.velocity.resampling_time_s=[100,100]")
+    seen = commands(env, 61)  # an episode lasts 30 steps
+    assert torch.equal(seen[0], seen[29])
+    assert (seen[29] != seen[30]).any(dim=1).all()
+    assert torch.equal(seen[30], seen[59])
+
+
+def test_commands_do_not_depend_on_the_number_of_environments(tmp_path):
+    few, many = commands(walker(tmp_path / "a", 3), 50), commands(walker(tmp_path / "b", 9), 50)
+    assert torch.equal(few, many[:, :3])
+
+
+def test_who_stands_is_asked_for_nothing(tmp_path):
+    seen = commands(walker(tmp_path, 400, rel_standing=0.25), 3)[2]
+    assert float((seen == 0).all(dim=1).float().mean()) == pytest.approx(0.25, abs=0.07)
+
+
+def test_a_heading_is_approached_at_a_rate_within_the_range(tmp_path):
+    env = walker(tmp_path, 16, heading=[-3.0, 3.0], heading_stiffness=0.5, ang_vel_z=[-0.4, 0.4])
+    env.reset()
+    for _ in range(3):
+        env.step(torch.zeros(16, env.layout.action_size))
+    term = env.command_manager.get_term("velocity")
+    for env_id in range(16):
+        w, x, y, z = env.entities["robot"].data.root_quat_w[env_id].tolist()
+        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        error = (float(term.state_dict()["target"][env_id]) - yaw + math.pi) % (2 * math.pi) - math.pi
+        assert float(term.command[env_id, 2]) == pytest.approx(max(-0.4, min(0.4, 0.5 * error)), abs=1e-5)
+
+
+def test_metrics_are_means_over_the_episode(tmp_path):
+    env = walker(tmp_path, 3, events={"push": None, "shove": None})
+    env.reset()
+    errors = []
+    for _ in range(30):
+        asked = env.command_manager.get_command("velocity").clone()
+        result = env.step(torch.zeros(3, env.layout.action_size))
+        seen = result.obs["policy"] if result.final_obs is None else result.final_obs["policy"]
+        errors.append((asked[:, :2] - seen[:, 1:3]).norm(dim=1))
+    found = result.episodes.ended().metrics["velocity/error_vel_xy"]
+    assert torch.allclose(found, torch.stack(errors).mean(dim=0), rtol=1e-5)
+
+
+def test_a_saved_state_goes_on_with_the_same_commands(tmp_path):
+    env, other = (walker(tmp_path / name, 4, heading=[-3.0, 3.0], rel_standing=0.2) for name in "ab")
+    run(env, 17)
+    other.reset(seed=3)
+    other.load_state_dict(env.state_dict())
+    for ours, theirs in zip(run(env, 40, 1, reset=False), run(other, 40, 1, reset=False), strict=True):
+        assert torch.equal(ours.obs["policy"], theirs.obs["policy"])
+
+
+def test_a_pose_is_asked_in_the_roots_frame(tmp_path):
+    task = yaml.safe_load(CRITTER_TASK)
+    task["commands"] = {"pose": {"func": "uniform_pose", "resampling_time_s": [9.0, 9.0], "bodies": ["leg_fl"],
+                                 "x": [0.1, 0.4], "y": [0.0, 0.0], "z": [-0.3, -0.1], "yaw": [-1.0, 1.0]}}  # fmt: skip
+    env = build(critter(tmp_path, dump(task)), 32)
+    env.reset()
+    pose = env.command_manager.get_command("pose")
+    assert 0.1 <= pose[:, 0].min() < 0.2 < 0.3 < pose[:, 0].max() <= 0.4
+    assert torch.equal(pose[:, 1], torch.zeros(32))
+    assert torch.allclose(pose[:, 3:].norm(dim=1), torch.ones(32))
+    metrics = env.command_manager.get_term("pose").metrics()
+    data = env.entities["robot"].data
+    index = env.entities["robot"].names["Bodies"].index("leg_fl")
+    for i in range(4):
+        w, x, y, z = data.root_quat_w[i].double().tolist()
+        turn = torch.tensor([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])  # fmt: skip
+        asked = data.root_pos_w[i].double() + turn.double() @ pose[i, :3].double()
+        distance = float((asked - data.body_pos_w[i, index]).norm())
+        assert float(metrics["position_error"][i]) == pytest.approx(distance, rel=1e-4)
+
+
+@pytest.mark.parametrize("curriculum", [
+    {"func": "stages", "address": "rewards.alive.weight", "steps": [5, 8], "values": [2.0, 0.0]},
+])  # fmt: skip
+def test_a_reward_weight_changes_at_its_step(tmp_path, curriculum):
+    task = yaml.safe_load(PENDULUM_TASK)
+    task["curriculum"] = {"more": curriculum}
+    env = build(pendulum(tmp_path, dump(task)), 2)
+    rewards = [float(result.reward[0]) for result in run(env, 10)]
+    # the weight of step 5 is the one that stands when five steps have passed
+    assert rewards == pytest.approx([0.02] * 5 + [0.04] * 3 + [0.0] * 2)
+    assert env.extras() == {"Curriculum/more": 0.0}
+
+
+def test_a_number_may_move_linearly(tmp_path):
+    curriculum = {"wider": {"func": "interpolate", "address": "commands.velocity.lin_vel_x", "to": [0.0, 4.0],
+                            "begin": 2, "end": 12}}  # fmt: skip
+    env = walker(tmp_path, 2, "commands.velocity.lin_vel_x=[0,0]", curriculum=curriculum)
+    env.reset()
+    seen = []
+    for _ in range(14):
+        env.step(torch.zeros(2, env.layout.action_size))
+        seen.append(env.extras()["Curriculum/wider"] * 2)  # the mean of both ends
+    assert seen == pytest.approx([0.0, 0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 2.4, 2.8, 3.2, 3.6, 4.0, 4.0, 4.0])
+    wide = commands(walker(tmp_path / "b", 64, curriculum=curriculum), 60)[45:, :, 0]
+    assert wide.max() > 3.0
+
+
+def test_the_end_of_an_events_range_may_move(tmp_path):
+    events = {"joints": {"func": "reset_joints_by_offset", "mode": "reset", "position": [0.0, 0.0]}}
+    curriculum = {"harder": {"func": "stages", "address": "events.joints.position.1", "steps": [10], "values": [0.5]}}
+    env = walker(tmp_path, 32, curriculum=curriculum, events=events)
+    env.reset()
+    position, default = env.entities["robot"].data.joint_pos, env.entities["robot"].data.default_joint_pos
+    assert torch.allclose(position, default)
+    for _ in range(30):
+        env.step(torch.zeros(32, env.layout.action_size))
+    assert (position - default).max() > 0.4
+    assert (position - default).min() >= -1e-6
+
+
+def test_a_noise_may_grow(tmp_path):
+    task = yaml.safe_load(PENDULUM_TASK)
+    task["observations"]["policy"]["pos"]["noise"] = {"kind": "uniform", "low": 0.0, "high": 0.0}
+    task["observations"]["critic"] = {"pos": {"func": "joint_pos"}}
+    task["curriculum"] = {"louder": {"func": "stages", "address": "observations.policy.pos.noise.high", "steps": [4],
+                                     "values": [1.0]}}  # fmt: skip
+    results = run(build(pendulum(tmp_path, dump(task)), 16), 8)
+    noise = [float((r.obs["policy"][:, :1] - r.obs["critic"]).abs().max()) for r in results]
+    assert noise[:3] == [0.0] * 3
+    assert min(noise[3:]) > 0.5
+
+
+def test_a_curriculum_goes_on_from_a_saved_state(tmp_path):
+    task = yaml.safe_load(PENDULUM_TASK)
+    task["curriculum"] = {"m": {"func": "interpolate", "address": "rewards.alive.weight", "to": 5.0, "end": 30}}
+    env, other = (build(pendulum(tmp_path / name, dump(task)), 3) for name in "ab")
+    run(env, 11)
+    other.reset()
+    other.load_state_dict(env.state_dict())
+    for ours, theirs in zip(run(env, 25, 1, reset=False), run(other, 25, 1, reset=False), strict=True):
+        assert torch.equal(ours.reward, theirs.reward)
+
+
+@pytest.mark.parametrize(
+    ("address", "says"),
+    [
+        ("rewards.alife.weight", "'rewards' has no 'alife'"),
+        ("reward.alive.weight", "did you mean 'rewards'"),
+        ("rewards.alive.func", "'rewards.alive' has no 'func'"),
+        ("rewards.alive", "leads to no number"),
+        ("rewards.alive.weight.0", "leads nowhere"),
+        ("sim.dt", "the task has no 'sim'"),
+        ("terminations.time_out.time_out", "has no 'time_out'"),
+    ],
+)
+def test_an_address_that_leads_nowhere_is_refused(tmp_path, address, says):
+    task = yaml.safe_load(PENDULUM_TASK)
+    task["curriculum"] = {"more": {"func": "stages", "address": address, "steps": [5], "values": [2.0]}}
+    with pytest.raises(ConfigError) as refusal:
+        build(pendulum(tmp_path, dump(task)), 2)
+    assert says in str(refusal.value) + str([p.hint for p in refusal.value.problems])
+    assert refusal.value.problems[0].path == "curriculum.more.address"
+
+
+def test_values_must_have_the_shape_of_what_they_replace(tmp_path):
+    task = yaml.safe_load(PENDULUM_TASK)
+    task["curriculum"] = {"more": {"func": "stages", "address": "rewards.alive.weight", "steps": [5],
+                                   "values": [[1.0, 2.0]]}}  # fmt: skip
+    with pytest.raises(ConfigError, match="shape"):
+        build(pendulum(tmp_path, dump(task)), 2)
+
+
+def test_a_command_that_nobody_declares_is_refused_with_those_that_exist(tmp_path):
+    with pytest.raises(ConfigError) as refusal:
+        walker(tmp_path, 2, "observations.policy.asked.command=velocty")
+    (problem,) = refusal.value.problems
+    assert "no command 'velocty'" in problem.message
+    assert "velocity" in problem.hint
