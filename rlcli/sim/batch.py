@@ -102,6 +102,10 @@ class BatchEngine:
             raise ValueError(f"'{name}' cannot differ between worlds; {did_you_mean(name, MODEL_FIELDS) or ''}")
         return torch.from_numpy(self._batch.expand(name))
 
+    def expanded(self) -> dict[str, Tensor]:
+        """The model fields that `expand` was asked for."""
+        return {name: torch.from_numpy(values) for name, values in self._batch._expanded.items()}
+
     def set_constants(self, selection: Selection | None = None) -> None:
         """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
         try:

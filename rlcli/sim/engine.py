@@ -57,6 +57,10 @@ class Engine(Protocol):
         """
         ...
 
+    def expanded(self) -> dict[str, Tensor]:
+        """The model fields that `expand` was asked for, live. (num_envs, ...) each"""
+        ...
+
     def set_constants(self, selection: Selection | None = None) -> None:
         """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones.
 

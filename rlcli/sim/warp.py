@@ -182,6 +182,10 @@ class WarpEngine:
             self._graphs.clear()
         return self._expanded[name]
 
+    def expanded(self) -> dict[str, Tensor]:
+        """The model fields that `expand` was asked for."""
+        return dict(self._expanded)
+
     def set_constants(self, selection: Selection | None = None) -> None:
         """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
         for name in (*_CONSTANTS, *(_BOUNDS if "geom_size" in self._expanded else ())):
