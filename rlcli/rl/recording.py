@@ -29,8 +29,6 @@ from rlcli.registry import TaskSource, find_task, folder_task
 from rlcli.rl.files import write_atomic
 
 FORMAT = 1
-MODES = ("all", "succeeded", "failed", "separate")
-"""Which episodes a recording keeps; `separate` writes the succeeded and the failed ones into a file each."""
 _STATES = ("qpos", "qvel", "act", "ctrl")
 
 
@@ -122,7 +120,10 @@ class Recorder:
         self._begin(ids)
 
     def save(self, file: Path, mode: str = "all") -> list[Path]:
-        """Write what the mode keeps; the files that were written.
+        """Write the episodes that a mode keeps: all, succeeded, failed, or separate (a file for each of the two).
+
+        Returns:
+            The files that were written.
 
         Raises:
             MachineError: if the disk refuses.
@@ -282,7 +283,7 @@ def replay(
                 if found := _differs(recording, number, e, t - e.begin + 1, after):
                     return found
                 recorded = recording.tensors[f"episode.{number}.rewards"][t - e.begin]
-                if not torch.equal(recorded, reward[e.env]):
+                if not _same(recorded, reward[e.env]):
                     return Difference(number, t - e.begin + 1, "reward", [float(recorded)], [float(reward[e.env])])
     finally:
         env.after_physics = None
@@ -294,9 +295,14 @@ def _differs(
 ) -> Difference | None:
     for name in _STATES:
         recorded, found = recording.tensors[f"episode.{number}.{name}"][step], state[name][episode.env]
-        if not torch.equal(recorded, found):
+        if not _same(recorded, found):
             return Difference(number, step, name, recorded.tolist(), found.tolist())
     return None
+
+
+def _same(left: Tensor, right: Tensor) -> bool:
+    """Whether the bits are equal: a NaN is itself, and 0 is not -0."""
+    return left.shape == right.shape and left.numpy().tobytes() == right.numpy().tobytes()
 
 
 def _state(env: VecEnv) -> dict[str, Tensor]:
