@@ -94,10 +94,10 @@ def _refuse_shared(terms: list[BoundTerm]) -> None:
     Raises:
         ConfigError: naming both terms and what they share.
     """
-    owner: dict[int, BoundTerm] = {}
+    owner: dict[int | str, BoundTerm] = {}
     for term in terms:
-        for actuator, element in zip(getattr(term.instance, "actuators", ()), term.instance.elements, strict=False):
-            first = owner.setdefault(actuator, term)
+        for sink, element in zip(getattr(term.instance, "sinks", ()), term.instance.elements, strict=False):
+            first = owner.setdefault(sink, term)
             if first is not term:
                 path = ".".join(map(str, term.path))
                 raise ConfigError([Problem("actions", path, f"'{element}' is driven by '{first.name}' already")])

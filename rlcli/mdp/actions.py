@@ -14,7 +14,7 @@ from torch import Tensor
 from rlcli.managers.action import CommandMap
 from rlcli.sim.actuators import JointCommand
 from rlcli.sim.kinematics import Jacobian
-from rlcli.sim.names import NameProblem, match
+from rlcli.sim.names import NameProblem, match_values
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotation_vector
 from rlcli.sim.selection import Columns, Selection, one_column
 from rlcli.task import Bodies, Entity, Joints, Range
@@ -23,11 +23,8 @@ if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
 
 
-ByJoint = float | dict[str, float]
-
-
 class _JointAction:
-    """raw x scale + offset, then clip, then what drives `joints`, in exactly the order written."""
+    """Some columns become a command, which is clipped and given to what drives `joints`, in the order written."""
 
     actuator: ClassVar[str]
     """What the scene gives joints that nothing of the kind drives."""
@@ -38,46 +35,37 @@ class _JointAction:
         env: ManagedEnv,
         entity: Entity,
         joints: Columns,
-        scale: ByJoint | Tensor,
-        offset: Tensor | ByJoint,
+        scale: float | dict[str, float],
         clip: Range | dict[str, Range] | None,
     ) -> None:
         self._entity, self._joints = entity, joints
         columns = torch.arange(len(entity.joint_names))[joints if isinstance(joints, slice) else joints.cpu()].tolist()
         self.elements = tuple(entity.joint_names[c] for c in columns)
         self._drive = JointCommand(entity, self.actuator, columns)
-        self.actuators = self._drive.actuators
+        self.sinks = self._drive.sinks
         self.size = len(columns)
-        self._scale, self._offset = self._by_joint(scale, 1.0, env), self._by_joint(offset, 0.0, env)
+        self._scale = self._by_joint(scale, 1.0, env)
         self._clip = self._bounds(clip, env)
-        self._limits = _command_limits(entity.engine.model, self.actuators, self.actuator)
         self.command = torch.zeros(env.num_envs, self.size, device=env.device)
-        """What reaches the actuators, before their own limits. (num_envs, size)"""
-
-    def command_map(self) -> CommandMap:
-        """What `process` computes, and the limits of the actuators behind it."""
-        scale = [self._scale] * self.size if isinstance(self._scale, float) else _row(self._scale)
-        offset = [self._offset] * self.size if isinstance(self._offset, float) else _row(self._offset)
-        clip = None if self._clip is None else tuple(zip(*(_row(end) for end in self._clip), strict=True))
-        return CommandMap(tuple(scale), tuple(offset), clip, self._limits)
+        """What reaches the actuators, before their own limits. (num_envs, joints)"""
 
     def process(self, action: Tensor) -> None:
         """Write the controls of this step. (num_envs, size)"""
-        torch.mul(action, self._scale, out=self.command)
-        if isinstance(self._offset, Tensor) or self._offset:
-            self.command += self._offset
+        self._target(action)
         if self._clip is not None:
             self.command.clamp_(*self._clip)
         self._drive.write(self.command)
 
-    def _by_joint(self, value: ByJoint | Tensor, default: float, env: ManagedEnv) -> float | Tensor:
+    def _target(self, action: Tensor) -> None:
+        """Fill `command`."""
+        raise NotImplementedError
+
+    def _by_joint(self, value: float | dict[str, float], default: float, env: ManagedEnv) -> float | Tensor:
         """A number, or one for each column; a mapping leaves joints that it does not name at `default`."""
         if not isinstance(value, dict):
             return value
-        values = torch.full((self.size,), default)
-        for pattern, number in value.items():
-            values[match(pattern, self.elements, "joint")] = number
-        return values.to(env.device)
+        values = [default if v is None else v for v in match_values(value, self.elements, "joint")]
+        return torch.tensor(values, dtype=torch.float32, device=env.device)
 
     def _bounds(self, clip: Range | dict[str, Range] | None, env: ManagedEnv) -> tuple[Tensor, Tensor] | None:
         if clip is None:
@@ -90,7 +78,43 @@ class _JointAction:
         return low, high
 
 
-class JointEffort(_JointAction):
+class _AffineJointAction(_JointAction):
+    """raw x scale + offset: an exported policy can contain it."""
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        entity: Entity,
+        joints: Columns,
+        scale: float | dict[str, float],
+        offset: float | dict[str, float],
+        default: Tensor | None,
+        clip: Range | dict[str, Range] | None,
+    ) -> None:
+        super().__init__(env, entity, joints, scale, clip)
+        own = self._by_joint(offset, 0.0, env)
+        self._offset = own if default is None else default[:, joints] + own
+        self._limits = _command_limits(entity.engine.model, self._drive.actuators, self.actuator)
+
+    def command_map(self) -> CommandMap:
+        """What `process` computes, and the limits of the actuators behind it."""
+        scale, offset = (self._each(value) for value in (self._scale, self._offset))
+        clip = None if self._clip is None else tuple(zip(*map(self._each, self._clip), strict=True))
+        return CommandMap(scale, offset, clip, self._limits)
+
+    def _target(self, action: Tensor) -> None:
+        torch.mul(action, self._scale, out=self.command)
+        if isinstance(self._offset, Tensor) or self._offset:
+            self.command += self._offset
+
+    def _each(self, value: float | Tensor) -> tuple[float, ...]:
+        """One number a column, which all environments share."""
+        if isinstance(value, Tensor):
+            return tuple((value[0] if value.dim() == 2 else value).tolist())
+        return (value,) * self.size
+
+
+class JointEffort(_AffineJointAction):
     """Efforts of joint motors: raw x scale + offset [N or N m]. Isaac Lab: JointEffortAction."""
 
     actuator = "motor"
@@ -106,10 +130,10 @@ class JointEffort(_JointAction):
         offset: float | dict[str, float] = 0.0,
         clip: Range | dict[str, Range] | None = None,
     ) -> None:
-        super().__init__(env, entity, joints, scale, offset, clip)
+        super().__init__(env, entity, joints, scale, offset, None, clip)
 
 
-class JointPosition(_JointAction):
+class JointPosition(_AffineJointAction):
     """Targets of position actuators: raw x scale + offset [m or rad], about the default pose unless told otherwise.
 
     Isaac Lab: JointPositionAction.
@@ -129,12 +153,11 @@ class JointPosition(_JointAction):
         use_default_offset: bool = True,
         clip: Range | dict[str, Range] | None = None,
     ) -> None:
-        super().__init__(env, entity, joints, scale, offset, clip)
-        if use_default_offset:
-            self._offset = entity.data.default_joint_pos[:, joints] + self._offset
+        default = entity.data.default_joint_pos if use_default_offset else None
+        super().__init__(env, entity, joints, scale, offset, default, clip)
 
 
-class JointVelocity(_JointAction):
+class JointVelocity(_AffineJointAction):
     """Targets of velocity actuators: raw x scale + offset [m/s or rad/s]. Isaac Lab: JointVelocityAction."""
 
     actuator = "velocity"
@@ -151,28 +174,11 @@ class JointVelocity(_JointAction):
         use_default_offset: bool = True,
         clip: Range | dict[str, Range] | None = None,
     ) -> None:
-        super().__init__(env, entity, joints, scale, offset, clip)
-        if use_default_offset:
-            self._offset = entity.data.default_joint_vel[:, joints] + self._offset
+        default = entity.data.default_joint_vel if use_default_offset else None
+        super().__init__(env, entity, joints, scale, offset, default, clip)
 
 
-class _OfTheState(_JointAction):
-    """A joint action whose command depends on more than this step's action: an export leaves it to the robot's side."""
-
-    command_map = None  # type: ignore[assignment]
-
-    def process(self, action: Tensor) -> None:
-        """Write the controls of this step. (num_envs, size)"""
-        self.command.copy_(self._target(action))
-        if self._clip is not None:
-            self.command.clamp_(*self._clip)
-        self._drive.write(self.command)
-
-    def _target(self, action: Tensor) -> Tensor:
-        raise NotImplementedError
-
-
-class RelativeJointPosition(_OfTheState):
+class RelativeJointPosition(_JointAction):
     """Targets of position actuators: the joint's position of this step + raw x scale [m or rad].
 
     Isaac Lab: RelativeJointPositionAction.
@@ -190,13 +196,13 @@ class RelativeJointPosition(_OfTheState):
         scale: float | dict[str, float] = 1.0,
         clip: Range | dict[str, Range] | None = None,
     ) -> None:
-        super().__init__(env, entity, joints, scale, 0.0, clip)
+        super().__init__(env, entity, joints, scale, clip)
 
-    def _target(self, action: Tensor) -> Tensor:
-        return self._entity.data.joint_pos[:, self._joints] + action * self._scale
+    def _target(self, action: Tensor) -> None:
+        torch.add(self._entity.data.joint_pos[:, self._joints], action * self._scale, out=self.command)
 
 
-class JointPositionToLimits(_OfTheState):
+class JointPositionToLimits(_JointAction):
     """Targets of position actuators: raw x scale, within [-1, 1], stretched over the soft limits [m or rad].
 
     With `rescale_to_limits: false` it is the target itself, kept within the limits. Isaac Lab:
@@ -216,7 +222,7 @@ class JointPositionToLimits(_OfTheState):
         rescale_to_limits: bool = True,
         clip: Range | dict[str, Range] | None = None,
     ) -> None:
-        super().__init__(env, entity, joints, scale, 0.0, clip)
+        super().__init__(env, entity, joints, scale, clip)
         self._rescale = rescale_to_limits
         limits = entity.data.soft_joint_pos_limits[joints]
         if rescale_to_limits and not bool(limits.isfinite().all()):
@@ -225,7 +231,10 @@ class JointPositionToLimits(_OfTheState):
                 f"joint '{unlimited}' has no limits to stretch over", "give it a range, or another action"
             )
 
-    def _target(self, action: Tensor) -> Tensor:
+    def _target(self, action: Tensor) -> None:
+        self.command.copy_(self._asked(action))
+
+    def _asked(self, action: Tensor) -> Tensor:
         low, high = self._entity.data.soft_joint_pos_limits[self._joints].unbind(-1)
         raw = action * self._scale
         if not self._rescale:
@@ -255,13 +264,12 @@ class EmaJointPositionToLimits(JointPositionToLimits):
         self._before = torch.zeros_like(self.command)
         self._fresh = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
 
-    def _target(self, action: Tensor) -> Tensor:
+    def _target(self, action: Tensor) -> None:
         low, high = self._entity.data.soft_joint_pos_limits[self._joints].unbind(-1)
         before = torch.where(self._fresh[:, None], self._entity.data.joint_pos[:, self._joints], self._before)
-        target = (self._alpha * super()._target(action) + (1.0 - self._alpha) * before).clamp(low, high)
-        self._before.copy_(target)
+        self._before.copy_((self._alpha * self._asked(action) + (1.0 - self._alpha) * before).clamp(low, high))
+        self.command.copy_(self._before)
         self._fresh.zero_()
-        return target
 
     def reset(self, selection: Selection) -> None:
         """New episodes average from where their joints start."""
@@ -280,8 +288,6 @@ class EmaJointPositionToLimits(JointPositionToLimits):
 class _BinaryJoint(_JointAction):
     """One column opens or closes several joints: open where it is not negative."""
 
-    command_map = None  # type: ignore[assignment]
-
     def __init__(
         self,
         env: ManagedEnv,
@@ -291,15 +297,13 @@ class _BinaryJoint(_JointAction):
         close_command: dict[str, float],
         threshold: float,
     ) -> None:
-        super().__init__(env, entity, joints, 1.0, 0.0, None)
+        super().__init__(env, entity, joints, 1.0, None)
         self._open, self._close = (self._all(c, w, env) for c, w in ((open_command, "open"), (close_command, "close")))
         self._threshold = threshold
         self.elements, self.size = (",".join(self.elements),), 1
 
-    def process(self, action: Tensor) -> None:
-        """Write the controls of this step. (num_envs, 1)"""
+    def _target(self, action: Tensor) -> None:
         self.command.copy_(torch.where(action < self._threshold, self._close, self._open))
-        self._drive.write(self.command)
 
     def _all(self, command: dict[str, float], which: str, env: ManagedEnv) -> Tensor:
         values = self._by_joint(command, math.nan, env)
@@ -354,7 +358,7 @@ class BinaryJointVelocity(_BinaryJoint):
         super().__init__(env, entity, joints, open_command, close_command, threshold)
 
 
-class DifferentialInverseKinematics(_OfTheState):
+class DifferentialInverseKinematics(_JointAction):
     """Joint position targets that move a body's frame to a pose, by damped least squares [m or rad].
 
     dq = J^T (J J^T + damping^2 I)^-1 e, with J the body's geometric Jacobian and e the error of its pose in the root's
@@ -381,7 +385,7 @@ class DifferentialInverseKinematics(_OfTheState):
         offset_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
         clip: Range | dict[str, Range] | None = None,
     ) -> None:
-        super().__init__(env, entity, joints, scale, 0.0, clip)
+        super().__init__(env, entity, joints, scale, clip)
         self._body = one_column(bodies, len(entity.body_ids), "bodies")
         self._mode, self._relative, self._damping = mode, relative, damping
         self._point = torch.tensor(offset_pos, device=env.device)
@@ -392,7 +396,7 @@ class DifferentialInverseKinematics(_OfTheState):
         parts = ["x", "y", "z"] + ([] if mode == "position" else ["rx", "ry", "rz"] if relative else list("wijk"))
         self.elements, self.size = tuple(parts), len(parts)
 
-    def _target(self, action: Tensor) -> Tensor:
+    def _target(self, action: Tensor) -> None:
         data = self._entity.data
         quat = data.body_quat_w[:, self._body]
         arm = rotate(quat, self._point.expand(len(quat), 3))
@@ -401,7 +405,7 @@ class DifferentialInverseKinematics(_OfTheState):
         jacobian = self._jacobian(position)[:, : error.shape[1]]
         square = jacobian @ jacobian.mT + self._damping**2 * torch.eye(error.shape[1], device=error.device)
         step = jacobian.mT @ torch.linalg.solve_ex(square, error[:, :, None])[0]
-        return data.joint_pos[:, self._joints] + step[:, :, 0]
+        torch.add(data.joint_pos[:, self._joints], step[:, :, 0], out=self.command)
 
     def _error(self, asked: Tensor, position: Tensor, quat: Tensor) -> Tensor:
         """What is left to the asked pose, world frame: position, and axis times angle. (num_envs, 3 or 6)"""
@@ -416,11 +420,6 @@ class DifferentialInverseKinematics(_OfTheState):
             return move
         wanted = multiply(root.root_quat_w, torch.nn.functional.normalize(asked[:, 3:], dim=1))
         return torch.cat([move, rotation_vector(multiply(wanted, conjugate(quat)))], dim=1)
-
-
-def _row(values: Tensor) -> list[float]:
-    """What all environments share of a setting. (k,) or (num_envs, k)"""
-    return (values[0] if values.dim() == 2 else values).tolist()
 
 
 def _command_limits(model: mujoco.MjModel, actuators: list[int | None], kind: str) -> tuple[tuple[float, float], ...]:

@@ -21,7 +21,12 @@ class Stages:
     """
 
     def __init__(
-        self, env: ManagedEnv, *, address: Address, steps: list[int], values: list[float] | list[list[float]]
+        self,
+        env: ManagedEnv,
+        *,
+        address: Address,
+        steps: list[int],
+        values: list[float] | list[list[float]] | list[list[list[float]]],
     ) -> None:
         if len(steps) != len(values) or not steps or sorted(steps) != steps:
             raise ValueError("steps and values are lists of equal length, steps in rising order")
@@ -45,7 +50,15 @@ class Interpolate:
     `begin` and `end` are environment steps since training began.
     """
 
-    def __init__(self, env: ManagedEnv, *, address: Address, to: float | list[float], begin: int = 0, end: int) -> None:
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        address: Address,
+        to: float | list[float] | list[list[float]],
+        begin: int = 0,
+        end: int,
+    ) -> None:
         if end <= begin:
             raise ValueError("end must be above begin")
         target = torch.tensor(to, dtype=torch.float32, device=env.device)

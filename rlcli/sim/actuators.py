@@ -13,7 +13,7 @@ from torch import Tensor
 from rlcli.config.schema import ActuatorConfig
 from rlcli.random import stream
 from rlcli.sim.entity import Entity, as_index
-from rlcli.sim.names import NameProblem, match
+from rlcli.sim.names import NameProblem, match, match_values
 from rlcli.sim.selection import Selection
 
 POSITION, VELOCITY, EFFORT = range(3)
@@ -144,6 +144,8 @@ class JointCommand:
         native = [i for i, c in enumerate(columns) if c not in by_model]
         self.actuators = [None if c in by_model else driven[c] for c in columns]
         """MuJoCo's actuator behind each column; None where a model drives the joint."""
+        self.sinks = [f"{entity.name}/{entity.joint_names[c]} {kind}" if c in by_model else driven[c] for c in columns]
+        """What each column writes to, so that two terms that write to the same are found."""
         controls = [driven[columns[i]] for i in native]
         gear = torch.tensor(model.actuator_gear[controls, 0], dtype=torch.float32, device=device)
         self._factor = (1.0 / gear if kind == "motor" else gear) if bool((gear != 1.0).any()) else None
@@ -180,9 +182,7 @@ def _by_joint(value: float | Mapping[str, float], names: Sequence[str], device: 
     """
     if isinstance(value, float | int):
         return torch.full((len(names),), float(value), device=device)
-    values = torch.full((len(names),), torch.nan)
-    for pattern, number in value.items():
-        values[match(pattern, names, "joint")] = number
-    if bool(values.isnan().any()):
-        raise NameProblem(f"no value for joint '{names[int(values.isnan().nonzero()[0, 0])]}'")
-    return values.to(device)
+    values = match_values(value, names, "joint")
+    if None in values:
+        raise NameProblem(f"no value for joint '{names[values.index(None)]}'")
+    return torch.tensor(values, dtype=torch.float32, device=device)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 from rlcli.errors import did_you_mean, listing
+
+Value = TypeVar("Value")
 
 
 class NameProblem(ValueError):
@@ -32,6 +35,23 @@ def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> lis
                 raise NameProblem(f"{what} '{names[position]}' is matched twice, the second time by '{pattern}'")
             positions.append(position)
     return positions
+
+
+def match_values(values: Mapping[str, Value], names: Sequence[str], what: str) -> list[Value | None]:
+    """The value that a mapping from names or regexes gives each name; None for a name that it leaves out.
+
+    Raises:
+        NameProblem: as `match`.
+    """
+    found: list[Value | None] = [None] * len(names)
+    taken: dict[int, str] = {}
+    for pattern, value in values.items():
+        for position in match(pattern, names, what):
+            if position in taken:
+                raise NameProblem(f"{what} '{names[position]}' is matched by '{taken[position]}' and by '{pattern}'")
+            taken[position] = pattern
+            found[position] = value
+    return found
 
 
 def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:

@@ -33,6 +33,31 @@ def every_term():
     task["events"]["scene"] = {"func": "reset_scene_to_default", "mode": "reset"}
     task["events"]["offset"] = {"func": "reset_joints_by_offset", "mode": "reset", "joints": ["hip_fl", "hip_br"],
                                 "position": [-0.1, 0.1], "velocity": [-0.1, 0.1]}  # fmt: skip
+    task["commands"] = {
+        "walk": {"func": "uniform_velocity", "resampling_time_s": [0.04, 0.08], "lin_vel_x": [-1.0, 1.0],
+                 "ang_vel_z": [-1.0, 1.0], "heading": [-3.0, 3.0], "rel_standing": 0.2},
+        "run": {"func": "normal_velocity", "resampling_time_s": [0.04, 0.08], "mean": [1.0, 0.0, 0.0],
+                "std": [0.1, 0.1, 0.1], "zero_prob": [0.0, 0.5, 0.5]},
+        "pose": {"func": "uniform_pose", "resampling_time_s": [0.04, 0.08], "bodies": ["torso"], "x": [0.0, 1.0],
+                 "y": [0.0, 0.0], "z": [0.0, 0.0]},
+        "place": {"func": "uniform_pose2d", "resampling_time_s": [0.04, 0.08], "x": [0.0, 1.0], "y": [0.0, 1.0]},
+    }  # fmt: skip
+    task["observations"]["policy"]["pos"] |= {
+        "modifiers": [{"kind": "digital_filter", "a": [0.5], "b": [0.5]}, {"kind": "integrator"},
+                      {"kind": "clip", "bounds": [-9.0, 9.0]}, {"kind": "scale", "factor": 2.0}],
+        "noise": {"kind": "gaussian", "std": 0.1}, "bias": {"kind": "uniform"},
+        "delay": {"steps": [0, 2], "redraw": 0.5}, "history": 3,
+    }  # fmt: skip
+    task["curriculum"] = {
+        "weight": {"func": "stages", "address": "rewards.alive.weight", "steps": [3], "values": [2.0]},
+        "push": {"func": "interpolate", "address": "events.push.linear_velocity", "end": 10,
+                 "to": [[-2.0, 2.0], [-2.0, 2.0], [0.0, 0.0]]},
+    }  # fmt: skip
+    task["scene"]["entities"]["robot"]["actuators"] = {
+        "front": {"joints": ["hip_f."], "stiffness": 20.0, "damping": 0.5, "delay": [0, 2]},
+        "rear": {"joints": ["hip_br"], "kind": "dc_motor", "stiffness": 20.0, "saturation_effort": 9.0,
+                 "velocity_limit": 20.0},
+    }  # fmt: skip
     task["rewards"]["target"] = {"func": "joint_pos_target_l2", "weight": -0.1, "target": 0.0}
     task["rewards"].pop("power")  # one joint a column of the action: here two actions drive the same joint
     task["terminations"] |= {
