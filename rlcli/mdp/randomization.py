@@ -568,6 +568,47 @@ class RandomizeActuatorGains:
         self._bias.write(selection, torch.cat([-stiffness, -damping], dim=2))
 
 
+class RandomizePdGains:
+    """Actuator models (`scene.entities.*.actuators`): stiffness, damping [x s], effort limit [N or N m] of joints."""
+
+    derives = False
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        joints: Joints = ".*",
+        stiffness: ScheduledPair | None = None,
+        damping: ScheduledPair | None = None,
+        effort_limit: ScheduledPair | None = None,
+        distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
+        operation: Literal["add", "scale", "set"] = "scale",
+        shared: bool = False,
+    ) -> None:
+        pairs = {"stiffness": stiffness, "damping": damping, "effort_limit": effort_limit}
+        if not any(pair is not None for pair in pairs.values()):
+            raise NameProblem("nothing to randomise", "give stiffness, damping, effort_limit or several")
+        driven = {joint: (model, place) for model in entity.actuators for place, joint in enumerate(model.joints)}
+        good = [joint in driven for joint in range(len(entity.joint_names))]
+        _require(entity, "Joints", joints, good, "has no actuator model", "randomize_actuator_gains has MuJoCo's own")
+        chosen = torch.arange(len(good))[joints.cpu() if isinstance(joints, Tensor) else joints].tolist()
+        self._parts = [(*driven[joint], number) for number, joint in enumerate(chosen)]
+        self._draws = []
+        for name, pair in pairs.items():
+            if pair is not None:
+                own = [getattr(model, name)[0, place] for model, place, _ in self._parts]
+                draw = _Draw(env, pair, distribution, operation, (len(chosen), 1), shared=shared, lowest=0.0)
+                self._draws.append((name, torch.stack(own)[:, None], draw))
+
+    def __call__(self, selection: Selection) -> None:
+        """Draw anew for the selected environments."""
+        for name, original, draw in self._draws:
+            values = draw(selection, original)
+            for model, place, number in self._parts:
+                selection.write(getattr(model, name), values[:, number], slice(place, place + 1))
+
+
 class RandomizeEffortLimit:
     """Largest force of MuJoCo's own actuators on their joints, to both sides [N or N m]."""
 

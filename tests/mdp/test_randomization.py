@@ -227,6 +227,30 @@ def test_actuator_gains_stay_those_of_their_kind(tmp_path, engine):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+def test_actuator_models_have_gains_of_each_environment_that_reach_the_joints(tmp_path, engine):
+    models = "{soft: {joints: [wrist], stiffness: 20.0, damping: 0.0, effort_limit: 100.0}}"
+    env = machine(
+        tmp_path,
+        6,
+        f"scene.entities.robot.actuators={models}",
+        "actions={turn: {func: joint_position, joints: [wrist]}}",
+        engine=engine,
+        it={"func": "randomize_pd_gains", "mode": "startup", "joints": "wrist", "stiffness": U, "effort_limit": U},
+    )
+    env.reset()
+    env.step(torch.full((6, 1), 0.001))
+    (model,) = env.entities["robot"].actuators
+    gains = model.stiffness[:, 0]
+    assert (gains >= 10.0).all()
+    assert (gains <= 30.0).all()
+    assert len(set(gains.tolist())) == 6
+    assert len(set(model.effort_limit[:, 0].tolist())) == 6
+    env.engine.field("qpos")[:, int(env.engine.model.joint("robot/wrist").qposadr[0])] = 0.0
+    model.compute()
+    assert model.applied_effort[:, 0].tolist() == pytest.approx((0.001 * gains).tolist(), rel=1e-4)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 def test_an_effort_limit_is_that_on_the_joint_whatever_the_gear(tmp_path, engine):
     env = machine(
         tmp_path,
@@ -500,6 +524,7 @@ BAD = [
     ({"func": "randomize_joint_range", "joints": "slide", "upper": U}, "slide has no limits"),
     ({"func": "randomize_actuator_gains", "actuators": ["push", "servo"], "kp": U}, "push has no kp"),
     ({"func": "randomize_actuator_gains"}, "nothing to randomise"),
+    ({"func": "randomize_pd_gains", "stiffness": U}, "has no actuator model"),
     ({"func": "randomize_effort_limit", "actuators": "spin", "range": U}, "spin has no effort limit"),
     ({"func": "randomize_pair_friction", "pairs": "none", "range": U}, "no pair matches 'none'"),
     ({"func": "reset_joints_within_limits", "joints": ["slide"]}, "no limits to reset within"),
