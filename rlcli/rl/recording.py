@@ -42,7 +42,7 @@ class Episode:
     """Steps of the recording before its first."""
     length: int
     """Environment steps."""
-    ret: float
+    total_reward: float
     """Undiscounted sum of rewards."""
     truncated: bool
     """Ended by time alone."""

@@ -54,7 +54,7 @@ def test_an_episode_holds_its_states_actions_rewards_and_model(task, tmp_path):
         assert part["qpos"].dtype == torch.float64
         assert part["qvel"].shape == (episode.length + 1, 10)
         assert part["actions"].shape == (episode.length, 4)
-        assert float(part["rewards"].sum()) == pytest.approx(episode.ret, rel=1e-4)
+        assert float(part["rewards"].sum()) == pytest.approx(episode.total_reward, rel=1e-4)
         assert episode.causes
         masses.add(float(part["model.body_mass"][1]))
     assert len(masses) == 9, "each episode's own"

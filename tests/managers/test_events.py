@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from worlds import CRITTER_TASK, PENDULUM_TASK, actions, build, critter, edited, pendulum
 
+from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import resolve
 from rlcli.errors import ConfigError
 from rlcli.registry import find_task
@@ -115,6 +116,35 @@ def test_a_step_schedule_of_one_end_changes_at_its_step(tmp_path):
     assert (positions[20] > 0).all()
     assert (positions[30] > 0).all()
     assert not torch.equal(positions[20], positions[30])
+
+
+def test_a_schedule_reads_back_from_the_configuration_that_a_run_keeps(tmp_path):
+    ranges = [
+        {"schedule": "linear", "from": [0.0, 1.0], "to": ["1/2", 3.0], "steps": [0, 9]},
+        [{"schedule": "step", "from": 1.0, "to": 0.5, "steps": 4}, 2.0],
+    ]
+    for number, range_ in enumerate(ranges):
+        event = {**DAMPING, "mode": "reset", "range": range_}
+        task = pendulum(tmp_path / str(number), edited(PENDULUM_TASK, events={"it": event}))
+        resolved = resolve(find_task(str(task)))
+        (task / "task.yaml").write_text(to_yaml(to_data(resolved)))
+        assert resolve(find_task(str(task))).task.events == resolved.task.events
+
+
+def test_a_curriculum_may_move_the_range_of_a_randomisation(tmp_path):
+    stages = {"func": "stages", "address": "events.it.range", "steps": [15], "values": [[4.0, 5.0]]}
+    task = pendulum(
+        tmp_path,
+        edited(
+            PENDULUM_TASK, events={"it": {**DAMPING, "mode": "reset", "range": [1.0, 2.0]}}, curriculum={"it": stages}
+        ),
+    )
+    env = build(task, 4)
+    env.reset()
+    step(env, 10)
+    assert (damping(env) <= 2.0).all()
+    step(env, 10)
+    assert (damping(env) >= 4.0).all()
 
 
 BAD = [
