@@ -57,6 +57,10 @@ Tendons: TypeAlias = Any
 """Tendons of `entity`. At run time: an index into the names of its tendons."""
 Pairs: TypeAlias = Any
 """Contact pairs of `entity`. At run time: an index into the names of its pairs."""
+ContactSensor: TypeAlias = Any
+"""A contact sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.sensors.ContactSensor`."""
+RaySensor: TypeAlias = Any
+"""A ray sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.sensors.RaySensor`."""
 Command: TypeAlias = Any
 """A term of `commands:`. YAML: its name. At run time: the term, whose `.command` is (num_envs, k)."""
 Address: TypeAlias = Any

@@ -91,6 +91,16 @@ def _said(
     kind, found = items[0]["type"], items[0]["input"]
     if kind == "extra_forbidden":
         return f"unknown key '{path[-1]}'", _right_key(str(path[-1]), _fields(model, path[:-1]), homes), path
+    if kind == "union_tag_not_found":
+        return "missing key 'kind'", f"one of {listing(_tags(model, path))}", path
+    if kind == "union_tag_invalid":
+        tag = items[0]["ctx"]["tag"]
+        near = did_you_mean(tag, _tags(model, path))
+        return (
+            f"expected {items[0]['ctx']['expected_tags'].replace(', ', ' or ')}, found {shown(tag)}",
+            near,
+            (*path, "kind"),
+        )
     if kind == "value_error":
         return str(items[0]["ctx"]["error"]), None, path
     if kind == "missing" and isinstance(items[0]["loc"][-1], str):
@@ -177,6 +187,12 @@ def _at(data: Any, path: Path) -> Any:
 def _fields(model: type[BaseModel], path: Path) -> set[str]:
     """Keys that the mapping at `path` may have, following the model's annotations."""
     return {name for arm in _arms_at(model, path) if _is_model(arm) for name in arm.model_fields}
+
+
+def _tags(model: type[BaseModel], path: Path) -> list[str]:
+    """Values of `kind` that tell the mappings apart which may stand at `path`."""
+    kinds = [arm.model_fields["kind"].annotation for arm in _arms_at(model, path) if _is_model(arm)]
+    return [tag for kind in kinds for tag in get_args(kind)]
 
 
 def _length(model: type[BaseModel], path: Path) -> int | None:

@@ -60,10 +60,17 @@ def _rotation(value: tuple[float, float, float, float]) -> tuple[float, float, f
     return value
 
 
+def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if math.hypot(*value) < 1e-6:
+        raise ValueError("a direction must not be zero; straight down is [0, 0, -1]")
+    return value
+
+
 Number = Annotated[float, _Fraction()]
 Positive = Annotated[float, Field(gt=0), _Fraction()]
 NotNegative = Annotated[float, Field(ge=0), _Fraction()]
 Count = Annotated[int, Field(ge=1)]
+_Share = Annotated[float, Field(ge=0, le=1), _Fraction()]
 Vec3 = tuple[Number, Number, Number]
 Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_rotation)]
 Range = Annotated[tuple[Number, Number], AfterValidator(_ordered)]
@@ -497,21 +504,51 @@ class ActuatorConfig(StrictModel):
 
 
 class InitialStateConfig(StrictModel):
-    """The default state of an entity, which resets start from."""
+    """The default state of an entity, which resets start from; its pose is the entity's `pos` and `quat`."""
 
     joint_pos: dict[str, Number] = {}
     """Joint name or regex -> position [m or rad]."""
     joint_vel: dict[str, Number] = {}
     """Joint name or regex -> velocity [m/s or rad/s]."""
+    lin_vel: Vec3 = (0.0, 0.0, 0.0)
+    """Velocity of a free root, world frame [m/s]."""
+    ang_vel: Vec3 = (0.0, 0.0, 0.0)
+    """Angular velocity of a free root, world frame [rad/s]."""
+
+
+_SIZES = {
+    "box": "[x, y, z], its edges",
+    "sphere": "[radius]",
+    "cylinder": "[radius, length]",
+    "capsule": "[radius, length], the length without the round ends",
+    "plane": "[x, y], its edges",
+}
+"""Shape -> what its `size` holds [m]."""
 
 
 class EntityConfig(StrictModel):
-    """A robot or object: an MJCF file attached to the scene under the entity's name."""
+    """A robot or object: an MJCF file attached to the scene under the entity's name, or a single shape."""
 
-    model: str
+    model: str | None = None
     """MJCF file, relative to the task's folder."""
+    shape: Literal["box", "sphere", "cylinder", "capsule", "plane"] | None = None
+    """Instead of a model: a body `body` with one geom `geom`."""
+    size: list[Positive] | None = None
+    """Of a shape [m]: box [x, y, z] and plane [x, y] edges; sphere [radius]; cylinder and capsule [radius, length]."""
+    free: bool = False
+    """A shape: it moves freely; false: it stands where `pos` has put it."""
+    mocap: bool = False
+    """A shape: it stands still, and events may move it."""
+    mass: Positive | None = None
+    """Mass of a shape [kg]; null: its density decides."""
+    density: Positive | None = None
+    """Density of a shape [kg/m^3]; null: 1000."""
+    friction: NotNegative = 1.0
+    """Sliding friction of a shape."""
+    color: Color = (0.55, 0.6, 0.65)
+    """Red, green, blue of a shape in [0, 1]."""
     pos: Vec3 = (0.0, 0.0, 0.0)
-    """Position of the MJCF's origin in the environment's frame [m]."""
+    """Position of the MJCF's origin, or of the middle of the shape, in the environment's frame [m]."""
     quat: Quaternion = (1.0, 0.0, 0.0, 0.0)
     """Orientation (w, x, y, z)."""
     joints: dict[str, JointConfig] = {}
@@ -519,9 +556,273 @@ class EntityConfig(StrictModel):
     actuators: dict[str, ActuatorConfig] = {}
     """Name -> actuator model; joints that none of them drives keep MuJoCo's actuators."""
     init: InitialStateConfig = InitialStateConfig()
-    """Default joint state; a joint not named starts at the MJCF's qpos0, at rest."""
+    """Default state; a joint not named starts at the MJCF's qpos0, at rest."""
     soft_joint_pos_limit_factor: Annotated[float, Field(gt=0, le=1), _Fraction()] = 1.0
     """Share of the joint range, about its middle, that counts as inside the soft limits."""
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> EntityConfig:
+        if (self.model is None) == (self.shape is None):
+            raise ValueError("an entity is a model (an MJCF file) or a shape: write one of the two")
+        if self.model is not None:
+            given = [key for key in ("size", "mass", "density") if getattr(self, key) is not None]
+            given += [key for key in ("free", "mocap") if getattr(self, key)]
+            if given:
+                raise ValueError(f"'{given[0]}' belongs to a shape; of a model the MJCF says it")
+            return self
+        self._check_shape()
+        return self
+
+    def _check_shape(self) -> None:
+        assert self.shape is not None
+        wanted = _SIZES[self.shape]
+        count = wanted.partition("]")[0].count(",") + 1
+        if self.size is None or len(self.size) != count:
+            found = "none" if self.size is None else f"{len(self.size)} numbers"
+            raise ValueError(f"size of a {self.shape} is {wanted} [m]; found {found}")
+        if self.mass is not None and self.density is not None:
+            raise ValueError("mass and density exclude each other")
+        if self.free and self.mocap:
+            raise ValueError("free and mocap exclude each other")
+        if self.shape == "plane" and (self.free or self.mocap):
+            raise ValueError("a plane cannot move; a flat box can")
+
+
+class TouchedConfig(StrictModel):
+    """What a contact sensor listens to contacts with."""
+
+    entity: str
+    """Name of an entity."""
+    bodies: Names | None = None
+    """Names or regexes of its bodies; null: all of them."""
+
+
+class ContactSensorConfig(StrictModel):
+    """What touches bodies of an entity: net force, and how long they have been in contact or in the air."""
+
+    kind: Literal["contact"]
+    """contact."""
+    entity: str = "robot"
+    """Name of an entity."""
+    bodies: Names
+    """Names or regexes of its bodies, one slot each in the order written."""
+    against: Literal["ground"] | TouchedConfig | None = None
+    """Only contacts with this: ground (the plane or the terrain), or bodies of an entity; null: with anything."""
+    history: Count = 1
+    """Steps that `force_history` keeps."""
+    force_threshold: NotNegative = 0.0
+    """Net force from which on a body counts as in contact [N]; 0: any contact does."""
+
+
+class GridPatternConfig(StrictModel):
+    """Parallel rays that start from a grid about the sensor, x running fastest."""
+
+    size: tuple[NotNegative, NotNegative]
+    """Extent along x and y [m]."""
+    resolution: Positive
+    """Distance between neighbouring rays [m]."""
+    direction: Annotated[Vec3, AfterValidator(_direction)] = (0.0, 0.0, -1.0)
+    """Where the rays go, in the sensor's frame."""
+
+
+class RaySensorConfig(StrictModel):
+    """Distances along rays from a body, as a height scanner or a lidar gives them."""
+
+    kind: Literal["rays"]
+    """rays."""
+    entity: str = "robot"
+    """Name of an entity."""
+    body: str | None = None
+    """The body that carries the sensor; null: the root."""
+    pattern: GridPatternConfig | Annotated[list[Annotated[Vec3, AfterValidator(_direction)]], Field(min_length=1)]
+    """A grid of parallel rays, or a list of directions from one point, in the sensor's frame."""
+    offset: Vec3 = (0.0, 0.0, 0.0)
+    """Where the sensor sits in its frame [m]."""
+    alignment: Literal["base", "yaw", "world"] = "base"
+    """Axes of the sensor's frame: those of the body, those of the body's heading with z up, or the world's."""
+    max_distance: Positive = 10.0
+    """Range [m]; what lies farther is missed."""
+    sees: Literal["ground", "all"] | Annotated[list[Annotated[int, Field(ge=0, le=5)]], Field(min_length=1)] = "ground"
+    """ground: the plane or the terrain; all: every geom but those of the body; or a list of geom groups."""
+
+
+SensorConfig = Annotated[ContactSensorConfig | RaySensorConfig, Field(discriminator="kind")]
+
+
+class PatchConfig(StrictModel):
+    """What all sub-terrains have in common. Pairs of values are those of difficulty 0 and of difficulty 1."""
+
+    proportion: NotNegative = 1.0
+    """Share of the columns (without curriculum: of the patches), relative to the other sub-terrains."""
+
+
+class FlatPatchConfig(PatchConfig):
+    """Flat ground."""
+
+    kind: Literal["flat"]
+    """flat."""
+
+
+class NoisePatchConfig(PatchConfig):
+    """Uneven ground: uniform random heights."""
+
+    kind: Literal["noise"]
+    """noise."""
+    height: Range = (0.02, 0.1)
+    """Heights lie within +-this [m]."""
+    spacing: Positive = 0.2
+    """Distance between two random heights; between them the ground is straight [m]."""
+
+
+class SlopePatchConfig(PatchConfig):
+    """A pyramid of four slopes."""
+
+    kind: Literal["slope"]
+    """slope."""
+    slope: Range = (0.0, 0.4)
+    """Rise over run."""
+    platform: NotNegative = 2.0
+    """Edge of the flat middle [m]."""
+    inverted: bool = False
+    """Down to the middle instead of up."""
+
+
+class WavesPatchConfig(PatchConfig):
+    """Sine waves along x and y."""
+
+    kind: Literal["waves"]
+    """waves."""
+    amplitude: Range = (0.05, 0.2)
+    """Half the height from trough to crest [m]."""
+    count: Count = 2
+    """Waves along an edge."""
+
+
+class ObstaclesPatchConfig(PatchConfig):
+    """Low blocks and pits in random places."""
+
+    kind: Literal["obstacles"]
+    """obstacles."""
+    height: Range = (0.05, 0.2)
+    """Height of blocks, depth of pits [m]."""
+    width: Range = (0.25, 1.0)
+    """[narrowest, widest] edge of an obstacle [m]."""
+    count: Count = 40
+    """Obstacles in a patch."""
+    platform: NotNegative = 2.0
+    """Edge of the flat middle [m]."""
+
+
+class StonesPatchConfig(PatchConfig):
+    """Stepping stones over a pit."""
+
+    kind: Literal["stones"]
+    """stones."""
+    width: Range = (0.25, 1.0)
+    """[narrowest, widest] edge of a stone [m]; at difficulty 0 stones are wide."""
+    gap: Range = (0.05, 0.3)
+    """Distance between stones [m]."""
+    depth: Positive = 1.0
+    """Depth of the pit [m]."""
+    platform: NotNegative = 2.0
+    """Edge of the flat middle [m]."""
+
+
+class StairsPatchConfig(PatchConfig):
+    """Stairs on four sides."""
+
+    kind: Literal["stairs"]
+    """stairs."""
+    step_height: Range = (0.05, 0.2)
+    """Height of a step [m]."""
+    step_width: Positive = 0.3
+    """Depth of a step [m]."""
+    platform: NotNegative = 2.0
+    """Edge of the flat middle [m]."""
+    inverted: bool = False
+    """Down to the middle instead of up."""
+    boxes: bool = False
+    """Boxes with upright faces; false: part of the height field, whose faces lean by one cell. Boxes cost time."""
+
+
+class GridPatchConfig(PatchConfig):
+    """A grid of cells of random heights."""
+
+    kind: Literal["grid"]
+    """grid."""
+    cell: Positive = 0.5
+    """Edge of a cell [m]."""
+    height: Range = (0.02, 0.15)
+    """Heights lie within +-this [m]."""
+    platform: NotNegative = 2.0
+    """Edge of the flat middle [m]."""
+    boxes: bool = False
+    """Boxes with upright faces; false: part of the height field, whose faces lean by one cell. Boxes cost time."""
+
+
+SubTerrainConfig = Annotated[
+    FlatPatchConfig
+    | NoisePatchConfig
+    | SlopePatchConfig
+    | WavesPatchConfig
+    | ObstaclesPatchConfig
+    | StonesPatchConfig
+    | StairsPatchConfig
+    | GridPatchConfig,
+    Field(discriminator="kind"),
+]
+
+
+class TerrainGeneratorConfig(StrictModel):
+    """Patches in rows of rising difficulty, a kind of ground in each column; environments start in their middles."""
+
+    kind: Literal["generator"]
+    """generator."""
+    rows: Count = 10
+    """Levels of difficulty, along x."""
+    columns: Count = 10
+    """Patches of a level, along y; environment i has column i modulo this."""
+    patch: tuple[Positive, Positive] = (8.0, 8.0)
+    """Extent of a patch along x and y [m]."""
+    border: NotNegative = 10.0
+    """Flat ground about the patches [m]."""
+    resolution: Positive = 0.1
+    """Distance between two heights of the height field [m]."""
+    sub_terrains: Annotated[dict[str, SubTerrainConfig], Field(min_length=1)]
+    """Name -> a kind of ground."""
+    difficulty: Annotated[tuple[_Share, _Share], AfterValidator(_ordered)] = (0.0, 1.0)
+    """Difficulty of the first and of the last row, in [0, 1]."""
+    curriculum: bool = True
+    """A kind of ground for each column, difficulty by row; false: both are drawn for each patch."""
+    max_start_level: Annotated[int, Field(ge=0)] | None = None
+    """Environments begin at random levels up to this one; null: the last."""
+    seed: int = 0
+    """Of the terrain's random heights."""
+    friction: NotNegative = 1.0
+    """Sliding friction."""
+
+    @field_validator("sub_terrains")
+    @classmethod
+    def _some_ground(cls, value: dict[str, SubTerrainConfig]) -> dict[str, SubTerrainConfig]:
+        if sum(patch.proportion for patch in value.values()) <= 0.0:
+            raise ValueError("the proportions of the sub-terrains sum to 0; one must be above 0")
+        return value
+
+
+class TerrainHeightsConfig(StrictModel):
+    """Ground of one's own: a height field from a file. All environments start in its middle."""
+
+    kind: Literal["heights"]
+    """heights."""
+    file: str
+    """A NumPy file (.npy) in the task's folder: heights [m], one row along y for each x."""
+    resolution: Positive
+    """Distance between two heights [m]."""
+    friction: NotNegative = 1.0
+    """Sliding friction."""
+
+
+TerrainConfig = Annotated[TerrainGeneratorConfig | TerrainHeightsConfig, Field(discriminator="kind")]
 
 
 class SceneConfig(StrictModel):
@@ -532,11 +833,15 @@ class SceneConfig(StrictModel):
     env_spacing: NotNegative = 4.0
     """Distance between environments on the grid that viewers draw [m]; physics runs at each world's origin."""
     ground: GroundConfig | None = GroundConfig()
-    """Ground plane; null for none."""
+    """Ground plane; null for none. A terrain replaces it."""
+    terrain: TerrainConfig | None = None
+    """Uneven ground, shared by all environments, each at its own place on it."""
     lights: LightsConfig = LightsConfig(dome=DomeLightConfig())
     """Lights."""
     entities: Annotated[dict[str, EntityConfig], Field(min_length=1)]
     """Name -> robot or object."""
+    sensors: dict[str, SensorConfig] = {}
+    """Name -> contact or ray sensor, for terms that ask for one. Sensors of the MJCF need no entry here."""
 
 
 class TaskConfig(StrictModel):

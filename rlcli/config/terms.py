@@ -49,16 +49,17 @@ SECTIONS: dict[str, type[TermConfig]] = {
 SELECTORS = ("Joints", "Bodies", "Sites", "Sensors", "Actuators", "Geoms", "Tendons", "Pairs")
 """Aliases of `rlcli.task` that pick elements of the term's `entity`."""
 
+NAMED = ("Entity", "Command", "Address", "ContactSensor", "RaySensor")
+"""Aliases of `rlcli.task` that name one thing."""
+
 _TYPES: dict[str, Any] = {
     "float": Number,
     "int": int,
     "bool": bool,
     "str": str,
     "None": None,
-    "Entity": str,
-    "Command": str,
-    "Address": str,
     "Range": Range,
+    **dict.fromkeys(NAMED, str),
     "ScheduledRange": ScheduledRange,
     "ScheduledPair": ScheduledPair,
     **dict.fromkeys(SELECTORS, Names),
@@ -219,7 +220,7 @@ def annotation_type(node: ast.expr) -> Any:
             return tuple[tuple(annotation_type(item) for item in items)]  # type: ignore[misc]
     raise SignatureError(
         f"annotation '{ast.unparse(node)}' is not one that YAML can express; use float, int, bool, str, Literal, tuple,"
-        f" list, dict[str, X], X | None, Range, Entity, Command, Address or {' / '.join(SELECTORS)}"
+        f" list, dict[str, X], X | None, Range, {', '.join(NAMED)} or {' / '.join(SELECTORS)}"
     )
 
 
@@ -300,7 +301,7 @@ def _alias(node: ast.expr) -> str | None:
     if isinstance(node, ast.BinOp):
         return _alias(node.left) or _alias(node.right)
     name = _last_name(node)
-    return name if name in (*SELECTORS, "Entity", "Command", "Address") else None
+    return name if name in (*SELECTORS, *NAMED) else None
 
 
 def _quoted(text: str) -> ast.expr:

@@ -176,6 +176,8 @@ class ManagedEnv(VecEnv):
     def _written(self, selection: Selection) -> None:
         self.engine.forward(selection)
         self.sim.refresh_rows(selection)
+        for sensor in self.sensors.values():
+            sensor.moved(selection)
 
     def _observe(self) -> dict[str, Tensor]:
         return self.observation_manager.compute()

@@ -26,8 +26,11 @@ from rlcli.sim.actuators import ActuatorModel
 from rlcli.sim.engine import open_engine
 from rlcli.sim.entity import Entity, SimData, is_finite
 from rlcli.sim.names import NameProblem
+from rlcli.sim.rotations import rotate_inverse
 from rlcli.sim.scene import Scene
 from rlcli.sim.selection import Selection
+from rlcli.sim.sensors import ContactSensor, RaySensor, make_sensors
+from rlcli.sim.terrain import Terrain
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +216,8 @@ class VecEnv(ABC):
             self.seed = seed
             self.episode_index.zero_()
             self._steps.zero_()
+            if self.terrain is not None:
+                self.terrain.start(seed)
         else:
             self.episode_index += 1
         self.engine.attach()
@@ -244,6 +249,8 @@ class VecEnv(ABC):
             self.after_physics()
         self.episode_length_buf += 1
         self._steps += 1
+        for sensor in self.sensors.values():
+            sensor.update(self.step_dt)
         reward, terminated, truncated = self._judge(diverged)
         self._require_finite(reward, "the reward")
         self._hold_success()
@@ -326,10 +333,18 @@ class VecEnv(ABC):
             for name, model in self._actuators.items()
             for key, value in model.state_dict().items()
         }
+        sensors = {
+            f"sensors.{name}.{key}": value
+            for name, sensor in self.sensors.items()
+            for key, value in sensor.state_dict().items()
+        }
+        terrain = {} if self.terrain is None else self.terrain.state_dict()
         return {
             **own,
             **engine,
             **models,
+            **{f"terrain.{name}": value for name, value in terrain.items()},
+            **sensors,
             **{f"workflow.{name}": value for name, value in self._workflow_state().items()},
         }
 
@@ -344,6 +359,10 @@ class VecEnv(ABC):
         for name, model in self._actuators.items():
             model.load_state_dict(_below(state, f"actuator.{name}."))
         self.sim.refresh()
+        if self.terrain is not None:
+            self.terrain.load_state_dict(_below(state, "terrain."))
+        for name, sensor in self.sensors.items():
+            sensor.load_state_dict(_below(state, f"sensors.{name}."))
         self._load_workflow_state(_below(state, "workflow."))
         return self._observe_again()
 
@@ -467,6 +486,7 @@ class VecEnv(ABC):
 
     def _restart(self, selection: Selection) -> None:
         self.engine.reset(selection)
+        self._place(selection)
         self.sim.refresh_rows(selection)  # a reset event or reset_idx reads the default state, not the last episode's
         for actuator in self._actuators.values():
             actuator.reset(selection)
@@ -475,6 +495,18 @@ class VecEnv(ABC):
         selection.write(self._success_hold, 0.0)
         self.engine.forward(selection)
         self.sim.refresh_rows(selection)
+        for sensor in self.sensors.values():
+            sensor.reset(selection)
+
+    def _place(self, selection: Selection) -> None:
+        """Move what can move from its default place to the environment's own."""
+        if self.terrain is None:
+            return
+        for entity in self.entities.values():
+            if entity.is_floating or entity.mocap >= 0:
+                default = selection.peek(entity.data.default_root_state)
+                place = default[:, :3] + selection.peek(self.origins)
+                entity.write_root_pose(selection, place, default[:, 3:7])
 
     def _select(self, mask: Tensor) -> Selection | None:
         return self.engine.select(mask, self.seed, self.episode_index)
@@ -532,10 +564,16 @@ class VecEnv(ABC):
         """`entity.name` -> actuator model, in the order of the configuration."""
         for built in self.entities.values():
             self._add_actuators(built)
+        self.sensors: dict[str, ContactSensor | RaySensor] = make_sensors(scene.sensors, self.sim, self.entities)
+        """Contact and ray sensors of `scene.sensors`, by name."""
         self._set_default(model)
         self.views = scene.views
         self.origins = torch.zeros(self.num_envs, 3, device=self.device)
-        """Where each environment's start place lies in its world. (num_envs, 3) [m]"""
+        """Where each environment's start place lies in its world: zeros without a terrain. (num_envs, 3) [m]"""
+        terrain = config.scene.terrain
+        self.terrain: Terrain | None = None
+        if terrain is not None and scene.ground is not None:
+            self.terrain = Terrain(scene.ground, terrain, self.origins, self.seed)
         self.env_origins = grid(self.num_envs, config.scene.env_spacing).to(self.device)
 
     def _add_actuators(self, entity: Entity) -> None:
@@ -554,6 +592,11 @@ class VecEnv(ABC):
         for entity in self.entities.values():
             qpos[entity.qpos_columns.cpu()] = entity.data.default_joint_pos[0].double().cpu()
             qvel[entity.dof_columns.cpu()] = entity.data.default_joint_vel[0].double().cpu()
+            if entity.is_floating:
+                _, dof = entity.floating()
+                root = entity.data.default_root_state[:1].double().cpu()
+                local = rotate_inverse(root[:, 3:7], root[:, 10:])  # a free joint's is in the body's frame
+                qvel[dof : dof + 6] = torch.cat([root[:, 7:10], local], dim=1)[0]
         self.engine.set_default(qpos, qvel)
         self.engine.reset(self._everyone())
         self.sim.refresh()

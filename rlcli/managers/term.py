@@ -23,6 +23,11 @@ from rlcli.sim.names import NameProblem
 
 if TYPE_CHECKING:
     from rlcli.envs.vec_env import VecEnv
+    from rlcli.sim.sensors import ContactSensor, RaySensor
+
+
+SENSORS = {"ContactSensor": "contact", "RaySensor": "rays"}
+"""Alias of `rlcli.task` -> kind of the sensor that it names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,12 +156,16 @@ class Binder:
                 params[parameter.name] = entity
         for parameter in signature.parameters:
             name = parameter.name
-            if parameter.alias == "Command":
+            if parameter.alias == "Command" and params[name] is not None:
                 params[name] = self._command(path, name, params[name])
                 good = good and params[name] is not None
             elif parameter.alias == "Address":
                 params[name] = self._opened.get((*path, name))
                 good = good and params[name] is not None
+            elif parameter.alias in SENSORS:
+                if params[name] is not None:
+                    params[name] = self._sensor(path, name, params[name], SENSORS[parameter.alias])
+                    good = good and params[name] is not None
             else:
                 params[name] = self.live.get((*path, name), params[name])
         for parameter in signature.parameters:
@@ -169,6 +178,19 @@ class Binder:
                     continue
                 params[parameter.name], elements[parameter.name] = index, names
         return (params if good else None), elements
+
+    def _sensor(self, path: Path, parameter: str, name: str, kind: str) -> ContactSensor | RaySensor | None:
+        configs = self.resolved.task.scene.sensors
+        found = configs.get(name)
+        if found is not None and found.kind == kind:
+            return self.env.sensors.get(name)  # absent if the scene refused it, and has said so
+        names = [other for other, config in configs.items() if config.kind == kind]
+        message = f"no sensor '{name}' of kind {kind} in scene.sensors"
+        if found is not None:
+            message = f"sensor '{name}' is of kind {found.kind}, the term needs one of kind {kind}"
+        near = did_you_mean(name, names) or f"sensors of this kind: {listing(names) if names else 'none'}"
+        self._problem(path, parameter, message, near)
+        return None
 
     def _open_addresses(self) -> None:
         """Find what the curriculum changes before anybody binds to it."""

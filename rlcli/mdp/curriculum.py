@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rlcli.task import Address
+from rlcli.task import Address, Command, Entity
 
 if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
+    from rlcli.sim.selection import Selection
 
 
 class Stages:
@@ -72,3 +73,40 @@ class Interpolate:
         share = ((step - self._begin).float() / (self._end - self._begin)).clamp(0.0, 1.0)
         self._live.copy_(self._from + share * (self._to - self._from))
         return self._live
+
+
+class TerrainLevels:
+    """A level up for who got off the middle half of its patch, down for who got less far than it should. -> the levels
+
+    Far is half a patch along x. An episode should have covered half of what its `command` (a velocity, x and y first)
+    asked for; without a command, `least` [m]. Past the last level comes a random one. Isaac Lab: terrain_levels_vel.
+    """
+
+    def __init__(
+        self, env: ManagedEnv, *, entity: Entity = "robot", command: Command | None = None, least: float = 0.0
+    ) -> None:
+        if env.terrain is None:
+            raise ValueError("the scene has no terrain; add scene.terrain")
+        self._env, self._entity, self._command, self._least = env, entity, command, least
+        self._far = 0.5 * env.terrain.patch[0]
+        self._asked = 0.5 * env.max_episode_length * env.step_dt
+
+    def __call__(self, selection: Selection) -> Tensor:
+        """Move the environments whose episode ends. -> (num_envs,)"""
+        terrain = self._env.terrain
+        assert terrain is not None
+        way = selection.peek(self._entity.data.root_pos_w) - selection.peek(self._env.origins)
+        distance = _length(way)
+        up = distance > self._far
+        if self._command is None:
+            down = distance < self._least
+        else:
+            down = distance < _length(selection.peek(self._command.command)) * self._asked
+        terrain.move(selection, up, down)
+        return terrain.levels
+
+
+def _length(vector: Tensor) -> Tensor:
+    """Of the first two components."""
+    x, y = vector[:, 0], vector[:, 1]
+    return (x * x + y * y).sqrt()

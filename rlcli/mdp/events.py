@@ -106,12 +106,12 @@ def reset_root_state_uniform(
     linear_velocity: list[ScheduledRange] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006 (read, never written)
     angular_velocity: list[ScheduledRange] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
 ) -> None:
-    """Default root state plus uniform offsets: position [m], attitude [rad], velocity [m/s, rad/s], world frame."""
+    """Default root state at the environment's origin plus uniform offsets [m, rad, m/s, rad/s], world frame."""
     default = selection.read(entity.data.default_root_state)
     offset = selection.uniform(*_bounds(env, x, y, z), (3, 1)).squeeze(2)
     turn = from_euler(*selection.uniform(*_bounds(env, roll, pitch, yaw), (3, 1)).squeeze(2).unbind(1))
     velocity = selection.uniform(*_bounds(env, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
-    position = default[:, :3] + offset + selection.peek(env.origins)
+    position = default[:, :3] + selection.peek(env.origins) + offset
     entity.write_root_pose(selection, position, multiply(default[:, 3:7], turn))
     entity.write_root_velocity(selection, default[:, 7:10] + velocity[:, :3], default[:, 10:] + velocity[:, 3:])
 
@@ -132,7 +132,7 @@ def reset_root_state_with_random_orientation(
     offset = selection.uniform(*_bounds(env, x, y, z), (3, 1)).squeeze(2)
     velocity = selection.uniform(*_bounds(env, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
     quat = random_quaternion(*selection.uniform(0.0, 1.0, (3,)).unbind(1))
-    entity.write_root_pose(selection, default[:, :3] + offset + selection.peek(env.origins), quat)
+    entity.write_root_pose(selection, default[:, :3] + selection.peek(env.origins) + offset, quat)
     entity.write_root_velocity(selection, default[:, 7:10] + velocity[:, :3], default[:, 10:] + velocity[:, 3:])
 
 
@@ -143,9 +143,10 @@ def reset_scene_to_default(env: ManagedEnv, selection: Selection) -> None:
         if entity.joint_names:
             entity.write_joint_positions(selection, selection.read(data.default_joint_pos))
             entity.write_joint_velocities(selection, selection.read(data.default_joint_vel))
-        if entity.is_floating:
-            root = selection.read(data.default_root_state)
+        root = selection.read(data.default_root_state)
+        if entity.is_floating or entity.mocap >= 0:
             entity.write_root_pose(selection, root[:, :3] + selection.peek(env.origins), root[:, 3:7])
+        if entity.is_floating:
             entity.write_root_velocity(selection, root[:, 7:10], root[:, 10:])
 
 

@@ -179,6 +179,26 @@ class BatchEngine:
         ids = mask.numpy().nonzero()[0]
         return IdSelection(ids, seed, counters.numpy()[ids]) if len(ids) else None
 
+    def rays(
+        self,
+        points: Tensor,
+        directions: Tensor,
+        *,
+        groups: tuple[int, ...] | None = None,
+        exclude: int = -1,
+        selection: Selection | None = None,
+    ) -> Tensor:
+        """Distances from points to the first geom along unit directions, -1 where there is none. (rows, rays)"""
+        seen = None if groups is None else np.array([g in groups for g in range(mujoco.mjNGROUP)], dtype=np.uint8)
+        ids = None if selection is None else _ids(selection).astype(np.int32)
+        try:
+            distance, _ = self._batch.ray(
+                points.double().numpy(), directions.double().numpy(), geomgroup=seen, bodyexclude=exclude, ids=ids
+            )
+        except SimulationError as error:
+            raise _engine_error(error) from None
+        return torch.from_numpy(distance).float()
+
     def watch(self, values: Tensor, what: str) -> None:
         """Never needed: values are checked where they are made."""
 

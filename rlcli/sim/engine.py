@@ -95,6 +95,27 @@ class Engine(Protocol):
         """The worlds where `mask` holds, with their random streams; None where that is known to be nobody."""
         ...
 
+    def rays(
+        self,
+        points: Tensor,
+        directions: Tensor,
+        *,
+        groups: tuple[int, ...] | None = None,
+        exclude: int = -1,
+        selection: Selection | None = None,
+    ) -> Tensor:
+        """Distances from points to the first geom along unit directions, -1 where there is none. (rows, rays) float32
+
+        Args:
+            points: world frame [m]; a row for every world, or for those of the selection as it reads fields.
+                (rows, rays, 3) float32
+            directions: of length 1. (rows, rays, 3) float32
+            groups: of the geoms that are seen; None: all.
+            exclude: a body whose geoms are not.
+            selection: the worlds; None: all.
+        """
+        ...
+
     def watch(self, values: Tensor, what: str) -> None:
         """Note, without waiting, if a value is not finite."""
         ...

@@ -14,7 +14,7 @@ from torch import Tensor
 from rlcli.config.schema import EntityConfig
 from rlcli.errors import TaskError
 from rlcli.sim.engine import Engine
-from rlcli.sim.names import match
+from rlcli.sim.names import NameProblem, match
 from rlcli.sim.rotations import rotate, rotate_inverse
 from rlcli.sim.scene import actuator_kind
 from rlcli.sim.selection import ALL, Columns, Selection
@@ -109,6 +109,8 @@ class Entity:
         self.dof_columns = torch.from_numpy(model.jnt_dofadr[self.joint_ids].astype(np.int64)).to(engine.device)
         self.root_body = int(self.body_ids[0]) if len(self.body_ids) else 0
         self.root_qpos, self.root_dof = self._root(model)
+        self.mocap = int(model.body_mocapid[self.root_body])
+        """Number of the mocap body that the root is; -1: none."""
         self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
         self._column_cache: dict[tuple, tuple[Columns, Columns]] = {}
         self.data = EntityData(self, sim)
@@ -160,7 +162,11 @@ class Entity:
         selection.write(self._qvel, values, self._columns(self.dof_columns, joints))
 
     def write_root_pose(self, selection: Selection, position: Tensor, quat: Tensor) -> None:
-        """Set the root's pose in its environment's frame. position (rows, 3) [m], quat (rows, 4) w, x, y, z"""
+        """Set the pose of a free or mocap root in its world. position (rows, 3) [m], quat (rows, 4) w, x, y, z"""
+        if self.mocap >= 0:
+            selection.write(self.engine.field("mocap_pos")[:, self.mocap], position)
+            selection.write(self.engine.field("mocap_quat")[:, self.mocap], quat)
+            return
         root, _ = self.floating()
         selection.write(self._qpos, torch.cat([position, quat], dim=1), slice(root, root + 7))
 
@@ -284,12 +290,16 @@ class EntityData:
     def root_pos_w(self) -> Tensor:
         """Root position. (num_envs, 3) [m]"""
         q = self._entity.root_qpos
+        if self._entity.mocap >= 0:
+            return self._sim.derived("mocap_pos")[:, self._entity.mocap]
         return self._sim.qpos[:, q : q + 3] if q is not None else self.default_root_state[:, :3]
 
     @property
     def root_quat_w(self) -> Tensor:
         """Root orientation (w, x, y, z). (num_envs, 4)"""
         q = self._entity.root_qpos
+        if self._entity.mocap >= 0:
+            return self._sim.derived("mocap_quat")[:, self._entity.mocap]
         return self._sim.qpos[:, q + 3 : q + 7] if q is not None else self.default_root_state[:, 3:7]
 
     @property
@@ -372,7 +382,12 @@ class EntityData:
         else:
             body = entity.root_body
             pose = np.concatenate([model.body_pos[body], model.body_quat[body]])
-        return torch.cat([torch.tensor(pose, dtype=torch.float32), torch.zeros(6)])
+        velocity = [*entity.config.init.lin_vel, *entity.config.init.ang_vel]
+        if entity.root_qpos is None and any(velocity):
+            raise NameProblem(
+                f"entity '{entity.name}' has no free root", "lin_vel and ang_vel are those of a free root"
+            )
+        return torch.tensor([*pose, *velocity], dtype=torch.float32)
 
 
 def _direction(vectors: Tensor) -> Tensor:

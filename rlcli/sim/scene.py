@@ -10,9 +10,19 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from rlcli.config.schema import EntityConfig, JointConfig, LightsConfig, SceneConfig, SimConfig
-from rlcli.errors import ConfigError, Problem
+from rlcli.config.schema import (
+    ContactSensorConfig,
+    EntityConfig,
+    JointConfig,
+    LightsConfig,
+    RaySensorConfig,
+    SceneConfig,
+    SimConfig,
+)
+from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli.sim.names import NameProblem, match
+from rlcli.sim.terrain import BODY as TERRAIN
+from rlcli.sim.terrain import Ground, add_ground, make_ground, misfits
 
 _INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
@@ -20,11 +30,26 @@ _INTEGRATORS = {
     "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
+_SHAPES = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "plane": mujoco.mjtGeom.mjGEOM_PLANE,
+}
 _OPTIONS = (
     "integrator", "cone", "jacobian", "solver", "tolerance", "ls_tolerance", "noslip_tolerance", "iterations",
     "ls_iterations", "noslip_iterations", "ccd_iterations", "ccd_tolerance", "impratio", "density", "viscosity",
     "wind", "magnetic", "disableflags", "enableflags", "disableactuator",
 )  # fmt: skip
+
+_FOUND_AND_FORCE = (1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)) | (
+    1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+)
+_NET_FORCE = 3
+"""Of a contact sensor's reductions the one that adds all contacts up, in the world frame."""
+_DRAWN_GROUPS = (0, 1, 2)
+"""Geom groups that viewers draw."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +60,24 @@ class ActuatorNeed:
     joints: str | list[str]
     kind: str
     path: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ContactSlots:
+    """A contact sensor in the model: its bodies, and the MJCF sensors of each, whose forces add up."""
+
+    config: ContactSensorConfig
+    bodies: list[str]
+    sensors: list[list[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class RayMount:
+    """A ray sensor in the model: the full name of its body, and the geom groups that it sees (None: all)."""
+
+    config: RaySensorConfig
+    body: str
+    groups: tuple[int, ...] | None
 
 
 class SceneProblem(ValueError):
@@ -57,12 +100,17 @@ class Scene:
         self.spec.copy_during_attach = True
         self.problems: list[SceneProblem] = []
         self.views: list[object] = []
+        self.sensors: dict[str, ContactSlots | RayMount] = {}
+        self.ground: Ground | None = None
         for name, entity in config.entities.items():
             self._attach(name, entity)
         self._options()
-        if config.ground is not None:
+        if config.terrain is not None:
+            self._terrain()
+        elif config.ground is not None:
             self._ground()
         self._lights(config.lights)
+        self._sensors()
 
     def add(self, view):
         """Register a view; it is bound to the simulation once the model is compiled."""
@@ -108,32 +156,12 @@ class Scene:
         return model
 
     def _attach(self, name: str, entity: EntityConfig) -> None:
-        path = ("scene", "entities", name)
-        file = (self.root / entity.model).resolve()
-        if not file.is_relative_to(self.root):
-            self.problems.append(
-                SceneProblem((*path, "model"), f"'{entity.model}' lies outside the task's folder {self.root}")
-            )
-            return
-        if not file.is_file():
-            have = sorted(str(p.relative_to(self.root)) for p in self.root.rglob("*.xml"))
-            self.problems.append(
-                SceneProblem(
-                    (*path, "model"),
-                    f"no file '{entity.model}' in {self.root}",
-                    f"MJCF files there: {', '.join(have) or 'none'}",
-                )
-            )
-            return
-        try:
-            child = mujoco.MjSpec.from_file(str(file))
-        except ValueError as error:
-            self.problems.append(
-                SceneProblem((*path, "model"), f"'{entity.model}' is not a valid MJCF: {_one_line(error)}")
-            )
+        child = self._load(name, entity) if entity.model is not None else _shape(entity)
+        if child is None:
             return
         _name_all(child)
-        if name == next(iter(self.config.entities)):
+        models = [other for other, config in self.config.entities.items() if config.model is not None]
+        if name == next(iter(models), None):
             for option in _OPTIONS:
                 if hasattr(child.option, option):
                     setattr(self.spec.option, option, getattr(child.option, option))
@@ -147,6 +175,34 @@ class Scene:
             self.spec.attach(child, prefix=f"{name}/", frame=frame)
         self._override_joints(name, entity, degrees=bool(child.compiler.degree))
         self._model_actuators(name, entity)
+
+    def _load(self, name: str, entity: EntityConfig) -> mujoco.MjSpec | None:
+        """The MJCF of an entity; None if it cannot be read."""
+        path = ("scene", "entities", name)
+        assert entity.model is not None
+        file = (self.root / entity.model).resolve()
+        if not file.is_relative_to(self.root):
+            self.problems.append(
+                SceneProblem((*path, "model"), f"'{entity.model}' lies outside the task's folder {self.root}")
+            )
+            return None
+        if not file.is_file():
+            have = sorted(str(p.relative_to(self.root)) for p in self.root.rglob("*.xml"))
+            self.problems.append(
+                SceneProblem(
+                    (*path, "model"),
+                    f"no file '{entity.model}' in {self.root}",
+                    f"MJCF files there: {', '.join(have) or 'none'}",
+                )
+            )
+            return None
+        try:
+            return mujoco.MjSpec.from_file(str(file))
+        except ValueError as error:
+            self.problems.append(
+                SceneProblem((*path, "model"), f"'{entity.model}' is not a valid MJCF: {_one_line(error)}")
+            )
+            return None
 
     def _override_joints(self, name: str, entity: EntityConfig, *, degrees: bool) -> None:
         joints = self._joints(name)
@@ -247,6 +303,24 @@ class Scene:
     def _ground(self) -> None:
         ground = self.config.ground
         assert ground is not None
+        self._surface()
+        self.spec.worldbody.add_geom(
+            name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[ground.size / 2, ground.size / 2, 1.0],
+            material="ground", friction=[ground.friction, 0.005, 0.0001],
+        )  # fmt: skip
+
+    def _terrain(self) -> None:
+        config = self.config.terrain
+        assert config is not None
+        wrong = [SceneProblem(("scene", "terrain", *p), text, hint) for p, text, hint in misfits(config, self.root)]
+        self.problems += wrong
+        if not wrong:
+            self._surface()
+            self.ground = make_ground(config, self.root)
+            add_ground(self.spec, self.ground, "ground")
+
+    def _surface(self) -> None:
+        """What the ground looks like, and the sky."""
         self.spec.add_texture(
             name="ground", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
             rgb1=[0.86, 0.88, 0.90], rgb2=[0.77, 0.79, 0.82], width=512, height=512,
@@ -256,10 +330,6 @@ class Scene:
         self.spec.add_texture(
             name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
             rgb1=[0.45, 0.63, 0.83], rgb2=[0.86, 0.91, 0.95], width=256, height=1536,
-        )  # fmt: skip
-        self.spec.worldbody.add_geom(
-            name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[ground.size / 2, ground.size / 2, 1.0],
-            material="ground", friction=[ground.friction, 0.005, 0.0001],
         )  # fmt: skip
 
     def _lights(self, lights: LightsConfig) -> None:
@@ -275,6 +345,108 @@ class Scene:
                 name="distant", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, dir=lights.distant.direction,
                 pos=[0, 0, 20], diffuse=[strength * c for c in lights.distant.color], castshadow=True,
             )  # fmt: skip
+
+    def _sensors(self) -> None:
+        for name, config in self.config.sensors.items():
+            try:
+                if isinstance(config, ContactSensorConfig):
+                    self.sensors[name] = self._contact_sensor(name, config)
+                else:
+                    self.sensors[name] = self._ray_sensor(name, config)
+            except SceneProblem as problem:
+                self.problems.append(problem)
+
+    def _contact_sensor(self, name: str, config: ContactSensorConfig) -> ContactSlots:
+        """For each body and what it may touch, a sensor of the model: net force on the body, and how many contacts.
+
+        The body is the second of the two, which makes the force the one that acts on it.
+        """
+        path = ("scene", "sensors", name)
+        bodies = self._bodies(config.entity, config.bodies, path, "bodies")
+        solid = [body for body in self._bodies(config.entity, ".*", path, "bodies") if self._can_touch(body)]
+        for body in bodies:
+            if not self._can_touch(body):
+                have = listing([b.removeprefix(f"{config.entity}/") for b in solid]) if solid else "none"
+                short = body.removeprefix(f"{config.entity}/")
+                message = f"body '{short}' has no geom that can touch anything"
+                raise SceneProblem((*path, "bodies"), message, f"bodies that have: {have}")
+        made: list[list[str]] = []
+        for slot, body in enumerate(bodies):
+            made.append([])
+            for number, other in enumerate(self._touched(config, path)):
+                sensor = self.spec.add_sensor(name=f"//{name}/{slot}/{number}", type=mujoco.mjtSensor.mjSENS_CONTACT)
+                if other is not None:
+                    sensor.objtype, sensor.objname = other
+                sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, body
+                sensor.intprm[:3] = [_FOUND_AND_FORCE, _NET_FORCE, 1]
+                made[-1].append(sensor.name)
+        return ContactSlots(config, [body.removeprefix(f"{config.entity}/") for body in bodies], made)
+
+    def _touched(self, config: ContactSensorConfig, path: tuple[str, ...]) -> list[tuple[mujoco.mjtObj, str] | None]:
+        against = config.against
+        if against is None:
+            return [None]
+        if against == "ground":
+            if not self._ground_geoms():
+                raise SceneProblem((*path, "against"), "the scene has no ground", "add scene.ground or scene.terrain")
+            if self.ground is not None:
+                return [(mujoco.mjtObj.mjOBJ_BODY, TERRAIN)]
+            return [(mujoco.mjtObj.mjOBJ_GEOM, "ground")]
+        path = (*path, "against")
+        if against.bodies is not None:
+            bodies = self._bodies(against.entity, against.bodies, path, "bodies")
+            return [(mujoco.mjtObj.mjOBJ_BODY, body) for body in bodies]
+        every = self._bodies(against.entity, ".*", path, "bodies")
+        roots = [body for body in every if not self.spec.body(body).parent.name.startswith(f"{against.entity}/")]
+        return [(mujoco.mjtObj.mjOBJ_XBODY, body) for body in roots]
+
+    def _ray_sensor(self, name: str, config: RaySensorConfig) -> RayMount:
+        path = ("scene", "sensors", name)
+        bodies = self._bodies(config.entity, ".*" if config.body is None else config.body, path, "body")
+        if config.body is not None and len(bodies) > 1:
+            short = listing([body.removeprefix(f"{config.entity}/") for body in bodies])
+            raise SceneProblem((*path, "body"), f"'{config.body}' is several bodies: {short}", "name one")
+        groups = tuple(config.sees) if isinstance(config.sees, list) else None
+        if config.sees == "ground":
+            groups = (self._group_of_ground((*path, "sees")),)
+        return RayMount(config, bodies[0], groups)
+
+    def _bodies(self, entity: str, patterns: str | list[str], path: tuple[str, ...], key: str) -> list[str]:
+        """Full names of bodies of an entity."""
+        if entity not in self.config.entities:
+            near = did_you_mean(entity, self.config.entities) or f"entities: {listing(self.config.entities)}"
+            raise SceneProblem((*path, "entity"), f"no entity '{entity}' in the scene", near)
+        prefix = f"{entity}/"
+        names = [body.name.removeprefix(prefix) for body in self.spec.bodies if body.name.startswith(prefix)]
+        try:
+            return [prefix + names[position] for position in match(patterns, names, "body")]
+        except NameProblem as problem:
+            raise SceneProblem((*path, key), str(problem), problem.hint) from None
+
+    def _can_touch(self, body: str) -> bool:
+        geoms = self.spec.body(body).geoms
+        paired = {name for pair in self.spec.pairs for name in (pair.geomname1, pair.geomname2)}
+        return any(geom.contype or geom.conaffinity or (geom.name and geom.name in paired) for geom in geoms)
+
+    def _ground_geoms(self) -> list[mujoco.MjsGeom]:
+        if self.ground is not None:
+            return list(self.spec.body(TERRAIN).geoms)
+        return [geom for geom in self.spec.worldbody.geoms if geom.name == "ground"]
+
+    def _group_of_ground(self, path: tuple[str, ...]) -> int:
+        """The geom group of the ground, made its own: a group is what a ray can be told to see."""
+        ground = self._ground_geoms()
+        if not ground:
+            raise SceneProblem(path, "the scene has no ground", "add scene.ground or scene.terrain, or write sees: all")
+        names = {geom.name for geom in ground}
+        taken = {int(geom.group) for geom in self.spec.geoms if geom.name not in names}
+        free = [group for group in _DRAWN_GROUPS if group not in taken]
+        if not free:
+            message = f"geoms of the entities are in all groups that are drawn, {listing(map(str, _DRAWN_GROUPS))}"
+            raise SceneProblem(path, message, "leave one of them to the ground in the MJCF, or write sees: all")
+        for geom in ground:
+            geom.group = free[0]
+        return free[0]
 
 
 def joint_settings(entity: EntityConfig, joint: str) -> JointConfig:
@@ -310,6 +482,31 @@ def actuator_kind(
 
 def _spec_kind(a: mujoco.MjsActuator) -> str:
     return actuator_kind(int(a.trntype), int(a.dyntype), int(a.gaintype), int(a.biastype), a.gainprm, a.biasprm)
+
+
+def _shape(entity: EntityConfig) -> mujoco.MjSpec:
+    """A body with one geom."""
+    assert entity.shape is not None
+    assert entity.size is not None
+    child = mujoco.MjSpec()
+    body = child.worldbody.add_body(name="body", mocap=entity.mocap)
+    if entity.free:
+        body.add_freejoint(name="root")
+    half = [edge / 2 for edge in entity.size]
+    sizes = {
+        "box": half,
+        "sphere": entity.size,
+        "cylinder": [entity.size[0], half[-1]],
+        "capsule": [entity.size[0], half[-1]],
+        "plane": [*half, 1.0],
+    }
+    size = sizes[entity.shape]
+    body.add_geom(
+        name="geom", type=_SHAPES[entity.shape], size=[*size, *[0.0] * (3 - len(size))], rgba=[*entity.color, 1.0],
+        friction=[entity.friction, 0.005, 0.0001], density=entity.density or 1000.0,
+        mass=np.nan if entity.mass is None else entity.mass,
+    )  # fmt: skip
+    return child
 
 
 def _name_all(child: mujoco.MjSpec) -> None:

@@ -67,6 +67,9 @@ _BOUNDS = ("geom_aabb", "geom_rbound")
 """Those that it derives from the sizes of geoms."""
 
 
+_Groups = wp.types.vector(length=mujoco.mjNGROUP, dtype=float)
+
+
 class WarpEngine:
     """Many worlds of one model on a GPU.
 
@@ -115,6 +118,7 @@ class WarpEngine:
         self._force_columns = as_index(force_columns, self.device)
         self._expanded: dict[str, Tensor] = {}
         self._graphs: dict[tuple[int, bool], Any] = {}
+        self._rays: dict[tuple[int, int], tuple[wp.array, wp.array, wp.array]] = {}
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         with wp.ScopedDevice(self._device), _on_torch_stream(self.device):
             self._model, self._data = self._put(model, capacity)
@@ -271,6 +275,28 @@ class WarpEngine:
         """The worlds where `mask` holds; whether there are any is known to the device alone."""
         return MaskSelection(mask, seed, counters)
 
+    def rays(
+        self,
+        points: Tensor,
+        directions: Tensor,
+        *,
+        groups: tuple[int, ...] | None = None,
+        exclude: int = -1,
+        selection: Selection | None = None,
+    ) -> Tensor:
+        """Distances from points to the first geom along unit directions, -1 where there is none. (num_envs, rays)"""
+        self.field("geom_xpos")  # current from now on
+        shape = (self.num_envs, points.shape[1])
+        distance = torch.empty(shape, device=self.device)
+        with self._launching():
+            excluded, geom, normal = self._ray_buffers(points.shape[1], exclude)
+            seen = _Groups(*(-1.0 if groups is None else float(g in groups) for g in range(mujoco.mjNGROUP)))
+            pnt, vec = (wp.from_torch(v.expand(*shape, 3).contiguous(), dtype=wp.vec3) for v in (points, directions))
+            mjw.rays(
+                self._model, self._data, pnt, vec, seen, True, excluded, wp.from_torch(distance), geom, normal
+            )  # fmt: skip
+        return distance
+
     def watch(self, values: Tensor, what: str) -> None:
         """Have the device note if a value is not finite; `noted` tells."""
         if what not in self._watched:
@@ -412,6 +438,17 @@ class WarpEngine:
     def _launch_rows(self, kernel: wp.Kernel, mask: Tensor, now: Tensor, last: Tensor) -> None:
         flat = [wp.from_torch(values.view(self.num_envs, -1)) for values in (now, last)]
         wp.launch(kernel, dim=flat[0].shape, inputs=[wp.from_torch(mask), *flat], device=self._device)
+
+    def _ray_buffers(self, rays: int, exclude: int) -> tuple[wp.array, wp.array, wp.array]:
+        """What a cast needs beside the rays, made once: the body each ray ignores, geoms and normals that are hit."""
+        if (rays, exclude) not in self._rays:
+            shape = (self.num_envs, rays)
+            self._rays[rays, exclude] = (
+                wp.full(rays, exclude, dtype=int),
+                wp.empty(shape, dtype=int),
+                wp.empty(shape, dtype=wp.vec3),
+            )
+        return self._rays[rays, exclude]
 
     def _before_forward(self) -> dict[str, Tensor]:
         """Copies of what a forward pass would overwrite, and which is the last substep's."""

@@ -32,6 +32,8 @@ from rlcli.testing.subject import (
 def names(subject: Subject) -> Iterator[Finding]:
     """Every name in the YAML resolves; joints, actuators and bodies of the models have names."""
     for entity, config in subject.resolved.task.scene.entities.items():
+        if config.model is None:
+            continue  # a shape has the names that rlcli gives it
         spec = mujoco.MjSpec.from_file(str(subject.source.root / config.model))
         scalar = [joint for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]  # a root needs no name
         for word, elements in (("joint", scalar), ("actuator", list(spec.actuators)), ("body", spec.bodies[1:])):

@@ -33,7 +33,7 @@ def run(env: VecEnv, act: Act, shown: int = 0) -> None:
         hint = "start it as: mjpython -m rlcli play ..." if sys.platform == "darwin" else None
         raise MachineError(f"the window cannot be opened: {error}", hint=hint) from error
     with handle as window, torch.no_grad():
-        camera = free_camera(env.config.viewer)
+        camera = free_camera(env.config.viewer, env.origins[shown].tolist())
         window.cam.lookat[:], window.cam.distance = camera.lookat, camera.distance
         window.cam.azimuth, window.cam.elevation = camera.azimuth, camera.elevation
         obs = env.reset(seed=env.seed)["policy"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -12,12 +13,12 @@ from rlcli.config.schema import ViewerConfig
 from rlcli.viewer.gl import open_context
 
 
-def free_camera(viewer: ViewerConfig) -> mujoco.MjvCamera:
-    """A camera at `eye` that looks at `lookat`."""
+def free_camera(viewer: ViewerConfig, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> mujoco.MjvCamera:
+    """A camera at `eye` that looks at `lookat`, both from an environment's origin."""
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(mujoco.MjModel.from_xml_string("<mujoco/>"), camera)
     ray = np.subtract(viewer.lookat, viewer.eye)
-    camera.lookat[:] = viewer.lookat
+    camera.lookat[:] = np.add(viewer.lookat, origin)
     camera.distance = max(float(np.linalg.norm(ray)), 1e-3)
     camera.azimuth = math.degrees(math.atan2(ray[1], ray[0]))
     camera.elevation = math.degrees(math.asin(np.clip(ray[2] / camera.distance, -1.0, 1.0)))
@@ -36,6 +37,7 @@ class Renderer:
     """
 
     def __init__(self, model: mujoco.MjModel, viewer: ViewerConfig) -> None:
+        self._viewer = viewer
         self._width, self._height = viewer.width, viewer.height
         self._context, self.backend = open_context(viewer.width, viewer.height)
         self._scene = mujoco.MjvScene(model, maxgeom=10_000)
@@ -45,8 +47,11 @@ class Renderer:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
         self._rect = mujoco.MjrRect(0, 0, viewer.width, viewer.height)
 
-    def draw(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """A picture of a forwarded state. (height, width, 3)"""
+    def draw(
+        self, model: mujoco.MjModel, data: mujoco.MjData, origin: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> NDArray[np.uint8]:
+        """A picture of a forwarded state, of an environment whose origin is there. (height, width, 3)"""
+        self._camera.lookat[:] = np.add(self._viewer.lookat, origin)
         everything = int(mujoco.mjtCatBit.mjCAT_ALL)
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self._scene)
         mujoco.mjr_render(self._rect, self._scene, self._mjr)

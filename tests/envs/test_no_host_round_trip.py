@@ -118,6 +118,31 @@ def test_a_step_of_a_task_with_every_kind_of_term_reads_nothing_back(tmp_path):
     assert env.divergences == 1
 
 
+@pytest.mark.slow  # kernels for height fields take a minute to compile
+def test_a_step_on_a_terrain_with_sensors_reads_nothing_back(tmp_path):
+    task = yaml.safe_load(every_term())
+    sub_terrains = {"hills": {"kind": "noise"}, "stairs": {"kind": "stairs", "boxes": True}}
+    task["scene"]["terrain"] = {"kind": "generator", "rows": 2, "columns": 2, "sub_terrains": sub_terrains}
+    task["scene"]["sensors"] = {
+        "feet": {"kind": "contact", "bodies": "leg_.*", "history": 2, "against": "ground", "force_threshold": 1.0},
+        "scan": {"kind": "rays", "pattern": {"size": [0.4, 0.4], "resolution": 0.2}, "alignment": "yaw"},
+    }
+    task["scene"]["entities"]["gate"] = {"shape": "box", "size": [0.1, 1.0, 1.0], "pos": [9.0, 0, 0.5], "mocap": True}
+    task["observations"]["policy"] |= {"feet": {"func": "sensed"}}
+    task["curriculum"] = {"levels": {"func": "terrain_levels", "least": 0.1}}
+    terms = """
+import torch
+from rlcli.task import ContactSensor, RaySensor
+
+def sensed(env, *, feet: ContactSensor = "feet", scan: RaySensor = "scan"):
+    \"\"\"What both sensors say. (num_envs, k)\"\"\"
+    return torch.cat([feet.force_history.flatten(1), feet.air_time, feet.first_contact.float(), scan.distance], dim=1)
+"""
+    folder = write(tmp_path / "critter", dump(task), critter_xml=CRITTER, terms_py=terms)
+    env = build(folder, 4, "episode_length_s=0.1")
+    assert watched_steps(env, 14) >= 4
+
+
 def test_the_detector_sees_a_mask_and_a_number_read_back():
     values = torch.arange(4.0)
     for reading in (lambda: values[values > 1], lambda: float(values.sum()), lambda: (values > 1).nonzero()):

@@ -5,9 +5,10 @@ import math
 
 import pytest
 import torch
+import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from worlds import CRITTER_TASK, PENDULUM_TASK, actions, build, critter, edited, pendulum
+from worlds import CRITTER_TASK, PENDULUM_TASK, actions, build, critter, dump, edited, pendulum
 
 from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import resolve
@@ -251,9 +252,19 @@ RANDOMISED = {
 
 @pytest.fixture(scope="module", params=LONG)
 def crowd(request, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("crowd")
-    task = critter(folder, edited(CRITTER_TASK, events=RANDOMISED, episode_length_s=2.0))
-    return [build(task, N, f"sim.engine={request.param}") for _ in range(2)]
+    task = yaml.safe_load(edited(CRITTER_TASK, events=RANDOMISED, episode_length_s=2.0))
+    task["observations"]["policy"]["pos"] |= {
+        "noise": {"kind": "gaussian", "std": 0.1},
+        "bias": {"kind": "uniform"},
+        "delay": {"steps": [0, 3], "redraw": 0.5},
+        "history": 4,
+        "modifiers": [{"kind": "digital_filter", "a": [0.5], "b": [0.5]}],
+    }
+    task["commands"] = {"walk": {"func": "uniform_velocity", "resampling_time_s": [0.04, 0.08], "lin_vel_x": [-1, 1]}}
+    front = {"joints": ["hip_f."], "stiffness": 20.0, "damping": 0.5, "delay": [0, 3]}
+    task["scene"]["entities"]["robot"]["actuators"] = {"front": front}
+    folder = critter(tmp_path_factory.mktemp("crowd"), dump(task))
+    return [build(folder, N, f"sim.engine={request.param}") for _ in range(2)]
 
 
 def rows_of(state, keep):

@@ -1,0 +1,266 @@
+"""Contact and ray sensors of a scene, as terms see them: (num_envs, ...) tensors, current at every step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import mujoco
+import torch
+from torch import Tensor
+
+from rlcli.config.schema import GridPatternConfig, RaySensorConfig
+from rlcli.sim.entity import Entity, SimData, as_index
+from rlcli.sim.rotations import rotate
+from rlcli.sim.scene import ContactSlots, RayMount
+from rlcli.sim.selection import Columns, Selection
+
+_TIMES = ("air_time", "contact_time", "last_air_time", "last_contact_time")
+_KEPT = (*_TIMES, "first_contact", "first_air", "found", "force_history")
+"""What a contact sensor carries from step to step."""
+
+
+class ContactSensor:
+    """Net contact forces on k bodies, and for how long each has been in contact or in the air.
+
+    Times count environment steps: the step in which contact begins counts as the last of the air time and as the first
+    of the contact time. An episode starts with all times 0, so its first contact or lift-off is none that changed.
+    """
+
+    def __init__(self, slots: ContactSlots, sim: SimData) -> None:
+        self._sim = sim
+        engine = sim.engine
+        n, k, device = engine.num_envs, len(slots.bodies), engine.device
+        self.names = slots.bodies
+        """The bodies, a slot each."""
+        self._threshold = slots.config.force_threshold
+        self._others = len(slots.sensors[0])
+        self._columns = _sensor_columns(engine.model, slots.sensors, device)
+        engine.field("sensordata")
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(n, *shape, dtype=dtype, device=device)
+
+        self.force_history = zeros(slots.config.history, k, 3)
+        """Net contact force on each body over the last steps, newest first, world frame. (num_envs, h, k, 3) [N]"""
+        self.force = self.force_history[:, 0]
+        """Net contact force on each body in the last substep, world frame. (num_envs, k, 3) [N]"""
+        self.found = zeros(k, dtype=torch.bool)
+        """Whether each body is in contact. (num_envs, k)"""
+        self.air_time = zeros(k)
+        """How long each body has been in the air; 0 in contact. (num_envs, k) [s]"""
+        self.contact_time = zeros(k)
+        """How long each body has been in contact; 0 in the air. (num_envs, k) [s]"""
+        self.last_air_time = zeros(k)
+        """How long each body was in the air before its last contact. (num_envs, k) [s]"""
+        self.last_contact_time = zeros(k)
+        """How long each body was in contact before it last lifted off. (num_envs, k) [s]"""
+        self.first_contact = zeros(k, dtype=torch.bool)
+        """Whether contact began in the last step. (num_envs, k)"""
+        self.first_air = zeros(k, dtype=torch.bool)
+        """Whether contact ended in the last step. (num_envs, k)"""
+
+    def update(self, dt: float) -> None:
+        """Take in what a step has measured."""
+        for age in range(self.force_history.shape[1] - 1, 0, -1):
+            self.force_history[:, age] = self.force_history[:, age - 1]
+        force, found = self._measured(self._sim.derived("sensordata"))
+        self.force.copy_(force)
+        self.found.copy_(found)
+        torch.logical_and(found, self.air_time > 0.0, out=self.first_contact)
+        torch.logical_and(~found, self.contact_time > 0.0, out=self.first_air)
+        self.air_time += dt
+        self.contact_time += dt
+        torch.where(self.first_contact, self.air_time, self.last_air_time, out=self.last_air_time)
+        torch.where(self.first_air, self.contact_time, self.last_contact_time, out=self.last_contact_time)
+        self.air_time *= ~found
+        self.contact_time *= found
+
+    def reset(self, selection: Selection) -> None:
+        """Begin new episodes: no times, no history, and the forces of the start state."""
+        for name in (*_TIMES, "first_contact", "first_air", "force_history"):
+            selection.write(getattr(self, name), 0)
+        force, found = self._measured(selection.peek(self._sim.derived("sensordata")))
+        selection.write(self.force, force)
+        selection.write(self.found, found)
+
+    def moved(self, selection: Selection) -> None:
+        """Forces are those of the last step, wherever an event has put the bodies since."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What the sensor carries from step to step."""
+        return {name: getattr(self, name).clone() for name in _KEPT}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `state_dict` gave."""
+        for name in _KEPT:
+            getattr(self, name).copy_(state[name])
+
+    def _measured(self, sensordata: Tensor) -> tuple[Tensor, Tensor]:
+        """Net force (rows, k, 3), and whether that is contact (rows, k)."""
+        values = sensordata[:, self._columns].unflatten(1, (-1, self._others, 4))
+        total = values[:, :, 0]
+        for other in range(1, self._others):
+            total = total + values[:, :, other]
+        force, found = total[..., 1:], total[..., 0] > 0.0
+        if self._threshold > 0.0:
+            x, y, z = force.unbind(-1)
+            found = found & ((x * x + y * y + z * z).sqrt() >= self._threshold)
+        return force, found
+
+
+class RaySensor:
+    """Distances along r rays from a body. They are cast when somebody reads them, at most once a step."""
+
+    def __init__(self, mount: RayMount, sim: SimData, entity: Entity) -> None:
+        self._sim = sim
+        self._config = config = mount.config
+        self._engine = engine = sim.engine
+        self._body = engine.model.body(mount.body).id
+        self._groups = mount.groups
+        self._root = entity.root_qpos if self._body == entity.root_body else None
+        starts, directions = (values.to(engine.device) for values in _pattern(config))
+        self._starts, self._directions = starts, directions
+        self._offset = torch.tensor([config.offset], device=engine.device)
+        self._unit = torch.eye(3, device=engine.device)
+        n, r = engine.num_envs, len(starts)
+        self.names = [f"ray_{i}" for i in range(r)]
+        """The rays."""
+        self._distance = torch.zeros(n, r, device=engine.device)
+        self._missed = torch.zeros(n, r, dtype=torch.bool, device=engine.device)
+        self._hits = torch.zeros(n, r, 3, device=engine.device)
+        self._position = torch.zeros(n, 3, device=engine.device)
+        self._current = False
+
+    @property
+    def distance(self) -> Tensor:
+        """Distance along each ray to what it hits, `max_distance` where it hits nothing. (num_envs, r) [m]"""
+        self._cast()
+        return self._distance
+
+    @property
+    def missed(self) -> Tensor:
+        """Whether each ray hits nothing within `max_distance`. (num_envs, r)"""
+        self._cast()
+        return self._missed
+
+    @property
+    def hits(self) -> Tensor:
+        """Where each ray ends, world frame. (num_envs, r, 3) [m]"""
+        self._cast()
+        return self._hits
+
+    @property
+    def position(self) -> Tensor:
+        """The sensor's own position, world frame. (num_envs, 3) [m]"""
+        self._cast()
+        return self._position
+
+    def update(self, dt: float) -> None:
+        """The bodies have moved."""
+        self._current = False
+
+    def reset(self, selection: Selection) -> None:
+        """The bodies of the selected environments have been put elsewhere."""
+        self.moved(selection)
+
+    def moved(self, selection: Selection) -> None:
+        """Cast anew for the selected environments, if rays have been cast in this step."""
+        if not self._current:
+            return
+        position, quat = self._pose()
+        distance, missed, hits, position = self._rays(selection.peek(position), selection.peek(quat), selection)
+        selection.write(self._distance, distance)
+        selection.write(self._missed, missed)
+        selection.write(self._hits, hits)
+        selection.write(self._position, position)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Nothing: rays follow from the state of the bodies."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """The bodies are where the loaded state has them."""
+        self._current = False
+
+    def _cast(self) -> None:
+        if not self._current:
+            self._current = True
+            found = self._rays(*self._pose())
+            for buffer, values in zip((self._distance, self._missed, self._hits, self._position), found, strict=True):
+                buffer.copy_(values)
+
+    def _rays(self, position: Tensor, quat: Tensor, selection: Selection | None = None) -> tuple[Tensor, ...]:
+        axes = self._axes(quat)
+        position = position + _turned(axes, self._offset)[:, 0]
+        points = position[:, None] + _turned(axes, self._starts)
+        directions = _turned(axes, self._directions)
+        found = self._engine.rays(points, directions, groups=self._groups, exclude=self._body, selection=selection)
+        reach = self._config.max_distance
+        missed = (found < 0.0) | (found > reach)
+        distance = found.masked_fill_(missed, reach)
+        return distance, missed, points + directions * distance[..., None], position
+
+    def _pose(self) -> tuple[Tensor, Tensor]:
+        if self._root is not None:
+            qpos = self._sim.qpos
+            return qpos[:, self._root : self._root + 3], qpos[:, self._root + 3 : self._root + 7]
+        return self._sim.derived("xpos")[:, self._body], self._sim.derived("xquat")[:, self._body]
+
+    def _axes(self, quat: Tensor) -> Tensor | None:
+        """The axes of the sensor's frame in the world, one below the other; None: the world's. (rows, 3, 3)"""
+        if self._config.alignment == "world":
+            return None
+        x, y, z = (rotate(quat, axis.expand(len(quat), 3)) for axis in self._unit)
+        if self._config.alignment == "base":
+            return torch.stack([x, y, z], dim=1)
+        ahead, left = x[:, 0] + 1e-12, x[:, 1]  # a body that points straight up heads along x
+        norm = (ahead * ahead + left * left).sqrt()
+        cos, sin, zero = ahead / norm, left / norm, torch.zeros_like(norm)
+        rows = [cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1.0]
+        return torch.stack(rows, dim=1).unflatten(1, (3, 3))
+
+
+def make_sensors(
+    made: Mapping[str, ContactSlots | RayMount], sim: SimData, entities: Mapping[str, Entity]
+) -> dict[str, ContactSensor | RaySensor]:
+    """The sensors that the scene has put into the model."""
+    return {
+        name: ContactSensor(sensor, sim)
+        if isinstance(sensor, ContactSlots)
+        else RaySensor(sensor, sim, entities[sensor.config.entity])
+        for name, sensor in made.items()
+    }
+
+
+def _pattern(config: RaySensorConfig) -> tuple[Tensor, Tensor]:
+    """Starts relative to the sensor, and unit directions. (r, 3) each"""
+    if not isinstance(config.pattern, GridPatternConfig):
+        directions = torch.tensor(config.pattern)
+        return torch.zeros_like(directions), torch.nn.functional.normalize(directions, dim=1)
+    x, y = (_line(size, config.pattern.resolution) for size in config.pattern.size)
+    y, x = torch.meshgrid(y, x, indexing="ij")
+    starts = torch.stack([x, y, torch.zeros_like(x)], dim=-1).view(-1, 3)
+    direction = torch.nn.functional.normalize(torch.tensor(config.pattern.direction), dim=0)
+    return starts, direction.expand(len(starts), 3).contiguous()
+
+
+def _line(size: float, resolution: float) -> Tensor:
+    """Points at the resolution's distance, centred, that fit in the size."""
+    count = math.floor(size / resolution + 1e-6) + 1
+    return (torch.arange(count) - (count - 1) / 2) * resolution
+
+
+def _turned(axes: Tensor | None, vectors: Tensor) -> Tensor:
+    """Vectors of the sensor's frame in the world. (r, 3) -> (rows, r, 3), one row where the frame is the world's"""
+    if axes is None:
+        return vectors[None]
+    x, y, z = axes[:, None].unbind(2)
+    return vectors[:, 0:1] * x + vectors[:, 1:2] * y + vectors[:, 2:3] * z
+
+
+def _sensor_columns(model: mujoco.MjModel, slots: list[list[str]], device: torch.device) -> Columns:
+    ids = [model.sensor(name).id for slot in slots for name in slot]
+    return as_index(
+        [c for s in ids for c in range(model.sensor_adr[s], model.sensor_adr[s] + model.sensor_dim[s])], device
+    )

@@ -1,0 +1,290 @@
+"""The terrain of a scene: patches put together in the model, and where on it each environment stands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rlcli import random
+from rlcli.config.schema import (
+    GridPatchConfig,
+    ObstaclesPatchConfig,
+    PatchConfig,
+    StairsPatchConfig,
+    StonesPatchConfig,
+    TerrainGeneratorConfig,
+    TerrainHeightsConfig,
+)
+from rlcli.sim.landscapes import Block, Heights, Patch, Plot, make_patch
+from rlcli.sim.selection import Selection
+
+BODY = "terrain"
+"""The body of the terrain's geoms."""
+_MOST = 1 << 24
+_START, _MOVE = random.stream("terrain.start"), random.stream("terrain.move")
+_SPAWN = 0.5
+"""Half the edge of the square in a patch's middle whose highest point is where its origin lies [m]."""
+_THICK = 0.5
+"""How far ground reaches below its lowest point [m]."""
+
+Misfit = tuple[tuple[str, ...], str, str | None]
+"""Path below scene.terrain, what is wrong, what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """A terrain as numbers."""
+
+    heights: Heights
+    """Of the height field, x along the first axis, its middle at the world's origin [m]."""
+    resolution: float
+    """Between two heights [m]."""
+    border: float
+    """Flat ground about it [m]."""
+    friction: float
+    """Sliding friction."""
+    blocks: tuple[Block, ...]
+    """In world coordinates."""
+    origins: NDArray[np.float32]
+    """Of the patches. (rows, columns, 3) [m]"""
+    patch: tuple[float, float]
+    """Extent of a patch along x and y [m]."""
+
+
+def misfits(config: TerrainGeneratorConfig | TerrainHeightsConfig, root: Path) -> Iterator[Misfit]:
+    """What of a terrain cannot be built."""
+    if isinstance(config, TerrainHeightsConfig):
+        yield from _file_misfits(config, root)
+        return
+    cells = [edge / config.resolution for edge in config.patch]
+    if any(abs(n - round(n)) > 1e-6 or n < 2 for n in cells):
+        edges = " x ".join(f"{edge:g}" for edge in config.patch)
+        message = f"a patch of {edges} m is not a whole number of cells of {config.resolution:g} m, two at least"
+        yield ("patch",), message, "change patch or resolution"
+        return
+    count = round(cells[0]) * config.rows * round(cells[1]) * config.columns
+    if count > _MOST:
+        hint = "fewer or smaller patches, or a coarser resolution"
+        yield ("resolution",), f"the height field has {count:,} heights, more than {_MOST:,}", hint
+    if config.max_start_level is not None and config.max_start_level >= config.rows:
+        yield ("max_start_level",), f"there is no level {config.max_start_level}", f"the last is {config.rows - 1}"
+    for name, patch in config.sub_terrains.items():
+        for key, text, advice in _patch_misfits(patch, min(config.patch), config.resolution):
+            yield ("sub_terrains", name, key), text, advice
+
+
+def make_ground(config: TerrainGeneratorConfig | TerrainHeightsConfig, root: Path) -> Ground:
+    """Heights, blocks and origins; the same ones for the same configuration."""
+    if isinstance(config, TerrainHeightsConfig):
+        heights = np.load(root / config.file, allow_pickle=False).astype(np.float64)
+        nx, ny = heights.shape
+        extent = ((nx - 1) * config.resolution, (ny - 1) * config.resolution)
+        origin = np.array([[[0.0, 0.0, heights[nx // 2, ny // 2]]]], dtype=np.float32)
+        return Ground(heights, config.resolution, 0.0, config.friction, (), origin, extent)
+    size, rows, columns = config.patch, config.rows, config.columns
+    nx, ny = (round(edge / config.resolution) for edge in size)
+    heights = np.zeros((rows * nx + 1, columns * ny + 1))
+    corner = np.array([-0.5 * rows * size[0], -0.5 * columns * size[1]])
+    origins = np.zeros((rows, columns, 3), dtype=np.float32)
+    blocks: list[Block] = []
+    for row in range(rows):
+        for column in range(columns):
+            draw = np.random.default_rng([config.seed & 0xFFFFFFFFFFFFFFFF, row, column])
+            kind, difficulty = _choose(config, row, column, draw)
+            patch = make_patch(kind, Plot(size, config.resolution, difficulty, draw))
+            low = corner + np.array([row * size[0], column * size[1]])
+            surface = patch.heights if not patch.blocks else _below(patch)
+            heights[row * nx : (row + 1) * nx + 1, column * ny : (column + 1) * ny + 1] = surface
+            blocks += [_moved(block, low) for block in patch.blocks]
+            origins[row, column] = (*(low + np.array(size) / 2), _spawn_height(patch.heights, config.resolution))
+    return Ground(heights, config.resolution, config.border, config.friction, tuple(blocks), origins, size)
+
+
+def add_ground(spec: mujoco.MjSpec, ground: Ground, material: str) -> None:
+    """Put a terrain into a model: a height field, boxes, and a border."""
+    body = spec.worldbody.add_body(name=BODY)
+    friction = [ground.friction, 0.005, 0.0001]
+    nx, ny = ground.heights.shape
+    half = [0.5 * (n - 1) * ground.resolution for n in (nx, ny)]
+    lowest, span = float(ground.heights.min()), float(np.ptp(ground.heights))
+    flat = span < 1e-9
+    if flat:
+        body.add_geom(
+            name=f"{BODY}/flat", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, _THICK], pos=[0.0, 0.0, lowest - _THICK],
+            material=material, friction=friction,
+        )  # fmt: skip
+    else:
+        spec.add_hfield(
+            name=BODY,
+            nrow=ny,
+            ncol=nx,
+            size=[*half, span, _THICK],
+            userdata=ground.heights.T.astype(np.float32).ravel(),
+        )
+        body.add_geom(
+            name=f"{BODY}/heights", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=BODY, pos=[0.0, 0.0, lowest],
+            material=material, friction=friction,
+        )  # fmt: skip
+    floor = min(lowest, 0.0) - _THICK
+    border = _border(half, ground.border)
+    for number, block in enumerate([*ground.blocks, *border]):
+        size = [(block.high[i] - block.low[i]) / 2 for i in (0, 1)]
+        middle = [(block.high[i] + block.low[i]) / 2 for i in (0, 1)]
+        body.add_geom(
+            name=f"{BODY}/box_{number}", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*size, (block.top - floor) / 2],
+            pos=[*middle, (block.top + floor) / 2], material=material, friction=friction,
+        )  # fmt: skip
+
+
+class Terrain:
+    """Where each environment stands. A level is a row of patches, a type a column.
+
+    Args:
+        ground: the terrain in the model.
+        config: its configuration.
+        origins: the environments' start places, kept up to date. (num_envs, 3) [m]
+        seed: of the start levels.
+    """
+
+    def __init__(
+        self,
+        ground: Ground,
+        config: TerrainGeneratorConfig | TerrainHeightsConfig,
+        origins: Tensor,
+        seed: int,
+    ) -> None:
+        device, count = origins.device, len(origins)
+        self.origins = torch.from_numpy(ground.origins).to(device)
+        """Start place on each patch. (rows, columns, 3) [m]"""
+        self.types = torch.arange(count, device=device) % self.origins.shape[1]
+        """Column of each environment. (num_envs,) int64"""
+        self.levels = torch.zeros(count, dtype=torch.int64, device=device)
+        """Row of each environment. (num_envs,) int64"""
+        self.patch = ground.patch
+        """Extent of a patch along x and y [m]."""
+        rows = len(self.origins)
+        last = config.max_start_level if isinstance(config, TerrainGeneratorConfig) else None
+        self._start_levels = rows if last is None else last + 1
+        self._env_origins = origins
+        self.start(seed)
+
+    @property
+    def rows(self) -> int:
+        """How many levels there are."""
+        return len(self.origins)
+
+    def start(self, seed: int) -> None:
+        """Put every environment on its start level, which depends on the seed and its number alone."""
+        ids = np.arange(len(self.levels))
+        keys = random.row_keys(seed, ids, np.zeros_like(ids))
+        self.levels.copy_(torch.from_numpy(random.integers(keys, _START, 0, 1, self._start_levels)[:, 0]))
+        self._env_origins.copy_(self.origins[self.levels, self.types])
+
+    def move(self, selection: Selection, up: Tensor, down: Tensor) -> None:
+        """Move environments a level up or down; who has passed the last level gets a random one. (rows,) bool each"""
+        levels = selection.read(self.levels) + up.long() - (down & ~up).long()
+        anywhere = selection.stream(_MOVE).choice(self.rows)
+        levels = torch.where(levels >= self.rows, anywhere, levels.clamp(min=0))
+        selection.write(self.levels, levels)
+        selection.write(self._env_origins, self.origins[levels, selection.peek(self.types)])
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The levels."""
+        return {"levels": self.levels.clone()}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Take back what `state_dict` gave."""
+        self.levels.copy_(state["levels"])
+        self._env_origins.copy_(self.origins[self.levels, self.types])
+
+
+def _choose(
+    config: TerrainGeneratorConfig, row: int, column: int, draw: np.random.Generator
+) -> tuple[PatchConfig, float]:
+    """Kind and difficulty of a patch."""
+    kinds = list(config.sub_terrains.values())
+    shares = np.cumsum([kind.proportion for kind in kinds])
+    low, high = config.difficulty
+    if config.curriculum:
+        share = (column + 0.5) / config.columns
+        step = row / (config.rows - 1) if config.rows > 1 else 0.5
+    else:
+        share, step = draw.uniform(0.0, 1.0, 2)
+    chosen = int(np.searchsorted(shares, share * shares[-1], side="right"))
+    return kinds[min(chosen, len(kinds) - 1)], low + (high - low) * step
+
+
+def _spawn_height(heights: Heights, resolution: float) -> float:
+    """The highest point in the middle of a patch."""
+    reach = round(_SPAWN / resolution)
+    x, y = (n // 2 for n in heights.shape)
+    return float(heights[max(0, x - reach) : x + reach + 1, max(0, y - reach) : y + reach + 1].max())
+
+
+def _below(patch: Patch) -> Heights:
+    """Heights that stay below a patch's blocks."""
+    lowest = min(block.top for block in patch.blocks)
+    inside = np.zeros_like(patch.heights)
+    inside[1:-1, 1:-1] = lowest - 0.05 if lowest < 0.0 else 0.0
+    return inside
+
+
+def _moved(block: Block, by: NDArray[np.float64]) -> Block:
+    x, y = by.tolist()
+    return Block((block.low[0] + x, block.low[1] + y), (block.high[0] + x, block.high[1] + y), block.top)
+
+
+def _border(half: list[float], width: float) -> list[Block]:
+    if width == 0.0:
+        return []
+    x, y = half
+    return [
+        Block((-x - width, -y - width), (x + width, -y), 0.0),
+        Block((-x - width, y), (x + width, y + width), 0.0),
+        Block((-x - width, -y), (-x, y), 0.0),
+        Block((x, -y), (x + width, y), 0.0),
+    ]
+
+
+def _patch_misfits(patch: PatchConfig, edge: float, resolution: float) -> Iterator[tuple[str, str, str | None]]:
+    platform = getattr(patch, "platform", 0.0)
+    if platform >= edge:
+        yield "platform", f"a platform of {platform:g} m does not fit in a patch of {edge:g} m", None
+    fine = "a finer resolution, or boxes: true"
+    if isinstance(patch, StairsPatchConfig) and not patch.boxes and patch.step_width < 2 * resolution:
+        yield "step_width", f"steps of {patch.step_width:g} m need cells of half that, not {resolution:g} m", fine
+    if isinstance(patch, GridPatchConfig) and not patch.boxes and patch.cell < 2 * resolution:
+        yield "cell", f"cells of {patch.cell:g} m need a resolution of half that, not {resolution:g} m", fine
+    if isinstance(patch, ObstaclesPatchConfig | StonesPatchConfig):
+        if patch.width[1] > edge:
+            yield "width", f"{patch.width[1]:g} m does not fit in a patch of {edge:g} m", None
+        if patch.width[0] < resolution:
+            yield "width", f"{patch.width[0]:g} m is less than a cell of {resolution:g} m", "a finer resolution"
+
+
+def _file_misfits(config: TerrainHeightsConfig, root: Path) -> Iterator[Misfit]:
+    file = (root / config.file).resolve()
+    if not file.is_relative_to(root.resolve()):
+        yield ("file",), f"'{config.file}' lies outside the task's folder {root}", None
+        return
+    if not file.is_file():
+        have = ", ".join(sorted(str(p.relative_to(root)) for p in root.rglob("*.npy"))) or "none"
+        yield ("file",), f"no file '{config.file}' in {root}", f"NumPy files there: {have}"
+        return
+    try:
+        heights = np.load(file, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        yield ("file",), f"'{config.file}' is not a NumPy file: {error}", None
+        return
+    if not isinstance(heights, np.ndarray) or heights.ndim != 2 or min(heights.shape) < 2:
+        shape = getattr(heights, "shape", None)
+        yield ("file",), f"'{config.file}' must hold a table of heights, two by two at least; found shape {shape}", None
+    elif heights.dtype.kind not in "fiu" or not np.isfinite(heights).all():
+        yield ("file",), f"'{config.file}' must hold finite numbers; found {heights.dtype}", None
