@@ -68,7 +68,3 @@ Address: TypeAlias = Any
 At run time: a tensor on the environment's device; whoever reads the number reads what is written there."""
 Range: TypeAlias = tuple[float, float]
 """`[low, high]` with low <= high."""
-ScheduledRange: TypeAlias = Any
-"""A `Range` of which an end may follow a schedule. At run time: what `rlcli.mdp.ranges.Ranges` takes."""
-ScheduledPair: TypeAlias = Any
-"""The same without an order: `[low, high]` or `[mean, std]`, as the term's `distribution` says."""

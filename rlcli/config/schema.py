@@ -13,12 +13,10 @@ from typing import Annotated, Any, Literal
 from pydantic import (
     AfterValidator,
     BaseModel,
-    BeforeValidator,
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
-    Strict,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -83,66 +81,6 @@ class StrictModel(BaseModel):
     model_config = ConfigDict(
         extra="forbid", strict=True, frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
-
-
-_Step = Annotated[int, Field(ge=0)]
-_LISTED = Strict(False)  # a list is a tuple also where a validator before it has read the JSON
-
-
-class Schedule(StrictModel):
-    """A number that changes in the course of the training."""
-
-    model_config = ConfigDict(serialize_by_alias=True)
-
-    schedule: Literal["linear", "step"]
-    """linear: in a straight line between the two steps; step: at once, at the one step."""
-    begin: Number = Field(alias="from")
-    """Value before."""
-    end: Number = Field(alias="to")
-    """Value after."""
-    steps: _Step | Annotated[tuple[_Step, _Step], _LISTED]
-    """Environment steps since the start of the training: [first, last], or the last; of `step`, the one."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Schedule:
-        if self.schedule == "step" and not isinstance(self.steps, int):
-            raise ValueError("a schedule 'step' changes at one step: steps is one number")
-        if self.first >= self.last:
-            raise ValueError(f"the first step {self.first} is not before the last, {self.last}")
-        return self
-
-    @property
-    def first(self) -> int:
-        """The last step with the value before."""
-        if isinstance(self.steps, tuple):
-            return self.steps[0]
-        return 0 if self.schedule == "linear" else self.steps - 1
-
-    @property
-    def last(self) -> int:
-        """The first step with the value after."""
-        return self.steps[1] if isinstance(self.steps, tuple) else self.steps
-
-
-def _spread(value: Any) -> Any:
-    """A schedule between two ranges is a schedule of each end."""
-    if not isinstance(value, dict) or not all(isinstance(value.get(key), list | tuple) for key in ("from", "to")):
-        return value
-    if len(value["from"]) != 2 or len(value["to"]) != 2:
-        return value
-    return [{**value, "from": value["from"][end], "to": value["to"][end]} for end in (0, 1)]
-
-
-def _ends_ordered(value: tuple[float | Schedule, float | Schedule]) -> tuple[float | Schedule, float | Schedule]:
-    before = [end.begin if isinstance(end, Schedule) else end for end in value]
-    after = [end.end if isinstance(end, Schedule) else end for end in value]
-    _ordered((before[0], before[1]))
-    _ordered((after[0], after[1]))
-    return value
-
-
-ScheduledPair = Annotated[tuple[Number | Schedule, Number | Schedule], _LISTED, BeforeValidator(_spread)]
-ScheduledRange = Annotated[ScheduledPair, AfterValidator(_ends_ordered)]
 
 
 class TermConfig(StrictModel):

@@ -26,8 +26,6 @@ from rlcli.config.schema import (
     ObservationConfig,
     Range,
     RewardConfig,
-    ScheduledPair,
-    ScheduledRange,
     StrictModel,
     SuccessConfig,
     TermConfig,
@@ -60,8 +58,6 @@ _TYPES: dict[str, Any] = {
     "None": None,
     "Range": Range,
     **dict.fromkeys(NAMED, str),
-    "ScheduledRange": ScheduledRange,
-    "ScheduledPair": ScheduledPair,
     **dict.fromkeys(SELECTORS, Names),
 }
 _MDP = Path(__file__).resolve().parent.parent / "mdp"

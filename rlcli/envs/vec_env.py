@@ -289,11 +289,6 @@ class VecEnv(ABC):
         return int(self._steps)
 
     @property
-    def steps(self) -> Tensor:
-        """The same on the device, for terms: reading it there does not wait. () int64"""
-        return self._steps
-
-    @property
     def divergences(self) -> int:
         """Environments whose simulation diverged, ever."""
         return self.engine.divergences

@@ -13,7 +13,7 @@ from rlcli.mdp.ranges import Pair, ranges
 from rlcli.sim.names import NameProblem
 from rlcli.sim.rotations import from_euler, multiply, random_quaternion
 from rlcli.sim.selection import Columns, Selection
-from rlcli.task import Bodies, Entity, Joints, ScheduledPair, ScheduledRange
+from rlcli.task import Bodies, Entity, Joints, Range
 
 if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
@@ -25,8 +25,8 @@ def reset_joints_by_offset(
     *,
     entity: Entity = "robot",
     joints: Joints = ".*",
-    position: ScheduledRange = (0.0, 0.0),
-    velocity: ScheduledRange = (0.0, 0.0),
+    position: Range = (0.0, 0.0),
+    velocity: Range = (0.0, 0.0),
 ) -> None:
     """Default joint state plus uniform offsets [m or rad, m/s or rad/s], positions kept within the soft limits."""
     default_pos, default_vel = _defaults(entity, selection, joints)
@@ -40,8 +40,8 @@ def reset_joints_by_scale(
     *,
     entity: Entity = "robot",
     joints: Joints = ".*",
-    position: ScheduledRange = (1.0, 1.0),
-    velocity: ScheduledRange = (1.0, 1.0),
+    position: Range = (1.0, 1.0),
+    velocity: Range = (1.0, 1.0),
 ) -> None:
     """Default joint state times uniform factors, positions kept within the soft limits."""
     default_pos, default_vel = _defaults(entity, selection, joints)
@@ -55,8 +55,8 @@ def reset_joints_by_gaussian(
     *,
     entity: Entity = "robot",
     joints: Joints = ".*",
-    position: ScheduledPair = (0.0, 0.0),
-    velocity: ScheduledPair = (0.0, 0.0),
+    position: tuple[float, float] = (0.0, 0.0),
+    velocity: tuple[float, float] = (0.0, 0.0),
 ) -> None:
     """Default joint state plus gaussian offsets [mean, std] [m or rad, m/s or rad/s], within the soft limits."""
     default_pos, default_vel = _defaults(entity, selection, joints)
@@ -73,8 +73,8 @@ class ResetJointsWithinLimits:
         *,
         entity: Entity = "robot",
         joints: Joints = ".*",
-        position: ScheduledRange = (0.0, 1.0),
-        velocity: ScheduledRange = (0.0, 0.0),
+        position: Range = (0.0, 1.0),
+        velocity: Range = (0.0, 0.0),
     ) -> None:
         finite = entity.data.joint_limits()[0][0].isfinite()[joints].tolist()
         names = [entity.joint_names[j] for j in torch.arange(len(entity.joint_names))[_host(joints)].tolist()]
@@ -97,14 +97,14 @@ def reset_root_state_uniform(
     selection: Selection,
     *,
     entity: Entity = "robot",
-    x: ScheduledRange = (0.0, 0.0),
-    y: ScheduledRange = (0.0, 0.0),
-    z: ScheduledRange = (0.0, 0.0),
-    roll: ScheduledRange = (0.0, 0.0),
-    pitch: ScheduledRange = (0.0, 0.0),
-    yaw: ScheduledRange = (0.0, 0.0),
-    linear_velocity: list[ScheduledRange] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006 (read, never written)
-    angular_velocity: list[ScheduledRange] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
+    x: Range = (0.0, 0.0),
+    y: Range = (0.0, 0.0),
+    z: Range = (0.0, 0.0),
+    roll: Range = (0.0, 0.0),
+    pitch: Range = (0.0, 0.0),
+    yaw: Range = (0.0, 0.0),
+    linear_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006 (read, never written)
+    angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
 ) -> None:
     """Default root state at the environment's origin plus uniform offsets [m, rad, m/s, rad/s], world frame."""
     default = selection.read(entity.data.default_root_state)
@@ -121,11 +121,11 @@ def reset_root_state_with_random_orientation(
     selection: Selection,
     *,
     entity: Entity = "robot",
-    x: ScheduledRange = (0.0, 0.0),
-    y: ScheduledRange = (0.0, 0.0),
-    z: ScheduledRange = (0.0, 0.0),
-    linear_velocity: list[ScheduledRange] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
-    angular_velocity: list[ScheduledRange] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
+    x: Range = (0.0, 0.0),
+    y: Range = (0.0, 0.0),
+    z: Range = (0.0, 0.0),
+    linear_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
+    angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
 ) -> None:
     """The same with every attitude as likely as any other [m, m/s, rad/s], world frame."""
     default = selection.read(entity.data.default_root_state)
@@ -155,8 +155,8 @@ def push_by_setting_velocity(
     selection: Selection,
     *,
     entity: Entity = "robot",
-    linear_velocity: list[ScheduledRange] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
-    angular_velocity: list[ScheduledRange] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
+    linear_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
+    angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
 ) -> None:
     """Add a uniform draw to the root's velocity, world frame [m/s, rad/s]."""
     push = selection.uniform(*_bounds(env, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
@@ -170,8 +170,8 @@ def apply_external_force_torque(
     *,
     entity: Entity = "robot",
     bodies: Bodies = ".*",
-    force: ScheduledRange = (0.0, 0.0),
-    torque: ScheduledRange = (0.0, 0.0),
+    force: Range = (0.0, 0.0),
+    torque: Range = (0.0, 0.0),
 ) -> None:
     """A uniform wrench on bodies, world frame, each component drawn [N, N m]; it lasts until changed or reset."""
     wrench = entity.engine.field("xfrc_applied").view(env.num_envs, -1)
@@ -188,9 +188,9 @@ class ApplyBodyImpulse:
         *,
         entity: Entity = "robot",
         bodies: Bodies = ".*",
-        force: ScheduledRange = (0.0, 0.0),
-        torque: ScheduledRange = (0.0, 0.0),
-        duration_s: ScheduledRange = (0.1, 0.1),
+        force: Range = (0.0, 0.0),
+        torque: Range = (0.0, 0.0),
+        duration_s: Range = (0.1, 0.1),
     ) -> None:
         self._env = env
         self._wrench = entity.engine.field("xfrc_applied").view(env.num_envs, -1)
@@ -234,7 +234,7 @@ def _drawn_wrench(env: ManagedEnv, selection: Selection, bodies: int, force: Pai
 
 def _bounds(env: ManagedEnv, *pairs: Pair) -> tuple[Tensor, Tensor]:
     """Lower and upper ends of several ranges, for draws of shape (rows, ranges, k). (ranges, 1) each"""
-    low, high = ranges(env.device, *pairs).at(env.steps)
+    low, high = ranges(env.device, *pairs).now()
     return low[:, None], high[:, None]
 
 

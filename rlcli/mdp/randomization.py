@@ -2,20 +2,20 @@
 
 Every term draws anew from the value that the compiled model has, so that what was drawn before never adds up:
 `operation: add` is original + draw, `scale` original x draw, `set` the draw itself. `range` is `[low, high]` of the
-distributions uniform and loguniform, and `[mean, std]` of gaussian; its ends may follow a schedule, and a list of
-pairs gives one to each axis. Axes are drawn each for itself, and so are the elements, unless `shared` gives all of
+distributions uniform and loguniform, and `[mean, std]` of gaussian; a list of pairs gives one to each axis, and a
+curriculum may move them. Axes are drawn each for itself, and so are the elements, unless `shared` gives all of
 them one draw. What cannot be negative is kept from it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import mujoco
 import torch
 from torch import Tensor
 
-from rlcli.config.schema import Schedule
 from rlcli.errors import listing
 from rlcli.mdp.ranges import Pair, Ranges
 from rlcli.sim.model_fields import FIELDS, ModelField
@@ -23,7 +23,7 @@ from rlcli.sim.names import NameProblem, match
 from rlcli.sim.rotations import from_euler, multiply
 from rlcli.sim.scene import actuator_kind
 from rlcli.sim.selection import Columns, Selection
-from rlcli.task import Actuators, Bodies, Entity, Geoms, Joints, Pairs, ScheduledPair, Sites, Tendons
+from rlcli.task import Actuators, Bodies, Entity, Geoms, Joints, Pairs, Sites, Tendons
 
 if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
@@ -42,7 +42,7 @@ class _Draw:
     def __init__(
         self,
         env: ManagedEnv,
-        range: Pair | list[Pair],
+        range: Pair | Sequence[Pair],
         distribution: str,
         operation: str,
         shape: tuple[int, int],
@@ -50,7 +50,6 @@ class _Draw:
         shared: bool = False,
         lowest: float | None = None,
     ) -> None:
-        self._env = env
         many = range.dim() == 2 if isinstance(range, Tensor) else isinstance(range, list)
         pairs: list[Pair] = list(range) if many else [range]  # type: ignore
         if len(pairs) not in (1, shape[1]):
@@ -73,7 +72,7 @@ class _Draw:
 
     def sample(self, selection: Selection) -> Tensor:
         """The draws alone. (rows, elements or 1, axes)"""
-        first, second = self._ranges.at(self._env.steps)
+        first, second = self._ranges.now()
         if self._distribution == "gaussian":
             return selection.normal(first, second, self._drawn)
         if self._distribution == "uniform":
@@ -83,9 +82,7 @@ class _Draw:
 
 def _check(pairs: list[Pair], distribution: str) -> None:
     for pair in (pair.tolist() if isinstance(pair, Tensor) else pair for pair in pairs):
-        before = [end.begin if isinstance(end, Schedule) else end for end in pair]
-        after = [end.end if isinstance(end, Schedule) else end for end in pair]
-        for first, second in (before, after):
+        for first, second in (pair,):
             if distribution == "gaussian" and second < 0:
                 raise NameProblem(f"gaussian: the standard deviation {second:g} is negative", "range is [mean, std]")
             if distribution != "gaussian" and first > second:
@@ -103,7 +100,7 @@ class _Randomization:
         entity: Any,
         field: str,
         elements: Columns | None,
-        range: Pair | list[Pair],
+        range: Pair | Sequence[Pair],
         distribution: str,
         operation: str,
         shared: bool = False,
@@ -130,7 +127,7 @@ class RandomizeBodyMass(_Randomization):
         *,
         entity: Entity = "robot",
         bodies: Bodies = ".*",
-        range: ScheduledPair,
+        range: tuple[float, float],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -161,7 +158,7 @@ class RandomizeBodyCom(_Randomization):
         entity: Entity = "robot",
         bodies: Bodies = ".*",
         axes: list[int] | None = None,
-        range: ScheduledPair | list[ScheduledPair],
+        range: tuple[float, float] | list[tuple[float, float]],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "add",
         shared: bool = False,
@@ -184,7 +181,7 @@ class RandomizeBodyInertia(_Randomization):
         *,
         entity: Entity = "robot",
         bodies: Bodies = ".*",
-        range: ScheduledPair,
+        range: tuple[float, float],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         shared: bool = False,
     ) -> None:
@@ -202,7 +199,7 @@ class RandomizeBodyPos(_Randomization):
         entity: Entity = "robot",
         bodies: Bodies = ".*",
         axes: list[int] | None = None,
-        range: ScheduledPair | list[ScheduledPair],
+        range: tuple[float, float] | list[tuple[float, float]],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "add",
         shared: bool = False,
@@ -243,9 +240,9 @@ class RandomizeBodyQuat(_Turn):
         *,
         entity: Entity = "robot",
         bodies: Bodies = ".*",
-        roll: ScheduledPair = (0.0, 0.0),
-        pitch: ScheduledPair = (0.0, 0.0),
-        yaw: ScheduledPair = (0.0, 0.0),
+        roll: tuple[float, float] = (0.0, 0.0),
+        pitch: tuple[float, float] = (0.0, 0.0),
+        yaw: tuple[float, float] = (0.0, 0.0),
         distribution: Literal["uniform", "gaussian"] = "uniform",
         shared: bool = False,
     ) -> None:
@@ -267,7 +264,7 @@ class RandomizeGeomFriction(_Randomization):
         entity: Entity = "robot",
         geoms: Geoms = ".*",
         axes: list[int] = [0],  # noqa: B006 (read, never written)
-        range: ScheduledPair | list[ScheduledPair],
+        range: tuple[float, float] | list[tuple[float, float]],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -297,7 +294,7 @@ class RandomizeGeomSize(_Randomization):
         entity: Entity = "robot",
         geoms: Geoms = ".*",
         axes: list[int] | None = None,
-        range: ScheduledPair | list[ScheduledPair],
+        range: tuple[float, float] | list[tuple[float, float]],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -318,7 +315,7 @@ class RandomizeGeomPos(_Randomization):
         entity: Entity = "robot",
         geoms: Geoms = ".*",
         axes: list[int] | None = None,
-        range: ScheduledPair | list[ScheduledPair],
+        range: tuple[float, float] | list[tuple[float, float]],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "add",
         shared: bool = False,
@@ -335,9 +332,9 @@ class RandomizeGeomQuat(_Turn):
         *,
         entity: Entity = "robot",
         geoms: Geoms = ".*",
-        roll: ScheduledPair = (0.0, 0.0),
-        pitch: ScheduledPair = (0.0, 0.0),
-        yaw: ScheduledPair = (0.0, 0.0),
+        roll: tuple[float, float] = (0.0, 0.0),
+        pitch: tuple[float, float] = (0.0, 0.0),
+        yaw: tuple[float, float] = (0.0, 0.0),
         distribution: Literal["uniform", "gaussian"] = "uniform",
         shared: bool = False,
     ) -> None:
@@ -354,7 +351,7 @@ class RandomizeSitePos(_Randomization):
         entity: Entity = "robot",
         sites: Sites = ".*",
         axes: list[int] | None = None,
-        range: ScheduledPair | list[ScheduledPair],
+        range: tuple[float, float] | list[tuple[float, float]],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "add",
         shared: bool = False,
@@ -371,9 +368,9 @@ class RandomizeSiteQuat(_Turn):
         *,
         entity: Entity = "robot",
         sites: Sites = ".*",
-        roll: ScheduledPair = (0.0, 0.0),
-        pitch: ScheduledPair = (0.0, 0.0),
-        yaw: ScheduledPair = (0.0, 0.0),
+        roll: tuple[float, float] = (0.0, 0.0),
+        pitch: tuple[float, float] = (0.0, 0.0),
+        yaw: tuple[float, float] = (0.0, 0.0),
         distribution: Literal["uniform", "gaussian"] = "uniform",
         shared: bool = False,
     ) -> None:
@@ -389,7 +386,7 @@ class RandomizeJointDamping(_Randomization):
         *,
         entity: Entity = "robot",
         joints: Joints = ".*",
-        range: ScheduledPair,
+        range: tuple[float, float],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -406,7 +403,7 @@ class RandomizeJointArmature(_Randomization):
         *,
         entity: Entity = "robot",
         joints: Joints = ".*",
-        range: ScheduledPair,
+        range: tuple[float, float],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -423,7 +420,7 @@ class RandomizeJointFrictionLoss(_Randomization):
         *,
         entity: Entity = "robot",
         joints: Joints = ".*",
-        range: ScheduledPair,
+        range: tuple[float, float],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -440,7 +437,7 @@ class RandomizeJointStiffness(_Randomization):
         *,
         entity: Entity = "robot",
         joints: Joints = ".*",
-        range: ScheduledPair,
+        range: tuple[float, float],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -459,8 +456,8 @@ class RandomizeJointRange:
         *,
         entity: Entity = "robot",
         joints: Joints = ".*",
-        lower: ScheduledPair | None = None,
-        upper: ScheduledPair | None = None,
+        lower: tuple[float, float] | None = None,
+        upper: tuple[float, float] | None = None,
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "add",
         shared: bool = False,
@@ -496,7 +493,7 @@ class RandomizeDefaultJointPos:
         *,
         entity: Entity = "robot",
         joints: Joints = ".*",
-        range: ScheduledPair,
+        range: tuple[float, float],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "add",
         shared: bool = False,
@@ -531,8 +528,8 @@ class RandomizeActuatorGains:
         *,
         entity: Entity = "robot",
         actuators: Actuators = ".*",
-        kp: ScheduledPair | None = None,
-        kv: ScheduledPair | None = None,
+        kp: tuple[float, float] | None = None,
+        kv: tuple[float, float] | None = None,
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -579,9 +576,9 @@ class RandomizePdGains:
         *,
         entity: Entity = "robot",
         joints: Joints = ".*",
-        stiffness: ScheduledPair | None = None,
-        damping: ScheduledPair | None = None,
-        effort_limit: ScheduledPair | None = None,
+        stiffness: tuple[float, float] | None = None,
+        damping: tuple[float, float] | None = None,
+        effort_limit: tuple[float, float] | None = None,
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -620,7 +617,7 @@ class RandomizeEffortLimit:
         *,
         entity: Entity = "robot",
         actuators: Actuators = ".*",
-        range: ScheduledPair,
+        range: tuple[float, float],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -649,7 +646,7 @@ class RandomizeGravity(_Randomization):
         env: ManagedEnv,
         *,
         axes: list[int] = [2],  # noqa: B006 (read, never written)
-        range: ScheduledPair | list[ScheduledPair],
+        range: tuple[float, float] | list[tuple[float, float]],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "add",
     ) -> None:
@@ -667,7 +664,7 @@ class RandomizeTendonStiffness(_Randomization):
         *,
         entity: Entity = "robot",
         tendons: Tendons = ".*",
-        range: ScheduledPair,
+        range: tuple[float, float],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -684,7 +681,7 @@ class RandomizeTendonDamping(_Randomization):
         *,
         entity: Entity = "robot",
         tendons: Tendons = ".*",
-        range: ScheduledPair,
+        range: tuple[float, float],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -701,7 +698,7 @@ class RandomizeTendonFrictionLoss(_Randomization):
         *,
         entity: Entity = "robot",
         tendons: Tendons = ".*",
-        range: ScheduledPair,
+        range: tuple[float, float],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -720,7 +717,7 @@ class RandomizeTendonArmature(_Randomization):
         *,
         entity: Entity = "robot",
         tendons: Tendons = ".*",
-        range: ScheduledPair,
+        range: tuple[float, float],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -738,7 +735,7 @@ class RandomizePairFriction(_Randomization):
         entity: Entity = "robot",
         pairs: Pairs = ".*",
         axes: list[int] = [0, 1],  # noqa: B006 (read, never written)
-        range: ScheduledPair | list[ScheduledPair],
+        range: tuple[float, float] | list[tuple[float, float]],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,
@@ -757,7 +754,7 @@ class RandomizeModelField(_Randomization):
         field: str,
         names: str | list[str] = ".*",
         axes: list[int] | None = None,
-        range: ScheduledPair | list[ScheduledPair],
+        range: tuple[float, float] | list[tuple[float, float]],
         distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
         operation: Literal["add", "scale", "set"] = "scale",
         shared: bool = False,

@@ -33,8 +33,7 @@ def every_term():
     task["events"]["scene"] = {"func": "reset_scene_to_default", "mode": "reset"}
     task["events"]["offset"] = {"func": "reset_joints_by_offset", "mode": "reset", "joints": ["hip_fl", "hip_br"],
                                 "position": [-0.1, 0.1], "velocity": [-0.1, 0.1]}  # fmt: skip
-    mixed = {"distribution": "loguniform", "range": {"schedule": "linear", "from": [0.8, 1.0], "to": [0.5, 2.0],
-                                                     "steps": 9}}  # fmt: skip
+    mixed = {"distribution": "loguniform", "range": [0.5, 2.0]}
     task["events"] |= {
         "mass": {"func": "randomize_body_mass", "mode": "reset", **mixed},
         "com": {"func": "randomize_body_com", "mode": "reset", "range": [-0.01, 0.01], "min_steps_between": 3},
@@ -69,6 +68,7 @@ def every_term():
         "delay": {"steps": [0, 2], "redraw": 0.5}, "history": 3,
     }  # fmt: skip
     task["curriculum"] = {
+        "mass": {"func": "interpolate", "address": "events.mass.range", "end": 10, "to": [0.8, 1.2]},
         "weight": {"func": "stages", "address": "rewards.alive.weight", "steps": [3], "values": [2.0]},
         "push": {"func": "interpolate", "address": "events.push.linear_velocity", "end": 10,
                  "to": [[-2.0, 2.0], [-2.0, 2.0], [0.0, 0.0]]},

@@ -1,4 +1,4 @@
-"""When events fire, what a schedule makes of their ranges, and that a partial reset touches nobody else."""
+"""When events fire, what a curriculum makes of their ranges, and that a partial reset touches nobody else."""
 
 import itertools
 import math
@@ -10,7 +10,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from worlds import CRITTER_TASK, PENDULUM_TASK, actions, build, critter, dump, edited, pendulum
 
-from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import resolve
 from rlcli.errors import ConfigError
 from rlcli.registry import find_task
@@ -95,43 +94,6 @@ def test_a_global_timer_does_not_depend_on_how_many_environments_there_are(tmp_p
     assert lives[0] == lives[1]
 
 
-@pytest.mark.parametrize("engine", LONG)
-def test_a_linear_schedule_moves_a_range_with_the_steps(tmp_path, engine):
-    schedule = {"schedule": "linear", "from": [1.0, 1.0], "to": [3.0, 3.0], "steps": [10, 30]}
-    env = swinging(tmp_path, engine=engine, it={**DAMPING, "mode": "reset", "range": schedule})
-    seen = {0: damping(env)[0].item()}
-    for i in range(1, 51):
-        step(env)
-        seen[i] = damping(env)[0].item()
-    assert [seen[i] for i in (0, 10, 20, 30, 40, 50)] == pytest.approx([1.0, 1.0, 2.0, 3.0, 3.0, 3.0])
-
-
-def test_a_step_schedule_of_one_end_changes_at_its_step(tmp_path):
-    ends = [0.0, {"schedule": "step", "from": 0.0, "to": 2.0, "steps": 20}]
-    env = swinging(tmp_path, it={"func": "reset_joints_by_offset", "mode": "reset", "position": ends})
-    positions = {}
-    for i in range(1, 31):
-        step(env)
-        positions[i] = env.entities["robot"].data.joint_pos[:, 0].clone()
-    assert (positions[10] == 0).all()
-    assert (positions[20] > 0).all()
-    assert (positions[30] > 0).all()
-    assert not torch.equal(positions[20], positions[30])
-
-
-def test_a_schedule_reads_back_from_the_configuration_that_a_run_keeps(tmp_path):
-    ranges = [
-        {"schedule": "linear", "from": [0.0, 1.0], "to": ["1/2", 3.0], "steps": [0, 9]},
-        [{"schedule": "step", "from": 1.0, "to": 0.5, "steps": 4}, 2.0],
-    ]
-    for number, range_ in enumerate(ranges):
-        event = {**DAMPING, "mode": "reset", "range": range_}
-        task = pendulum(tmp_path / str(number), edited(PENDULUM_TASK, events={"it": event}))
-        resolved = resolve(find_task(str(task)))
-        (task / "task.yaml").write_text(to_yaml(to_data(resolved)))
-        assert resolve(find_task(str(task))).task.events == resolved.task.events
-
-
 def test_a_curriculum_may_move_the_range_of_a_randomisation(tmp_path):
     stages = {"func": "stages", "address": "events.it.range", "steps": [15], "values": [[4.0, 5.0]]}
     task = pendulum(
@@ -149,20 +111,14 @@ def test_a_curriculum_may_move_the_range_of_a_randomisation(tmp_path):
 
 
 BAD = [
-    ({**DAMPING, "mode": "reset", "range": [{"schedule": "linear", "from": 0, "to": 1, "steps": [5, 5]}, 1]},
-     "the first step 5 is not before the last, 5"),
-    ({**DAMPING, "mode": "reset", "range": [{"schedule": "step", "from": 0, "to": 1, "steps": [5, 9]}, 1]},
-     "changes at one step"),
-    ({**DAMPING, "mode": "reset", "range": [{"schedule": "cubic", "from": 0, "to": 1, "steps": 5}, 1]}, "'linear'"),
     ({**DAMPING, "mode": "reset", "range": [0, 1], "global_time": True}, "global_time belongs to mode interval"),
     ({**DAMPING, "mode": "startup", "range": [0, 1], "min_steps_between": 3}, "belongs to mode reset"),
-    ({"func": "reset_joints_by_offset", "mode": "reset",
-      "position": {"schedule": "linear", "from": [0, 1], "to": [1, 0], "steps": 9}}, "the lower end 1 is above"),
+    ({"func": "reset_joints_by_offset", "mode": "reset", "position": [1, 0]}, "the lower end 1 is above"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("event", "message"), BAD, ids=[message for _, message in BAD])
-def test_a_wrong_schedule_or_timer_is_refused_before_anything_is_built(tmp_path, event, message):
+def test_a_wrong_timer_is_refused_before_anything_is_built(tmp_path, event, message):
     task = pendulum(tmp_path, edited(PENDULUM_TASK, events={"it": event}))
     with pytest.raises(ConfigError) as error:
         resolve(find_task(str(task)))
