@@ -139,13 +139,11 @@ class Recorder:
 
     def _begin(self, ids: Iterable[int]) -> None:
         engine = self._env.engine
-        fields = {name: engine.expanded(name) for name in engine.expansions()}
+        fields = {name: engine.expand(name) for name in engine.expansions()}
         for env in ids:
             self._began[env] = len(self._rewards)
             if fields:
-                rows = {
-                    name: values[env].detach().cpu().clone() for name, values in fields.items() if values is not None
-                }
+                rows = {name: values[env].detach().cpu().clone() for name, values in fields.items()}
                 self._models[env, self._began[env]] = rows
 
     def _write(self, file: Path, episodes: list[Episode]) -> Path:
