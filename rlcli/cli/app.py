@@ -26,6 +26,7 @@ COMMANDS = {
     "export": "export",
     "replay": "replay",
     "check": "check",
+    "lint": "lint",
 }
 """Command -> module of `rlcli.cli` that registers it."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -119,10 +118,4 @@ def _stopped(name: str, subject: Subject, error: Exception, before: list[Finding
     hint = "mend what raises it, then check again"
     if earlier is not None:
         hint = f"see {earlier}"
-    return Finding(name, "error", _place(subject, error), message, hint)
-
-
-def _place(subject: Subject, error: Exception) -> str:
-    """The innermost line of the task's own files, or the task."""
-    own = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).is_relative_to(subject.source.root)]
-    return f"{own[-1].filename}:{own[-1].lineno}" if own else subject.source.label
+    return Finding(name, "error", subject.place(error), message, hint)
