@@ -10,7 +10,7 @@ for finding in check_task("acrobot"):
 ```
 """
 
-from rlcli.testing.kit import CHECKS, Finding, check_task
+from rlcli.testing.kit import CHECKS, Finding, check_task, record_layout
 from rlcli.testing.lint import RULES, Remark, lint_task
 
-__all__ = ["CHECKS", "RULES", "Finding", "Remark", "check_task", "lint_task"]
+__all__ = ["CHECKS", "RULES", "Finding", "Remark", "check_task", "lint_task", "record_layout"]

@@ -38,6 +38,10 @@ class Finding:
         return f"{self.severity}: {self.check}: {self.where}: {self.message}; {self.hint}"
 
 
+class NotRunError(Exception):
+    """Raised by a check that says nothing about this task, or on this machine: why."""
+
+
 @dataclass(slots=True)
 class Recording:
     """What an environment gave, step by step: copies, and the tensors themselves to see whether they change."""
@@ -64,6 +68,8 @@ class Subject:
         resolve(source, agent=agent, overrides=overrides)
         resolve(source, agent=agent, overrides=overrides, play=True)
         self.resolved = self._resolve({})
+        self.notes: dict[str, str] = {}
+        """Check -> what else there is to say, besides what it found."""
         self._recording: Recording | None = None
 
     @property
