@@ -328,10 +328,15 @@ def repeated_observation(subject: Subject) -> Iterator[Finding]:
 
 
 def _second_look(twins: _Twins) -> dict[str, tuple[Tensor, Tensor]]:
-    env, obs = twins.kept, {group: values.clone() for group, values in twins.step()[0].obs.items()}
+    env = twins.kept
+    memory = env.observation_manager.state_dict() if isinstance(env, ManagedEnv) else {}
+    result = twins.step()[0]
     if isinstance(env, ManagedEnv):
+        obs = {group: values.clone() for group, values in result.obs.items()}
+        running = ~(result.terminated | result.truncated)
+        env.observation_manager.load_state_dict(memory)  # histories and filters look at the same past again
         again = env.observation_manager.compute()
-        return {f"observations.{group}": (values, again[group]) for group, values in obs.items()}
+        return {f"observations.{group}": (values[running], again[group][running]) for group, values in obs.items()}
     task = task_of(env)
     first = {"obs_buf": task.obs_buf.clone(), "states_buf": task.states_buf.clone()}
     env._fill()  # type: ignore[attr-defined]

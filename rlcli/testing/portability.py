@@ -251,12 +251,13 @@ def engines(subject: Subject) -> Iterator[Finding]:
     env = subject.env(episode_steps=EPISODE, flags={"scene.num_envs": FEW_WORLDS})
     place = "sim.engine = warp"
     hint = "use the selection's methods and the engine's fields alone; or say sim.engine: batch, if it is for CPUs only"
-    pairs = [(env.reset(seed=0), other.reset(seed=0))]
-    action = next(random_actions(env, subject.bound))[:FEW_WORLDS]
-    torch.manual_seed(0)
-    results = [one.step(action.clone()) for one in (env, other)]
+    action = next(random_actions(env, subject.bound))
+    seen = []
+    for one in (env, other):
+        torch.manual_seed(0)  # what a task draws from torch itself is same-seed's business
+        seen.append((one.reset(seed=0), flat(one.step(action.clone()))))
     other.check()
-    pairs.append((flat(results[0]), flat(results[1])))
+    pairs = list(zip(*seen, strict=True))
     for when, (left, right) in zip(("at the start", "after a step"), pairs, strict=True):
         for what, values in left.items():
             there = right[what].to(values.device)

@@ -118,7 +118,7 @@ def test_histories_delays_and_noise_of_the_configuration_are_in_order(managed):
     managed.config["curriculum"] = {
         "weight": {"func": "interpolate", "address": "rewards.upright.weight", "end": 20, "to": -2.0}
     }
-    assert only(managed, "checkpoint", "threads", "num-envs")[0] == []
+    assert only(managed, "checkpoint", "threads", "num-envs", "repeated-observation")[0] == []
     managed.config["curriculum"] = {}
     assert only(managed, "back-fill") == ([], {})
 
