@@ -54,6 +54,12 @@ Sensors: TypeAlias = Any
 """MJCF sensors of `entity`. At run time: an index into sensor-data columns."""
 Actuators: TypeAlias = Any
 """Actuators of `entity`. At run time: an index into actuator columns."""
+Geoms: TypeAlias = Any
+"""Geoms of `entity`. At run time: an index into the names of its geoms."""
+Tendons: TypeAlias = Any
+"""Tendons of `entity`. At run time: an index into the names of its tendons."""
+Pairs: TypeAlias = Any
+"""Contact pairs of `entity`. At run time: an index into the names of its pairs."""
 ContactSensor: TypeAlias = Any
 """A contact sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.sensors.ContactSensor`."""
 RaySensor: TypeAlias = Any

@@ -24,6 +24,7 @@ COMMANDS = {
     "play": "play",
     "eval": "eval",
     "export": "export",
+    "replay": "replay",
     "check": "check",
 }
 """Command -> module of `rlcli.cli` that registers it."""

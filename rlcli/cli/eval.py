@@ -17,6 +17,8 @@ from rlcli.cli.options import (
     NumEnvs,
     Overrides,
     Quiet,
+    Record,
+    RecordMode,
     RunsDir,
     Seed,
     draw_seed,
@@ -38,6 +40,8 @@ def command(
         typer.Option("--fail-under", help="success=0.99, return=4 or length=250: exit 9 below; repeatable."),
     ] = None,
     stochastic: Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")] = False,
+    record: Record = None,
+    record_mode: RecordMode = "all",
     num_envs: NumEnvs = None,
     seed: Seed = 42,
     config: ConfigFile = None,
@@ -48,7 +52,7 @@ def command(
     headless: Headless = True,
 ) -> None:
     """Evaluate a policy."""
-    from rlcli.cli.session import open_session
+    from rlcli.cli.session import check_record, open_session
     from rlcli.errors import UsageError
 
     console.quiet = quiet
@@ -58,6 +62,7 @@ def command(
         if "success" in limits and resolved.task.success is None:
             raise UsageError("this task defines no success", hint="add `success:` to its YAML, or use return=X")
 
+    check_record(record, record_mode)
     session = open_session(
         task,
         overrides or [],
@@ -70,9 +75,9 @@ def command(
         runs_dir=runs_dir,
         check=check,
     )
-    from rlcli.rl.rollout import evaluate
+    from rlcli.cli.session import run_episodes
 
-    summary = evaluate(session.env, session.act, episodes).summary()
+    summary, recorded = run_episodes(session, episodes, record, record_mode)
     failures = _verdict(summary, limits)
     _show(summary)
     console.document(
@@ -83,6 +88,7 @@ def command(
         **summary,
         passed=not failures,
         failures=failures,
+        recorded=recorded,
     )
     if failures:
         for failure in failures:

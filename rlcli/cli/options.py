@@ -32,6 +32,12 @@ Seed = Annotated[
 ]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
 RunsDir = Annotated[Path | None, typer.Option("--runs-dir", help="Runs folder; else RLCLI_RUNS_DIR, else runs/.")]
+Record = Annotated[
+    Path | None, typer.Option("--record", help="Write the episodes, states and actions, to FILE; `replay` steps them.")
+]
+RecordMode = Annotated[
+    str, typer.Option("--record-mode", help="Which episodes: all, succeeded, failed, or separate (a file each).")
+]
 CheckpointRef = Annotated[
     str | None,
     typer.Option("--checkpoint", help="RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest."),

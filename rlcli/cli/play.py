@@ -18,6 +18,8 @@ from rlcli.cli.options import (
     NumEnvs,
     Overrides,
     Quiet,
+    Record,
+    RecordMode,
     RunsDir,
     Seed,
     draw_seed,
@@ -41,6 +43,8 @@ def command(
     ] = None,
     viewer: Annotated[str, typer.Option("--viewer", help="auto, native or none.")] = "auto",
     stochastic: Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")] = False,
+    record: Record = None,
+    record_mode: RecordMode = "all",
     num_envs: NumEnvs = None,
     seed: Seed = 42,
     config: ConfigFile = None,
@@ -51,7 +55,7 @@ def command(
     headless: Headless = False,
 ) -> None:
     """Play a policy."""
-    from rlcli.cli.session import open_session
+    from rlcli.cli.session import check_record, open_session
     from rlcli.errors import UsageError, did_you_mean
 
     console.quiet = quiet
@@ -62,7 +66,10 @@ def command(
         from rlcli.viewer.writer import check_video
 
         check_video(_FALLBACK_VIDEO if str(video) == CHOOSE else video)
-    window = video is None and _window(viewer, headless)
+    window = video is None and record is None and _window(viewer, headless)
+    if record is not None and video is not None:
+        raise UsageError("--record writes episodes, not pictures", hint="rlcli replay FILE --video draws what it holds")
+    check_record(record, record_mode)
     session = open_session(
         task,
         overrides or [],
@@ -81,7 +88,7 @@ def command(
 
         run(session.env, session.act)
     else:
-        _statistics(session)
+        _statistics(session, record, record_mode)
 
 
 def _default_video(session: Any) -> Path:
@@ -131,11 +138,11 @@ def _video(session: Any, file: Path) -> None:
     console.document("play", video=str(file), frames=frames, fps=fps, gl=backend, **summary)
 
 
-def _statistics(session: Any) -> None:
+def _statistics(session: Any, record: Path | None, record_mode: str) -> None:
     from rlcli.cli.eval import _show
-    from rlcli.rl.rollout import evaluate
+    from rlcli.cli.session import run_episodes
 
     console.info("no window asked for, or no display: one episode an environment, as numbers (--video FILE.mp4 draws)")
-    summary = evaluate(session.env, session.act, session.env.num_envs).summary()
+    summary, recorded = run_episodes(session, session.env.num_envs, record, record_mode)
     _show(summary)
-    console.document("play", video=None, **summary)
+    console.document("play", video=None, recorded=recorded, **summary)

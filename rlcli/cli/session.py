@@ -96,3 +96,38 @@ def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic
     else:
         act = random_policy(env, resolved.agent.action_bound if resolved.agent else 1.0, derive(seed, "play"))
     return Session(env, act, run, folder, resolved)
+
+
+def check_record(record: Path | None, mode: str) -> None:
+    """Refuse, before anything is built, what cannot be recorded.
+
+    Raises:
+        UsageError: for a mode that there is not.
+        MachineError: if the folder is not there.
+    """
+    from rlcli.errors import MachineError, UsageError, did_you_mean
+
+    modes = ("all", "succeeded", "failed", "separate")
+    if mode not in modes:
+        raise UsageError(f"no --record-mode '{mode}'", hint=did_you_mean(mode, modes) or f"modes: {', '.join(modes)}")
+    if record is None:
+        return
+    if record.is_dir():
+        raise UsageError(f"--record {record} is a folder", hint=f"give a file: {record / 'episodes.safetensors'}")
+    if not record.absolute().parent.is_dir():
+        raise MachineError(f"--record: there is no folder {record.absolute().parent}")
+
+
+def run_episodes(session: Session, episodes: int, record: Path | None, mode: str) -> tuple[dict[str, Any], list[str]]:
+    """Evaluate, and record if asked to: the summary, and the files that were written."""
+    from rlcli.rl.rollout import evaluate
+
+    if record is None:
+        return evaluate(session.env, session.act, episodes).summary(), []
+    from rlcli.rl.recording import Recorder
+
+    with Recorder(session.env, session.act, episodes) as recorder:
+        summary = evaluate(session.env, recorder.act, episodes, recorder.on_step).summary()
+    files = [str(file) for file in recorder.save(record, mode)]
+    console.info(f"recorded {len(recorder.episodes)} episodes to {' and '.join(files)}")
+    return summary, files

@@ -130,6 +130,10 @@ class EventConfig(TermConfig):
     """startup: once; reset: when an episode starts; interval: again and again."""
     interval_range_s: Range | None = None
     """[low, high] time between two firings [s], drawn an environment; required by mode interval."""
+    global_time: bool = False
+    """Mode interval: one timer for all environments, which resets do not restart."""
+    min_steps_between: Annotated[int, Field(ge=0)] = 0
+    """Mode reset: environment steps that must have passed since the last firing; the first reset always fires."""
 
     @model_validator(mode="after")
     def _interval(self) -> EventConfig:
@@ -137,6 +141,10 @@ class EventConfig(TermConfig):
             raise ValueError("interval_range_s belongs to mode interval, and mode interval needs it")
         if self.interval_range_s is not None and self.interval_range_s[0] <= 0:
             raise ValueError("interval_range_s must be above 0")
+        if self.global_time and self.mode != "interval":
+            raise ValueError("global_time belongs to mode interval")
+        if self.min_steps_between and self.mode != "reset":
+            raise ValueError("min_steps_between belongs to mode reset")
         return self
 
 

@@ -46,7 +46,7 @@ SECTIONS: dict[str, type[TermConfig]] = {
 }
 """Section of the YAML -> what its terms have in common."""
 
-SELECTORS = ("Joints", "Bodies", "Sites", "Sensors", "Actuators")
+SELECTORS = ("Joints", "Bodies", "Sites", "Sensors", "Actuators", "Geoms", "Tendons", "Pairs")
 """Aliases of `rlcli.task` that pick elements of the term's `entity`."""
 
 NAMED = ("Entity", "Command", "Address", "ContactSensor", "RaySensor")
@@ -126,7 +126,8 @@ class Vocabulary:
 @functools.cache
 def builtin_terms(section: str) -> dict[str, Signature]:
     """The terms of `rlcli.mdp` for a section of the YAML."""
-    return read_terms(_MDP / f"{section}.py")
+    terms = read_terms(_MDP / f"{section}.py")
+    return {**read_terms(_MDP / "randomization.py"), **terms} if section == "events" else terms
 
 
 def read_terms(file: Path) -> dict[str, Signature]:

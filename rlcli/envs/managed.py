@@ -41,6 +41,12 @@ class ManagedEnv(VecEnv):
         scene.add_actuators(self._actuator_needs())
         if any(getattr(term, "reads_body_forces", False) for term in self._judging_terms()):
             add_body_forces(scene.spec)
+        for config in self.config.events.values():
+            assert config is not None
+            signature = self.resolved.vocabulary.find("events", config.func)
+            prepare = None if signature is None else getattr(self._binder.load(signature), "prepare", None)
+            if prepare is not None:
+                prepare(scene.spec, config.params)
 
     def _bind(self) -> None:
         binder = self._binder
@@ -59,7 +65,9 @@ class ManagedEnv(VecEnv):
         self.command_manager = CommandManager(self._commands, n, self.step_dt, device, live)
         self.action_manager = ActionManager(self._actions, n, device)
         self.termination_manager = TerminationManager(self._terminations, n, device)
-        self.event_manager = EventManager(self._events, n, self.step_dt, device)
+        self.event_manager = EventManager(self._events, n, self.step_dt, device, self.engine.set_constants)
+        if self.event_manager.derives:
+            self.engine.set_constants()  # makes room for them; from here on all of them are derived in one way
         self.event_manager.startup(self._everyone())
         reward_dt = self.step_dt if self.config.reward_dt_scaling else 1.0
         self.reward_manager = RewardManager(self._rewards, n, reward_dt, device, live, self.config.divergence_reward)
@@ -134,6 +142,9 @@ class ManagedEnv(VecEnv):
         returns, terms = self.reward_manager.episode(ended)
         return returns, terms, self.termination_manager.causes(ended)
 
+    def _start_over(self) -> None:
+        self.event_manager.start_over(self._everyone())
+
     def _metrics_of(self, ended: Selection) -> dict[str, Tensor]:
         return self.command_manager.episode(ended)
 
@@ -141,7 +152,7 @@ class ManagedEnv(VecEnv):
         self.curriculum_manager.compute(ended)
 
     def _restart_workflow(self, selection: Selection) -> None:
-        self.event_manager.reset(selection)
+        self.event_manager.reset(selection, self._steps)
         self.action_manager.reset(selection)
         self.command_manager.reset(selection)
         self.reward_manager.reset(selection)
@@ -203,10 +214,10 @@ class ManagedEnv(VecEnv):
         }
         terms = [
             *self.action_manager.terms,
+            *self.event_manager.terms,
             *self.termination_manager.terms,
             *self.reward_manager.terms,
             *self.command_manager.terms,
-            *self.event_manager.terms,
             *self.curriculum_manager.terms,
             *(
                 pipeline.term

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -193,6 +193,8 @@ class VecEnv(ABC):
         self.num_envs = self.config.scene.num_envs
         self.final_obs_of = "finished"
         self.seconds = {"physics": 0.0, "step": 0.0}
+        self.after_physics: Callable[[], None] | None = None
+        """Called in every step with the state that it is judged by, before anything ends or begins."""
         self._playing = True
         self._counters()
         self._open(resolved)
@@ -245,6 +247,8 @@ class VecEnv(ABC):
 
         self._act(action)
         diverged = self._simulate()
+        if self.after_physics is not None:
+            self.after_physics()
         self.episode_length_buf += 1
         self._steps += 1
         for sensor in self.sensors.values():

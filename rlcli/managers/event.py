@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -12,58 +12,110 @@ from rlcli.managers.term import BoundTerm
 from rlcli.sim.selection import Selection
 
 Select = Callable[[Tensor], Selection | None]
+Settle = Callable[[Selection], None]
 
 
 class EventManager:
-    """Interval timers run an environment each; they start anew with its episode."""
+    """Fires events; interval timers run an environment each and start anew with its episode, unless they are global.
 
-    def __init__(self, terms: list[BoundTerm], num_envs: int, step_dt: float, device: torch.device) -> None:
-        self.terms = terms
+    Args:
+        terms: the events.
+        num_envs: environments.
+        step_dt: control period [s].
+        device: of the timers.
+        settle: called once after a firing that wrote something from which the engine derives constants.
+    """
+
+    def __init__(
+        self,
+        terms: list[BoundTerm],
+        num_envs: int,
+        step_dt: float,
+        device: torch.device,
+        settle: Settle = lambda _: None,
+    ) -> None:
         by_mode: dict[str, list[BoundTerm]] = {"startup": [], "reset": [], "interval": []}
         for term in terms:
             by_mode[term.config.mode].append(term)  # type: ignore[attr-defined]
+        self.terms = terms
         self._startup, self._reset, self._interval = by_mode["startup"], by_mode["reset"], by_mode["interval"]
+        self._lasting = [term.instance for term in terms if hasattr(term.instance, "update")]
         self._step_dt = step_dt
+        self._settle = settle
         # counted in whole steps: subtracting step_dt again and again drifts
         self._steps_left = torch.zeros(len(self._interval), num_envs, dtype=torch.int64, device=device)
+        self._fired_at = torch.full((len(self._reset), num_envs), _NEVER, dtype=torch.int64, device=device)
+
+    @property
+    def derives(self) -> bool:
+        """Whether some event changes what the engine derives constants from."""
+        return any(map(_derives, self.terms))
 
     @property
     def has_intervals(self) -> bool:
-        """Whether there are interval events at all."""
-        return bool(self._interval)
+        """Whether anything happens between resets."""
+        return bool(self._interval or self._lasting)
 
     def startup(self, everyone: Selection) -> None:
         """Fire the startup events, once."""
         for term in self._startup:
             term.call(everyone.stream(term.stream))
+        self._after(self._startup, everyone)
 
-    def reset(self, selection: Selection) -> None:
-        """Fire the reset events of new episodes, and start their interval timers."""
-        for term in self._reset:
-            term.call(selection.stream(term.stream))
+    def start_over(self, everyone: Selection) -> None:
+        """Forget what has fired, before all environments begin anew."""
+        self._fired_at.fill_(_NEVER)
         for term, left in zip(self._interval, self._steps_left, strict=True):
-            selection.write(left, self._draw(term, selection, _FIRST))
+            if _is_global(term):
+                everyone.write(left, self._draw(term, everyone, _FIRST)[:1])
+
+    def reset(self, selection: Selection, step: Tensor) -> None:
+        """Fire the reset events of new episodes at a `step` since the start, and start their interval timers."""
+        for term in self.terms:
+            term.reset(selection)
+        for term, fired_at in zip(self._reset, self._fired_at, strict=True):
+            apart = term.config.min_steps_between  # type: ignore[attr-defined]
+            due = selection.where(step - fired_at >= apart) if apart else selection
+            if due is not None:
+                term.call(due.stream(term.stream))
+                if apart:
+                    due.write(fired_at, step.expand(1))
+        self._after(self._reset, selection)
+        for term, left in zip(self._interval, self._steps_left, strict=True):
+            if not _is_global(term):
+                selection.write(left, self._draw(term, selection, _FIRST))
 
     def interval(self, select: Select, running: Tensor, fired: Callable[[Selection], None]) -> None:
         """Let one step pass where an episode is `running` (1 or 0) and fire what is due, telling `fired` after each.
 
-        `select` draws from the step's own counter.
+        `select` draws from the step's own counter. Global timers run everywhere.
         """
+        for lasting in self._lasting:
+            lasting.update(select, running)
         for term, left in zip(self._interval, self._steps_left, strict=True):
-            left -= running
+            is_global = _is_global(term)
+            left -= 1 if is_global else running
             due = select(left <= 0)
             if due is not None:
                 term.call(due.stream(term.stream))
-                due.write(left, self._draw(term, due, _NEXT))
+                self._after([term], due)
+                steps = self._draw(term, due, _NEXT)
+                due.write(left, steps[:1] if is_global else steps)
                 fired(due)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The interval timers."""
-        return {"steps_left": self._steps_left.clone()}
+        """The interval timers, and when reset events fired."""
+        return {"steps_left": self._steps_left.clone(), "fired_at": self._fired_at.clone()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Take back what `state_dict` gave."""
         self._steps_left.copy_(state["steps_left"])
+        if "fired_at" in state:
+            self._fired_at.copy_(state["fired_at"])
+
+    def _after(self, fired: Sequence[BoundTerm], selection: Selection) -> None:
+        if any(map(_derives, fired)):
+            self._settle(selection)
 
     def _draw(self, term: BoundTerm, selection: Selection, timer: np.uint64) -> Tensor:
         low, high = term.config.interval_range_s  # type: ignore[attr-defined]
@@ -71,5 +123,14 @@ class EventManager:
         return (steps * (1.0 - 1e-6)).ceil_().long()  # the slack absorbs rounding: 0.1 s at 0.02 s are 5 steps
 
 
+def _derives(term: BoundTerm) -> bool:
+    return bool(getattr(term.instance, "derives", False))
+
+
+def _is_global(term: BoundTerm) -> bool:
+    return bool(term.config.global_time)  # type: ignore[attr-defined]
+
+
+_NEVER = -(1 << 62)
 # Two streams: an episode's first interval is drawn by the episode's number, the later ones by the step's.
 _FIRST, _NEXT = np.uint64(0x5449_4D45_5231), np.uint64(0x5449_4D45_5232)

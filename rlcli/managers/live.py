@@ -18,7 +18,18 @@ from rlcli.errors import did_you_mean, listing
 from rlcli.sim.names import NameProblem
 
 _SECTIONS = ("rewards", "terminations", "commands", "events", "observations", "actions")
-_FIXED = {"func", "mode", "time_out", "history", "delay", "modifiers", "interval_range_s", "resampling_time_s"}
+_FIXED = {
+    "min_steps_between",
+    "axes",
+    "func",
+    "mode",
+    "time_out",
+    "history",
+    "delay",
+    "modifiers",
+    "interval_range_s",
+    "resampling_time_s",
+}
 """Settings of terms that are read once."""
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from rlcli.sim.rotations import from_euler, multiply
-from rlcli.sim.selection import Selection
+from rlcli.errors import listing
+from rlcli.mdp.ranges import Pair, ranges
+from rlcli.sim.names import NameProblem
+from rlcli.sim.rotations import from_euler, multiply, random_quaternion
+from rlcli.sim.selection import Columns, Selection
 from rlcli.task import Bodies, Entity, Joints, Range
 
 if TYPE_CHECKING:
@@ -27,7 +30,7 @@ def reset_joints_by_offset(
 ) -> None:
     """Default joint state plus uniform offsets [m or rad, m/s or rad/s], positions kept within the soft limits."""
     default_pos, default_vel = _defaults(entity, selection, joints)
-    offset = selection.uniform(*_bounds(env.device, position, velocity), (2, default_pos.shape[1]))
+    offset = selection.uniform(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
     _write_joints(entity, selection, joints, default_pos + offset[:, 0], default_vel + offset[:, 1])
 
 
@@ -42,8 +45,51 @@ def reset_joints_by_scale(
 ) -> None:
     """Default joint state times uniform factors, positions kept within the soft limits."""
     default_pos, default_vel = _defaults(entity, selection, joints)
-    factor = selection.uniform(*_bounds(env.device, position, velocity), (2, default_pos.shape[1]))
+    factor = selection.uniform(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
     _write_joints(entity, selection, joints, default_pos * factor[:, 0], default_vel * factor[:, 1])
+
+
+def reset_joints_by_gaussian(
+    env: ManagedEnv,
+    selection: Selection,
+    *,
+    entity: Entity = "robot",
+    joints: Joints = ".*",
+    position: tuple[float, float] = (0.0, 0.0),
+    velocity: tuple[float, float] = (0.0, 0.0),
+) -> None:
+    """Default joint state plus gaussian offsets [mean, std] [m or rad, m/s or rad/s], within the soft limits."""
+    default_pos, default_vel = _defaults(entity, selection, joints)
+    offset = selection.normal(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
+    _write_joints(entity, selection, joints, default_pos + offset[:, 0], default_vel + offset[:, 1])
+
+
+class ResetJointsWithinLimits:
+    """Joint positions between the soft limits: 0 is the lower one, 1 the upper; velocities drawn [m/s or rad/s]."""
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        joints: Joints = ".*",
+        position: Range = (0.0, 1.0),
+        velocity: Range = (0.0, 0.0),
+    ) -> None:
+        finite = entity.data.joint_limits()[0][0].isfinite()[joints].tolist()
+        names = [entity.joint_names[j] for j in torch.arange(len(entity.joint_names))[_host(joints)].tolist()]
+        if not all(finite):
+            without = [name for name, limited in zip(names, finite, strict=True) if not limited]
+            raise NameProblem(f"{listing(without)}: no limits to reset within", "choose joints that have a range")
+        self._env, self._entity, self._joints, self._count = env, entity, joints, len(names)
+        self._ranges = position, velocity
+
+    def __call__(self, selection: Selection) -> None:
+        """Draw the joint state of the selected environments."""
+        low, high = (_rows(selection, limit)[:, self._joints] for limit in self._entity.data.joint_limits(soft=True))
+        drawn = selection.uniform(*_bounds(self._env, *self._ranges), (2, self._count))
+        position = low + (high - low) * drawn[:, 0]
+        _write_joints(self._entity, selection, self._joints, position, drawn[:, 1])
 
 
 def reset_root_state_uniform(
@@ -62,16 +108,36 @@ def reset_root_state_uniform(
 ) -> None:
     """Default root state at the environment's origin plus uniform offsets [m, rad, m/s, rad/s], world frame."""
     default = selection.read(entity.data.default_root_state)
-    offset = selection.uniform(*_bounds(env.device, x, y, z), (3, 1)).squeeze(2)
-    turn = from_euler(*selection.uniform(*_bounds(env.device, roll, pitch, yaw), (3, 1)).squeeze(2).unbind(1))
-    velocity = selection.uniform(*_bounds(env.device, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
-    place = default[:, :3] + selection.peek(env.origins) + offset
-    entity.write_root_pose(selection, place, multiply(default[:, 3:7], turn))
+    offset = selection.uniform(*_bounds(env, x, y, z), (3, 1)).squeeze(2)
+    turn = from_euler(*selection.uniform(*_bounds(env, roll, pitch, yaw), (3, 1)).squeeze(2).unbind(1))
+    velocity = selection.uniform(*_bounds(env, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
+    position = default[:, :3] + selection.peek(env.origins) + offset
+    entity.write_root_pose(selection, position, multiply(default[:, 3:7], turn))
+    entity.write_root_velocity(selection, default[:, 7:10] + velocity[:, :3], default[:, 10:] + velocity[:, 3:])
+
+
+def reset_root_state_with_random_orientation(
+    env: ManagedEnv,
+    selection: Selection,
+    *,
+    entity: Entity = "robot",
+    x: Range = (0.0, 0.0),
+    y: Range = (0.0, 0.0),
+    z: Range = (0.0, 0.0),
+    linear_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
+    angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
+) -> None:
+    """The same with every attitude as likely as any other [m, m/s, rad/s], world frame."""
+    default = selection.read(entity.data.default_root_state)
+    offset = selection.uniform(*_bounds(env, x, y, z), (3, 1)).squeeze(2)
+    velocity = selection.uniform(*_bounds(env, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
+    quat = random_quaternion(*selection.uniform(0.0, 1.0, (3,)).unbind(1))
+    entity.write_root_pose(selection, default[:, :3] + selection.peek(env.origins) + offset, quat)
     entity.write_root_velocity(selection, default[:, 7:10] + velocity[:, :3], default[:, 10:] + velocity[:, 3:])
 
 
 def reset_scene_to_default(env: ManagedEnv, selection: Selection) -> None:
-    """Every entity to its default state."""
+    """Every entity to its default state, at its environment's origin."""
     for entity in env.entities.values():
         data = entity.data
         if entity.joint_names:
@@ -93,7 +159,7 @@ def push_by_setting_velocity(
     angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
 ) -> None:
     """Add a uniform draw to the root's velocity, world frame [m/s, rad/s]."""
-    push = selection.uniform(*_bounds(env.device, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
+    push = selection.uniform(*_bounds(env, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
     linear, angular = entity.read_root_velocity(selection)
     entity.write_root_velocity(selection, linear + push[:, :3], angular + push[:, 3:])
 
@@ -110,24 +176,66 @@ def apply_external_force_torque(
     """A uniform wrench on bodies, world frame, each component drawn [N, N m]; it lasts until changed or reset."""
     wrench = entity.engine.field("xfrc_applied").view(env.num_envs, -1)
     columns = _wrench_columns(entity, bodies)
-    shape = (len(columns) // 6, 3)
-    drawn = torch.cat([selection.uniform(*force, shape), selection.uniform(*torque, shape)], dim=2)
-    selection.write(wrench, drawn.flatten(1), columns)
+    selection.write(wrench, _drawn_wrench(env, selection, len(columns) // 6, force, torque), columns)
 
 
-def _bounds(device: torch.device, *ranges: Range | Tensor) -> tuple[Tensor, Tensor]:
+class ApplyBodyImpulse:
+    """A uniform wrench on bodies for a while, world frame, each component drawn [N, N m]; it ends by itself [s]."""
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        bodies: Bodies = ".*",
+        force: Range = (0.0, 0.0),
+        torque: Range = (0.0, 0.0),
+        duration_s: Range = (0.1, 0.1),
+    ) -> None:
+        self._env = env
+        self._wrench = entity.engine.field("xfrc_applied").view(env.num_envs, -1)
+        self._columns = _wrench_columns(entity, bodies)
+        self._force, self._torque, self._duration = force, torque, duration_s
+        self._steps_left = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
+
+    def __call__(self, selection: Selection) -> None:
+        """Begin to act on the selected environments."""
+        drawn = _drawn_wrench(self._env, selection, len(self._columns) // 6, self._force, self._torque)
+        selection.write(self._wrench, drawn, self._columns)
+        low, high = _bounds(self._env, self._duration)
+        steps = selection.uniform(low[0], high[0], (1,))[:, 0].double() / self._env.step_dt
+        selection.write(self._steps_left, (steps * (1.0 - 1e-6)).ceil_().long())
+
+    def update(self, select: Callable[[Tensor], Selection | None], running: Tensor) -> None:
+        """Let one step pass where an episode is `running`, and end what is over."""
+        acting = self._steps_left > 0
+        self._steps_left -= running * acting
+        over = select(acting & (self._steps_left <= 0))
+        if over is not None:
+            over.write(self._wrench, 0.0, self._columns)
+
+    def reset(self, selection: Selection) -> None:
+        """A new episode begins without."""
+        selection.write(self._steps_left, 0)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """How long the wrenches act yet."""
+        return {"steps_left": self._steps_left.clone()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state_dict` gave."""
+        self._steps_left.copy_(state["steps_left"])
+
+
+def _drawn_wrench(env: ManagedEnv, selection: Selection, bodies: int, force: Pair, torque: Pair) -> Tensor:
+    low, high = _bounds(env, *[force] * 3, *[torque] * 3)
+    return selection.uniform(low[:, 0], high[:, 0], (bodies, 6)).flatten(1)
+
+
+def _bounds(env: ManagedEnv, *pairs: Pair) -> tuple[Tensor, Tensor]:
     """Lower and upper ends of several ranges, for draws of shape (rows, ranges, k). (ranges, 1) each"""
-    if any(isinstance(ends, Tensor) for ends in ranges):  # a curriculum moves them
-        both = torch.stack([ends if isinstance(ends, Tensor) else _fixed(device, ends)[0] for ends in ranges])
-    else:
-        both = _fixed(device, *ranges)
-    low, high = both.split(1, dim=1)
-    return low, high
-
-
-@functools.lru_cache
-def _fixed(device: torch.device, *ranges: Range) -> Tensor:
-    return torch.tensor(ranges, device=device)
+    low, high = ranges(env.device, *pairs).now()
+    return low[:, None], high[:, None]
 
 
 def _wrench_columns(entity: Entity, bodies: Bodies) -> Tensor:
@@ -146,6 +254,15 @@ def _defaults(entity: Entity, selection: Selection, joints: Joints) -> tuple[Ten
 
 
 def _write_joints(entity: Entity, selection: Selection, joints: Joints, position: Tensor, velocity: Tensor) -> None:
-    limits = entity.data.soft_joint_pos_limits
-    entity.write_joint_positions(selection, position.clamp_(limits[joints, 0], limits[joints, 1]), joints)
+    low, high = (_rows(selection, limit)[:, joints] for limit in entity.data.joint_limits(soft=True))
+    entity.write_joint_positions(selection, position.clamp_(low, high), joints)
     entity.write_joint_velocities(selection, velocity, joints)
+
+
+def _rows(selection: Selection, values: Tensor) -> Tensor:
+    """The selected rows of what may be the same for all environments and then has one row. (rows or 1, k)"""
+    return values if len(values) == 1 else selection.peek(values)
+
+
+def _host(index: Columns) -> Columns:
+    return index.cpu() if isinstance(index, Tensor) else index

@@ -63,7 +63,7 @@ def joint_torques_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joint
 def joint_pos_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """How far joints are outside their soft limits, summed [rad]. (num_envs,)"""
     position = entity.data.joint_pos[:, joints]
-    low, high = entity.data.soft_joint_pos_limits[joints].unbind(dim=1)
+    low, high = (limit[:, joints] for limit in entity.data.joint_limits(soft=True))
     return ((low - position).clamp_(min=0.0) + (position - high).clamp_(min=0.0)).sum(dim=1)
 
 
@@ -76,7 +76,7 @@ def joint_pos_limits_penalty_ratio(
     gear_ratio: float = 1.0,
 ) -> Tensor:
     """How far beyond `threshold` of their range joints are, as a share of what is left of it, summed. (num_envs,)"""
-    low, high = entity.data.joint_pos_limits[joints].unbind(dim=1)
+    low, high = (limit[:, joints] for limit in entity.data.joint_limits())
     scaled = ((2.0 * entity.data.joint_pos[:, joints] - low - high) / (high - low)).abs()
     violation = (scaled - threshold) / (1.0 - threshold)
     # a joint without limits has no scale (nan), and is never beyond it

@@ -31,7 +31,7 @@ def joint_pos_out_of_manual_limit(
 def joint_pos_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Some joint is outside its soft limits. (num_envs,)"""
     position = entity.data.joint_pos[:, joints]
-    low, high = entity.data.soft_joint_pos_limits[joints].unbind(dim=1)
+    low, high = (limit[:, joints] for limit in entity.data.joint_limits(soft=True))
     return ((position < low) | (position > high)).any(dim=1)
 
 

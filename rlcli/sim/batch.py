@@ -92,6 +92,10 @@ class BatchEngine:
             self._fields[name] = bound
         return self._fields[name]
 
+    def can_expand(self, name: str) -> bool:
+        """Whether a model field may differ between worlds."""
+        return name in MODEL_FIELDS
+
     def expand(self, name: str) -> Tensor:
         """A model field with a value for every world."""
         if name not in MODEL_FIELDS:
@@ -102,10 +106,14 @@ class BatchEngine:
         """The same where somebody has asked for it before; None where all worlds share the model's value."""
         return self.expand(name) if name in self._batch._expanded else None
 
-    def set_constants(self) -> None:
+    def expansions(self) -> list[str]:
+        """The model fields that somebody has asked for."""
+        return list(self._batch._expanded)
+
+    def set_constants(self, selection: Selection | None = None) -> None:
         """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
         try:
-            self._batch.set_const()
+            self._batch.set_const(None if selection is None else _ids(selection).astype(np.int32))
         except SimulationError as error:
             raise _engine_error(error) from None
         self._own_constants = True

@@ -47,6 +47,10 @@ class Engine(Protocol):
         """
         ...
 
+    def can_expand(self, name: str) -> bool:
+        """Whether a model field may differ between worlds."""
+        ...
+
     def expand(self, name: str) -> Tensor:
         """A model field with a value for every world, live and writable. (num_envs, ...)
 
@@ -58,8 +62,15 @@ class Engine(Protocol):
         """The same where somebody has asked for it before; None where all worlds share the model's value."""
         ...
 
-    def set_constants(self) -> None:
-        """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
+    def expansions(self) -> list[str]:
+        """The model fields that somebody has asked for."""
+        ...
+
+    def set_constants(self, selection: Selection | None = None) -> None:
+        """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones.
+
+        Of the selected worlds, or of all; an `asynchronous` engine always does it for all.
+        """
         ...
 
     def step(self, nstep: int, *, derive: bool = True) -> None:

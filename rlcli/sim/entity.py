@@ -87,12 +87,18 @@ class Entity:
         self.site_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_SITE, model.nsite)
         self.sensor_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor)
         self.actuator_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu)
+        self.geom_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_GEOM, model.ngeom)
+        self.tendon_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_TENDON, model.ntendon)
+        self.pair_ids = _ids(model, name, mujoco.mjtObj.mjOBJ_PAIR, model.npair)
         self.names: dict[str, list[str]] = {
             "Joints": _names(model, name, mujoco.mjtObj.mjOBJ_JOINT, self.joint_ids),
             "Bodies": _names(model, name, mujoco.mjtObj.mjOBJ_BODY, self.body_ids),
             "Sites": _names(model, name, mujoco.mjtObj.mjOBJ_SITE, self.site_ids),
             "Sensors": _names(model, name, mujoco.mjtObj.mjOBJ_SENSOR, self.sensor_ids),
             "Actuators": _names(model, name, mujoco.mjtObj.mjOBJ_ACTUATOR, self.actuator_ids),
+            "Geoms": _names(model, name, mujoco.mjtObj.mjOBJ_GEOM, self.geom_ids),
+            "Tendons": _names(model, name, mujoco.mjtObj.mjOBJ_TENDON, self.tendon_ids),
+            "Pairs": _names(model, name, mujoco.mjtObj.mjOBJ_PAIR, self.pair_ids),
         }
         self.joint_names = self.names["Joints"]
         self.qpos_columns = torch.from_numpy(model.jnt_qposadr[self.joint_ids].astype(np.int64)).to(engine.device)
@@ -236,6 +242,9 @@ class EntityData:
         soft = torch.stack([middle - half, middle + half], dim=1)
         self.soft_joint_pos_limits = torch.where(limited[:, None], soft, infinite)
         """The limits, drawn in by `soft_joint_pos_limit_factor`. (k, 2) [m or rad]"""
+        self._limited = limited
+        self._joint_index = as_index(entity.joint_ids.tolist(), device)
+        self._infinite = infinite
         position, velocity = (values.to(device) for values in default_joint_state(entity))
         self.default_joint_pos = position.expand(num_envs, -1).clone()
         """Default joint positions. (num_envs, k) [m or rad]"""
@@ -376,6 +385,24 @@ class EntityData:
     def withheld_effort(self) -> Tensor:
         """How much less than `computed_effort` limits let through, >= 0. (num_envs, k) [N or N m]"""
         return self._once("withheld_effort", self._drives.withheld)
+
+    def joint_limits(self, soft: bool = False) -> tuple[Tensor, Tensor]:
+        """Lower and upper position limits as they are now, infinite where there is none. (num_envs or 1, k) each
+
+        `joint_pos_limits` are those of the configuration; these follow a randomisation.
+        """
+        ranges = self._entity.engine.expanded("jnt_range")
+        if ranges is None:
+            low, high = (self.soft_joint_pos_limits if soft else self.joint_pos_limits).unbind(dim=1)
+            return low[None], high[None]
+        low, high = self._once(
+            "joint_ranges", lambda: ranges.view(len(ranges), -1, 2)[:, self._joint_index].float()
+        ).unbind(dim=2)
+        if soft:
+            half = 0.5 * self._entity.config.soft_joint_pos_limit_factor * (high - low)
+            middle = 0.5 * (low + high)
+            low, high = middle - half, middle + half
+        return torch.where(self._limited, low, self._infinite[0]), torch.where(self._limited, high, self._infinite[1])
 
     @property
     def body_pos_w(self) -> Tensor:

@@ -79,6 +79,10 @@ class MaskSelection:
         """Mean of a (num_envs,) tensor over the masked rows. ()"""
         return torch.where(self.mask, values.float(), 0.0).sum() / self.count.clamp(min=1)
 
+    def where(self, mask: Tensor) -> MaskSelection:
+        """Those of the rows where `mask` (num_envs,) holds."""
+        return MaskSelection(self.mask & mask, self._seed, self._counters, self._stream)
+
     def env_ids(self) -> Tensor:
         """The masked rows' numbers; waits for the device. (rows,) int64"""
         return self.mask.nonzero()[:, 0]

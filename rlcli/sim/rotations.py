@@ -113,6 +113,13 @@ def from_euler(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
     )
 
 
+def random_quaternion(u: Tensor, v: Tensor, w: Tensor) -> Tensor:
+    """Uniform over all rotations, from three uniform draws in [0, 1) (Shoemake 1992). (n,) each -> (n, 4)"""
+    a, b = torch.sqrt(1.0 - u), torch.sqrt(u)
+    v, w = 2.0 * math.pi * v, 2.0 * math.pi * w
+    return torch.stack([b * torch.cos(w), a * torch.sin(v), a * torch.cos(v), b * torch.sin(w)], dim=-1)
+
+
 def atan2(y: Tensor, x: Tensor) -> Tensor:
     """Angle from the x axis to the point (x, y), within 1e-6 of torch's atan2; 0 at the origin [rad]. (...) each"""
     x = x + 1e-30  # neither 0 nor -0, so that the quotient is a number at the origin too

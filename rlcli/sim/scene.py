@@ -527,6 +527,9 @@ def _name_all(child: mujoco.MjSpec) -> None:
         ("site", child.sites),
         ("sensor", child.sensors),
         ("actuator", child.actuators),
+        ("geom", child.geoms),
+        ("tendon", child.tendons),
+        ("pair", child.pairs),
     ):
         taken = {element.name for element in elements}
         for number, element in enumerate(elements):

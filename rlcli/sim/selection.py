@@ -72,6 +72,10 @@ class Selection(Protocol):
         """Mean of a (num_envs,) tensor over the rows. ()"""
         ...
 
+    def where(self, mask: Tensor) -> Selection | None:
+        """Those of the rows where `mask` (num_envs,) holds; None where that is known to be nobody."""
+        ...
+
     def env_ids(self) -> Tensor:
         """The rows' numbers, for code that wants ids; on a GPU this waits for the device. (rows,) int64"""
         ...
@@ -143,6 +147,15 @@ class IdSelection:
     def mean(self, values: Tensor) -> Tensor:
         """Mean of a (num_envs,) tensor over the rows. ()"""
         return self.read(values).float().mean()
+
+    def where(self, mask: Tensor) -> IdSelection | None:
+        """Those of the rows where `mask` (num_envs,) holds; None for nobody."""
+        chosen = mask.numpy()[self.ids]
+        if chosen.all():
+            return self
+        if not chosen.any():
+            return None
+        return IdSelection(self.ids[chosen], self._seed, self._counters[chosen], self._stream, self._device)
 
     def env_ids(self) -> Tensor:
         """The rows' numbers. (rows,) int64"""

@@ -63,6 +63,8 @@ _CONSTANTS = (
     *("actuator_acc0", "eq_data"),
 )
 """Model fields that `set_const` derives from others."""
+_BOUNDS = ("geom_aabb", "geom_rbound")
+"""Those that it derives from the sizes of geoms."""
 
 
 _Groups = wp.types.vector(length=mujoco.mjNGROUP, dtype=float)
@@ -167,14 +169,19 @@ class WarpEngine:
                     self._last_derived[name] = self._fields[name].clone()
         return self._fields[name]
 
+    def can_expand(self, name: str) -> bool:
+        """Whether a model field may differ between worlds."""
+        owner, attribute = self._owner(name)
+        return attribute in _batched(owner) and getattr(owner, attribute, None) is not None
+
     def expand(self, name: str) -> Tensor:
         """A model field with a value for every world."""
         if name not in self._expanded:
-            owner, attribute = (self._model.opt, name[4:]) if name.startswith("opt.") else (self._model, name)
-            array = getattr(owner, attribute, None)
-            batched = {f.name for f in dataclasses.fields(owner) if _is_batched(f.type)}
-            if attribute not in batched or array is None:
+            owner, attribute = self._owner(name)
+            batched = _batched(owner)
+            if not self.can_expand(name):
                 raise ValueError(f"'{name}' cannot differ between worlds; {did_you_mean(attribute, batched) or ''}")
+            array = getattr(owner, attribute)
             values = np.repeat(array.numpy()[:1], self.num_envs, axis=0)
             wide = wp.array(values, dtype=array.dtype, device=self._device)
             setattr(owner, attribute, wide)
@@ -186,9 +193,13 @@ class WarpEngine:
         """The same where somebody has asked for it before; None where all worlds share the model's value."""
         return self._expanded.get(name)
 
-    def set_constants(self) -> None:
+    def expansions(self) -> list[str]:
+        """The model fields that somebody has asked for."""
+        return list(self._expanded)
+
+    def set_constants(self, selection: Selection | None = None) -> None:
         """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
-        for name in _CONSTANTS:
+        for name in (*_CONSTANTS, *(_BOUNDS if "geom_size" in self._expanded else ())):
             array = getattr(self._model, name, None)
             if array is not None and array.size:
                 self.expand(name)
@@ -404,6 +415,9 @@ class WarpEngine:
         elif _KINEMATICS in self._derived:
             mjw.fwd_kinematics(m, d)
 
+    def _owner(self, name: str) -> tuple[Any, str]:
+        return (self._model.opt, name[4:]) if name.startswith("opt.") else (self._model, name)
+
     def _stages(self, name: str) -> set[int]:
         """What a field derives from."""
         if name in (*_STATE, *_INPUTS):
@@ -512,6 +526,10 @@ def _on_torch_stream(device: torch.device) -> Any:
         return
     with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
         yield
+
+
+def _batched(owner: Any) -> set[str]:
+    return {f.name for f in dataclasses.fields(owner) if _is_batched(f.type)}
 
 
 def _is_batched(kind: Any) -> bool:

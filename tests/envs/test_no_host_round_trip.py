@@ -33,6 +33,25 @@ def every_term():
     task["events"]["scene"] = {"func": "reset_scene_to_default", "mode": "reset"}
     task["events"]["offset"] = {"func": "reset_joints_by_offset", "mode": "reset", "joints": ["hip_fl", "hip_br"],
                                 "position": [-0.1, 0.1], "velocity": [-0.1, 0.1]}  # fmt: skip
+    mixed = {"distribution": "loguniform", "range": [0.5, 2.0]}
+    task["events"] |= {
+        "mass": {"func": "randomize_body_mass", "mode": "reset", **mixed},
+        "com": {"func": "randomize_body_com", "mode": "reset", "range": [-0.01, 0.01], "min_steps_between": 3},
+        "friction": {"func": "randomize_geom_friction", "mode": "interval", "interval_range_s": [0.02, 0.1],
+                     "global_time": True, "range": [0.5, 1.5]},
+        "gravity": {"func": "randomize_gravity", "mode": "reset", "range": [0.0, 0.1], "distribution": "gaussian"},
+        "limits": {"func": "randomize_joint_range", "mode": "reset", "upper": [-0.1, 0.1]},
+        "pose": {"func": "randomize_default_joint_pos", "mode": "reset", "range": [-0.1, 0.1]},
+        "gains": {"func": "randomize_actuator_gains", "mode": "reset", "actuators": ["hip_bl"], "kp": [0.9, 1.1]},
+        "effort": {"func": "randomize_effort_limit", "mode": "reset", "actuators": ["hip_bl"], "range": [0.9, 1.1]},
+        "pd": {"func": "randomize_pd_gains", "mode": "reset", "joints": ["hip_f.", "hip_br"], "stiffness": [0.9, 1.1]},
+        "turn": {"func": "randomize_body_quat", "mode": "reset", "bodies": ["leg_bl"], "yaw": [-0.1, 0.1]},
+        "hit": {"func": "apply_body_impulse", "mode": "interval", "interval_range_s": [0.02, 0.1], "bodies": ["torso"],
+                "force": [-1.0, 1.0]},
+        "anyhow": {"func": "reset_root_state_with_random_orientation", "mode": "reset", "z": [0.2, 0.3]},
+        "within": {"func": "reset_joints_within_limits", "mode": "reset"},
+        "gauss": {"func": "reset_joints_by_gaussian", "mode": "reset", "position": [0.0, 0.1]},
+    }  # fmt: skip
     task["commands"] = {
         "walk": {"func": "uniform_velocity", "resampling_time_s": [0.04, 0.08], "lin_vel_x": [-1.0, 1.0],
                  "ang_vel_z": [-1.0, 1.0], "heading": [-3.0, 3.0], "rel_standing": 0.2},
@@ -49,6 +68,7 @@ def every_term():
         "delay": {"steps": [0, 2], "redraw": 0.5}, "history": 3,
     }  # fmt: skip
     task["curriculum"] = {
+        "mass": {"func": "interpolate", "address": "events.mass.range", "end": 10, "to": [0.8, 1.2]},
         "weight": {"func": "stages", "address": "rewards.alive.weight", "steps": [3], "values": [2.0]},
         "push": {"func": "interpolate", "address": "events.push.linear_velocity", "end": 10,
                  "to": [[-2.0, 2.0], [-2.0, 2.0], [0.0, 0.0]]},

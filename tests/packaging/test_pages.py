@@ -25,6 +25,11 @@ def test_quickstart_works_as_written(tmp_path):
 
 
 @pytest.mark.slow
+def test_the_recording_page_works_as_written(tmp_path):
+    assert "20 episodes" in run_commands(blocks(DOCS / "recording.md"), tmp_path)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "folder"), [("write-a-task.md", "my_task"), ("write-a-direct-task.md", "my_arm")])
 def test_the_task_of_a_page_checks_trains_and_learns(page, folder, tmp_path):
     found = blocks(DOCS / page)

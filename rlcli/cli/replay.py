@@ -1,0 +1,95 @@
+"""`rlcli replay`: step a recording again, and say whether it is the same bit by bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rlcli.cli.console import console
+from rlcli.cli.options import CHOOSE, Debug, Json, Quiet
+
+
+def command(
+    file: Annotated[Path, typer.Argument(help="A recording, written by eval or play with --record.")],
+    episode: Annotated[
+        int | None, typer.Option("--episode", min=0, help="Only this episode, counted from 0; else all.")
+    ] = None,
+    video: Annotated[
+        Path | None, typer.Option("--video", help="Draw one episode (--episode, else the first) to FILE.mp4 or .gif.")
+    ] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Replay a recording."""
+    from rlcli.errors import UsageError
+
+    console.quiet = quiet
+    if video is not None:
+        from rlcli.viewer.writer import check_video
+
+        video = Path("replay.mp4") if str(video) == CHOOSE else video
+        check_video(video)
+    from rlcli.rl.recording import read_recording
+
+    recording = read_recording(file)
+    count = len(recording.episodes)
+    if episode is not None and episode >= count:
+        raise UsageError(f"no episode {episode} in {file}", hint=f"it has {count}, counted from 0")
+    if not count:
+        raise UsageError(f"{file} has no episodes", hint="record with --record-mode all")
+    chosen = list(range(count)) if episode is None else [episode]
+    difference, frames = _replay(recording, chosen, video)
+    steps = sum(recording.episodes[number].length for number in chosen)
+    said = {
+        "file": str(file),
+        "episodes": len(chosen),
+        "steps": steps,
+        "equal": difference is None,
+        "video": str(video) if video is not None else None,
+        "frames": frames,
+    }
+    if difference is None:
+        console.data(f"{file}: {len(chosen)} episodes, {steps} steps: equal bit by bit")
+        console.document("replay", difference=None, **said)
+        return
+    console.data(
+        f"{file}: episode {difference.episode} differs first at step {difference.step} in {difference.field}:"
+        f" recorded {_short(difference.recorded)}, now {_short(difference.replayed)}"
+    )
+    console.info("the task's model or code, MuJoCo or the machine is not what it was recorded with")
+    told = {key: getattr(difference, key) for key in ("episode", "step", "field", "recorded", "replayed")}
+    console.document("replay", difference=told, **said)
+    raise typer.Exit(9)
+
+
+def _replay(recording: Any, chosen: list[int], video: Path | None) -> tuple[Any, int]:
+    import torch
+
+    from rlcli.envs.vec_env import make_env
+    from rlcli.rl.recording import replay
+
+    torch.set_num_threads(1)
+    env = make_env(recording.resolved())
+    if video is None:
+        return replay(recording, env, chosen), 0
+    from rlcli.viewer.video import Renderer
+    from rlcli.viewer.writer import VideoWriter
+
+    shown = recording.episodes[chosen[0]]
+    stride = max(1, env.config.sim.render_interval // env.config.decimation)
+    with Renderer(env.engine.model, env.config.viewer) as renderer, VideoWriter(video, stride * env.step_dt) as writer:
+
+        def draw(step: int) -> None:
+            if shown.begin <= step < shown.begin + shown.length and (step - shown.begin) % stride == 0:
+                writer.add(renderer.draw(*env.world(shown.env)))
+
+        difference = replay(recording, env, chosen, draw)
+    return difference, writer.frames
+
+
+def _short(values: list[float]) -> str:
+    text = ", ".join(repr(value) for value in values[:6])
+    return f"[{text}{', ...' if len(values) > 6 else ''}]"
