@@ -47,6 +47,8 @@ def export(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
 
     cfg = env_cfg(1)
     robot = Entity(cfg.scene.entities["robot"]).spec
+    for key in list(robot.keys):
+        robot.delete(key)
     robot.meshdir = str(go1_constants.GO1_XML.parent / "assets")
     given = cfg.sim.mujoco
     robot.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -84,13 +86,14 @@ def terms(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
         environment.action_manager.apply_action()
         environment.scene.write_data_to_sim()
         environment.sim.forward()
+        environment.sim.sense()
         environment.scene.update(dt=environment.step_dt)
         environment.sim.sense()
         manager = environment.reward_manager
         row = {}
         for name, term in zip(manager._term_names, manager._term_cfgs, strict=True):
             row[f"reward.{name}"] = term.func(environment, **term.params).float().clone()
-        for group, values in environment.observation_manager.compute().items():
+        for group, values in environment.observation_manager.compute(update_history=True).items():
             row[f"observation.{group}"] = values.clone()
         rows.append(row)
     found = {name: torch.stack([row[name] for row in rows]).cpu().numpy() for name in rows[0]}
