@@ -288,6 +288,7 @@ def main():
         if "train" in parts:
             for n in sizes:
                 alone("train-one", n)
+                alone("train-one", n, "update compiled and tuned")
             if args.peer_path:
                 peer(args.peer_path, "train", "--num-envs", *sizes)
                 peer(args.peer_path, "train", "--num-envs", *sizes, "--logs")

@@ -49,7 +49,7 @@ def draw_states(env, states):
     """States in which the robot stands and tilts with some feet on the ground, and what is asked for in them."""
     rng, n, model = np.random.default_rng(0), env.num_envs, env.engine.model
     qpos = np.tile(model.qpos0, (states, n, 1))
-    qpos[..., 3:7] = [1.0, 0.0, 0.0, 0.0] + rng.normal(0.0, 0.1, (states, n, 4))
+    qpos[..., 3:7] = [1.0, 0.0, 0.0, 0.0] + rng.normal(0.0, 0.05, (states, n, 4))
     qpos[..., 3:7] /= np.linalg.norm(qpos[..., 3:7], axis=-1, keepdims=True)
     qpos[..., 7:] = env.entities["robot"].data.default_joint_pos[0].numpy() + rng.uniform(-0.3, 0.3, (states, n, 12))
     data, feet = mujoco.MjData(model), [model.site(f"robot/{leg}").id for leg in ("FR", "FL", "RR", "RL")]
