@@ -167,9 +167,7 @@ def ppo_cfg(seed: int) -> Any:
     )
 
 
-def make_env(
-    num_envs: int, device: str, seed: int | None = None, endless: bool = False, task: str = "cartpole"
-) -> Any:
+def make_env(num_envs: int, device: str, seed: int | None = None, endless: bool = False, task: str = "cartpole") -> Any:
     """The environment; `endless` ones neither end nor reset episodes, for whoever judges the states himself."""
     from mjlab.envs import ManagerBasedRlEnv
 

@@ -106,8 +106,10 @@ def compare(folder, path, num_envs=16, states=8):
             group = name.partition(".")[2]
             sizes = [term.size for term in env.layout.observations["policy" if group == "actor" else "critic"]]
             edges = np.cumsum(sizes)[:-1]
-            parts = zip(TERMS[: split[group]], np.split(ours[name], edges, -1), np.split(peers[name], edges, -1))
-            for term, mine, other in parts:  # the force on the foot here, the foot's on the ground there
+            columns = np.split(ours[name], edges, -1), np.split(peers[name], edges, -1)
+            for term, mine, other in zip(
+                TERMS[: split[group]], *columns, strict=True
+            ):  # the force on the foot here, the foot's on the ground there
                 worst[f"{name}.{term}"] = apart(mine, -other if term == "foot_forces" else other)
         else:
             worst[name] = apart(ours[name], peers[name])
@@ -183,17 +185,16 @@ def main():
     parser.add_argument("--num-envs", type=int, default=4096)
     parser.add_argument("--iterations", type=int, default=15)
     parser.add_argument("--output", type=Path)
-    parser.add_argument("--one", nargs="+", help=argparse.SUPPRESS)
+    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.one:
-        folder, what, *more = args.one
+        folder, what = args.one
         if what == "env":
             gpu.measure_env(folder, args.num_envs)
         elif what == "split":
             measure_split(folder, args.num_envs)
         else:
-            flags = {"compile": "tuned"} if "tuned" in more else {}
-            gpu.measure_train(args.num_envs, " ".join(more) or "all on", folder, args.iterations, equal={}, **flags)
+            gpu.measure_train(args.num_envs, task=folder, iterations=args.iterations, equal={})
         return
     parts, path = args.only.split(","), args.peer_path
     versions = {"torch": torch.__version__, "warp": wp.__version__, "mujoco_warp": mjw.__version__}
@@ -213,7 +214,6 @@ def main():
                 alone(folder, args, "split")
             if "train" in parts:
                 alone(folder, args, "train")
-                alone(folder, args, "train", "tuned")
                 gpu.peer(path, "train", "--task", "velocity", *size, "--iterations", 8, "--warm-up", 3)
         finally:
             if args.output:

@@ -11,6 +11,7 @@ from worlds import CRITTER, PENDULUM_TASK, build, critter, edited, pendulum
 from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DivergedError
 from rlcli.sim.engine import open_engine
+from rlcli.sim.entity import SimData
 
 torch.set_num_threads(1)
 
@@ -471,3 +472,19 @@ def test_a_world_that_diverges_is_seen_where_it_was_and_the_others_where_they_ar
     for name in names:
         torch.testing.assert_close(now[name][3], before[name][3], rtol=1e-5, atol=1e-5)
         assert not torch.equal(now[name][2], before[name][2]), name
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_worlds_that_move_twice_are_seen_where_they_are(kind):
+    engine = pair(fields=("xpos",))[kind]
+    sim = SimData(engine)
+    for world, height in ((1, 2.0), (3, 3.0)):
+        chosen = some(engine, world)
+        engine.field("qpos")[world, 2] = height
+        sim.moved(chosen)
+    sim.settle()
+    start = float(engine.model.qpos0[2])
+    torch.testing.assert_close(sim.derived("xpos")[:, 1, 2], torch.tensor([start, 2.0, start, 3.0, start]))
+    engine.field("qpos")[0, 2] = 4.0
+    sim.moved(some(engine, 0))
+    assert float(sim.derived("xpos")[0, 1, 2]) == pytest.approx(4.0), "what is read is current without more ado"
