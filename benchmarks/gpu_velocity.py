@@ -30,7 +30,10 @@ from rlcli.registry import find_task
 HERE = Path(__file__).parent
 TOLERANCE = 2e-3
 """Of the largest value: a different release of MuJoCo Warp computes the peer's contact forces."""
-OWN_WAY = {"body_ang_vel": "about the body's axes here, about the world's there"}
+OWN_WAY = {
+    "body_ang_vel": "about the body's axes here, about the world's there",
+    "foot_swing_height": "a swing's highest point may be that of touching down here, not there",
+}
 """Rewards that mean something else."""
 TERMS = ("lin", "ang", "gravity", "pos", "vel", "action", "command", "foot_height", "foot_air_time", "foot_contact",
          "foot_forces")  # fmt: skip
@@ -49,7 +52,7 @@ def draw_states(env, states):
     """States in which the robot stands and tilts with some feet on the ground, and what is asked for in them."""
     rng, n, model = np.random.default_rng(0), env.num_envs, env.engine.model
     qpos = np.tile(model.qpos0, (states, n, 1))
-    qpos[..., 3:7] = [1.0, 0.0, 0.0, 0.0] + rng.normal(0.0, 0.05, (states, n, 4))
+    qpos[..., 3:7] = np.eye(4)[0] + rng.normal(0.0, 0.05, (states, n, 4))
     qpos[..., 3:7] /= np.linalg.norm(qpos[..., 3:7], axis=-1, keepdims=True)
     qpos[..., 7:] = env.entities["robot"].data.default_joint_pos[0].numpy() + rng.uniform(-0.3, 0.3, (states, n, 12))
     data, feet = mujoco.MjData(model), [model.site(f"robot/{leg}").id for leg in ("FR", "FL", "RR", "RL")]
