@@ -16,7 +16,7 @@ LAYERS = [
     {"config", "registry", "probe"},
     {"sim"},
     {"managers", "mdp", "envs", "oige"},
-    {"rl", "viewer", "adapters", "testing", "pytest_plugin", "isaaclab"},
+    {"rl", "viewer", "adapters", "testing", "pytest_plugin", "isaaclab", "diagnosis"},
     {"cli"},
 ]
 ANYWHERE = {"rlcli", "rlcli.__main__"}
@@ -30,6 +30,7 @@ LIGHT = [
     "config",
     "registry",
     "probe",
+    "diagnosis.py",
     "cli",
     "rl/trainer.py",
     "rl/sb3_config.py",
