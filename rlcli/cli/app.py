@@ -27,6 +27,7 @@ COMMANDS = {
     "export": "export",
     "replay": "replay",
     "check": "check",
+    "new": "new",
     "doctor": "doctor",
 }
 """Command -> module of `rlcli.cli` that registers it."""
