@@ -16,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from importlib import metadata
@@ -58,11 +59,16 @@ class Check:
 
 def examine(runs_dir: Path, timeout_s: float = TIMEOUT_S) -> list[Check]:
     """Look at everything."""
+    stop = threading.Event()
     with ThreadPoolExecutor(2) as pool:
-        tasks = pool.submit(_entries, TASKS, timeout_s)
-        asked = pool.submit(_outside, timeout_s)
-        checks = [*_installation(), _cores(), _runs_folder(runs_dir), *_settings()]
-        return [*checks, *asked.result(), *_metadata(), *tasks.result(), *_entries(TRAINERS, timeout_s)]
+        try:
+            tasks = pool.submit(_entries, TASKS, timeout_s, stop)
+            asked = pool.submit(_outside, timeout_s)
+            checks = [*_installation(), _cores(), _runs_folder(runs_dir), *_settings()]
+            return [*checks, *asked.result(), *_metadata(), *tasks.result(), *_entries(TRAINERS, timeout_s, stop)]
+        except BaseException:  # Ctrl-C
+            stop.set()
+            raise
 
 
 def _installation() -> list[Check]:
@@ -182,11 +188,11 @@ def _graphics(answers: dict[str, tuple[dict[str, Any] | None, str]]) -> Check:
     return Check("graphics", "ok", said, details=details)
 
 
-def _entries(group: str, timeout_s: float) -> list[Check]:
+def _entries(group: str, timeout_s: float, stop: threading.Event) -> list[Check]:
     """Every task, or every trainer, loaded in another process."""
     kind = "task" if group == TASKS else "trainer"
     entries, _ = catalog(group)
-    rows = probe(entries, timeout_s, group)
+    rows = probe(entries, timeout_s, group, stop)
     checks = []
     for entry in entries:
         row = rows[entry.qualified]

@@ -61,17 +61,19 @@ def cached(entries: Iterable[Entry]) -> dict[str, Details]:
     return {name: row for name, row in rows.items() if row is not None}
 
 
-def probe(entries: Iterable[Entry], timeout_s: float = TIMEOUT_S, group: str = TASKS) -> dict[str, Details]:
+def probe(
+    entries: Iterable[Entry], timeout_s: float = TIMEOUT_S, group: str = TASKS, stop: threading.Event | None = None
+) -> dict[str, Details]:
     """Load every task in a process other than this one, and remember what it says. A broken one is a row with a reason.
 
     The tasks of a distribution share a process; who ends it, or takes longer than `timeout_s`, is alone to blame, and
-    the others go on in a new one. Several distributions are loaded at a time.
+    the others go on in a new one. Several distributions are loaded at a time. `stop` ends it early.
     """
     entries = list(entries)
     owners: dict[str, list[Entry]] = {}
     for entry in entries:
         owners.setdefault(entry.distribution, []).append(entry)
-    stop = threading.Event()
+    stop = stop or threading.Event()
     with ThreadPoolExecutor(max(1, min(len(owners), available_cores()))) as pool:
         rows = pool.map(lambda owned: _probe_distribution(owned, timeout_s, group, stop), owners.values())
         try:

@@ -140,8 +140,11 @@ def unreadable_distributions() -> list[Broken]:
 
 def unknown_wanted() -> list[str]:
     """Names in RLCLI_PLUGINS that are no installed distribution with tasks or trainers."""
+    wanted = _wanted()
+    if not wanted:
+        return []
     installed = {_normal(entry.distribution) for group in (TASKS, TRAINERS) for entry in catalog(group, hidden=True)[0]}
-    return sorted((_wanted() or set()) - installed - {OWN})
+    return sorted(wanted - installed - {OWN})
 
 
 @contextlib.contextmanager
@@ -405,7 +408,10 @@ def _newer_rlcli(entry: Entry) -> str | None:
     """What to do about a plugin that asks for a newer rlcli in its metadata."""
     import rlcli
 
-    for line in metadata.requires(entry.distribution) or ():
+    requirements: list[str] = []
+    with contextlib.suppress(Exception):  # malformed metadata
+        requirements = metadata.requires(entry.distribution) or []
+    for line in requirements:
         wanted = re.match(r"rlcli\s*(?:\[[^]]*\])?\s*\(?(?:>=|==|~=|>)\s*([0-9]+(?:\.[0-9]+)*)", line)
         if wanted and _numbers(wanted[1]) > _numbers(rlcli.__version__):
             return f"it asks for rlcli {wanted[1]}, this is {rlcli.__version__}: pip install --upgrade rlcli"

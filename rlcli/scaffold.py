@@ -90,13 +90,13 @@ def check_name(name: str) -> None:
     for entry in catalog(TASKS, hidden=True)[0]:
         if entry.name == name:
             owner = f"{entry.distribution} {entry.version}"
-            raise UsageError(f"'{name}' is a task of {owner} already", hint=f"my-{name}, for example")
+            raise UsageError(f"'{name}' is a task of {owner} already", hint=f"{name}-2, for example")
     installed = _installed(name)
     if installed is not None:
-        raise UsageError(f"a package {installed} is installed already", hint=f"my-{name}, for example")
+        raise UsageError(f"a package {installed} is installed already", hint=f"{name}-2, for example")
     place = _module_place(package)
     if place is not None:
-        raise UsageError(f"there is a Python module '{package}' already: {place}", hint=f"my-{name}, for example")
+        raise UsageError(f"there is a Python module '{package}' already: {place}", hint=f"{name}-2, for example")
 
 
 def render(name: str, flavour: str) -> dict[str, str]:

@@ -9,7 +9,7 @@ import typer
 from rlcli.cli.console import console
 from rlcli.cli.options import Debug, Json
 from rlcli.probe import TIMEOUT_S, Details, cached, probe
-from rlcli.registry import OWN, catalog
+from rlcli.registry import OWN, catalog, unknown_wanted
 
 
 def command(
@@ -56,6 +56,8 @@ def command(
     )
     for bad in broken:
         console.warn(f"{bad.distribution}: {bad.reason}; its tasks are not listed")
+    for name in unknown_wanted():
+        console.warn(f"RLCLI_PLUGINS names '{name}', which is no installed distribution with tasks or trainers")
     console.document(
         "list-tasks",
         tasks=[

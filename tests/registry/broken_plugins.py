@@ -87,6 +87,12 @@ BROKEN = {
     "points-not-utf8": Case(None, SPEC, {"entry_points": b"\xff\xfe[rlcli.tasks]\nx = y:z\n"}, unreadable=True),
     "metadata-empty": Case(None, SPEC, {"metadata": ""}, unreadable=True),
     "metadata-nameless": Case(None, SPEC, {"metadata": "Metadata-Version: 2.1\n"}, unreadable=True),
+    "metadata-not-utf8": Case(
+        None,
+        SPEC,
+        {"metadata": b"Metadata-Version: 2.1\nName: metadata-not-utf8\nVersion: 1.0\nSummary: \xff\n"},
+        unreadable=True,
+    ),
     "foreign-points-malformed": Case(None, "", {"entry_points": "[console_scripts]\nnonsense\n"}, foreign=True),
     "takes-a-built-in-name": Case("does not exist", SPEC, {"task": "cartpole"}),
     "shares-a-name": Case(None, SPEC, {"task": "shared-task", **with_files()}),

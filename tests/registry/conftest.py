@@ -31,7 +31,7 @@ def plugins(tmp_path, monkeypatch):
         if metadata is None:
             metadata = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
         if metadata is not None:
-            (info / "METADATA").write_text(metadata)
+            (info / "METADATA").write_bytes(metadata if isinstance(metadata, bytes) else metadata.encode())
         task = task or f"{name}-task"
         points = f"[rlcli.tasks]\n{task} = {package}:SPEC\n" if entry_points is None else entry_points
         (info / "entry_points.txt").write_bytes(points if isinstance(points, bytes) else points.encode())

@@ -1,6 +1,10 @@
 """What a broken plugin costs: its own row. Everything else goes on as if it were not there."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
 import time
 
 import pytest
@@ -133,6 +137,7 @@ def test_a_hidden_plugin_is_said_to_be_hidden(broken_plugins, cli):
     assert done.returncode == 4
     assert "RLCLI_PLUGINS=none leaves its plugin out" in done.stderr
     assert cli("show", "good-task", RLCLI_PLUGINS="GOOD").returncode == 0
+    assert "RLCLI_PLUGINS names 'nmae'" in cli("list-tasks", RLCLI_PLUGINS="good,nmae").stderr
 
 
 def test_a_plugin_that_wants_a_newer_rlcli_is_told_which(plugins, cli):
@@ -141,3 +146,27 @@ def test_a_plugin_that_wants_a_newer_rlcli_is_told_which(plugins, cli):
     done = cli("show", "early-task")
     assert done.returncode == 4
     assert "it asks for rlcli 99.1, this is" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["doctor", "list-tasks"])
+def test_ctrl_c_ends_the_probes_too(broken_plugins, tmp_path, command):
+    """A plugin that hangs is not waited for, and its process does not stay."""
+    broken_plugins("hangs")
+    here = tmp_path / "here"
+    here.mkdir()
+    arguments = ["list-tasks", "hangs", "--probe"] if command == "list-tasks" else ["doctor"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rlcli", *arguments, "--probe-timeout", "500"],
+        cwd=here,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(here)},
+    )
+    deadline = time.monotonic() + 60
+    while not list(here.glob("rlcli-probe-*")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, "Traceback" in err) == (130, False)
+    assert not list(here.glob("rlcli-probe-*"))
