@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.machine import available_cores
-from rlcli.registry import TASKS, Entry, package_folder
+from rlcli.registry import OWN, TASKS, Entry, package_folder
 
 TIMEOUT_S = 30.0
 _BUILDER = "rlcli.envs.describe"
@@ -57,8 +57,15 @@ _KINDS: dict[str, Any] = {
 def cached(entries: Iterable[Entry]) -> dict[str, Details]:
     """What is known already, by qualified name."""
     own = _raw(_cache_file())
-    rows = {entry.qualified: _details(_shipped(entry) or own.get(_key(entry))) for entry in entries}
+    rows = {entry.qualified: _known(entry, own) for entry in entries}
     return {name: row for name, row in rows.items() if row is not None}
+
+
+def _known(entry: Entry, own: dict[str, Any]) -> Details | None:
+    shipped, probed = _details(_shipped(entry)), _details(own.get(_key(entry)))
+    if entry.distribution != OWN and probed is not None and probed.broken:
+        return probed  # its authors did not ship this
+    return shipped or probed
 
 
 def probe(
@@ -81,6 +88,8 @@ def probe(
         except BaseException:  # Ctrl-C
             stop.set()
             raise
+    if stop.is_set():
+        raise InterruptedError("the probe was ended before it was done")
     if group == TASKS:
         _remember({_key(entry): found[entry.qualified].record() for entry in entries})
     return {entry.qualified: found[entry.qualified] for entry in entries}

@@ -165,3 +165,10 @@ def test_a_broken_plugin_exits_with_4_and_no_traceback(plugins, cli, source):
     assert "plugin odd 1.0 is broken" in error["message"]
     assert "Traceback" not in done.stderr
     assert cli("show", "cartpole").returncode == 0
+
+
+def test_what_a_probe_found_broken_is_said_whatever_the_plugin_ships(plugins, cli):
+    plugins("bad", "raise ValueError('out of cheese')\n", files={"index.json": '{"bad-task": {"summary": "Fine."}}'})
+    assert rows(cli("list-tasks", "--json"))["bad-task"]["broken"] is None
+    assert "out of cheese" in rows(cli("list-tasks", "bad", "--probe", "--json"))["bad-task"]["broken"]
+    assert "out of cheese" in rows(cli("list-tasks", "--json"))["bad-task"]["broken"]
