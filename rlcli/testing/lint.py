@@ -147,6 +147,8 @@ def _active(evidence: Evidence) -> list[str]:
 
 def silent_rewards(evidence: Evidence) -> Iterator[Remark]:
     """Every reward term with a weight pays something, at some time, to some agent."""
+    if evidence.steps < min(evidence.subject.resolved.task.max_episode_length, MAX_STEPS):
+        return  # a look that is shorter than an episode has not seen what comes at its end
     steps = sum(life.reward.numel() for life in evidence.lives)
     for name in _active(evidence):
         values = [life.terms[name] for life in evidence.lives if name in life.terms]
