@@ -300,7 +300,7 @@ class RlGamesTrainer(ABC):
             "vec_env": self.vec,
             "features": {"observer": AlgoObserver()},
         }
-        network = _nones(config.params.network.model_dump())
+        network = {key: _nones(part) for key, part in config.params.network.model_dump().items() if part is not None}
         parts = {"algo": {"name": config.params.algo.name}, "model": {"name": config.params.model.name}}
         return {**parts, "network": network, "config": {**settings, **own, "reward_shaper": shaper}}
 

@@ -267,6 +267,17 @@ def test_a_resumed_sac_run_goes_on_with_the_same_bits(sac_task):
     resumed(lambda seed: trainer_of(task=sac_task, seed=seed, small=SMALL_SAC))
 
 
+def test_the_ants_agent_learns_with_sac():
+    small = ("scene.num_envs=4", "agent.params.config.num_warmup_steps=1", "agent.params.config.batch_size=16")
+    small += ("agent.params.config.replay_buffer_size=500", "agent.params.network.mlp.units=[8, 8]")
+    resolved = resolve(find_task("ant-direct"), agent="rl-games-sac", overrides=small)
+    trainer = make_trainer(make_env(resolved, seed=3), resolved.agent, seed=1, device="cpu", torch_threads=1)
+    trainer.start()
+    before = dict(trainer.policy().state_dict())
+    assert trainer.iterate().metrics["Loss/critic"] > 0.0
+    assert "actor.0.weight" in differing(before, dict(trainer.policy().state_dict()))
+
+
 def test_the_critic_of_its_own_sees_the_critics_group(asymmetric):
     trainer = trainer_of(CRITIC, CENTRAL, task=asymmetric)
     before = {name: value.clone() for name, value in trainer.agent.central_value_net.state_dict().items()}
