@@ -17,6 +17,7 @@ $(VENV)/.demo: pyproject.toml constraints.txt
 $(VENV)/.dev: $(VENV)/.demo
 	$(PIP) install -c constraints.txt -e '.[dev]'
 	$(PIP) install -c constraints.txt --no-deps rsl-rl-lib rl_games
+	$(PIP) install --no-deps -e plugins/rlcli-rsl-rl -e plugins/rlcli-rl-games
 	touch $@
 
 setup: $(VENV)/.dev

@@ -369,10 +369,11 @@ def _build(job: _Job, device: str) -> Any:
     from rlcli.registry import load_object
     from rlcli.rl import distributed
     from rlcli.rl.checkpoint import drop_after, open_checkpoint
-    from rlcli.rl.load import require_fit
+    from rlcli.rl.load import require_fit, require_same_policy, require_trainer
 
     resolved, record = job.resolved, job.run.record
     assert resolved.trainer is not None
+    assert resolved.agent is not None
     peers = distributed.current()
     env = make_env(resolved, seed=peers.seed(record["seed"], "environments"), device=device)
     threads = int(record.get("torch_threads") or _threads(resolved)[1])
@@ -383,10 +384,12 @@ def _build(job: _Job, device: str) -> Any:
         if job.init_from is not None:
             initial = open_checkpoint(job.init_from)
             require_fit(initial, env.layout)
+            require_same_policy(initial, trainer.policy(), resolved.agent.trainer)
             _take(initial, lambda: trainer.load_weights(initial.tensors("policy")), "its weights do not fit the agent")
         trainer.start()
         return trainer, env
     require_fit(saved, env.layout)
+    require_trainer(saved, resolved.agent.trainer)
     state = saved.state()
     _take(saved, lambda: trainer.load(state), "it cannot be resumed")
     if trainer.env_steps != saved.step:
@@ -422,6 +425,7 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
     resume = None if job.resume_from is None else (trainer.iteration, trainer.env_steps)
     manifest = {
         **{key: run.record[key] for key in ("task", "agent", "seed")},
+        "trainer": agent.trainer,
         "layout": env.layout.record(),
         "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
     }

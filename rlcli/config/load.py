@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rlcli.config import messages, oige, python
 from rlcli.config.layers import Layers, Origin, marked, parse_override, read
@@ -22,6 +22,7 @@ from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.terms import SECTIONS, Signature, SignatureError, Vocabulary, params_model, read_params
 from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing
 from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, load_entry
+from rlcli.task import API_VERSION
 from rlcli.trainers import TrainerSpec
 
 KNOWN_TRAINERS = {"ppo": "--upgrade rlcli", "rsl-rl": "rlcli-rsl-rl", "rl-games": "rlcli-rl-games"}
@@ -175,6 +176,12 @@ class _AnyAgent(AgentConfig):
     """An agent of a trainer that is not known: what all agents have in common is still checked."""
 
     model_config = ConfigDict(extra="allow")
+
+    algorithm: str | dict[str, Any]  # type: ignore[assignment]
+
+    @model_validator(mode="after")
+    def _budget(self) -> _AnyAgent:
+        return self  # a trainer may have its budget elsewhere
 
 
 Change = tuple[Path, Any, Origin]
@@ -355,6 +362,14 @@ class _Check:
                 self.problem((*at, "trainer"), error.message, error.hint)
             return None, _AnyAgent
         spec = load_entry(entry, TrainerSpec)
+        if spec.api > API_VERSION:
+            raise TaskError(
+                f"trainer '{entry.qualified}' ({entry.version}) needs plugin API {spec.api};"
+                f" this rlcli has {API_VERSION}",
+                hint="pip install --upgrade rlcli",
+            )
+        if isinstance(algorithm, dict):  # a library's own form
+            algorithm = str(algorithm.get("class_name", next(iter(spec.algorithms)))).lower()
         if not isinstance(algorithm, str):
             return spec, _AnyAgent
         if algorithm not in spec.algorithms:

@@ -72,13 +72,50 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
         raise CheckpointError(f"{checkpoint.folder}/manifest.json is corrupt: its layout is malformed") from None
     if not differing:
         return
-    rows = [("field", "in the checkpoint", "now"), *differing]
-    widths = [max(len(row[column]) for row in rows) for column in range(2)]
-    table = "\n".join(f"  {a.ljust(widths[0])}  {b.ljust(widths[1])}  {c}" for a, b, c in rows)
+    table = _table([("field", "in the checkpoint", "now"), *differing])
     raise CheckpointError(
         f"{checkpoint.folder} does not fit the installed task:\n{table}",
         hint="install the task's version that run.json names, or train again",
     )
+
+
+def require_trainer(checkpoint: Checkpoint, trainer: str) -> None:
+    """A run goes on with the trainer that saved it; checkpoints of older versions do not say which.
+
+    Raises:
+        CheckpointError: naming both.
+    """
+    saved = checkpoint.manifest.get("trainer")
+    if saved is not None and saved != trainer:
+        raise CheckpointError(
+            f"{checkpoint.folder} is a checkpoint of trainer '{saved}', and the run's agent is one of '{trainer}'",
+            hint="--init-from takes only the weights of its policy, in a new run",
+        )
+
+
+def require_same_policy(checkpoint: Checkpoint, policy: Policy, trainer: str) -> None:
+    """Weights go into a policy that computes the same with them; how far actions reach is the new agent's own.
+
+    Raises:
+        CheckpointError: with a table of what differs.
+    """
+    saved, wanted = policy_of(checkpoint).spec.model_dump(), policy.spec.model_dump()
+    rows = [(key, str(saved[key]), str(wanted[key])) for key in wanted if saved[key] != wanted[key]]
+    alike = {"action_bound"} if saved["normalize"] and wanted["normalize"] else {"action_bound", "normalize_clip"}
+    rows = [row for row in rows if row[0] not in alike]
+    if rows:
+        table = _table([("policy", "in the checkpoint", "the agent's"), *rows])
+        owner = checkpoint.manifest.get("trainer") or "?"
+        raise CheckpointError(
+            f"{checkpoint.folder}: the weights do not fit the agent; it is a checkpoint of trainer '{owner}', and the"
+            f" agent is one of '{trainer}':\n{table}",
+            hint="give the agent the network of the checkpoint, or begin without --init-from",
+        )
+
+
+def _table(rows: Sequence[tuple[str, str, str]]) -> str:
+    widths = [max(len(row[column]) for row in rows) for column in range(2)]
+    return "\n".join(f"  {a.ljust(widths[0])}  {b.ljust(widths[1])}  {c}" for a, b, c in rows)
 
 
 def _differing(record: Mapping[str, Any], current: Mapping[str, Any]) -> list[tuple[str, str, str]]:

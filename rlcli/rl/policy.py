@@ -13,7 +13,6 @@ from rlcli.errors import CheckpointError
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 _LOG_STD_RANGE = (-20.0, 2.0)
-_CLIP = 10.0
 
 
 class PolicySpec(BaseModel):
@@ -34,6 +33,10 @@ class PolicySpec(BaseModel):
     activation: Literal["elu", "relu", "tanh", "silu"]
     action_bound: PositiveFloat | None
     normalize: bool = False
+    normalize_clip: PositiveFloat | None = 10.0
+    """Normalised observations are clipped to +-this; null: they are not."""
+    log_std_range: tuple[float, float] | None = None
+    """Of a squashed-gaussian-mlp: tanh maps the logarithm of the deviation into this; null: it is clamped."""
     memory: list[PositiveInt] = []
     """Cells of each layer of the memory."""
 
@@ -50,22 +53,31 @@ class Normalizer(nn.Module):
     """Running mean and variance of observations, merged batch by batch (Chan, Golub and LeVeque 1979).
 
     It belongs to the policy: frozen outside training, and part of what is exported.
+
+    Args:
+        size: columns.
+        clip: what it gives lies within +-this; None: anywhere.
     """
+
+    EPSILON = 1e-8
+    """Added to the variance."""
 
     mean: Tensor
     var: Tensor
     count: Tensor
 
-    def __init__(self, size: int | tuple[()]) -> None:
+    def __init__(self, size: int | tuple[()], clip: float | None = 10.0) -> None:
         super().__init__()
+        self.clip = clip
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     def forward(self, obs: Tensor) -> Tensor:
-        """(obs - mean) / std, clipped to +-10. (n, d)"""
-        scale = (self.var + 1e-8).rsqrt().float()
-        return ((obs - self.mean.float()) * scale).clamp(-_CLIP, _CLIP)
+        """(obs - mean) / std, clipped. (n, d)"""
+        scale = (self.var + self.EPSILON).rsqrt().float()
+        normal = (obs - self.mean.float()) * scale
+        return normal if self.clip is None else normal.clamp(-self.clip, self.clip)
 
     def update(self, obs: Tensor) -> None:
         """Take in a batch. (n, d)"""
@@ -134,7 +146,7 @@ class Policy(nn.Module):
     def __init__(self, spec: PolicySpec) -> None:
         super().__init__()
         self.spec = spec
-        self.normalizer = Normalizer(spec.observation_size) if spec.normalize else None
+        self.normalizer = Normalizer(spec.observation_size, spec.normalize_clip) if spec.normalize else None
         self.memory = Lstm(spec.observation_size, spec.memory, wide=True) if spec.memory else None
         inputs = spec.memory[-1] if spec.memory else spec.observation_size
         self.actor = mlp(inputs, spec.hidden, spec.action_size, spec.activation)
@@ -174,15 +186,19 @@ class Policy(nn.Module):
         if not stochastic or self.spec.kind == "deterministic-mlp":
             return self._bounded(mean), memory
         noise = torch.randn(mean.shape, generator=generator, device=mean.device)
-        log_std = (
-            self.log_std
-            if self.spec.kind.startswith("gaussian-")
-            else self.log_std_head(features).float().clamp(*_LOG_STD_RANGE)
-        )
-        return self._bounded(mean + log_std.exp() * noise), memory
+        return self._bounded(mean + self._log_std(features).exp() * noise), memory
 
     def _seen(self, obs: Tensor) -> Tensor:
         return obs if self.normalizer is None else self.normalizer(obs)
+
+    def _log_std(self, features: Tensor) -> Tensor:
+        if self.spec.kind.startswith("gaussian-"):
+            return self.log_std
+        log_std = self.log_std_head(features).float()
+        if self.spec.log_std_range is None:
+            return log_std.clamp(*_LOG_STD_RANGE)
+        low, high = self.spec.log_std_range
+        return low + 0.5 * (high - low) * (torch.tanh(log_std) + 1.0)
 
     def _bounded(self, action: Tensor) -> Tensor:
         bound = self.spec.action_bound

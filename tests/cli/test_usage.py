@@ -115,7 +115,8 @@ def test_underscores_are_accepted_for_hyphens(in_process):
         (["train", "cartpole", "agent.trainer=rsl-rl"], 7, "dependency"),
     ],
 )
-def test_errors_are_one_document_and_their_exit_code(in_process, here, arguments, code, kind):
+def test_errors_are_one_document_and_their_exit_code(in_process, here, monkeypatch, arguments, code, kind):
+    monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")  # the trainers of others are not there
     found, out, err = in_process(*arguments, "--json")
     error = document(out)["error"]
     assert (found, error["exit_code"], error["kind"]) == (code, code, kind)
@@ -135,7 +136,8 @@ def test_debug_shows_the_traceback_of_an_error(in_process):
     assert "Traceback" in err
 
 
-def test_a_missing_trainer_is_answered_with_the_pip_line(in_process):
+def test_a_missing_trainer_is_answered_with_the_pip_line(in_process, monkeypatch):
+    monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")
     code, _, err = in_process("train", "cartpole", "agent.trainer=rl-games")
     assert code == 7
     assert "trainer 'rl-games' is not installed" in err

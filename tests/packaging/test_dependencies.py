@@ -35,3 +35,13 @@ def test_what_is_asked_for_is_pinned_within_its_bounds(extra):
 def test_bounds_are_lower_bounds():
     every = [Requirement(line) for lines in (PROJECT["dependencies"], *EXTRAS.values()) for line in lines]
     assert {bound.operator for requirement in every for bound in requirement.specifier} == {">="}
+
+
+@pytest.mark.parametrize("name", ["rlcli-rsl-rl", "rlcli-rl-games"])
+def test_what_a_trainer_plugin_asks_for_is_pinned_within_its_bounds(name):
+    project = tomllib.loads((REPOSITORY / "plugins" / name / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    wanted = [Requirement(line) for line in project["dependencies"]]
+    library = [requirement for requirement in wanted if requirement.name != "rlcli"]
+    assert len(library) == 1
+    assert library[0].specifier.contains(pinned()[canonicalize_name(library[0].name)])
+    assert "<" in str(library[0].specifier)

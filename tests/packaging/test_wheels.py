@@ -9,9 +9,10 @@ import zipfile
 from email.parser import Parser
 
 import pytest
-from fenced import REPOSITORY, blocks, run_commands, success_rate, success_rates
+from fenced import REPOSITORY, blocks, run_commands, success_rate, success_rates, write_files
 
 ACROBOT = REPOSITORY / "plugins" / "rlcli-example-acrobot"
+TRAINERS = ("rlcli-rsl-rl", "rlcli-rl-games")
 pytestmark = pytest.mark.slow
 
 
@@ -143,3 +144,35 @@ def test_the_plugins_of_the_page_are_made_installed_and_learned_as_written(site,
     assert len(shown) == 6
     for block in shown:
         assert (tmp_path / block.file).read_text(encoding="utf-8") == block.text, block.file
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_the_tests_of_a_trainer_plugin_pass_against_the_wheels(name, site, tmp_path):
+    own = tmp_path / "site"
+    shutil.copytree(site, own)
+    build(REPOSITORY / "plugins" / name, tmp_path)
+    (wheel,) = tmp_path.glob("*.whl")
+    install([wheel], own)
+    folder = tmp_path / name
+    shutil.copytree(REPOSITORY / "plugins" / name / "tests", folder / "tests")
+    shutil.copy(REPOSITORY / "plugins" / name / "pyproject.toml", folder)
+    environment = {**os.environ, "PYTHONPATH": str(own), "PYTHONSAFEPATH": "1"}
+    command = [sys.executable, "-m", "pytest", "-m", "not slow", "-v"]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stdout[-4000:]
+    assert int(done.stdout.partition(" passed")[0].split()[-1]) > 20
+    where = [sys.executable, "-c", f"import {name.replace('-', '_')} as package; print(package.__file__)"]
+    place = subprocess.run(where, cwd=folder, env=environment, capture_output=True, text=True, check=True).stdout
+    assert place.startswith(str(own))
+
+
+def test_the_trainer_of_the_page_works_as_written(site, tmp_path):
+    own = tmp_path / "site"
+    shutil.copytree(site, own)
+    found = blocks(REPOSITORY / "docs" / "write-a-trainer.md")
+    write_files(found, tmp_path)
+    output = run_commands(found, tmp_path, site=own)
+    assert 0.0 <= success_rate(output) <= 1.0
+    (run,) = (tmp_path / "my-learner" / "runs" / "cartpole").glob("*-first")
+    record = json.loads((run / "run.json").read_text())
+    assert (record["state"], record["iteration"]) == ("finished", 8)

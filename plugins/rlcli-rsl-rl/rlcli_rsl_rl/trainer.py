@@ -1,0 +1,413 @@
+"""RSL-RL's PPO, one iteration at a time, saved and restored exactly."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import math
+import time
+from collections.abc import Mapping
+from importlib import metadata
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import ConfigError, DependencyError, DivergedError
+from rlcli.random import derive
+from rlcli.registry import load_object
+from rlcli.rl.policy import Policy, PolicySpec
+from rlcli.rl.rng import load_rng_state, rng_state
+from rlcli.rl.statistics import EpisodeStatistics
+from rlcli.rl.trainer import Report, TrainerState
+from rlcli_rsl_rl.config import RunnerConfig
+
+NEEDED = "rsl-rl-lib>=5.5,<6"
+try:
+    _VERSION = tuple(int(part) for part in metadata.version("rsl-rl-lib").split(".")[:2])
+except metadata.PackageNotFoundError:
+    _VERSION = (0, 0)
+if not (5, 5) <= _VERSION < (6, 0):
+    _found = f"rsl-rl-lib {'.'.join(map(str, _VERSION))} is" if any(_VERSION) else "rsl-rl-lib is not"
+    raise DependencyError(f"trainer 'rsl-rl' needs {NEEDED}, and {_found} installed", hint=f"pip install '{NEEDED}'")
+
+from rsl_rl.algorithms import PPO  # noqa: E402
+from rsl_rl.models import MLPModel, RNNModel  # noqa: E402
+from rsl_rl.modules import GaussianDistribution  # noqa: E402
+
+from rlcli.adapters.rsl_rl import RslRlVecEnv  # noqa: E402
+
+_RECORDED = 256
+"""Recent observations that a checkpoint keeps, for checking what is made of the policy later."""
+_ACTIVATIONS = {"swish": "silu"}
+_NORMALIZER_EPS = 1e-2
+"""What RSL-RL adds to the deviation of observations."""
+_LEARNER_HINT = "lower algorithm.learning_rate or algorithm.max_grad_norm; the last good checkpoint is kept"
+
+
+class RslRlTrainer:
+    """Drives RSL-RL's PPO as its runner does, and can stop, save and go on after any iteration.
+
+    Args:
+        env: the environment.
+        config: the agent.
+        seed: of the networks and of exploration.
+        device: where networks and samples live, as the environment does.
+        torch_threads: threads of the update; the rollout runs torch on one, because two thread pools fight.
+    """
+
+    def __init__(self, env: VecEnv, config: RunnerConfig, *, seed: int, device: str, torch_threads: int) -> None:
+        self.env, self.config, self.torch_threads = env, config, torch_threads
+        self.iteration, self.env_steps = 0, 0
+        self.steps_per_iteration = config.num_steps_per_env * env.num_envs
+        env.final_obs_of = "truncated"
+        self.statistics = EpisodeStatistics(env.config.episode_length_s)
+        self._adapter = RslRlVecEnv(env)
+        self._groups = _groups(env, config)
+        self.spec = _policy_spec(env, config)
+        _require_batch(env, config)
+        torch.set_num_threads(torch_threads)
+        torch.manual_seed(derive(seed, "trainer"))
+        with contextlib.redirect_stdout(io.StringIO()):  # RSL-RL prints its networks; standard output is for data
+            settings = _settings(env, config, self._groups)
+            self.alg = PPO.construct_algorithm(self._adapter.blank(), self._adapter, settings, device)
+        self.alg.train_mode()
+        self._obs = self._adapter.blank()
+        self._recorded = torch.zeros(0, self.spec.observation_size)
+        self._notes = [f"not read by trainer rsl-rl: {said}" for said in config.not_read]
+
+    def start(self) -> None:
+        """Reset the environment to its first episodes."""
+        self._take_in(self.env.reset(seed=self.env.seed))
+
+    def iterate(self) -> Report:
+        """Collect experience, then update."""
+        physics, step = self.env.seconds["physics"], self.env.seconds["step"]
+        begin = time.perf_counter()
+        torch.set_num_threads(1)
+        self._collect()
+        collected = time.perf_counter()
+        torch.set_num_threads(self.torch_threads)
+        losses = self.alg.update()
+        updated = time.perf_counter()
+        self.iteration += 1
+        self.env_steps += self.steps_per_iteration
+        metrics = self._checked(losses)
+        physics, step = self.env.seconds["physics"] - physics, self.env.seconds["step"] - step
+        seconds = {
+            "physics": physics,
+            "task": step - physics,
+            "policy": collected - begin - step,
+            "update": updated - collected,
+        }
+        task = {name: value for name, value in self.env.extras().items() if math.isfinite(value)}
+        notes, self._notes = self._notes, []
+        return Report({**self.statistics.flush(), **task, **metrics}, seconds, notes)
+
+    def policy(self) -> Policy:
+        """The deployable policy as it is now, with weights of its own."""
+        policy = Policy(self.spec)
+        policy.load_state_dict(self._policy_tensors())
+        return policy.eval().requires_grad_(False)
+
+    def state(self) -> TrainerState:
+        """A copy of everything that the next iteration depends on."""
+        rest = {"observations": self._recorded.clone()}
+        for part, module in self._modules().items():
+            rest |= {f"{part}.{name}": value.detach().clone() for name, value in module.state_dict().items()}
+        for name, optimizer in self._optimizers().items():
+            rest |= _optimizer_tensors(optimizer, f"optimizer.{name}.")
+        for part, network in (("actor", self.alg.actor), ("critic", self.alg.critic)):
+            for index, memory in enumerate(network.get_hidden_state() or ()):
+                rest[f"memory.{part}.{index}"] = memory.detach().clone()
+        values: dict[str, Any] = {
+            "policy": self.spec.model_dump(),
+            "iteration": self.iteration,
+            "env_steps": self.env_steps,
+            "learning_rate": self.alg.learning_rate,
+            "statistics": self.statistics.state(),
+        }
+        if self.alg.rnd:
+            values["rnd_updates"] = self.alg.rnd.update_counter
+            average = self._curiosity_average()
+            if average is not None and average.avg is not None:
+                rest["rnd_average"] = average.avg.detach().clone()
+        tensors = {"policy": self._policy_tensors(), "trainer": rest, "env": self.env.state_dict(), "rng": rng_state()}
+        return TrainerState(tensors, values)
+
+    def load(self, state: TrainerState) -> None:
+        """Go back to a boundary: the next iteration gives the same bits as it did then."""
+        values, rest = state.values, state.tensors["trainer"]
+        for part, module in self._modules().items():
+            module.load_state_dict(_below(rest, f"{part}."))
+        for name, optimizer in self._optimizers().items():
+            _load_optimizer(optimizer, _below(rest, f"optimizer.{name}."))
+        self.alg.learning_rate = values["learning_rate"]
+        for group in self.alg.optimizer.param_groups:
+            group["lr"] = values["learning_rate"]
+        for part, network in (("actor", self.alg.actor), ("critic", self.alg.critic)):
+            memory = _below(rest, f"memory.{part}.")
+            if memory:
+                network.reset(hidden_state=tuple(memory[str(index)].clone() for index in range(len(memory))))
+        if self.alg.rnd:
+            self.alg.rnd.update_counter = values["rnd_updates"]
+            if "rnd_average" in rest:
+                self._curiosity_average().avg = rest["rnd_average"].clone()
+        self.iteration, self.env_steps = values["iteration"], values["env_steps"]
+        self.statistics.load(values["statistics"])
+        self._obs = self._adapter.observations(self.env.load_state_dict(state.tensors["env"]))
+        self._recorded = rest["observations"]
+        self._notes = []
+        load_rng_state(state.tensors["rng"])
+
+    def load_weights(self, policy: Mapping[str, Tensor]) -> None:
+        """Take a policy's weights, with its normaliser; the critic stays as it is."""
+        actor = self.alg.get_policy()
+        weights = actor.state_dict()
+        for theirs, ours in self._names().items():
+            weights[theirs] = policy[ours].clone()
+        std = policy["log_std"].exp()
+        for name in ("std_param", "log_std_param"):
+            if f"distribution.{name}" in weights:
+                weights[f"distribution.{name}"] = std if name == "std_param" else std.log()
+        if self.spec.normalize:
+            deviation = (policy["normalizer.var"] + 1e-8).sqrt() - _NORMALIZER_EPS
+            weights["obs_normalizer._mean"] = policy["normalizer.mean"].float()[None]
+            weights["obs_normalizer._std"] = deviation.float()[None]
+            weights["obs_normalizer._var"] = deviation.square().float()[None]
+            weights["obs_normalizer.count"] = policy["normalizer.count"].round().long()
+        actor.load_state_dict(weights)
+
+    # --- the rollout ---
+
+    @torch.no_grad()
+    def _collect(self) -> None:
+        """Take `num_steps_per_env` in every environment; then estimate returns."""
+        bound, before = self.config.action_bound, self.config.bootstrap == "pre_step"
+        for _ in range(self.config.num_steps_per_env):
+            action = self.alg.act(self._obs)
+            step = self.env.step(action if bound is None else action.clamp(-bound, bound))
+            cut = step.truncated & ~step.terminated  # by time alone
+            reward, extras = step.reward, {}
+            if before:
+                extras["time_outs"] = cut
+            elif step.final_obs is not None:
+                value = self._value(step.final_obs)
+                reward = reward + self.alg.gamma * torch.where(cut, value, 0.0)
+            self._obs = self._adapter.observations(step.obs)
+            self.alg.process_env_step(self._obs, reward, step.terminated | step.truncated, extras)
+            self.statistics.add(step.episodes)
+        self._record(self._obs["policy"])
+        self.alg.compute_returns(self._obs)
+
+    def _value(self, obs: dict[str, Tensor]) -> Tensor:
+        """What the critic makes of these observations, at this point of its memory. (num_envs,)"""
+        memory = self.alg.critic.get_hidden_state()
+        value = self.alg.critic(self._adapter.observations(obs)).squeeze(-1)
+        self.alg.critic.reset(hidden_state=memory)
+        return value
+
+    def _take_in(self, obs: dict[str, Tensor]) -> None:
+        self._obs = self._adapter.observations(obs)
+        self._record(obs["policy"])
+
+    def _record(self, obs: Tensor) -> None:
+        self._recorded = torch.cat([obs[:_RECORDED].cpu(), self._recorded])[:_RECORDED]
+
+    # --- metrics ---
+
+    def _checked(self, losses: Mapping[str, float]) -> dict[str, float]:
+        metrics = {f"Loss/{name}": float(value) for name, value in losses.items()}
+        metrics["Loss/learning_rate"] = self.alg.learning_rate
+        metrics["Policy/mean_std"] = float(self._log_std().exp().mean())
+        if self.alg.rnd:
+            metrics["Rnd/weight"] = float(self.alg.rnd.weight)
+        for name, value in metrics.items():
+            if not math.isfinite(value):
+                raise DivergedError(f"{name} is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
+        for part, module in self._modules().items():
+            for name, parameter in module.named_parameters():
+                if not bool(parameter.isfinite().all()):
+                    message = f"weight '{part}.{name}' is not finite in iteration {self.iteration}"
+                    raise DivergedError(message, hint=_LEARNER_HINT)
+        return metrics
+
+    # --- what a checkpoint holds ---
+
+    def _modules(self) -> dict[str, torch.nn.Module]:
+        modules = {"actor": self.alg._raw_actor, "critic": self.alg._raw_critic}
+        return {**modules, "rnd": self.alg.rnd} if self.alg.rnd else modules
+
+    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        optimizers = {"policy": self.alg.optimizer}
+        return {**optimizers, "rnd": self.alg.rnd.optimizer} if self.alg.rnd else optimizers
+
+    def _curiosity_average(self) -> Any:
+        normalizer = self.alg.rnd.reward_normalizer
+        return getattr(normalizer, "disc_avg", None)
+
+    def _names(self) -> dict[str, str]:
+        """RSL-RL's name of each weight of the actor -> its name in a saved policy."""
+        names = {}
+        for name in self.alg.get_policy().state_dict():
+            if name.startswith("mlp."):
+                names[name] = f"actor.{name.removeprefix('mlp.')}"
+            elif name.startswith("rnn.rnn."):
+                kind, _, layer = name.removeprefix("rnn.rnn.").rpartition("_l")
+                names[name] = f"memory.layers.{layer}.{kind}"
+        return names
+
+    def _log_std(self) -> Tensor:
+        distribution = self.alg.get_policy().distribution
+        low, high = distribution.log_std_range
+        if distribution.std_type == "log":
+            return distribution.log_std_param.detach().clamp(low, high)
+        return distribution.std_param.detach().clamp(math.exp(low), math.exp(high)).log()
+
+    def _policy_tensors(self) -> dict[str, Tensor]:
+        """Copies of the actor's weights under the names of a saved policy; it computes what RSL-RL computes."""
+        weights = self.alg.get_policy().state_dict()
+        tensors = {ours: weights[theirs].detach().clone() for theirs, ours in self._names().items()}
+        tensors["log_std"] = self._log_std().clone()
+        if self.spec.normalize:
+            # RSL-RL divides by the deviation plus a little, a saved policy by the root of a variance plus very little
+            deviation = weights["obs_normalizer._std"][0].double() + _NORMALIZER_EPS
+            tensors["normalizer.mean"] = weights["obs_normalizer._mean"][0].double()
+            tensors["normalizer.var"] = deviation.square() - 1e-8
+            tensors["normalizer.count"] = weights["obs_normalizer.count"].double()
+        return tensors
+
+
+def _policy_spec(env: VecEnv, config: RunnerConfig) -> PolicySpec:
+    """What the trained policy is made of."""
+    actor, _ = config.networks
+    memory = config.memory or []
+    return PolicySpec(
+        kind="gaussian-lstm" if memory else "gaussian-mlp",
+        memory=memory,
+        observation_size=env.layout.size("policy"),
+        action_size=env.layout.action_size,
+        hidden=actor.hidden_dims,
+        activation=_ACTIVATIONS.get(actor.activation, actor.activation),  # type: ignore[arg-type]
+        action_bound=config.action_bound,
+        normalize=actor.obs_normalization,
+        normalize_clip=None if actor.obs_normalization else 10.0,
+    )
+
+
+def _groups(env: VecEnv, config: RunnerConfig) -> dict[str, list[str]]:
+    """Observation set of RSL-RL -> groups of the task.
+
+    Raises:
+        ConfigError: for a set or group that is not there.
+    """
+    have = env.layout.observations
+    sets = {"actor": ["policy"], "critic": ["critic"] if "critic" in have else ["policy"]}
+    if config.algorithm.rnd_cfg is not None:
+        sets["rnd_state"] = ["policy"]
+    allowed = {"policy": "actor", "actor": "actor", "critic": "critic", "rnd_state": "rnd_state"}
+    for name, groups in config.obs_groups.items():
+        if name not in allowed:
+            raise _problem(env, ("obs_groups", name), f"no observation set '{name}'", f"sets: {', '.join(allowed)}")
+        for group in groups:
+            if group not in have:
+                hint = f"groups of the task: {', '.join(have)}"
+                raise _problem(env, ("obs_groups", name), f"no observation group '{group}'", hint)
+        if allowed[name] == "actor" and groups != ["policy"]:
+            message = f"the policy acts on the group policy alone, found {', '.join(groups)}"
+            raise _problem(env, ("obs_groups", name), message, "put the terms into observations.policy")
+        if allowed[name] in sets:
+            sets[allowed[name]] = list(groups)
+    return sets
+
+
+def _require_batch(env: VecEnv, config: RunnerConfig) -> None:
+    parts = config.algorithm.num_mini_batches
+    whole = config.num_steps_per_env if config.memory is not None else 1  # samples that stay together
+    samples = config.num_steps_per_env * env.num_envs // whole
+    if samples // parts < 2:
+        what = "environments" if whole > 1 else "samples"
+        message = f"{parts} minibatches cannot be made of a rollout of {samples} {what}"
+        at = ("algorithm", "num_mini_batches")
+        raise _problem(env, at, message, "more environments, more num_steps_per_env, or fewer minibatches")
+
+
+def _settings(env: VecEnv, config: RunnerConfig, groups: dict[str, list[str]]) -> dict[str, Any]:
+    """The dictionary that RSL-RL 5 is built from."""
+    algorithm: dict[str, Any] = config.algorithm.model_dump(exclude={"class_name", "rnd_cfg", "symmetry_cfg"})
+    algorithm["class_name"] = PPO
+    if config.algorithm.rnd_cfg is not None:
+        rnd = config.algorithm.rnd_cfg.model_dump(exclude_none=True)
+        algorithm["rnd_cfg"] = rnd
+    if config.algorithm.symmetry_cfg is not None:
+        symmetry = config.algorithm.symmetry_cfg.model_dump()
+        symmetry["data_augmentation_func"] = _mirror(env, config.algorithm.symmetry_cfg.data_augmentation_func)
+        algorithm["symmetry_cfg"] = symmetry
+    actor, critic = config.networks
+    return {
+        "num_steps_per_env": config.num_steps_per_env,
+        "obs_groups": copy.deepcopy(groups),
+        "multi_gpu": None,
+        "actor": _network(actor),
+        "critic": _network(critic),
+        "algorithm": algorithm,
+    }
+
+
+def _network(config: Any) -> dict[str, Any]:
+    memory = config.class_name == "RNNModel"
+    settings = config.model_dump(include={"hidden_dims", "activation", "obs_normalization"})
+    settings["class_name"] = RNNModel if memory else MLPModel
+    if memory:
+        settings |= config.model_dump(include={"rnn_type", "rnn_hidden_dim", "rnn_num_layers"})
+    if config.distribution_cfg is not None:
+        settings["distribution_cfg"] = config.distribution_cfg.model_dump() | {"class_name": GaussianDistribution}
+    return settings
+
+
+def _mirror(env: VecEnv, reference: str) -> Any:
+    """The function that mirrors observations and actions."""
+    module, _, name = reference.rpartition(":")
+    if not module:
+        module, _, name = reference.rpartition(".")
+    if module.endswith(".py"):
+        module = str(env.resolved.source.root / module)
+    try:
+        found = load_object(f"{module}:{name}")
+    except (ImportError, AttributeError, OSError, ValueError) as error:
+        found, why = None, f": {error}"
+    else:
+        why = ", which is not a function"
+    if not callable(found):
+        at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
+        hint = "module:function of an installed package, or file.py:function beside the task"
+        raise _problem(env, at, f"there is no function '{reference}'{why}", hint)
+    return found
+
+
+def _problem(env: VecEnv, at: tuple[str, ...], message: str, hint: str) -> ConfigError:
+    return ConfigError([env.resolved.problem(("agents", env.resolved.agent_name or "", *at), message, hint)])
+
+
+def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def _optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
+    state = optimizer.state_dict()["state"]
+    return {
+        f"{prefix}{index}.{slot}": torch.as_tensor(value).clone()
+        for index, slots in state.items()
+        for slot, value in slots.items()
+        if value is not None
+    }
+
+
+def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        index, slot = name.split(".")
+        state.setdefault(int(index), {})[slot] = value.clone()
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

@@ -1,0 +1,86 @@
+"""A `VecEnv` as RSL-RL wants it: its own runners train in it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from rsl_rl.env import VecEnv as RslRlBase
+from tensordict import TensorDict
+from torch import Tensor
+
+from rlcli.envs.vec_env import VecEnv
+from rlcli.rl.statistics import EpisodeStatistics
+
+
+class RslRlVecEnv(RslRlBase):
+    """All observation groups of a `VecEnv`. The first look at the observations starts the first episodes.
+
+    `extras["time_outs"]` marks episodes that time alone ended; RSL-RL then bootstraps from the observation before the
+    step. The true last observations are in `extras["final_obs"]`, which RSL-RL does not read.
+
+    Args:
+        env: the environment.
+        clip_actions: actions are clipped to +-this; None: they are not.
+    """
+
+    def __init__(self, env: VecEnv, clip_actions: float | None = None) -> None:
+        self.unwrapped = env
+        self.clip_actions = clip_actions
+        self.num_envs = env.num_envs
+        self.num_actions = env.layout.action_size
+        self.max_episode_length = env.max_episode_length
+        self.device = env.device
+        self.cfg = env.config.model_dump(mode="json")
+        self._obs: TensorDict | None = None
+        self._statistics = EpisodeStatistics(env.config.episode_length_s)
+
+    @property
+    def episode_length_buf(self) -> Tensor:
+        """Steps of each episode so far. (num_envs,) int64"""
+        return self.unwrapped.episode_length_buf
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: Tensor) -> None:
+        self.unwrapped.episode_length_buf.copy_(value)
+
+    def reset(self) -> tuple[TensorDict, dict[str, Any]]:
+        """Start new episodes everywhere."""
+        self._obs = self.observations(self.unwrapped.reset())
+        return self._obs, {}
+
+    def get_observations(self) -> TensorDict:
+        """Group -> observations. (num_envs, d) each"""
+        if self._obs is None:
+            self._obs = self.observations(self.unwrapped.reset(seed=self.unwrapped.seed))
+        return self._obs
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+        """Step; see RSL-RL's `VecEnv.step`."""
+        if self._obs is None:
+            self.get_observations()
+        bound = self.clip_actions
+        result = self.unwrapped.step(actions if bound is None else actions.clamp(-bound, bound))
+        self._obs = self.observations(result.obs)
+        extras: dict[str, Any] = {"time_outs": result.truncated & ~result.terminated}
+        if result.final_obs is not None:
+            extras["final_obs"] = self.observations(result.final_obs)
+        if result.episodes is not None and len(result.episodes.ended().ids):
+            self._statistics.add(result.episodes)
+            extras["log"] = self._statistics.flush()
+        return self._obs, result.reward, (result.terminated | result.truncated).long(), extras
+
+    def observations(self, groups: dict[str, Tensor]) -> TensorDict:
+        """Observation groups in RSL-RL's form."""
+        return TensorDict(dict(groups), batch_size=[self.num_envs], device=self.device)
+
+    def blank(self) -> TensorDict:
+        """Observations of zeros, which show the shapes alone."""
+        layout = self.unwrapped.layout
+        return self.observations(
+            {group: torch.zeros(self.num_envs, layout.size(group), device=self.device) for group in layout.observations}
+        )
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.unwrapped.close()

@@ -1,0 +1,114 @@
+"""Trainers from installed distributions: two of one name, one for a newer rlcli, one that is not installed."""
+
+import textwrap
+
+import pytest
+
+TRAINER = """
+    from rlcli.trainers import TrainerSpec
+    SPEC = TrainerSpec(summary="Twice.", algorithms={"ppo": "rlcli.rl.ppo_config:PpoConfig"},
+                       trainer="rlcli.rl.ppo:PpoTrainer"%s)
+"""
+POINTS = "[rlcli.trainers]\n%s = %s:SPEC\n"
+
+
+@pytest.fixture
+def mine(tmp_path, cli):
+    """mine(command, settings, words...) runs it with an agent of these settings."""
+
+    def run(command, settings, *words, **environment):
+        file = tmp_path / "agents.yaml"
+        file.write_text(f"agents: {{mine: {settings}}}\n")
+        return cli(command, "cartpole", "--config", str(file), "--agent", "mine", *words, **environment)
+
+    return run
+
+
+def train(mine, trainer, algorithm="ppo"):
+    settings = f"{{trainer: {trainer}, algorithm: {algorithm}, max_iterations: 1}}"
+    return mine("train", settings, "--num-envs", "2", "--logger", "none", "-q", "--device", "cpu")
+
+
+@pytest.fixture
+def two(plugins):
+    for name in ("first-learner", "second-learner"):
+        package = name.replace("-", "_")
+        plugins(name, TRAINER % "", entry_points=POINTS % ("learner", package))
+
+
+def test_two_trainers_of_one_name_are_both_named_and_one_can_be_chosen(two, mine):
+    done = train(mine, "learner")
+    assert done.returncode == 3, done.stderr
+    assert "offered by first-learner 1.0 and second-learner 1.0" in done.stderr
+    assert "first-learner:learner or second-learner:learner" in done.stderr
+    chosen = train(mine, "'second-learner:learner'")
+    assert chosen.returncode == 0, chosen.stderr
+
+
+def test_two_trainers_of_one_name_leave_other_agents_alone(two, cli):
+    done = cli(
+        "train", "cartpole", "--agent", "ppo", "--num-envs", "2", "--max-iterations", "1", "--device", "cpu", "-q"
+    )
+    assert done.returncode == 0, done.stderr
+    assert cli("list-tasks").returncode == 0
+
+
+def test_a_trainer_for_a_newer_rlcli_is_refused_with_both_numbers(plugins, mine):
+    plugins("late-learner", TRAINER % ", api=99", entry_points=POINTS % ("late", "late_learner"))
+    done = train(mine, "late")
+    assert done.returncode == 4, done.stderr
+    assert "'late-learner:late' (1.0) needs plugin API 99; this rlcli has 1" in done.stderr
+    assert "pip install --upgrade rlcli" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "line"),
+    [
+        ("rsl-rl", "ppo", "pip install rlcli-rsl-rl"),
+        ("rsl-rl", "{class_name: PPO, gamma: 0.9}", "pip install rlcli-rsl-rl"),
+        ("rl-games", "sac", "pip install rlcli-rl-games"),
+    ],
+)
+def test_a_known_trainer_that_is_not_installed_comes_with_the_pip_line(mine, name, form, line):
+    settings = f"{{trainer: {name}, algorithm: {form}, params: {{config: {{max_epochs: 3}}}}}}"
+    done = mine("train", settings, RLCLI_PLUGINS="rlcli")
+    assert done.returncode == 7, done.stderr
+    assert f"trainer '{name}' is not installed" in done.stderr
+    assert line in done.stderr
+
+
+def test_a_trainer_that_nobody_knows_is_no_dependency(mine):
+    done = train(mine, "skrl")
+    assert done.returncode == 3
+    assert "no trainer 'skrl'" in done.stderr
+    assert "pip" not in done.stderr
+
+
+def test_the_built_in_tasks_train_their_other_agents_without_those_trainers(cli):
+    for task in ("cartpole", "cartpole-direct"):
+        done = cli("train", task, "--num-envs", "2", "--max-iterations", "1", "-q", RLCLI_PLUGINS="rlcli")
+        assert done.returncode == 0, done.stderr
+        checked = cli("validate", task, RLCLI_PLUGINS="rlcli")
+        assert checked.returncode == 0, checked.stderr
+        assert "not checked" in checked.stderr + checked.stdout or "not installed" in checked.stderr + checked.stdout
+
+
+def test_an_algorithm_in_a_librarys_own_form_is_named_by_its_class(plugins, mine):
+    source = """
+    from typing import Any
+    from rlcli.config.schema import AgentConfig
+    from rlcli.trainers import TrainerSpec
+
+    class Settings(AgentConfig):
+        algorithm: dict[str, Any]
+
+    SPEC = TrainerSpec(summary="Own.", algorithms={"ppo": "own:Settings"}, trainer="own:Settings",
+                       refused={"distillation": "it has no teacher"})
+    """
+    plugins("own", textwrap.dedent(source), entry_points=POINTS % ("own", "own"))
+    shown = mine("show", "{trainer: own, algorithm: {class_name: PPO, lr: 1}, max_iterations: 1}")
+    assert shown.returncode == 0, shown.stderr
+    assert "lr: 1" in shown.stdout
+    refused = train(mine, "own", algorithm="{class_name: Distillation}")
+    assert refused.returncode == 3
+    assert "it has no teacher" in refused.stderr
