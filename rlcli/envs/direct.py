@@ -42,6 +42,8 @@ class DirectTask:
     """Their units."""
     action_names: ClassVar[tuple[str, ...]] = ()
     """What the columns of the action drive, for messages and exports."""
+    action_limits: tuple[tuple[float, float], ...] = ()
+    """Lowest and highest of each column: the action space that other libraries see; empty: +-1."""
     motors: ClassVar[bool] = True
     """Give every joint without an actuator a motor, so that the task may set any effort."""
     Params: type[StrictModel] = StrictModel

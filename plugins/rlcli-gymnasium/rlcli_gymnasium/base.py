@@ -42,6 +42,7 @@ class GymnasiumTask(DirectTask):
         self.dtype = self.field.qpos.dtype
         self.start_pos = torch.tensor(self.model.qpos0, dtype=self.dtype, device=self.device)
         self.action_names = tuple(self.model.actuator(a).name.removeprefix("robot/") for a in range(self.model.nu))
+        self.action_limits = tuple((float(low), float(high)) for low, high in self.model.actuator_ctrlrange)
         self.actions = torch.zeros(self.num_envs, self.num_actions, device=self.device)
         self.observation = torch.zeros(self.num_envs, self.num_observations, dtype=self.dtype, device=self.device)
         self.reward = torch.zeros(self.num_envs, dtype=self.dtype, device=self.device)
