@@ -226,6 +226,7 @@ class VecEnv(ABC):
         self._start_over()
         self._restart(self._everyone())
         self._between()
+        self.sim.settle()
         return self._observe()
 
     def step(self, action: Tensor, begin: Tensor | None = None) -> StepResult:
@@ -280,6 +281,7 @@ class VecEnv(ABC):
         if again is not None:
             self._restart(again)  # its draws are those of the same episode: it begins alike
         self._between()
+        self.sim.settle()
         obs = self._observe()
         self.seconds["step"] += time.perf_counter() - start
         return StepResult(obs, reward, terminated, truncated, final_obs, episodes)
@@ -502,8 +504,7 @@ class VecEnv(ABC):
         self._restart_workflow(selection)
         selection.write(self.episode_length_buf, 0)
         selection.write(self._success_hold, 0.0)
-        self.engine.forward(selection)
-        self.sim.refresh_rows(selection)
+        self.sim.moved(selection)
         for sensor in self.sensors.values():
             sensor.reset(selection)
 
