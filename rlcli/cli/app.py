@@ -27,6 +27,7 @@ COMMANDS = {
     "export": "export",
     "replay": "replay",
     "check": "check",
+    "lint": "lint",
     "new": "new",
     "doctor": "doctor",
 }

@@ -18,6 +18,9 @@ def command(
     task: Annotated[str, typer.Argument(help="A task's name, distribution:name, or a folder with a task.yaml.")],
     overrides: Overrides = None,
     only: Annotated[list[str] | None, typer.Option("--only", help="Run only this check; repeatable.")] = None,
+    record: Annotated[
+        bool, typer.Option("--record-layout", help="Write down the columns of observations and actions, for `layout`.")
+    ] = False,
     agent: Agent = None,
     json: Json = False,
     debug: Debug = False,
@@ -28,20 +31,26 @@ def command(
     find_task(task)  # what is not there is said before anything heavy is imported
     import torch
 
-    from rlcli.testing import check_task
+    from rlcli.testing import check_task, record_layout
 
     torch.set_num_threads(1)
+    if record:
+        console.info(f"recorded {record_layout(task, agent=agent, overrides=overrides or ())}")
     checks: list[tuple[str, list[Finding] | None]] = []
+    notes: dict[str, str] = {}
     findings = check_task(
         task,
         agent=agent,
         overrides=overrides or (),
         only=only or (),
         on_check=lambda name, found: checks.append((name, found)),
+        on_note=notes.__setitem__,
     )
     errors = sum(f.severity == "error" for f in findings)
     warnings = len(findings) - errors
     console.table(["CHECK", "RESULT"], [[name, _result(found)] for name, found in checks])
+    for name, text in notes.items():
+        console.data(f"note: {name}: {text}")
     for finding in findings:
         console.data(str(finding))
     console.data(f"{task}: {_count(errors, 'error')}, {_count(warnings, 'warning')}")
@@ -49,7 +58,7 @@ def command(
         "check",
         task=task,
         passed=errors == 0,
-        checks=[{"name": name, "result": _result(found)} for name, found in checks],
+        checks=[{"name": name, "result": _result(found), "note": notes.get(name)} for name, found in checks],
         findings=[asdict(finding) for finding in findings],
     )
     if errors:

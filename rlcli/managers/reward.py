@@ -71,6 +71,10 @@ class RewardManager:
         self._sums += self._values
         return total
 
+    def values(self) -> dict[str, Tensor]:
+        """Term -> what it paid in the last step, weight included; zeros where it is not called. (num_envs,) each"""
+        return {term.name: row for term, row in zip(self.terms, self._rows, strict=True)}
+
     def replace_diverged(self, diverged: Tensor, total: Tensor) -> None:
         """Pay the `divergence_reward`, if there is one, instead of this step's terms."""
         if self._divergence_reward is None:

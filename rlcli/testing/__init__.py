@@ -1,4 +1,6 @@
-"""The contract kit: what every task must keep, found out by running it. For task authors, `rlcli check` and pytest.
+"""The contract kit, what every task must keep, and the linter, what a policy learns well from: both by running it.
+
+For task authors, `rlcli check`, `rlcli lint` and pytest.
 
 ```python
 from rlcli.testing import check_task
@@ -8,6 +10,7 @@ for finding in check_task("acrobot"):
 ```
 """
 
-from rlcli.testing.kit import CHECKS, Finding, check_task
+from rlcli.testing.kit import CHECKS, Finding, check_task, record_layout
+from rlcli.testing.lint import RULES, Remark, lint_task
 
-__all__ = ["CHECKS", "Finding", "check_task"]
+__all__ = ["CHECKS", "RULES", "Finding", "Remark", "check_task", "lint_task", "record_layout"]

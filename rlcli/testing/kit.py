@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -10,11 +9,12 @@ import torch
 
 from rlcli.errors import ConfigError, DependencyError, DeviceError, RlcliError, TaskError, UsageError, did_you_mean
 from rlcli.registry import find_task
-from rlcli.testing import lives, values
-from rlcli.testing.subject import Finding, Subject
+from rlcli.testing import lives, portability, values
+from rlcli.testing.subject import Finding, NotRunError, Subject
 
 Check = Callable[[Subject], Iterable[Finding]]
 OnCheck = Callable[[str, "list[Finding] | None"], None]
+OnNote = Callable[[str, str], None]
 
 CHECKS: dict[str, Check] = {
     "names": values.names,
@@ -34,6 +34,14 @@ CHECKS: dict[str, Check] = {
     "termination": lives.termination,
     "repeated-observation": lives.repeated_observation,
     "observation-after-reset": lives.observation_after_reset,
+    "back-fill": lives.back_fill,
+    "checkpoint": portability.checkpoint,
+    "layout": portability.layout,
+    "threads": portability.threads,
+    "num-envs": portability.num_envs,
+    "speed": portability.speed,
+    "engines": portability.engines,
+    "captured": portability.captured,
 }
 """Name -> check, in the order in which they run. The first line of a check's docstring says what it demands."""
 
@@ -47,6 +55,7 @@ def check_task(
     overrides: Sequence[str] = (),
     only: Sequence[str] = (),
     on_check: OnCheck = lambda name, findings: None,
+    on_note: OnNote = lambda name, text: None,
 ) -> list[Finding]:
     """Check a task against the contract, in a few seconds.
 
@@ -55,7 +64,8 @@ def check_task(
         agent: whose patch of the task and action bound hold; None takes the default agent.
         overrides: `key.path=value`, as on the command line.
         only: names of checks to run; all if empty.
-        on_check: called after each check with its name and findings; with None for a check that could not be run.
+        on_check: called after each check with its name and findings; with None for a check that was not run.
+        on_note: called after a check with its name and what else it has to say: why it was not run, what it measured.
 
     Returns:
         What the task does not keep; empty for a task that is in order.
@@ -68,8 +78,7 @@ def check_task(
     for name in only:
         if name not in CHECKS:
             raise UsageError(f"no check '{name}'", hint=did_you_mean(name, CHECKS) or f"checks: {', '.join(CHECKS)}")
-    path = Path(task)
-    subject = Subject(find_task(str(path.resolve()) if isinstance(task, Path) else task), agent, overrides)
+    subject = _subject(task, agent, overrides)
     chosen = [name for name in CHECKS if (not only or name in only) and (subject.is_direct or name not in _DIRECT_ONLY)]
     found: list[Finding] = []
     with torch.random.fork_rng(devices=[]):
@@ -81,10 +90,35 @@ def check_task(
                 on_check(name, mine or None)
             return found
         for name in chosen:
-            findings = list(_run(name, subject, found))
+            try:
+                findings = list(_run(name, subject, found))
+            except NotRunError as reason:
+                on_check(name, None)
+                on_note(name, f"not run: {reason}")
+                continue
             found += findings
             on_check(name, findings)
+            if name in subject.notes:
+                on_note(name, subject.notes[name])
     return found
+
+
+def record_layout(task: str | Path, *, agent: str | None = None, overrides: Sequence[str] = ()) -> Path:
+    """Write down the columns of a task's observations and actions, beside its configuration; `layout` compares later.
+
+    Returns:
+        The file.
+
+    Raises:
+        ConfigError: if the task is not valid.
+        TaskError: if there is no such task, or it cannot be imported.
+    """
+    return portability.record_layout(_subject(task, agent, overrides))
+
+
+def _subject(task: str | Path, agent: str | None, overrides: Sequence[str]) -> Subject:
+    path = Path(task)
+    return Subject(find_task(str(path.resolve()) if isinstance(task, Path) else task), agent, overrides)
 
 
 def _build(subject: Subject) -> Iterator[Finding]:
@@ -108,6 +142,8 @@ def _build(subject: Subject) -> Iterator[Finding]:
 def _run(name: str, subject: Subject, before: list[Finding]) -> Iterator[Finding]:
     try:
         yield from CHECKS[name](subject)
+    except NotRunError:
+        raise
     except Exception as error:
         yield _stopped(name, subject, error, before)
 
@@ -119,10 +155,4 @@ def _stopped(name: str, subject: Subject, error: Exception, before: list[Finding
     hint = "mend what raises it, then check again"
     if earlier is not None:
         hint = f"see {earlier}"
-    return Finding(name, "error", _place(subject, error), message, hint)
-
-
-def _place(subject: Subject, error: Exception) -> str:
-    """The innermost line of the task's own files, or the task."""
-    own = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).is_relative_to(subject.source.root)]
-    return f"{own[-1].filename}:{own[-1].lineno}" if own else subject.source.label
+    return Finding(name, "error", subject.place(error), message, hint)

@@ -14,6 +14,7 @@ from rlcli.envs.vec_env import StepResult, VecEnv
 from rlcli.testing.subject import (
     NUM_ENVS,
     Finding,
+    NotRunError,
     Subject,
     column_names,
     end_soon,
@@ -46,7 +47,7 @@ def same_seed(subject: Subject) -> Iterator[Finding]:
         ),
     )
     for what, life, hint in lives:
-        difference = _first_difference(env, first, life)
+        difference = first_difference(env, first, life)
         if difference is not None:
             where, message = difference
             yield Finding(
@@ -61,9 +62,10 @@ _RANDOM = (
 _MEMORY = "something outlives the episode: clear it in the term's reset(selection), or in reset_idx"
 
 
-def _first_difference(
+def first_difference(
     env: VecEnv, left: list[dict[str, Tensor]], right: list[dict[str, Tensor]]
 ) -> tuple[str, str] | None:
+    """Where two lives part, and how; None if they are equal bit for bit."""
     for step, (a, b) in enumerate(zip(left, right, strict=True)):
         for what in a:
             if not same(a[what], b[what]):
@@ -117,13 +119,14 @@ class _Twins:
         return results[0], results[1]
 
 
-def _twins(subject: Subject, warm_up: int = 5) -> _Twins:
+def _twins(subject: Subject) -> _Twins:
+    """Twins that have lived for some steps; in the next one episodes of `ended` end."""
     kept, ended = subject.env(episode_steps=50), subject.env(episode_steps=50)
-    twins = _Twins(kept, ended, list(random_actions(kept, subject.bound, 2 * warm_up + 1)))
+    twins = _Twins(kept, ended, list(random_actions(kept, subject.bound, 11)))
     for env in (kept, ended):
         torch.manual_seed(0)
         env.reset(seed=0)
-    for _ in range(warm_up):
+    for _ in range(5):
         twins.step()
     end_soon(ended, _ENDING)
     return twins
@@ -200,6 +203,51 @@ def _ends(subject: Subject, limit: int) -> list[_End]:
             ends.append(_End(limit + 1, False, False, ()))
             break
     return ends
+
+
+def back_fill(subject: Subject) -> Iterator[Finding]:
+    """A new episode's first observation holds nothing of the old one: histories, delays and buffers are filled anew."""
+    require_one_life(subject)
+    env, other = subject.env(episode_steps=50), subject.env(episode_steps=50)
+    for one in (env, other):
+        torch.manual_seed(0)
+        one.reset(seed=0)
+    for number, action in enumerate(random_actions(env, subject.bound, 6)):
+        if number == 5:
+            end_soon(env, _ENDING)
+            end_soon(other, _ENDING)
+        results = []
+        for one, given in ((env, action), (other, -0.5 * action)):
+            torch.manual_seed(number)
+            results.append(one.step(given.clone()))
+    alike = env.episode_index == other.episode_index  # an end of the task's own may have come before
+    rows = [row for row in _ENDING if bool(alike[row])]
+    for group, first in results[0].obs.items():
+        second = first.clone()
+        second[rows] = results[1].obs[group][rows]
+        if not same(first, second):
+            where, message = _difference(env, f"observation '{group}'", first, second, "at its start")
+            yield Finding(
+                "back-fill",
+                "error",
+                where,
+                f"an episode's first one depends on what was done in the episode before: {message}",
+                "fill histories, delays and buffers anew for the environments that are reset, in reset(selection) or"
+                " reset_idx",
+            )
+
+
+def require_one_life(subject: Subject) -> None:
+    """Where starts depend on how episodes went, two lives cannot be compared.
+
+    Raises:
+        NotRunError: then.
+    """
+    task = subject.resolved.task
+    if task.scene.terrain is not None:
+        raise NotRunError("on a terrain an episode starts where the one before led to")
+    if task.curriculum:
+        raise NotRunError("a curriculum may let an episode depend on the one before")
 
 
 def truncation(subject: Subject) -> Iterator[Finding]:
@@ -280,10 +328,15 @@ def repeated_observation(subject: Subject) -> Iterator[Finding]:
 
 
 def _second_look(twins: _Twins) -> dict[str, tuple[Tensor, Tensor]]:
-    env, obs = twins.kept, {group: values.clone() for group, values in twins.step()[0].obs.items()}
+    env = twins.kept
+    memory = env.observation_manager.state_dict() if isinstance(env, ManagedEnv) else {}
+    result = twins.step()[0]
     if isinstance(env, ManagedEnv):
+        obs = {group: values.clone() for group, values in result.obs.items()}
+        running = ~(result.terminated | result.truncated)
+        env.observation_manager.load_state_dict(memory)  # histories and filters look at the same past again
         again = env.observation_manager.compute()
-        return {f"observations.{group}": (values, again[group]) for group, values in obs.items()}
+        return {f"observations.{group}": (values[running], again[group][running]) for group, values in obs.items()}
     task = task_of(env)
     first = {"obs_buf": task.obs_buf.clone(), "states_buf": task.states_buf.clone()}
     env._fill()  # type: ignore[attr-defined]

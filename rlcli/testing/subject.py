@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import contextlib
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from rlcli.config.load import Resolved, resolve
+from rlcli.config.load import Resolved, agent_names, resolve
 from rlcli.envs.direct import DirectEnv, DirectTask
 from rlcli.envs.vec_env import StepResult, VecEnv, make_env
+from rlcli.errors import DependencyError
 from rlcli.registry import TaskSource
 
 NUM_ENVS = 8
@@ -32,6 +36,10 @@ class Finding:
     def __str__(self) -> str:
         """One line."""
         return f"{self.severity}: {self.check}: {self.where}: {self.message}; {self.hint}"
+
+
+class NotRunError(Exception):
+    """Raised by a check that says nothing about this task, or on this machine: why."""
 
 
 @dataclass(slots=True)
@@ -60,6 +68,8 @@ class Subject:
         resolve(source, agent=agent, overrides=overrides)
         resolve(source, agent=agent, overrides=overrides, play=True)
         self.resolved = self._resolve({})
+        self.notes: dict[str, str] = {}
+        """Check -> what else there is to say, besides what it found."""
         self._recording: Recording | None = None
 
     @property
@@ -72,11 +82,15 @@ class Subject:
         """Largest action tried: the agent's bound, or 1 where it has none."""
         return (self.resolved.agent and self.resolved.agent.action_bound) or 1.0
 
-    def env(self, *, episode_steps: int | None = None, seed: int = 0) -> VecEnv:
-        """A new environment of the task; with `episode_steps`, with episodes of that many steps."""
-        step_dt = self.resolved.task.step_dt
-        flags = {} if episode_steps is None else {"episode_length_s": episode_steps * step_dt}
-        return make_env(self._resolve(flags), seed=seed)
+    def env(self, *, episode_steps: int | None = None, seed: int = 0, flags: Mapping[str, Any] | None = None) -> VecEnv:
+        """A new environment of the task; with `episode_steps`, with episodes of that many steps.
+
+        `flags` are further settings, by dotted key.
+        """
+        settings = dict(flags or {})
+        if episode_steps is not None:
+            settings["episode_length_s"] = episode_steps * self.resolved.task.step_dt
+        return make_env(self._resolve(settings), seed=seed)
 
     def recording(self) -> Recording:
         """200 steps of random actions. The first to ask gets the error that ended them, if one did."""
@@ -86,6 +100,26 @@ class Subject:
             if self._recording.error is not None:
                 raise self._recording.error
         return self._recording
+
+    def place(self, error: Exception) -> str:
+        """The innermost line of the task's own files that an error passed through, or the task."""
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [f for f in frames if Path(f.filename).is_relative_to(self.source.root)]
+        return f"{own[-1].filename}:{own[-1].lineno}" if own else self.source.label
+
+    def agents(self) -> dict[str, Resolved]:
+        """The task as each of its agents would train it, those left out whose trainer is not installed."""
+        names = [self._agent] if self._agent else agent_names(self.resolved.layers)
+        found = {}
+        for name in names:
+            with contextlib.suppress(DependencyError):
+                overrides = self._overrides if name == self.resolved.agent_name else self._task_overrides()
+                found[name] = resolve(self.source, agent=name, overrides=overrides)
+        return found
+
+    def _task_overrides(self) -> tuple[str, ...]:
+        """What was overridden besides the chosen agent's settings."""
+        return tuple(override for override in self._overrides if not override.startswith("agent."))
 
     def _resolve(self, flags: dict[str, Any]) -> Resolved:
         small = {"scene.num_envs": NUM_ENVS, "sim.engine_threads": 1}

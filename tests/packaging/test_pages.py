@@ -11,7 +11,7 @@ from fenced import REPOSITORY, blocks, run_commands, success_rate, write_files
 from worlds import CRITTER, CRITTER_TASK, build, edited, write
 
 import rlcli.errors
-from rlcli.testing import CHECKS
+from rlcli.testing import CHECKS, RULES
 
 DOCS = REPOSITORY / "docs"
 README = REPOSITORY / "README.md"
@@ -113,6 +113,11 @@ def test_the_page_on_plugins_lists_every_check():
         name for cell in re.findall(r"^\| (`.*?`) \|", text, re.MULTILINE) for name in re.findall(r"`(.+?)`", cell)
     ]
     assert set(CHECKS) <= set(listed)
+
+
+def test_the_page_on_lint_lists_every_rule():
+    text = (DOCS / "check-and-lint.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `(.*?)` \|", text.partition("## Lint")[2], re.MULTILINE) == list(RULES)
 
 
 def test_links_between_pages_lead_somewhere():

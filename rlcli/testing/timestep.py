@@ -1,0 +1,75 @@
+"""Whether a physics time step is short enough: energy that it makes, and motion that half of it does not show."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from rlcli.envs.vec_env import VecEnv
+
+PASSIVE_S = 1.0
+"""How long the model is left to itself [s]."""
+MAX_STEPS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How the energy of a model that nothing drives depends on the time step."""
+
+    relative: float
+    """Largest difference between the energy at dt and at dt / 2, over the energy that moves to and fro; median over
+    the start states. Infinite where one of the two diverges."""
+    seconds: float
+
+
+def energy_drift(env: VecEnv, starts: int = 8) -> Drift:
+    """Leave the model alone, from the states that `env` is in, once with dt and once with half of it."""
+    model, _ = env.world(0)
+    dt = float(model.opt.timestep)
+    steps = max(1, min(MAX_STEPS, round(PASSIVE_S / dt)))
+    worst = []
+    for number in range(min(starts, env.num_envs)):
+        model, data = env.world(number)
+        coarse, fine = (_energy(model, data, dt / parts, steps, parts) for parts in (1, 2))
+        worst.append(_difference(coarse, fine))
+    return Drift(float(np.median(worst)), steps * dt)
+
+
+def _energy(model: mujoco.MjModel, start: mujoco.MjData, dt: float, steps: int, parts: int) -> np.ndarray:
+    """Potential and kinetic energy after each `parts` steps, without actuators. (steps + 1, 2) [J]; NaN: diverged"""
+    model = copy.copy(model)
+    model.opt.timestep = dt
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    data = mujoco.MjData(model)
+    for name in ("qpos", "qvel", "mocap_pos", "mocap_quat", "eq_active"):
+        getattr(data, name)[:] = getattr(start, name)
+    energy = np.full((steps + 1, 2), np.nan)
+    mujoco.mj_forward(model, data)
+    energy[0] = data.energy
+    for step in range(steps):
+        for _ in range(parts):
+            mujoco.mj_step(model, data)
+        if any(data.warning[kind].number for kind in _DIVERGED):
+            break
+        mujoco.mj_forward(model, data)
+        energy[step + 1] = data.energy
+    return energy
+
+
+_W = mujoco.mjtWarning
+_DIVERGED = [int(w) for w in (_W.mjWARN_BADQPOS, _W.mjWARN_BADQVEL, _W.mjWARN_BADQACC)]
+
+
+def _difference(coarse: np.ndarray, fine: np.ndarray) -> float:
+    if np.isnan(coarse).any():
+        return np.inf
+    if np.isnan(fine).any():
+        return 0.0  # what half the step cannot do either is no matter of the step
+    potential, kinetic = np.concatenate([coarse, fine]).T
+    scale = max(float(np.ptp(fine[:, 0])), float(fine[:, 1].max()))
+    largest = max(scale, 1e-9 * max(float(np.abs(potential).max()), float(kinetic.max())), 1e-12)
+    return float(np.abs(coarse.sum(axis=1) - fine.sum(axis=1)).max()) / largest

@@ -1,0 +1,309 @@
+"""The linter finds each planted defect by its rule and place, and nothing in tasks that are in order."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rlcli.cli.app import main
+from rlcli.testing import RULES, lint_task
+
+ACROBOT = Path(__file__).parents[2] / "plugins" / "rlcli-example-acrobot" / "rlcli_example_acrobot"
+
+
+def lint(folder, **arguments):
+    found = lint_task(folder.write(), **arguments)
+    assert all(f.where and f.message and f.hint and f.numbers for f in found)
+    return found
+
+
+def rules(folder, **arguments):
+    """Rule -> its first remark."""
+    found = {}
+    for remark in lint(folder, **arguments):
+        found.setdefault(remark.rule, remark)
+    return found
+
+
+# --- what is in order ---
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["cartpole", "cartpole-direct", "ant-direct", ACROBOT])
+def test_built_in_tasks_and_the_example_have_nothing_to_remark(task):
+    assert lint_task(task) == []
+
+
+def test_small_tasks_in_order_have_nothing_to_remark(managed, direct):
+    assert lint(managed) == []
+    direct.path = direct.path.with_name("direct")
+    assert lint(direct) == []
+
+
+# --- resets ---
+
+
+def test_start_behind_its_own_termination_is_found(managed):
+    managed.config["terminations"]["fell"] = {"func": "joint_pos_out_of_manual_limit", "bounds": [-0.1, 0.1]}
+    managed.config["rewards"]["alive"] = {"func": "is_alive", "weight": 2.0}
+    found = rules(managed)
+    assert found["early-resets"].severity == "error"
+    assert found["early-resets"].where == "terminations: fell"
+    assert found["early-resets"].numbers["share"] > 0.5
+
+
+def test_direct_task_that_is_done_when_it_begins_is_found(direct):
+    direct.replace("self.obs_buf[:, 0].abs() > 3.0", "self.obs_buf[:, 0].abs() > 0.3")
+    assert rules(direct)["early-resets"].where == "terminations: task"
+
+
+# --- rewards ---
+
+
+def test_reward_that_never_pays_is_found(managed):
+    managed.terms = (
+        "def far(env, *, entity: Entity = 'robot') -> Tensor:\n"
+        "    return (entity.data.joint_pos[:, 0].abs() > 100.0).float()\n"
+    )
+    managed.config["rewards"]["far"] = {"func": "far", "weight": 1.0}
+    (remark,) = lint(managed)
+    assert (remark.rule, remark.where) == ("silent-reward", "rewards.far")
+
+
+def test_reward_of_weight_0_may_be_silent(managed):
+    managed.config["rewards"]["rate"] = {"func": "joint_vel_l2", "weight": 0.0}
+    assert lint(managed) == []
+
+
+def test_reward_beside_which_all_others_are_lost_is_found(managed):
+    managed.config["rewards"]["rate"] = {"func": "joint_vel_l2", "weight": -50.0}
+    (remark,) = lint(managed)
+    assert (remark.rule, remark.where) == ("dominant-reward", "rewards.rate")
+    assert "upright" in remark.message
+    assert remark.numbers["share"] > 0.99
+
+
+def test_reward_that_is_always_the_same_is_found(direct):
+    direct.replace("1.0 - self.obs_buf[:, 0].square()", "1.0")
+    direct.replace("self.obs_buf[:, 0].abs() > 3.0", "self.obs_buf[:, 0].abs() > 1e9")
+    (remark,) = lint(direct)
+    assert (remark.rule, remark.where) == ("constant-reward", "rew_buf")
+
+
+def test_constant_reward_for_living_on_is_in_order(direct):
+    direct.replace("1.0 - self.obs_buf[:, 0].square()", "1.0")
+    assert lint(direct) == []
+
+
+def test_dying_early_that_pays_is_found(managed):
+    managed.config["rewards"] = {
+        "rate": {"func": "joint_vel_l2", "weight": -0.2},
+        "effort": {"func": "action_l2", "weight": -1.0},
+        "life": {"func": "is_alive", "weight": -1.0},
+    }
+    managed.config["terminations"]["fell"] = {"func": "joint_pos_out_of_manual_limit", "bounds": [-2.0, 2.0]}
+    (remark,) = lint(managed)
+    assert (remark.rule, remark.severity) == ("dying-pays", "error")
+    assert remark.numbers["good_step"] < 0.0
+    assert "is_alive" in remark.hint
+
+
+def test_prize_for_falling_is_found(managed):
+    managed.config["rewards"] = {
+        "alive": {"func": "is_alive", "weight": 0.1},
+        "fell": {"func": "is_terminated", "weight": 100.0},
+    }
+    managed.config["terminations"]["fell"] = {"func": "joint_pos_out_of_manual_limit", "bounds": [-2.0, 2.0]}
+    remark = rules(managed)["dying-pays"]
+    assert remark.severity == "warning"
+    assert remark.numbers["last_step"] == pytest.approx(2.0)
+
+
+def test_death_that_costs_more_than_living_on_is_in_order(managed):
+    managed.config["rewards"]["fell"] = {"func": "is_terminated", "weight": -400.0}
+    managed.config["terminations"]["fell"] = {"func": "joint_pos_out_of_manual_limit", "bounds": [-2.0, 2.0]}
+    assert "dying-pays" not in rules(managed)
+
+
+# --- observations and actions ---
+
+
+def test_column_far_out_of_scale_is_found_and_a_scale_proposed(managed):
+    managed.config["observations"]["policy"]["rate"]["scale"] = 1000.0
+    (remark,) = lint(managed)
+    assert remark.rule == "observation-scale"
+    assert "column 1 (rate" in remark.where
+    assert "scale: 0.0001" in remark.hint
+    managed.config["observations"]["policy"]["rate"]["scale"] = 1e-5
+    (remark,) = lint(managed)
+    assert remark.numbers["largest"] < 0.001
+
+
+def test_agent_that_normalises_may_see_any_scale(managed):
+    managed.config["observations"]["policy"]["rate"]["scale"] = 1000.0
+    managed.config["agents"] = agents(normalize_observations=True)
+    assert lint(managed) == []
+
+
+def test_constant_column_is_found(direct):
+    direct.replace("self.obs_buf[:, 1] = self.arms.get_joint_velocities()[:, 0]", "self.obs_buf[:, 1] = 0.5")
+    (remark,) = lint(direct)
+    assert (remark.rule, remark.severity) == ("constant-observation", "error")
+    assert "column 1" in remark.where
+
+
+def test_actuator_that_is_always_at_its_limit_is_found(managed):
+    managed.config["actions"]["torque"]["scale"] = 300.0
+    (remark,) = lint(managed)
+    assert remark.rule == "saturated-actions"
+    assert "joint 'hinge'" in remark.where
+    assert remark.numbers["share"] > 0.9
+
+
+def test_action_that_is_clipped_before_it_arrives_is_found(direct):
+    direct.config["clip_actions"] = 0.05
+    (remark,) = lint(direct)
+    assert remark.rule == "saturated-actions"
+    assert "column 0 of the action" in remark.where
+
+
+@pytest.mark.parametrize("planted", ["without force", "column that nothing reads"])
+def test_action_that_moves_nothing_is_found(planted, managed, direct):
+    if planted == "without force":
+        managed.config["actions"]["torque"]["scale"] = 0.0
+        (remark,) = lint(managed)
+    else:
+        direct.replace("num_actions = 1", "num_actions = 2")
+        direct.replace("self.params.max_effort * actions", "self.params.max_effort * actions[:, :1]")
+        (remark,) = lint(direct)
+        assert "column 1" in remark.where
+    assert (remark.rule, remark.severity) == ("dead-action", "error")
+    assert remark.numbers["moved"] == 0.0
+
+
+# --- time ---
+
+
+def stiff(managed, stiffness, dt):
+    managed.xml = managed.xml.replace('damping="0.05"', f'damping="0" armature="0.0001" stiffness="{stiffness}"')
+    managed.config["sim"] = {"dt": dt}
+    managed.config["decimation"] = 1
+
+
+def test_time_step_at_which_energy_drifts_is_found(managed):
+    stiff(managed, 200.0, 0.02)
+    remark = rules(managed)["timestep"]
+    assert remark.where == "sim.dt = 0.02 s"
+    assert remark.numbers["energy_drift"] > 0.2
+    stiff(managed, 200.0, 0.0005)
+    assert "timestep" not in rules(managed, seconds=0.1)
+
+
+def test_time_step_at_which_the_simulation_diverges_is_found(managed):
+    managed.xml = managed.xml.replace('damping="0.05"', 'armature="0.0001" stiffness="200000"')
+    managed.config["sim"] = {"dt": 0.05, "integrator": "rk4"}
+    remark = rules(managed)["timestep"]
+    assert remark.severity == "error"
+    assert remark.numbers["diverged"] > 0
+
+
+def test_gain_too_high_for_the_time_step_is_found(managed):
+    managed.config["actions"] = {"target": {"func": "joint_position", "joints": ["hinge"]}}
+    managed.config["scene"]["entities"]["robot"]["joints"] = {"hinge": {"kp": 500.0, "kv": 0.0}}
+    managed.config["sim"] = {"dt": 0.05}
+    assert "timestep" in rules(managed)
+
+
+@pytest.mark.parametrize(("gamma", "found"), [(0.5, True), (0.99, False), (0.99999, True)])
+def test_discount_that_looks_far_less_or_more_than_an_episode_is_found(gamma, found, managed):
+    managed.config["agents"] = agents(gamma=gamma)
+    remarks = lint(managed, only=["horizon"])
+    assert [r.where for r in remarks] == ([f"agents.sb3.gamma = {gamma:g}"] if found else [])
+    assert all(r.numbers["episode"] == 100 for r in remarks)
+
+
+def agents(**settings):
+    return {"default": "sb3", "sb3": {"trainer": "sb3", "algorithm": "ppo", "max_iterations": 1, **settings}}
+
+
+def test_every_agent_of_the_task_is_judged_unless_one_is_chosen(managed):
+    managed.config["agents"] = agents() | {"other": {**agents()["sb3"], "gamma": 0.1}}
+    assert [r.where for r in lint(managed, only=["horizon"])] == ["agents.other.gamma = 0.1"]
+    assert lint(managed, only=["horizon"], agent="sb3") == []
+
+
+# --- the rules themselves ---
+
+
+def test_a_task_that_raises_in_a_step_is_one_remark_with_its_place(direct):
+    direct.replace(
+        "    def is_done(self):\n",
+        "    def is_done(self):\n        if self.env.common_step > 5:\n            raise KeyError('late')\n",
+    )
+    (remark,) = lint(direct)
+    assert remark.rule == "stops"
+    assert "KeyError: 'late'" in remark.message
+    assert "task.py:" in remark.where
+
+
+def test_a_task_that_raises_before_its_first_step_is_one_remark_too(direct):
+    direct.replace("    def is_done(self):\n", "    def is_done(self):\n        raise KeyError('done')\n")
+    (remark,) = lint(direct)
+    assert remark.numbers == {"step": 0}
+
+
+def test_the_same_task_gets_the_same_remarks_again(managed):
+    managed.config["observations"]["policy"]["rate"]["scale"] = 1000.0
+    assert lint(managed) == lint(managed)
+
+
+def test_every_rule_has_a_docstring_that_says_what_it_wants():
+    assert all((rule.__doc__ or "").split("\n")[0].endswith(".") for rule in RULES.values())
+
+
+# --- the command ---
+
+
+def command(capsys, *arguments):
+    """(exit code, stdout, stderr) of `rlcli lint`."""
+    code = main(["lint", *map(str, arguments)])
+    return code, *capsys.readouterr()
+
+
+def test_task_in_order_ends_with_0_and_a_table(managed, capsys):
+    code, out, err = command(capsys, managed.write(), "--seconds", "0.5")
+    assert code == 0
+    assert out.splitlines()[0].split() == ["RULE", "RESULT"]
+    assert [line.split()[0] for line in out.splitlines()[1:-1]] == list(RULES)
+    assert out.splitlines()[-1].endswith("0 errors, 0 warnings")
+    assert err == ""
+
+
+def test_a_warning_ends_with_9_and_can_be_ignored(managed, capsys):
+    managed.config["agents"] = agents(gamma=0.5)
+    code, out, _ = command(capsys, managed.write(), "--seconds", "0.2")
+    assert code == 9
+    assert "warning: horizon: agents.sb3.gamma = 0.5" in out
+    assert command(capsys, managed.path, "--seconds", "0.2", "--ignore", "horizon")[0] == 0
+
+
+def test_json_is_one_document_with_rules_findings_and_numbers(managed, capsys):
+    managed.config["actions"]["torque"]["scale"] = 0.0
+    code, out, _ = command(capsys, managed.write(), "--json", "--seconds", "0.2")
+    document = json.loads(out)
+    assert code == 9
+    assert document["passed"] is False
+    assert {r["name"]: r["result"] for r in document["rules"]}["dead-action"] == "error"
+    (finding,) = document["findings"]
+    assert set(finding) == {"rule", "severity", "where", "message", "hint", "numbers"}
+    assert finding["numbers"]["moved"] == 0.0
+
+
+def test_unknown_rule_task_and_time_are_refused(managed, capsys):
+    folder = managed.write()
+    code, _, err = command(capsys, folder, "--only", "horizons")
+    assert code == 2
+    assert "did you mean 'horizon'" in err
+    assert command(capsys, folder, "--seconds", "-1")[0] == 2
+    assert command(capsys, "cartpoel")[0] == 4
+    assert command(capsys, folder, "decimation=0")[0] == 3
