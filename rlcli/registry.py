@@ -471,18 +471,41 @@ def _neighbours(folder: Path) -> Iterator[None]:
 
 
 def model_file(root: Path, model: str) -> Path:
-    """Where a task in `root` finds a model: in its own folder, or as `TASK:FILE` in that of an installed task.
+    """Where a task in `root` finds a model.
+
+    In its own folder; as `TASK:FILE` in that of an installed task; as `package:PACKAGE/FILE` in an installed package,
+    which is not imported.
 
     Raises:
-        TaskError: if there is no such task, or the file is not in its folder.
+        TaskError: if there is no such task or package, or the file is not in its folder.
     """
     task, _, file = model.rpartition(":")
     if not task:
         return root / model
+    if task == "package":
+        return _package_file(file)
     home = installed_task(find_entry(TASKS, task, what="task")).root
     if not (home / file).resolve().is_relative_to(home.resolve()):
         raise TaskError(f"'{file}' lies outside the folder {home} of task '{task}'")
     return home / file
+
+
+def _package_file(model: str) -> Path:
+    """A file in a package, by `PACKAGE/FILE`."""
+    package, _, file = model.partition("/")
+    try:
+        found = importlib.util.find_spec(package) if package.isidentifier() else None
+    except (ImportError, ValueError):
+        found = None
+    places = [Path(place) for place in (found.submodule_search_locations or ())] if found else []
+    if not places:
+        raise TaskError(f"no Python package '{package}' is installed", hint="write package:PACKAGE/FILE")
+    place = next((place for place in places if (place / file).is_file()), places[0])
+    if not (place / file).resolve().is_relative_to(place.resolve()):
+        raise TaskError(f"'{file}' lies outside the package '{package}' in {place}")
+    if not (place / file).is_file():
+        raise TaskError(f"no file '{file}' in the package '{package}' in {place}")
+    return place / file
 
 
 def import_file(file: Path) -> Any:

@@ -17,7 +17,7 @@ LAYERS = [
     {"sim"},
     {"managers", "mdp", "envs", "oige"},
     {"rl", "viewer", "adapters", "testing", "pytest_plugin", "isaaclab", "diagnosis", "scaffold"},
-    {"cli"},
+    {"cli", "gym"},
 ]
 ANYWHERE = {"rlcli", "rlcli.__main__"}
 """The package itself, which imports nothing, and what starts the command line."""

@@ -10,6 +10,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv as Sb3Base
 
+from rlcli.adapters.gymnasium import Changes, open_task
 from rlcli.envs.vec_env import StepResult, VecEnv
 
 UNBOUNDED = 1e6
@@ -92,3 +93,10 @@ class Sb3VecEnv(Sb3Base):
                 if ended.success is not None:
                     infos[env]["is_success"] = bool(ended.success[row])
         return infos
+
+
+def make_sb3(
+    task: str, num_envs: int = 1, cfg: Changes = None, *, action_bound: float | None = 1.0, **settings: Any
+) -> Sb3VecEnv:
+    """Environments of a task for SB3's own scripts; see `rlcli.adapters.gymnasium.open_task` for the arguments."""
+    return Sb3VecEnv(open_task(task, num_envs, cfg, **settings), action_bound)

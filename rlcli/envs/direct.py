@@ -42,6 +42,10 @@ class DirectTask:
     """Their units."""
     action_names: ClassVar[tuple[str, ...]] = ()
     """What the columns of the action drive, for messages and exports."""
+    action_limits: tuple[tuple[float, float], ...] = ()
+    """Lowest and highest of each column: the action space that other libraries see; empty: +-1."""
+    motors: ClassVar[bool] = True
+    """Give every joint without an actuator a motor, so that the task may set any effort."""
     Params: type[StrictModel] = StrictModel
     """Model of the YAML's `params:`."""
 
@@ -124,7 +128,8 @@ class DirectEnv(VecEnv):
             raise ConfigError([self.resolved.problem(("params",), " ".join(str(error).split()))]) from None
         self.task: DirectTask = task_class(self, params)
         self.task.set_up_scene(scene)
-        scene.add_motors()
+        if task_class.motors:
+            scene.add_motors()
 
     def _task_class(self) -> type[DirectTask]:
         """The task's class, imported."""

@@ -229,8 +229,13 @@ class VecEnv(ABC):
         self.sim.settle()
         return self._observe()
 
-    def step(self, action: Tensor) -> StepResult:
+    def step(self, action: Tensor, begin: Tensor | None = None) -> StepResult:
         """Apply one action for `decimation` physics steps. action (num_envs, a) float32
+
+        Args:
+            action: of every environment.
+            begin: environments that sit this step out: in its end they are where their running episode began, with
+                reward 0. (num_envs,) bool
 
         Raises:
             DivergedError: for an action, observation or reward that is not finite; divergence of the simulation is not
@@ -244,6 +249,8 @@ class VecEnv(ABC):
                 f"action has shape {tuple(action.shape)}, expected {(self.num_envs, self.layout.action_size)}"
             )
         self.engine.attach()
+        if begin is not None:
+            action = action.masked_fill(begin[:, None], 0.0)
         self._require_finite(action, "the policy's action")
 
         self._act(action)
@@ -258,6 +265,8 @@ class VecEnv(ABC):
         self._require_finite(reward, "the reward")
         self._hold_success()
 
+        if begin is not None:
+            reward, terminated, truncated = reward.masked_fill(begin, 0.0), terminated & ~begin, truncated & ~begin
         final_obs, episodes = None, None
         finished = terminated | truncated
         self.episode_index += finished  # before the selection: what begins now draws from its own counter
@@ -268,6 +277,9 @@ class VecEnv(ABC):
             episodes = self._episodes(ended, finished, terminated, truncated)
             self._conclude(ended)
             self._restart(ended)
+        again = None if begin is None else self._select(begin)
+        if again is not None:
+            self._restart(again)  # its draws are those of the same episode: it begins alike
         self._between()
         self.sim.settle()
         obs = self._observe()

@@ -48,11 +48,30 @@ _NONE, _VEL, _ACC = (
 
 
 class BatchEngine:
-    """Many worlds of one model on CPU threads. Physics is float64."""
+    """Many worlds of one model on CPU threads. Physics is float64.
+
+    Args:
+        model: the compiled model.
+        num_envs: worlds.
+        threads: that step them.
+        forces_after_reset: whether `forward` computes the acceleration stage, or leaves zeros there.
+        late: derived fields are left as the last substep made them.
+        external_forces: compute `cfrc_ext`, exactly. Batch itself does so for models with certain sensors alone, and
+            with RK4 at the wrong one of a substep's stages.
+    """
 
     asynchronous = False
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, threads: int, forces_after_reset: bool = True) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        threads: int,
+        forces_after_reset: bool = True,
+        *,
+        late: bool = False,
+        external_forces: bool = False,
+    ) -> None:
         quiet_mujoco()
         self.model = model
         self.num_envs = num_envs
@@ -60,14 +79,21 @@ class BatchEngine:
         self.threads = threads
         self.divergences = 0
         self.warnings = dict.fromkeys(_NOTED, 0)
-        self._batch = Batch(model, num_envs, threads)
+        self._batch = Batch(model, num_envs, threads, persistent=external_forces)
         self._state = torch.from_numpy(self._batch.state)
         self._warning_words = self._batch.warning.reshape(-1).view(np.int64)
         self._default = self._default_row()
         self._fields: dict[str, Tensor] = {}
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
+        self._late = late
         self._step_stage = _NONE
-        self._forward_stage = _NONE
+        self._forward_stage = _ACC if late else _NONE  # a start state gets what `mj_forward` makes, warm start included
+        self._external: Tensor | None = None
+        if external_forces:
+            self._external = torch.zeros(num_envs, model.nbody, 6, dtype=torch.float64)
+            self._fields["cfrc_ext"] = self._external
+            self._contacts = self._batch.bind("ncon")
+            self._world = mujoco.MjData(model)
         self._own_constants = False
         self.forces_after_reset = forces_after_reset
         self._reset_stage = _ACC if forces_after_reset else _VEL
@@ -86,7 +112,7 @@ class BatchEngine:
                 bound = torch.from_numpy(self._batch.bind(name))
             if self._of_substep(name):
                 self._forward_stage = _ACC
-            if name not in _NOT_DERIVED and name not in _ACCELERATION and not self._senses_forces_alone(name):
+            if name not in _NOT_DERIVED and not self._late and not self._of_forces_alone(name):
                 self._step_stage = _VEL
                 self._forward_stage = max(self._forward_stage, _VEL)
             if name not in _NOT_DERIVED:
@@ -126,6 +152,21 @@ class BatchEngine:
             self._batch.step(nstep=nstep, stage=self._step_stage if derive else _NONE)
         except SimulationError as error:
             raise _engine_error(error) from None
+        if self._external is not None and derive:
+            self._feel(self._external.numpy())
+
+    def _feel(self, forces: np.ndarray) -> None:
+        """Compute `cfrc_ext` of the last substep. It is 0 where nothing touches, pushes or holds a body."""
+        acts = self._contacts.reshape(-1) > 0
+        if "xfrc_applied" in self._fields:
+            acts |= self._fields["xfrc_applied"].numpy().any(axis=(1, 2))
+        if self.model.neq:
+            acts[:] = True
+        forces[~acts] = 0.0
+        for world in acts.nonzero()[0]:
+            self._batch.get_data(world, self._world)
+            mujoco.mj_rnePostConstraint(self.model, self._world)
+            forces[world] = self._world.cfrc_ext
 
     def diverged(self) -> Tensor | None:
         """Worlds whose warning counters rose in the last step.
@@ -152,6 +193,8 @@ class BatchEngine:
 
     def forward(self, selection: Selection) -> None:
         """Compute what is bound of the derived fields of the selected worlds."""
+        if self._external is not None:
+            selection.write(self._external, 0.0)  # no contact has acted on a start state yet
         if self._forward_stage == _NONE:
             return
         forces = self._forces(selection) if self._reset_stage < self._forward_stage else []
@@ -274,12 +317,14 @@ class BatchEngine:
         """Whether the field holds sensors of the acceleration stage."""
         return name == "sensordata" and bool(self._force_sensors)
 
-    def _senses_forces_alone(self, name: str) -> bool:
-        """Whether the field holds sensors of the acceleration stage and no others: no other stage writes it."""
-        return name == "sensordata" and len(self._force_sensors) == self.model.nsensordata
+    def _of_forces_alone(self, name: str) -> bool:
+        """Whether the acceleration stage alone writes the field; of sensors, whether there are no others."""
+        if name == "sensordata":
+            return len(self._force_sensors) == self.model.nsensordata
+        return name in _ACCELERATION
 
     def _of_substep(self, name: str) -> bool:
-        return name in _ACCELERATION or self._senses(name)
+        return name in _ACCELERATION or self._senses(name) or (self._late and name not in _NOT_DERIVED)
 
     def _default_row(self) -> np.ndarray:
         data = mujoco.MjData(self.model)

@@ -45,7 +45,7 @@ class Engine(Protocol):
         """A live view of an MjData field: state fields are writable, derived ones (xpos, ...) must only be read.
 
         Position- and velocity-dependent fields are current after `step` and `forward`; acceleration-dependent ones
-        (qacc, actuator_force, ...) are those of the last substep.
+        (qacc, actuator_force, ...) are those of the last substep. With `sim.derived_fields: substep` all are.
         """
         ...
 
@@ -164,14 +164,29 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
     if wanted == "batch":
         from rlcli.sim.batch import BatchEngine
 
-        return BatchEngine(model, num_envs, config.engine_threads or available_cores(), config.forces_after_reset)
+        return BatchEngine(
+            model,
+            num_envs,
+            config.engine_threads or available_cores(),
+            config.forces_after_reset,
+            late=config.derived_fields == "substep",
+            external_forces=config.external_forces,
+        )
     require_device(device)
     try:
         from rlcli.sim.warp import WarpEngine
     except ImportError as error:
         raise DependencyError(f"the GPU engine needs mujoco-warp: {error}", hint='pip install "rlcli[gpu]"') from None
     room = capacity(model, config.contacts_per_env, config.constraints_per_env)
-    return WarpEngine(model, num_envs, device, room, config.forces_after_reset)
+    return WarpEngine(
+        model,
+        num_envs,
+        device,
+        room,
+        config.forces_after_reset,
+        late=config.derived_fields == "substep",
+        external_forces=config.external_forces,
+    )
 
 
 _BODY_FORCE_SENSORS = [

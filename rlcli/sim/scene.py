@@ -21,6 +21,7 @@ from rlcli.config.schema import (
 )
 from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
 from rlcli.registry import model_file
+from rlcli.sim.engine import quiet_mujoco
 from rlcli.sim.names import NameProblem, match
 from rlcli.sim.terrain import BODY as TERRAIN
 from rlcli.sim.terrain import Ground, add_ground, make_ground, misfits
@@ -94,6 +95,7 @@ class Scene:
     """A scene under construction; `spec` is open to a direct task's `set_up_scene` until it is compiled."""
 
     def __init__(self, config: SceneConfig, sim: SimConfig, root: Path) -> None:
+        quiet_mujoco()  # attaching a model whose options differ from the scene's logs each of them
         self.config = config.model_copy(update={"entities": dict(config.entities)})
         self.sim = sim
         self.root = root.resolve()
@@ -166,6 +168,8 @@ class Scene:
         """Add an entity to the scene; `child` is its model, which `entity.model` need not name."""
         self.config.entities[name] = entity
         _name_all(child)
+        if child.compiler.settotalmass > 0:
+            _settle_masses(child)
         models = [other for other, config in self.config.entities.items() if config.model is not None]
         if name == next(iter(models), None):
             for option in _OPTIONS:
@@ -539,6 +543,21 @@ def _name_all(child: mujoco.MjSpec) -> None:
                     wanted += "_"
                 element.name = wanted
                 taken.add(wanted)
+
+
+def _settle_masses(child: mujoco.MjSpec) -> None:
+    """Write down the mass and inertia of every body: attaching would lose the MJCF's `settotalmass`."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # MuJoCo means to drop the attribute; models have it
+        model = child.compile()
+    for body in child.bodies[1:]:
+        compiled = model.body(body.name)
+        body.explicitinertial = True
+        body.fullinertia[:] = np.nan
+        body.mass, body.inertia = float(compiled.mass[0]), compiled.inertia
+        body.ipos, body.iquat = compiled.ipos, compiled.iquat
+    child.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    child.compiler.settotalmass = -1.0
 
 
 def _override(joint: mujoco.MjsJoint, change: JointConfig, *, degrees: bool) -> None:

@@ -90,6 +90,8 @@ class WarpEngine:
         device: cuda, cuda:N, or cpu.
         capacity: room for contacts and constraints in a world.
         forces_after_reset: whether `forward` computes the acceleration stage, or leaves zeros there.
+        late: derived fields are left as the last substep made them.
+        external_forces: compute `cfrc_ext`, which MuJoCo Warp does for models with certain sensors alone.
 
     Raises:
         ConfigError: for a model that MuJoCo Warp cannot run.
@@ -106,6 +108,9 @@ class WarpEngine:
         device: str,
         capacity: Capacity,
         forces_after_reset: bool = True,
+        *,
+        late: bool = False,
+        external_forces: bool = False,
     ) -> None:
         quiet_mujoco()
         self.model = model
@@ -124,6 +129,8 @@ class WarpEngine:
         self._motion_alone = True
         self._overwritten: dict[str, wp.array] = {}
         self.forces_after_reset = forces_after_reset
+        self._late = late
+        self._external_forces = external_forces
         force_columns = force_sensors(model)
         self._sensor_stages = {_FORCE} if force_columns else set()
         if len(force_columns) < model.nsensordata:
@@ -183,7 +190,7 @@ class WarpEngine:
                     mjw.forward(self._model, self._data)  # a field asked for late is that of the state
                 for other, values in kept.items():
                     self._fields[other].copy_(values)
-                if _FORCE in self._stages(name):
+                if _FORCE in self._stages(name) or (self._late and self._fields[name].dtype == torch.float32):
                     self._last_derived[name] = self._fields[name].clone()
         return self._fields[name]
 
@@ -404,8 +411,11 @@ class WarpEngine:
     def _advance(self, nstep: int, derive: bool) -> None:
         for _ in range(nstep):
             mjw.step(self._model, self._data)
+        if derive and self._external_forces:
+            mjw.rne_postconstraint(self._model, self._data)
         if derive:
             self._guard()
+        if derive and not self._late:
             self._derive()
 
     def _guard(self) -> None:
@@ -465,10 +475,10 @@ class WarpEngine:
         return _VELOCITY not in self._stages(name) or name in _MOTION
 
     def _of_substep(self) -> list[str]:
-        return [name for name in self._fields if _FORCE in self._stages(name)]
+        return [name for name in self._fields if _FORCE in (stages := self._stages(name)) or (self._late and stages)]
 
     def _forward(self, selection: Selection) -> None:
-        if _FORCE not in self._derived or not self.forces_after_reset:
+        if not self._late and (_FORCE not in self._derived or not self.forces_after_reset):
             with self._launching():
                 self._derive()
             return
@@ -480,6 +490,8 @@ class WarpEngine:
             new = now.clone()
             now.copy_(old)
             selection.write(now, new)
+        if self._external_forces and "cfrc_ext" in before:  # no contact has acted on a start state yet
+            selection.write(self._fields["cfrc_ext"], 0.0)
 
     def _launch_rows(self, kernel: wp.Kernel, mask: Tensor, now: Tensor, last: Tensor) -> None:
         flat = [wp.from_torch(values.view(self.num_envs, -1)) for values in (now, last)]

@@ -355,10 +355,12 @@ def observation_after_reset(subject: Subject) -> Iterator[Finding]:
         return result
 
     task.get_observations = watched  # type: ignore[method-assign]
-    twins.step()
+    result = twins.step()[1]
+    over = (result.terminated | result.truncated).tolist()
+    running = [row for row in _RUNNING if not over[row]]  # some may end by themselves just now
     for before, after in pairwise(seen):
-        if not same(before[_RUNNING], after[_RUNNING]):
-            rows = [row for row in _RUNNING if not same(before[row], after[row])]
+        rows = [row for row in running if not same(before[row], after[row])]
+        if rows:
             yield Finding(
                 "observation-after-reset",
                 "error",

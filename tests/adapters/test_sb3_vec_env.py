@@ -6,7 +6,7 @@ import torch
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
-from rlcli.adapters.sb3 import Sb3VecEnv
+from rlcli.adapters.sb3 import Sb3VecEnv, make_sb3
 from rlcli.config.load import resolve
 from rlcli.envs.vec_env import make_env
 from rlcli.registry import find_task
@@ -81,3 +81,9 @@ def test_sb3_itself_learns_in_it(vec, algorithm):
     model = algorithm("MlpPolicy", vec, n_steps=8, seed=1, device="cpu", **sizes)
     model.learn(48)
     assert model.num_timesteps == 48
+
+
+def test_a_task_is_made_for_sb3_by_its_name():
+    vec = make_sb3("cartpole", num_envs=2, cfg={"episode_length_s": 0.1}, action_bound=2.0)
+    assert (vec.num_envs, vec.env.max_episode_length) == (2, 6)
+    assert vec.action_space.high.tolist() == [2.0]

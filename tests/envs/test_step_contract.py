@@ -245,6 +245,31 @@ def test_partial_reset_leaves_other_envs_untouched(tmp_path, name):
     assert not torch.equal(rows[0][1], rows[1][1])
 
 
+@pytest.mark.parametrize("name", ["ant-direct", "cartpole", "cartpole-direct", "critter"])
+def test_who_sits_a_step_out_begins_alike_and_the_others_do_not_notice(tmp_path, name):
+    task = critter(tmp_path) if name == "critter" else name
+    waiting, plain = (build(task, 6) for _ in range(2))
+    for env in (waiting, plain):
+        run(env, 7)
+        env.episode_length_buf[[1, 4]] = env.max_episode_length - 1
+    action = torch.full((6, plain.layout.action_size), 0.1)
+    plain.step(action)
+    first = waiting.step(action).obs["policy"][[1, 4]].clone()
+    begin = torch.tensor([False, True, False, False, True, False])
+    index = waiting.episode_index.clone()
+    sat, went = waiting.step(action.masked_fill(begin[:, None], torch.nan), begin), plain.step(action)
+    rest = [0, 2, 3, 5]
+    for group in went.obs:
+        assert torch.equal(sat.obs[group][rest], went.obs[group][rest])
+    assert torch.equal(sat.reward[rest], went.reward[rest])
+    assert not sat.reward[begin].any()
+    assert not (sat.terminated | sat.truncated)[begin].any()
+    assert torch.equal(waiting.episode_index, index)
+    assert waiting.episode_length_buf[begin].tolist() == [0, 0]
+    if name != "critter":  # whose observations are noisy, and whose commands are drawn by the step
+        assert torch.equal(sat.obs["policy"][begin], first)
+
+
 def events(env, tag):
     return [(step, ids) for t, step, ids in getattr(env, "notes", []) if t == tag]
 

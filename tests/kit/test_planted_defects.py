@@ -336,6 +336,11 @@ def test_running_rows_that_change_with_a_reset_of_others_are_found(direct):
     assert "[0, 2, 3, 6, 7]" in finding.message
 
 
+def test_environments_that_end_by_themselves_meanwhile_are_no_finding(direct):
+    direct.replace("self.obs_buf[:, 0].abs() > 3.0", "self.obs_buf[:, 0].abs() > 0.3")
+    assert "observation-after-reset" not in errors(direct)
+
+
 # --- isolation ---
 
 

@@ -68,6 +68,16 @@ def test_the_examples_for_isaac_labs_users_train_as_written(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("number", range(3))
+def test_the_scripts_for_other_libraries_run_as_written(number, tmp_path):
+    found = [block.text for block in blocks(DOCS / "adapters.md") if block.language == "python"]
+    assert len(found) == 3
+    done = subprocess.run([sys.executable, "-c", found[number]], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r"(steps (512|1024)|best return \S+)\n", done.stdout)
+
+
+@pytest.mark.slow
 def test_the_readmes_task_of_your_own_works_as_written(tmp_path):
     found = blocks(README, "## A task of your own", "## Licence")
     write_files(found, tmp_path)

@@ -1,6 +1,7 @@
 """From MJCF files to a model: what the configuration says is what the compiled model has."""
 
 import math
+import warnings
 
 import mujoco
 import numpy as np
@@ -37,11 +38,8 @@ ARM = """
 </mujoco>
 """
 
-ARM_TASK = edited(
-    PENDULUM_TASK,
-    scene={"entities": {"robot": {"model": "arm.xml"}}},
-    actions={"torque": {"func": "joint_effort", "joints": ["shoulder"], "scale": 20.0}},
-)
+ARM_ACTIONS = {"torque": {"func": "joint_effort", "joints": ["shoulder"], "scale": 20.0}}
+ARM_TASK = edited(PENDULUM_TASK, scene={"entities": {"robot": {"model": "arm.xml"}}}, actions=ARM_ACTIONS)
 
 
 def arm(tmp_path, xml=ARM, robot=None, **changes):
@@ -338,3 +336,49 @@ def test_a_model_that_does_not_compile_is_a_configuration_error(tmp_path):
     xml = ARM.replace('<geom size="0.03" mass="0.2"', '<geom size="0.03" mass="0"').replace('mass="0.5"', 'mass="0"')
     with pytest.raises(ConfigError, match=r"MuJoCo cannot compile the model: .*mass"):
         build(arm(tmp_path, xml=xml))
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_total_mass_that_a_model_asks_for_is_kept_for_each_entity(tmp_path, number):
+    xml = ARM.replace('autolimits="true"', 'autolimits="true" settotalmass="14"')
+    entities = {f"arm_{i}": {"model": "arm.xml"} for i in range(number)}
+    task = edited(PENDULUM_TASK, scene={"entities": {"robot": {"model": "arm.xml"}, **entities}}, actions=ARM_ACTIONS)
+    model = build(write(tmp_path / "arm", task, arm_xml=xml)).engine.model
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        alone = mujoco.MjModel.from_xml_string(xml)
+    for name in ("robot", *entities):
+        for body in ("upper", "ball", "lower"):
+            attached, own = model.body(f"{name}/{body}"), alone.body(body)
+            for field in ("mass", "inertia", "ipos", "iquat"):
+                np.testing.assert_array_equal(getattr(attached, field), getattr(own, field), err_msg=f"{body} {field}")
+    assert model.body_mass.sum() == pytest.approx(14.0 * (number + 1))
+
+
+def test_attaching_a_model_with_options_of_its_own_prints_nothing(tmp_path, capfd):
+    model_of(tmp_path, xml=ARM.replace("<option ", '<option timestep="0.003" '))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_model_may_lie_in_an_installed_package_that_is_not_imported(tmp_path, monkeypatch):
+    package = tmp_path / "site" / "armory" / "assets"
+    package.mkdir(parents=True)
+    (package.parent / "__init__.py").write_text("raise SystemExit('imported')\n")
+    (package / "arm.xml").write_text(ARM)
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    model = model_of(tmp_path, robot={"model": "package:armory/assets/arm.xml"})
+    assert joint(model, "robot/elbow") >= 0
+
+
+@pytest.mark.parametrize(
+    ("reference", "said"),
+    [
+        ("package:no_such_package_here/arm.xml", "no Python package 'no_such_package_here'"),
+        ("package:numpy/arm.xml", "no file 'arm.xml' in the package 'numpy'"),
+        ("package:numpy/../arm.xml", "lies outside the package 'numpy'"),
+    ],
+)
+def test_a_model_that_is_in_no_package_is_refused(tmp_path, reference, said):
+    with pytest.raises(ConfigError) as refused:
+        model_of(tmp_path, robot={"model": reference})
+    assert said in str(refused.value)

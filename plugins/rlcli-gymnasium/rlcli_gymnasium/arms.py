@@ -1,0 +1,129 @@
+"""Reacher and pusher: an arm reaches a point, and pushes a puck to one."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from rlcli.config.schema import StrictModel
+from rlcli.sim.rotations import length
+from rlcli.sim.selection import Selection
+
+from .base import GymnasiumTask
+
+_CANDIDATES = 32
+"""Draws for the puck's place; 38% of the area is taken, so that all of them fail once in 10^13 episodes."""
+
+
+class _Arm(GymnasiumTask):
+    """Looks up bodies by name."""
+
+    reads = ("xpos",)
+
+    def place(self, body: str) -> Tensor:
+        """Where a body is, a physics step late. (num_envs, 3) [m]"""
+        return self.field.xpos[:, self.bodies[body]]
+
+    def post_reset(self) -> None:
+        """Bodies by name."""
+        model = self.env.engine.model
+        self.bodies = {model.body(b).name.removeprefix("robot/"): b for b in range(model.nbody)}
+        super().post_reset()
+
+    def velocities(self, selection: Selection, still: int) -> Tensor:
+        """Small ones for the arm, none for the last joints, which are not driven. (rows, nv)"""
+        noise = self.noise(selection, 0.005, self.model.nv)
+        noise[:, -still:] = 0.0
+        return noise
+
+
+class Reacher(_Arm):
+    """Reacher-v5: two links in a plane."""
+
+    num_observations = 10
+    num_actions = 2
+    observation_names = (
+        *("cos_1", "cos_2", "sin_1", "sin_2", "target_x", "target_y"),
+        *("vel_1", "vel_2", "to_fingertip_x", "to_fingertip_y"),
+    )
+    observation_units = ("", "", "", "", "m", "m", "rad/s", "rad/s", "m", "m")
+
+    class Params(StrictModel):
+        """The task's settings, by Gymnasium's names."""
+
+        reward_dist_weight: float = Field(1.0, description="Penalty on the distance to the target [1/m].")
+        reward_control_weight: float = Field(1.0, description="Penalty on the sum of squared actions.")
+
+    params: Params
+
+    def columns(self) -> list[Tensor]:
+        """The arm, the target, and the way between."""
+        qpos, angles = self.field.qpos, self.field.qpos[:, :2]
+        return [angles.cos(), angles.sin(), qpos[:, 2:], self.field.qvel[:, :2], self.gap()[:, :2]]
+
+    def gap(self) -> Tensor:
+        """From the target to the fingertip. (num_envs, 3) [m]"""
+        return self.place("fingertip") - self.place("target")
+
+    def score(self) -> Tensor:
+        """Distance and actions cost."""
+        params = self.params
+        return -length(self.gap()) * params.reward_dist_weight - self.action_cost(params.reward_control_weight)
+
+    def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """The arm near straight, the target anywhere within 0.2 m."""
+        qpos = self.start_pos + self.noise(selection, 0.1, self.model.nq)
+        radius, turn = 0.2 * selection.uniform(0.0, 1.0).sqrt(), selection.uniform(-math.pi, math.pi)
+        qpos[:, -2:] = torch.stack([radius * turn.cos(), radius * turn.sin()], dim=1)
+        return qpos, self.velocities(selection, 2)
+
+
+class Pusher(_Arm):
+    """Pusher-v5: an arm of seven joints pushes a puck."""
+
+    num_observations = 23
+    num_actions = 7
+    observation_names = (
+        *(f"qpos_{i}" for i in range(7)),
+        *(f"qvel_{i}" for i in range(7)),
+        *(f"{what}_{axis}" for what in ("tips", "object", "goal") for axis in "xyz"),
+    )
+    observation_units = (*("rad",) * 7, *("rad/s",) * 7, *("m",) * 9)
+
+    class Params(StrictModel):
+        """The task's settings, by Gymnasium's names."""
+
+        reward_near_weight: float = Field(0.5, description="Penalty on the distance from the arm to the puck [1/m].")
+        reward_dist_weight: float = Field(1.0, description="Penalty on the distance from the puck to the goal [1/m].")
+        reward_control_weight: float = Field(0.1, description="Penalty on the sum of squared actions.")
+
+    params: Params
+
+    def columns(self) -> list[Tensor]:
+        """The arm, its tip, the puck, the goal."""
+        places = [self.place(body) for body in ("tips_arm", "object", "goal")]
+        return [self.field.qpos[:, :7], self.field.qvel[:, :7], *places]
+
+    def score(self) -> Tensor:
+        """Distances and actions cost."""
+        params, puck = self.params, self.place("object")
+        near = -length(puck - self.place("tips_arm")) * params.reward_near_weight
+        far = -length(puck - self.place("goal")) * params.reward_dist_weight
+        return far - self.action_cost(params.reward_control_weight) + near
+
+    def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """The puck anywhere in a box, but not on the goal: the first of some draws that is off it."""
+        x = selection.uniform(-0.3, 0.0, (_CANDIDATES,))
+        y = selection.uniform(-0.2, 0.2, (_CANDIDATES,))
+        off = (x * x + y * y).sqrt() > 0.17
+        first = off.to(torch.int8).argmax(dim=1, keepdim=True)
+        qpos = self.start_pos.repeat(len(x), 1)
+        qpos[:, -4:-2] = torch.cat([x.gather(1, first), y.gather(1, first)], dim=1)
+        qpos[:, -2:] = 0.0
+        return qpos, self.velocities(selection, 4)
+
+
+__all__ = ["Pusher", "Reacher"]

@@ -1,0 +1,136 @@
+"""What Gymnasium's MuJoCo tasks have in common: read the engine in its own dtype, cast at the boundary alone.
+
+Two things are as in Gymnasium and as nowhere else in rlcli. What MuJoCo derives from the state (xpos, cinert, forces)
+is read one physics step late, as `mj_step` leaves it: `sim.derived_fields: substep` in the YAML is the switch. And the
+cost of an action is summed in float32, in the order in which numpy adds.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import ClassVar
+
+import mujoco
+import torch
+from torch import Tensor
+
+from rlcli.envs.direct import DirectTask
+from rlcli.sim.selection import Selection
+
+
+class GymnasiumTask(DirectTask):
+    """One of Gymnasium's MuJoCo tasks.
+
+    `observation` (num_envs, k) and `reward` (num_envs,) are what the buffers hold, before the cast to float32.
+    """
+
+    motors = False
+    reads: ClassVar[tuple[str, ...]] = ()
+    """Derived fields of the engine that the task reads."""
+
+    def set_up_scene(self, scene) -> None:
+        """On MuJoCo Warp, which has no PGS solver, Newton stands in."""
+        on_warp = self.cfg.sim.engine == "warp" or (self.cfg.sim.engine == "auto" and self.device.type == "cuda")
+        if on_warp and scene.spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
+            scene.spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+
+    def post_reset(self) -> None:
+        """Look up fields, and make the buffers that the hooks fill."""
+        engine = self.env.engine
+        self.model = engine.model
+        self.field = SimpleNamespace(**{name: engine.field(name) for name in ("qpos", "qvel", "ctrl", *self.reads)})
+        self.dtype = self.field.qpos.dtype
+        self.start_pos = torch.tensor(self.model.qpos0, dtype=self.dtype, device=self.device)
+        self.action_names = tuple(self.model.actuator(a).name.removeprefix("robot/") for a in range(self.model.nu))
+        self.action_limits = tuple((float(low), float(high)) for low, high in self.model.actuator_ctrlrange)
+        self.actions = torch.zeros(self.num_envs, self.num_actions, device=self.device)
+        self.observation = torch.zeros(self.num_envs, self.num_observations, dtype=self.dtype, device=self.device)
+        self.reward = torch.zeros(self.num_envs, dtype=self.dtype, device=self.device)
+        self.before = self.progress().clone()
+
+    def pre_physics_step(self, actions: Tensor) -> None:
+        """The actions are the controls."""
+        self.actions.copy_(actions)
+        self.field.ctrl.copy_(actions)
+        self.before.copy_(self.progress())
+
+    def get_observations(self) -> None:
+        """Fill obs_buf."""
+        torch.cat(self.columns(), dim=1, out=self.observation)
+        self.obs_buf.copy_(self.observation)
+
+    def calculate_metrics(self) -> None:
+        """Fill rew_buf."""
+        self.reward.copy_(self.score())
+        self.rew_buf.copy_(self.reward)
+
+    def is_done(self) -> None:
+        """Fill reset_buf."""
+        self.reset_buf.copy_(self.failed())
+
+    def reset(self, selection: Selection) -> None:
+        """Write the start state."""
+        qpos, qvel = self.start(selection)
+        selection.write(self.field.qpos, qpos.to(self.dtype))
+        selection.write(self.field.qvel, qvel.to(self.dtype))
+
+    # --- what each task says ---
+
+    def columns(self) -> list[Tensor]:
+        """The observation, in parts. (num_envs, k) each"""
+        raise NotImplementedError
+
+    def score(self) -> Tensor:
+        """The reward. (num_envs,)"""
+        raise NotImplementedError
+
+    def failed(self) -> Tensor:
+        """Where the task ends the episode: nowhere, unless it says so. (num_envs,) bool"""
+        return torch.zeros_like(self.reward, dtype=torch.bool)
+
+    def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """Joint positions and velocities of new episodes. (rows, nq), (rows, nv)"""
+        raise NotImplementedError
+
+    def progress(self) -> Tensor:
+        """What has moved by how much the reward counts. (num_envs,) [m]"""
+        return self.field.qpos[:, 0]
+
+    # --- what several use ---
+
+    def speed(self) -> Tensor:
+        """Change of `progress` over the step. (num_envs,) [m/s]"""
+        return (self.progress() - self.before) / self.step_dt
+
+    def action_cost(self, weight: float) -> Tensor:
+        """Sum of squared actions times weight, in their float32. (num_envs,)"""
+        return weight * float32_sum(self.actions.square())
+
+    def noise(self, selection: Selection, scale: float, size: int) -> Tensor:
+        """Uniform in +-scale. (rows, size)"""
+        return selection.uniform(-scale, scale, (size,))
+
+
+def float32_sum(values: Tensor) -> Tensor:
+    """Sum of up to eight columns, to the last bit as numpy sums as many numbers. (num_envs,)"""
+    columns = list(values.unbind(dim=1))
+    if len(columns) == 8:
+        while len(columns) > 1:
+            columns = [a + b for a, b in zip(columns[::2], columns[1::2], strict=True)]
+    total = columns[0]
+    for column in columns[1:]:
+        total = total + column
+    return total
+
+
+def square_sum(values: Tensor) -> Tensor:
+    """Sum of squares of each environment. values (num_envs, ...) -> (num_envs,)"""
+    return values.square().flatten(1).sum(dim=1)
+
+
+def within(values: Tensor, low: float, high: float) -> Tensor:
+    """Whether values lie strictly between two bounds."""
+    return (values > low) & (values < high)
+
+
+__all__ = ["GymnasiumTask", "float32_sum", "square_sum", "within"]

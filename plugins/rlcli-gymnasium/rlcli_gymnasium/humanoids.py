@@ -1,0 +1,130 @@
+"""Humanoid and humanoid stand-up: walk, and get up from the ground."""
+
+from __future__ import annotations
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from rlcli.config.schema import StrictModel
+from rlcli.sim.selection import Selection
+
+from .base import GymnasiumTask, square_sum, within
+
+_BODIES = range(1, 14)
+_NAMES = (
+    *(f"qpos_{i}" for i in range(2, 24)),
+    *(f"qvel_{i}" for i in range(23)),
+    *(f"cinert_{body}_{i}" for body in _BODIES for i in range(10)),
+    *(f"cvel_{body}_{i}" for body in _BODIES for i in range(6)),
+    *(f"qfrc_actuator_{i}" for i in range(6, 23)),
+    *(f"cfrc_ext_{body}_{i}" for body in _BODIES for i in range(6)),
+)
+
+
+class _Humanoid(GymnasiumTask):
+    """What both see, and how both start."""
+
+    num_observations = 348
+    num_actions = 17
+    observation_names = _NAMES
+    reads = ("xipos", "cinert", "cvel", "qfrc_actuator", "cfrc_ext")
+
+    def columns(self) -> list[Tensor]:
+        """Pose without x and y, velocity, inertias and velocities of bodies, actuator and contact forces."""
+        field = self.field
+        return [
+            field.qpos[:, 2:],
+            field.qvel,
+            field.cinert[:, 1:].flatten(1),
+            field.cvel[:, 1:].flatten(1),
+            field.qfrc_actuator[:, 6:],
+            field.cfrc_ext[:, 1:].flatten(1),
+        ]
+
+    def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """Uniform."""
+        scale = self.params.reset_noise_scale
+        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
+        return qpos, self.noise(selection, scale, self.model.nv)
+
+    def control_cost(self) -> Tensor:
+        """Of the controls as the engine holds them. (num_envs,)"""
+        return self.params.ctrl_cost_weight * square_sum(self.field.ctrl.contiguous())
+
+    def force_cost(self, weight: float, bounds: tuple[float | None, float | None]) -> Tensor:
+        """Sum of squared contact forces times weight, within bounds. (num_envs,)"""
+        low, high = bounds
+        return (weight * square_sum(self.field.cfrc_ext)).clamp(low, high)
+
+
+class Humanoid(_Humanoid):
+    """Humanoid-v5: walk along x."""
+
+    class Params(StrictModel):
+        """The task's settings, by Gymnasium's names."""
+
+        ctrl_cost_weight: float = Field(0.1, ge=0, description="Penalty on the sum of squared controls.")
+        reset_noise_scale: float = Field(0.01, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+        forward_reward_weight: float = Field(1.25, description="Reward on the speed of the centre of mass [s/m].")
+        contact_cost_weight: float = Field(5e-7, ge=0, description="Penalty on the sum of squared contact forces.")
+        contact_cost_range: tuple[float | None, float | None] = Field(
+            (None, 10.0), description="Bounds of that penalty; null: none."
+        )
+        healthy_reward: float = Field(5.0, description="Reward of a step that does not end the episode.")
+        healthy_z_range: tuple[float, float] = Field(
+            (1.0, 2.0), description="Height of a torso that has not failed [m]."
+        )
+
+    params: Params
+
+    def post_reset(self) -> None:
+        """The centre of mass is the progress."""
+        mass = torch.tensor(self.env.engine.model.body_mass, dtype=torch.float64)
+        self.share = (mass / mass.sum()).to(self.env.engine.field("qpos"))
+        super().post_reset()
+
+    def progress(self) -> Tensor:
+        """Where the centre of mass is, a physics step late. (num_envs,) [m]"""
+        return (self.field.xipos[:, :, 0] * self.share).sum(dim=1)
+
+    def healthy(self) -> Tensor:
+        """The torso's height is in range. (num_envs,) bool"""
+        return within(self.field.qpos[:, 2], *self.params.healthy_z_range)
+
+    def score(self) -> Tensor:
+        """Speed and health, less the cost of controls and contacts."""
+        params = self.params
+        gains = params.forward_reward_weight * self.speed() + self.healthy() * params.healthy_reward
+        contact_cost = self.force_cost(params.contact_cost_weight, params.contact_cost_range)
+        return gains - (self.control_cost() + contact_cost)
+
+    def failed(self) -> Tensor:
+        """Not healthy."""
+        return ~self.healthy()
+
+
+class HumanoidStandup(_Humanoid):
+    """HumanoidStandup-v5: get up."""
+
+    class Params(StrictModel):
+        """The task's settings, by Gymnasium's names."""
+
+        ctrl_cost_weight: float = Field(0.1, ge=0, description="Penalty on the sum of squared controls.")
+        reset_noise_scale: float = Field(0.01, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+        uph_cost_weight: float = Field(1.0, description="Reward on the torso's height over the time step [s/m].")
+        impact_cost_weight: float = Field(5e-7, ge=0, description="Penalty on the sum of squared contact forces.")
+        impact_cost_range: tuple[float | None, float | None] = Field(
+            (None, 10.0), description="Bounds of that penalty; null: none."
+        )
+
+    params: Params
+
+    def score(self) -> Tensor:
+        """Height, less the cost of controls and impacts, plus 1."""
+        params = self.params
+        height = params.uph_cost_weight * self.field.qpos[:, 2] / self.env.physics_dt
+        return height - self.control_cost() - self.force_cost(params.impact_cost_weight, params.impact_cost_range) + 1
+
+
+__all__ = ["Humanoid", "HumanoidStandup"]

@@ -1,0 +1,94 @@
+"""Inverted pendulum and inverted double pendulum: balance on a cart."""
+
+from __future__ import annotations
+
+from pydantic import Field
+from torch import Tensor
+
+from rlcli.config.schema import StrictModel
+from rlcli.sim.selection import Selection
+
+from .base import GymnasiumTask
+
+
+class InvertedPendulum(GymnasiumTask):
+    """InvertedPendulum-v5: one pole."""
+
+    num_observations = 4
+    num_actions = 1
+    observation_names = ("cart_pos", "pole_pos", "cart_vel", "pole_vel")
+    observation_units = ("m", "rad", "m/s", "rad/s")
+
+    class Params(StrictModel):
+        """The task's settings, by Gymnasium's names."""
+
+        reset_noise_scale: float = Field(0.01, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+
+    params: Params
+
+    def columns(self) -> list[Tensor]:
+        """Joint positions and velocities."""
+        return [self.field.qpos, self.field.qvel]
+
+    def score(self) -> Tensor:
+        """1 unless it fell."""
+        return (~self.failed()).to(self.dtype)
+
+    def failed(self) -> Tensor:
+        """The pole leans by more than 0.2 rad."""
+        finite = self.field.qpos.isfinite().all(dim=1) & self.field.qvel.isfinite().all(dim=1)
+        return ~finite | (self.field.qpos[:, 1].abs() > 0.2)
+
+    def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """Uniform."""
+        scale = self.params.reset_noise_scale
+        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
+        return qpos, self.noise(selection, scale, self.model.nv)
+
+
+class InvertedDoublePendulum(GymnasiumTask):
+    """InvertedDoublePendulum-v5: a pole on a pole."""
+
+    num_observations = 9
+    num_actions = 1
+    observation_names = (
+        *("cart_pos", "sin_1", "sin_2", "cos_1", "cos_2"),
+        *("cart_vel", "vel_1", "vel_2", "cart_constraint_force"),
+    )
+    observation_units = ("m", "", "", "", "", "m/s", "rad/s", "rad/s", "N")
+    reads = ("site_xpos", "qfrc_constraint")
+
+    class Params(StrictModel):
+        """The task's settings, by Gymnasium's names."""
+
+        healthy_reward: float = Field(10.0, description="Reward of a step that does not end the episode.")
+        reset_noise_scale: float = Field(0.1, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+
+    params: Params
+
+    def columns(self) -> list[Tensor]:
+        """Cart, sines and cosines of the angles, clipped velocities and force on the cart."""
+        qpos, force = self.field.qpos, self.field.qfrc_constraint[:, :1]
+        angles = qpos[:, 1:]
+        return [qpos[:, :1], angles.sin(), angles.cos(), self.field.qvel.clamp(-10.0, 10.0), force.clamp(-10.0, 10.0)]
+
+    def score(self) -> Tensor:
+        """Alive, less the distance of the tip from its place and the speed of the poles."""
+        x, height = self.field.site_xpos[:, 0, 0], self.field.site_xpos[:, 0, 2]
+        first, second = self.field.qvel[:, 1], self.field.qvel[:, 2]
+        distance = 0.01 * x.square() + (height - 2).square()
+        rates = 0.001 * first.square() + 0.005 * second.square()
+        return self.params.healthy_reward * (~self.failed()) - distance - rates
+
+    def failed(self) -> Tensor:
+        """The tip is no higher than 1 m, a physics step late."""
+        return self.field.site_xpos[:, 0, 2] <= 1
+
+    def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """Uniform positions, Gaussian velocities."""
+        scale = self.params.reset_noise_scale
+        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
+        return qpos, selection.normal(0.0, scale, (self.model.nv,))
+
+
+__all__ = ["InvertedDoublePendulum", "InvertedPendulum"]

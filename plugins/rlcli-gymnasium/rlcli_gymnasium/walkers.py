@@ -1,0 +1,221 @@
+"""Ant, half cheetah, hopper, walker and swimmer: move along x."""
+
+from __future__ import annotations
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from rlcli.config.schema import StrictModel
+from rlcli.sim.selection import Selection
+
+from .base import GymnasiumTask, square_sum, within
+
+
+class Ant(GymnasiumTask):
+    """Ant-v5: a four-legged walker, which feels the forces of contacts."""
+
+    num_observations = 105
+    num_actions = 8
+    observation_names = (
+        *(f"qpos_{i}" for i in range(2, 15)),
+        *(f"qvel_{i}" for i in range(14)),
+        *(f"cfrc_ext_{body}_{i}" for body in range(1, 14) for i in range(6)),
+    )
+    reads = ("xpos", "cfrc_ext")
+
+    class Params(StrictModel):
+        """The task's settings, by Gymnasium's names."""
+
+        forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
+        ctrl_cost_weight: float = Field(0.5, ge=0, description="Penalty on the sum of squared actions.")
+        contact_cost_weight: float = Field(5e-4, ge=0, description="Penalty on the sum of squared contact forces.")
+        healthy_reward: float = Field(1.0, description="Reward of a step that does not end the episode.")
+        healthy_z_range: tuple[float, float] = Field(
+            (0.2, 1.0), description="Height of a torso that has not failed [m]."
+        )
+        contact_force_range: tuple[float, float] = Field((-1.0, 1.0), description="Clip of contact forces [N, N m].")
+        reset_noise_scale: float = Field(0.1, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+
+    params: Params
+
+    def post_reset(self) -> None:
+        """The torso's place is the progress."""
+        self.torso = 1
+        super().post_reset()
+
+    def progress(self) -> Tensor:
+        """Where the torso is, a physics step late. (num_envs,) [m]"""
+        return self.field.xpos[:, self.torso, 0]
+
+    def contact_forces(self) -> Tensor:
+        """Clipped. (num_envs, bodies, 6)"""
+        return self.field.cfrc_ext.clamp(*self.params.contact_force_range)
+
+    def columns(self) -> list[Tensor]:
+        """Pose without x and y, velocity, contact forces."""
+        return [self.field.qpos[:, 2:], self.field.qvel, self.contact_forces()[:, 1:].flatten(1)]
+
+    def healthy(self) -> Tensor:
+        """The torso's height is in range. (num_envs,) bool"""
+        low, high = self.params.healthy_z_range
+        height = self.field.qpos[:, 2]
+        return (height >= low) & (height <= high)
+
+    def score(self) -> Tensor:
+        """Speed and health, less the cost of actions and contacts."""
+        params = self.params
+        gains = self.speed() * params.forward_reward_weight + self.healthy() * params.healthy_reward
+        contact_cost = params.contact_cost_weight * square_sum(self.contact_forces())
+        return gains - (self.action_cost(params.ctrl_cost_weight) + contact_cost)
+
+    def failed(self) -> Tensor:
+        """Not healthy."""
+        return ~self.healthy()
+
+    def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """Uniform positions, Gaussian velocities."""
+        scale = self.params.reset_noise_scale
+        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
+        return qpos, selection.normal(0.0, scale, (self.model.nv,))
+
+
+class HalfCheetah(GymnasiumTask):
+    """HalfCheetah-v5: a planar runner that cannot fail."""
+
+    num_observations = 17
+    num_actions = 6
+    observation_names = (*(f"qpos_{i}" for i in range(1, 9)), *(f"qvel_{i}" for i in range(9)))
+
+    class Params(StrictModel):
+        """The task's settings, by Gymnasium's names."""
+
+        forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
+        ctrl_cost_weight: float = Field(0.1, ge=0, description="Penalty on the sum of squared actions.")
+        reset_noise_scale: float = Field(0.1, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+
+    params: Params
+
+    def columns(self) -> list[Tensor]:
+        """Joint positions without x, velocities."""
+        return [self.field.qpos[:, 1:], self.field.qvel]
+
+    def score(self) -> Tensor:
+        """Speed, less the cost of actions."""
+        params = self.params
+        return params.forward_reward_weight * self.speed() - self.action_cost(params.ctrl_cost_weight)
+
+    def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """Uniform positions, Gaussian velocities."""
+        scale = self.params.reset_noise_scale
+        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
+        return qpos, selection.normal(0.0, scale, (self.model.nv,))
+
+
+class Swimmer(HalfCheetah):
+    """Swimmer-v5: three links in a thick fluid."""
+
+    num_observations = 8
+    num_actions = 2
+    observation_names = (*(f"qpos_{i}" for i in range(2, 5)), *(f"qvel_{i}" for i in range(5)))
+
+    class Params(StrictModel):
+        """The task's settings, by Gymnasium's names."""
+
+        forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
+        ctrl_cost_weight: float = Field(1e-4, ge=0, description="Penalty on the sum of squared actions.")
+        reset_noise_scale: float = Field(0.1, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+
+    params: Params
+
+    def columns(self) -> list[Tensor]:
+        """Joint positions without x and y, velocities."""
+        return [self.field.qpos[:, 2:], self.field.qvel]
+
+    def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """Uniform."""
+        scale = self.params.reset_noise_scale
+        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
+        return qpos, self.noise(selection, scale, self.model.nv)
+
+
+class Walker2d(GymnasiumTask):
+    """Walker2d-v5: two legs in a plane."""
+
+    num_observations = 17
+    num_actions = 6
+    observation_names = (*(f"qpos_{i}" for i in range(1, 9)), *(f"qvel_{i}" for i in range(9)))
+
+    class Params(StrictModel):
+        """The task's settings, by Gymnasium's names."""
+
+        forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
+        ctrl_cost_weight: float = Field(1e-3, ge=0, description="Penalty on the sum of squared actions.")
+        healthy_reward: float = Field(1.0, description="Reward of a step that does not end the episode.")
+        healthy_z_range: tuple[float, float] = Field(
+            (0.8, 2.0), description="Height of a torso that has not failed [m]."
+        )
+        healthy_angle_range: tuple[float, float] = Field((-1.0, 1.0), description="Its pitch [rad].")
+        reset_noise_scale: float = Field(5e-3, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+
+    params: Params
+
+    def columns(self) -> list[Tensor]:
+        """Joint positions without x, velocities clipped to +-10."""
+        return [self.field.qpos[:, 1:], self.field.qvel.clamp(-10.0, 10.0)]
+
+    def healthy(self) -> Tensor:
+        """Height and pitch are in range. (num_envs,) bool"""
+        height, angle = self.field.qpos[:, 1], self.field.qpos[:, 2]
+        return within(height, *self.params.healthy_z_range) & within(angle, *self.params.healthy_angle_range)
+
+    def score(self) -> Tensor:
+        """Speed and health, less the cost of actions."""
+        params = self.params
+        gains = params.forward_reward_weight * self.speed() + self.healthy() * params.healthy_reward
+        return gains - self.action_cost(params.ctrl_cost_weight)
+
+    def failed(self) -> Tensor:
+        """Not healthy."""
+        return ~self.healthy()
+
+    def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """Uniform."""
+        scale = self.params.reset_noise_scale
+        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
+        return qpos, self.noise(selection, scale, self.model.nv)
+
+
+class Hopper(Walker2d):
+    """Hopper-v5: one leg in a plane."""
+
+    num_observations = 11
+    num_actions = 3
+    observation_names = (*(f"qpos_{i}" for i in range(1, 6)), *(f"qvel_{i}" for i in range(6)))
+
+    class Params(StrictModel):
+        """The task's settings, by Gymnasium's names."""
+
+        forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
+        ctrl_cost_weight: float = Field(1e-3, ge=0, description="Penalty on the sum of squared actions.")
+        healthy_reward: float = Field(1.0, description="Reward of a step that does not end the episode.")
+        healthy_state_range: tuple[float, float] = Field((-100.0, 100.0), description="All of the state but x and z.")
+        healthy_z_range: tuple[float, float | None] = Field(
+            (0.7, None), description="Height of a torso that has not failed [m]; null: no upper end."
+        )
+        healthy_angle_range: tuple[float, float] = Field((-0.2, 0.2), description="Its pitch [rad].")
+        reset_noise_scale: float = Field(5e-3, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+
+    params: Params
+
+    def healthy(self) -> Tensor:
+        """Height, pitch and all else are in range. (num_envs,) bool"""
+        params, qpos = self.params, self.field.qpos
+        low, high = params.healthy_z_range
+        state = torch.cat([qpos[:, 2:], self.field.qvel], dim=1)
+        healthy = within(state, *params.healthy_state_range).all(dim=1)
+        healthy &= within(qpos[:, 1], low, torch.inf if high is None else high)
+        return healthy & within(qpos[:, 2], *params.healthy_angle_range)
+
+
+__all__ = ["Ant", "HalfCheetah", "Hopper", "Swimmer", "Walker2d"]
