@@ -259,7 +259,7 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
         raise TaskError(f"'{folder}' is not a task: it has no {file} ({found})")
     name = oige.task_name(config)
     if name is not None:
-        return _oige_task(root, config, name)
+        return _oige_task(config.parent, config, name)
     terms, task = root / "terms.py", root / "task.py"
     return TaskSource(
         name=root.name,
@@ -275,10 +275,11 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
 
 
 def _oige_config(root: Path) -> Path | None:
-    """The one YAML of a folder that has OmniIsaacGymEnvs' form; None if there is none."""
-    found = [file for file in sorted(root.glob("*.yaml")) if oige.is_oige_file(file)]
+    """The one YAML of a folder, or of its `cfg/task`, that has OmniIsaacGymEnvs' form; None if there is none."""
+    files = sorted(root.glob("*.yaml")) or sorted(root.glob("cfg/task/*.yaml"))
+    found = [file for file in files if oige.is_oige_file(file)]
     if len(found) > 1:
-        names = listing(f"{root.name}/{file.name}" for file in found)
+        names = listing(f"{root.name}/{file.relative_to(root)}" for file in found)
         raise TaskError(f"'{root}' holds several tasks", hint=f"name one file: {names}")
     return found[0] if found else None
 
@@ -286,9 +287,9 @@ def _oige_config(root: Path) -> Path | None:
 def _oige_task(root: Path, config: Path, name: str) -> TaskSource:
     file: Path | None
     try:
-        file, class_name = oige.find_class(root, name)
+        file, class_name = oige.find_class(oige.home(config), name)
     except LookupError as problem:
-        if next(root.rglob("*.py"), None) is not None:
+        if next(oige.home(config).rglob("*.py"), None) is not None:
             raise TaskError(f"'{config}' is not a task: {problem.args[0]}") from None
         file, class_name = None, f"{name}Task"  # the YAML can be checked without
     return TaskSource(

@@ -406,6 +406,12 @@ def relative(prim_path: str) -> str:
     return "/".join(parts)
 
 
+def home(config: FilePath) -> FilePath:
+    """The folder that the files of a task lie below: that of its YAML, or the package whose `cfg/task` holds it."""
+    inside = config.parent.parts[-2:] == ("cfg", "task")
+    return config.parent.parent.parent if inside else config.parent
+
+
 def find_class(folder: FilePath, name: str) -> tuple[FilePath, str]:
     """The file and the class of a task in a folder: in `task.py`, else in any Python file below.
 
