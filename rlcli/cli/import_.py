@@ -66,6 +66,9 @@ def _tell(form: str, imported: Imported) -> None:
             for note in imported.notes
         ],
     )
+    for note in imported.notes:
+        if note.status == "to do":
+            console.info(str(note))
     for text in imported.messages:
         console.info(text)
     console.info(f"wrote {', '.join(str(file) for file in imported.files)}; next: rlcli train {imported.folder}")

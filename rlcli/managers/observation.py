@@ -139,8 +139,9 @@ class ObservationManager:
         return draws
 
     def _fill(self, group: _Group, views: list[Tensor], draws: Draws, *, advance: bool) -> None:
+        fresh = self._fresh if self._watch is not None or bool(self._fresh.any()) else None
         for pipeline, view in zip(group.pipelines, views, strict=True):
-            pipeline.write(view, draws, self._fresh, advance)
+            pipeline.write(view, draws, fresh, advance)
 
     def _group(self, terms: list[BoundTerm], config: ObservationGroupConfig) -> _Group:
         pipelines = []

@@ -78,7 +78,7 @@ def leaves(value, key=()):
 
 
 def test_every_key_is_accounted_for(imported):
-    _, document, err, _ = imported()
+    _, document, _, _ = imported()
     told = {tuple(row["key"].split(".")): row for row in document["keys"]}
     text = ENV.read_text().replace("!!python/tuple", "").replace("!!python/object/apply:builtins.slice", "")
     text = text.replace("!!python/object/apply:isaaclab.managers.recorder_manager.DatasetExportMode", "")
@@ -92,7 +92,6 @@ def test_every_key_is_accounted_for(imported):
     assert status["sim.dt"] == status["rewards.alive.weight"] == "mapped"
     assert status["scene.robot.spawn.rigid_props"] == status["sim.physx"] == "ignored"
     assert status["scene.robot.spawn.collision_props"] == "default"
-    assert "ignored: sim.physx" in err
 
 
 def test_a_function_that_only_its_author_has_becomes_a_stub(imported):
@@ -100,7 +99,7 @@ def test_a_function_that_only_its_author_has_becomes_a_stub(imported):
     text = ENV.read_text().replace("func: isaaclab.envs.mdp.rewards:is_alive\n    params: {}", own)
     code, _, err, folder = imported(text)
     assert code == 0
-    assert "to do: rewards.alive.func (write 'wobble' in terms.py)" in err
+    assert "rewards.alive.func: to do: write 'wobble' in terms.py" in err
     assert "def wobble(env, *, strength: float):" in (folder / "terms.py").read_text()
     assert resolve(folder_task(folder)).task.rewards["alive"].params == {"strength": 2.0}
 

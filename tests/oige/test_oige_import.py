@@ -73,7 +73,7 @@ def test_a_file_of_another_form_and_a_form_that_is_not_known_are_refused(tmp_pat
     assert main(["import", "oige", str(tmp_path / "task.yaml"), "-o", str(tmp_path / "out")]) == 3
     assert "is not a task of OmniIsaacGymEnvs" in capsys.readouterr().err
     assert main(["import", "oigge", str(tmp_path / "task.yaml")]) == 2
-    assert "did you mean 'oige'?" in capsys.readouterr().err
+    assert "Did you mean 'oige'?" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
