@@ -41,7 +41,9 @@ def test_the_task_of_a_page_checks_trains_and_learns(page, folder, tmp_path):
 
 @pytest.mark.parametrize("number", range(3))
 def test_the_scenes_of_the_page_build_and_run(number, tmp_path):
-    found = [b for b in blocks(DOCS / "write-a-task.md", "## Scenes", "## Events and randomisation") if b.language == "yaml"]
+    found = [
+        b for b in blocks(DOCS / "write-a-task.md", "## Scenes", "## Events and randomisation") if b.language == "yaml"
+    ]
     assert len(found) == 3
     part = yaml.safe_load(found[number].text)
     part["scene"]["entities"]["robot"]["joints"] = {".*": {"kp": 20.0, "kv": 0.5}}  # the critter has no servos
