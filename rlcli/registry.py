@@ -254,6 +254,12 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
             return python_task(f"{root / 'task.py'}:TASK", root.name)
         if (root / "__init__.py").is_file() and b"register(" in (root / "__init__.py").read_bytes():
             return python_task(str(root))
+        classes = _environments(root)
+        if len(classes) > 1:
+            names = listing(f"{root.name}/{found}" for found in classes)
+            raise TaskError(f"'{root}' holds several tasks", hint=f"name one: {names}")
+        if classes:
+            return python_task(f"{root / classes[0]}", root.name)
     if not config.is_file():
         found = listing(sorted(p.name for p in root.iterdir())) if root.is_dir() else "no such folder"
         raise TaskError(f"'{folder}' is not a task: it has no {file} ({found})")
@@ -459,13 +465,37 @@ def _package(folder: Path) -> str:
     return name
 
 
+def _environments(root: Path) -> list[str]:
+    """`file.py:Class` of a folder's environments in Isaac Lab's words, without what a file only builds upon."""
+    files = sorted(root.glob("*.py")) if root.is_dir() else []
+    classes = [
+        (file.name, node.name, {ast.unparse(base).rpartition(".")[2] for base in node.bases})
+        for file in files
+        for node in _body(file)
+        if isinstance(node, ast.ClassDef)
+    ]
+    kinds, before = {"ManagerBasedRLEnvCfg"}, 0
+    while len(kinds) > before:
+        before = len(kinds)
+        kinds |= {name for _, name, bases in classes if bases & kinds}
+    inner = {(file, base) for file, _, bases in classes for base in bases}
+    return [
+        f"{file}:{name}"
+        for file, name, bases in classes
+        if bases & kinds and (file, name) not in inner and not name.upper().endswith("_PLAY")
+    ]
+
+
+def _body(file: Path) -> list[ast.stmt]:
+    try:
+        return ast.parse(file.read_bytes()).body
+    except (OSError, SyntaxError, ValueError):
+        return []
+
+
 def _defines(file: Path, name: str) -> bool:
     """Whether a Python file has a top-level assignment or definition of this name."""
-    try:
-        tree = ast.parse(file.read_bytes())
-    except (OSError, SyntaxError, ValueError):
-        return False
-    for node in tree.body:
+    for node in _body(file):
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
         if getattr(node, "name", None) == name or any(isinstance(t, ast.Name) and t.id == name for t in targets):
             return True

@@ -448,12 +448,8 @@ class SceneReader:
             entity["pos"] = position
         if rotation != [1.0, 0.0, 0.0, 0.0]:
             entity["quat"] = rotation
-        for key in ("lin_vel", "ang_vel"):
-            if any(init.data.get(key) or ()):
-                init.say("ignored", key, "an entity starts at rest; a reset event gives it a velocity")
-            else:
-                init.skip(key)
         self._init_joints(name, entity, init)
+        self._init_velocity(entity, init)
         factor = item.get("soft_joint_pos_limit_factor", 1.0)
         if factor != 1.0:
             entity["soft_joint_pos_limit_factor"] = _float(factor)
@@ -481,6 +477,7 @@ class SceneReader:
         init = item.node("init_state")
         made["pos"] = [_float(v) for v in init.get("pos", (0.0, 0.0, 0.0))]
         made["quat"] = [_float(v) for v in init.get("rot", (1.0, 0.0, 0.0, 0.0))]
+        self._init_velocity(made, init)
         spawn.skip("func", "visible", "semantic_tags", "copy_from_source", "activate_contact_sensors", "axis")
         spawn.skip("visual_material_path", "physics_material_path", "visual_material", "collision_props")
         return made
@@ -533,6 +530,12 @@ class SceneReader:
             made[key] = wanted
         if made:
             entity["init"] = made
+
+    def _init_velocity(self, entity: dict[str, Any], init: Node) -> None:
+        for key in ("lin_vel", "ang_vel"):
+            value = [_float(v) for v in init.get(key, (0.0, 0.0, 0.0))]
+            if any(value):
+                entity.setdefault("init", {})[key] = value
 
     def _says(self, entity: str, pattern: str, value: float, known: Mapping[str, float]) -> bool:
         """Whether the joints that a pattern matches have this value already."""

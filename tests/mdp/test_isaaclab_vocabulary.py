@@ -193,7 +193,7 @@ class SceneCfg(InteractiveSceneCfg):
     object = RigidObjectCfg(
         prim_path="{ENV_REGEX_NS}/Object",
         spawn=sim_utils.SphereCfg(radius=0.05, rigid_props=sim_utils.RigidBodyPropertiesCfg()),
-        init_state=RigidObjectCfg.InitialStateCfg(pos=(0.0, 2.0, 1.0)),
+        init_state=RigidObjectCfg.InitialStateCfg(pos=(0.0, 2.0, 1.0), lin_vel=(0.5, 0.0, 0.0)),
     )
     contact_forces = ContactSensorCfg(prim_path="{ENV_REGEX_NS}/Walker/.*", history_length=3, track_air_time=True)
     height_scanner = RayCasterCfg(
@@ -292,6 +292,12 @@ def test_all_of_them_run_in_one_environment(source):
         assert step.reward.isfinite().all()
     assert env.divergences == 0
     assert env.extras()["Curriculum/ramp"] == -0.5
+
+
+def test_an_object_starts_with_the_velocity_that_it_is_given(source):
+    env = make_env(resolve(source(), overrides=["events.reset_root_state_with_random_orientation=null"]), seed=1)
+    env.reset()
+    assert env.entities["object"].data.root_lin_vel_w.tolist() == [[0.5, 0.0, 0.0]] * 3
 
 
 def test_a_term_with_some_bodies_of_a_contact_sensor_sees_those_alone(source):
