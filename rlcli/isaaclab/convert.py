@@ -19,7 +19,7 @@ from rlcli.isaaclab import assets
 from rlcli.isaaclab.configclass import is_missing
 from rlcli.isaaclab.managers import SceneEntityCfg
 from rlcli.isaaclab.mdp import MdpFunction
-from rlcli.isaaclab.randomization import EVENTS, Given
+from rlcli.isaaclab.randomization import EVENTS, translated
 from rlcli.isaaclab.table import ACTIONS, COMMANDS, TERMS, Entry, seconds
 
 Key = tuple[str, ...]
@@ -931,7 +931,7 @@ class Terms:
         theirs = _builtin_name(node.data.get("func"))
         if section == "events" and theirs in EVENTS:
             node.get("func")
-            parts = EVENTS[theirs](Given(node.node("params"), self.scene))
+            parts = translated(theirs, node.node("params"), self.scene)
             common = self._common(section, node)
         else:
             parts, common = {"": self.term(section, node)}, {}

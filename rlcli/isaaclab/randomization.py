@@ -15,6 +15,24 @@ _OPERATIONS = {"abs": "set"}
 _DISTRIBUTIONS = {"log_uniform": "loguniform"}
 
 
+class Unfit(ValueError):
+    """A parameter that is missing, or that is not what it should be."""
+
+
+def translated(name: str, params: Node, scene: SceneReader) -> Parts:
+    """The events that one of Isaac Lab's becomes; what is wrong with it goes into the report."""
+    report = params.report
+    try:
+        parts = EVENTS[name](Given(params, scene))
+    except Unfit as error:
+        report.problem(params.key, str(error))
+        return {}
+    for key in params.data:
+        if (*params.key, key) not in report.entries:
+            report.problem((*params.key, key), f"'{name}' has no such parameter")
+    return parts
+
+
 class Given:
     """The parameters of one of Isaac Lab's events, and the elements that its `asset_cfg` picks."""
 
@@ -25,10 +43,17 @@ class Given:
         self.name = str(self.asset.get("name") or "robot")
         self.key = (*params.key, "asset_cfg")
 
+    def need(self, name: str) -> Any:
+        """A value that must be there."""
+        value = self.params.get(name)
+        if value is None:
+            raise Unfit(f"missing '{name}'")
+        return value
+
     def range(self, name: str) -> Any:
         """A pair of numbers, or None."""
         value = self.params.get(name)
-        return None if value is None else [float(end) for end in value]
+        return None if value is None else _pair(name, value)
 
     def entity(self) -> Made:
         """Which entity, if it is not the robot."""
@@ -72,7 +97,10 @@ class Given:
 
 def _mass(given: Given) -> Parts:
     made: Made = {"func": "randomize_body_mass", **given.entity(), **given.picked("body", "bodies")}
-    made |= {"range": given.range("mass_distribution_params"), **given.spread("scale")}
+    made |= {
+        "range": _pair("mass_distribution_params", given.need("mass_distribution_params")),
+        **given.spread("scale"),
+    }
     if given.params.get("recompute_inertia", True) is False:
         made["with_inertia"] = False
     given.ignore("min_mass", "no mass falls below what MuJoCo takes")
@@ -80,7 +108,7 @@ def _mass(given: Given) -> Parts:
 
 
 def _com(given: Given) -> Parts:
-    ranges = _axes(given.params.get("com_range") or {}, 0.0)
+    ranges = _axes("com_range", given.need("com_range"), 0.0)
     picked = given.picked("body", "bodies")
     return {"": {"func": "randomize_body_com", **given.entity(), **picked, "range": ranges, "shared": True}}
 
@@ -92,6 +120,8 @@ def _material(given: Given) -> Parts:
         made["geoms"] = given.scene.geoms_of(given.name, bodies, given.key)
     friction = given.range("dynamic_friction_range")
     static = given.range("static_friction_range")
+    if friction is None and static is None:
+        raise Unfit("missing 'dynamic_friction_range'")
     if static != friction:
         given.approximate("static_friction_range", "MuJoCo has one friction, the dynamic one")
     given.ignore("restitution_range", "MuJoCo's contacts have solref")
@@ -112,8 +142,14 @@ def _offsets(given: Given) -> Parts:
 
 
 def _gravity(given: Given) -> Parts:
-    low, high = given.params.get("gravity_distribution_params")
-    pairs = [[float(a), float(b)] for a, b in zip(low, high, strict=True)]
+    ends = given.need("gravity_distribution_params")
+    if (
+        not isinstance(ends, list | tuple)
+        or len(ends) != 2
+        or any(not isinstance(end, list | tuple) or len(end) != 3 for end in ends)
+    ):
+        raise Unfit(f"gravity_distribution_params: expected ([x, y, z], [x, y, z]), found {ends}")
+    pairs = [_pair("gravity_distribution_params", pair) for pair in zip(*ends, strict=True)]
     given.approximate("gravity_distribution_params", "each environment has its own gravity, not all the same")
     return {"": {"func": "randomize_gravity", "axes": [0, 1, 2], "range": pairs, **given.spread("add")}}
 
@@ -161,23 +197,32 @@ def _tendons(given: Given) -> Parts:
 
 
 def _scale(given: Given) -> Parts:
-    value = given.params.get("scale_range")
+    value = given.need("scale_range")
     made: Made = {"func": "randomize_geom_size", **given.entity(), "operation": "scale"}
     given.params.skip("relative_child_path")
     if isinstance(value, Mapping):
-        return {"": {**made, "range": _axes(value, 1.0)}}
+        return {"": {**made, "range": _axes("scale_range", value, 1.0)}}
     given.approximate("scale_range", "each axis of a shape draws its own scale")
-    return {"": {**made, "range": [float(end) for end in value]}}
+    return {"": {**made, "range": _pair("scale_range", value)}}
 
 
 def _gaussian(given: Given) -> Parts:
-    pair = [float(given.params.get("mean")), float(given.params.get("std"))]
+    pair = _pair("mean, std", [given.need("mean"), given.need("std")])
     picked = given.picked("joint", "joints")
     return {"": {"func": "reset_joints_by_gaussian", **given.entity(), **picked, "position": pair}}
 
 
-def _axes(ranges: Mapping[str, Any], still: float) -> list[list[float]]:
-    return [[float(end) for end in ranges.get(axis, (still, still))] for axis in ("x", "y", "z")]
+def _axes(name: str, ranges: Any, still: float) -> list[list[float]]:
+    if not isinstance(ranges, Mapping) or not set(ranges) <= {"x", "y", "z"}:
+        raise Unfit(f"{name}: expected ranges for x, y and z, found {ranges}")
+    return [_pair(f"{name}.{axis}", ranges.get(axis, (still, still))) for axis in ("x", "y", "z")]
+
+
+def _pair(name: str, value: Any) -> list[float]:
+    numbers = isinstance(value, list | tuple) and all(isinstance(end, int | float) for end in value)
+    if not numbers or len(value) != 2:
+        raise Unfit(f"{name}: expected two numbers, found {value}")
+    return [float(end) for end in value]
 
 
 EVENTS: dict[str, Callable[[Given], Parts]] = {

@@ -50,12 +50,15 @@ def _neighbours(importer: Path) -> Iterator[Path]:
 
 def _places(folder: Path) -> list[Path]:
     above = [folder, *list(folder.parents)[:3]]
-    homes = (depth for depth, place in enumerate(above) if any(map(is_oige_file, _yamls(place))))
-    home = next(homes, None)
+    home = next((depth for depth, place in enumerate(above) if any(map(_is_task, _yamls(place)))), None)
     if home is not None:
         return above[: home + 1]
     # a folder of views lies beside the folder of tasks: look a little further up, as long as it is a package
     return [folder, *(place for place in above[1:3] if (place / "__init__.py").is_file())]
+
+
+def _is_task(file: Path) -> bool:
+    return file.name == "task.yaml" or is_oige_file(file)
 
 
 def _yamls(place: Path) -> Iterator[Path]:

@@ -12,6 +12,7 @@ from rlcli.config.dump import to_data
 from rlcli.config.load import resolve
 from rlcli.config.python import source_of
 from rlcli.envs.vec_env import make_env
+from rlcli.errors import ConfigError
 from rlcli.isaaclab import (
     ArticulationCfg,
     ContactSensorCfg,
@@ -313,3 +314,46 @@ def test_a_term_with_some_bodies_of_a_contact_sensor_sees_those_alone(source):
     for name in ("contact_forces_leg", "contact_forces_torso", "contact_forces_leg_f"):
         places = [sensors["contact_forces"].names.index(body) for body in sensors[name].names]
         assert torch.equal(sensors[name].force_history, whole[:, :, places])
+
+
+MASS = {"asset_cfg": Pick("robot"), "mass_distribution_params": (0.0, 1.0), "operation": "add"}
+
+
+@pytest.mark.parametrize(
+    ("section", "name", "params", "message"),
+    [
+        ("rewards", "undesired_contacts", {"threshold": 1.0, "sensor_cfg": Pick("contacts")},
+         "no sensor 'contacts' of kind contact.*did you mean 'contact_forces'"),
+        ("rewards", "undesired_contacts", {"threshold": 1.0, "sensor_cfg": Pick("contact_forces", body_names="toe")},
+         "no body matches 'toe'; bodies: torso, leg_fl"),
+        ("rewards", "joint_vel_l2", {"asset_cfg": Pick("robot", joint_names=["hip_f.", "hip_fl"])}, "matched twice"),
+        ("rewards", "track_lin_vel_xy_exp", {"command_name": "speed", "std": 0.5},
+         "no command 'speed'; commands: base_velocity, hand, place"),
+        ("rewards", "power_consumption", {"gear_ratio": {"knee": 1.0}}, "no joint matches 'knee'"),
+        ("events", "randomize_rigid_body_mass", {**MASS, "asset_cfg": Pick("robot", body_names="base")},
+         "no body matches 'base'"),
+        ("events", "randomize_rigid_body_mass", {**MASS, "mass_range": 3}, "'randomize_rigid_body_mass' has no such"),
+        ("events", "randomize_rigid_body_mass", {"asset_cfg": Pick("robot")}, "missing 'mass_distribution_params'"),
+        ("events", "randomize_rigid_body_com", {"asset_cfg": Pick("robot"), "com_range": {"roll": (0.0, 1.0)}},
+         "expected ranges for x, y and z"),
+        ("events", "randomize_physics_scene_gravity", {"gravity_distribution_params": (0.0, 1.0)},
+         r"expected two numbers|expected \(\[x, y, z\]"),
+        ("events", "randomize_rigid_body_material", {"asset_cfg": Pick("robot")}, "missing 'dynamic_friction_range'"),
+        ("events", "randomize_actuator_gains",
+         {"asset_cfg": Pick("cabinet"), "stiffness_distribution_params": (1.0, 2.0)}, "no actuator of 'cabinet'"),
+        ("curriculum", "modify_reward_weight", {"term_name": "acton_l2", "weight": 1.0, "num_steps": 3},
+         "'rewards.acton_l2.weight' leads nowhere.*did you mean 'action_l2'"),
+        ("curriculum", "modify_term_cfg", {"address": "rewards.action_l2.weight", "modify_fn": max},
+         "calls a function of its own.*|'stages' and 'interpolate'"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_with_what_there_is(source, section, name, params, message):
+    class Wrong(Cfg):
+        def __post_init__(self):
+            super().__post_init__()
+            kind = {"rewards": RewTerm, "events": EventTerm, "curriculum": CurrTerm}[section]
+            more = {"rewards": {"weight": 1.0}, "events": {"mode": "startup"}}.get(section, {})
+            getattr(self, section)["wrong"] = kind(func=getattr(mdp, name), params=params, **more)
+
+    with pytest.raises(ConfigError, match=message):
+        make_env(resolve(source(Wrong)))
