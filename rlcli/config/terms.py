@@ -1,7 +1,8 @@
 """Term signatures, read from source text with `ast`: files are checked without importing a stranger's code.
 
-A term is a public function whose first parameter is `env`, or a class whose `__init__` takes `(self, env, *, ...)`
-(named in YAML by its class name in snake_case). Its keyword-only parameters are its YAML keys.
+A term is a public function whose first parameter is `env`, or a class whose `__init__` takes `(self, env, *, ...)`,
+its own or that of a base in the same file (named in YAML by its class name in snake_case). Its keyword-only parameters
+are its YAML keys.
 """
 
 from __future__ import annotations
@@ -137,12 +138,13 @@ def read_terms(file: Path) -> dict[str, Signature]:
         SyntaxError: if the file is not Python.
     """
     tree = _tree(file)
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
     terms: dict[str, Signature] = {}
     for node in tree.body:
         if isinstance(node, ast.FunctionDef) and _takes_env(node.args, 0) and not node.name.startswith("_"):
             terms[node.name] = _signature(node, node, node.name, file)
         elif isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-            init = next((n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"), None)
+            init = _init(node, classes)
             if init is not None and _takes_env(init.args, 1):
                 name = snake_case(node.name)
                 terms[name] = _signature(node, init, name, file)
@@ -349,6 +351,16 @@ def _field_default(node: ast.expr | None) -> Any:
         keywords = {k.arg: _literal(k.value) for k in node.keywords if k.arg}
         return Field(*arguments, **keywords)
     return _literal(node)
+
+
+def _init(node: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> ast.FunctionDef | None:
+    """A class's own `__init__`, or the one that it inherits from a class of the same file."""
+    own = next((n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"), None)
+    if own is not None:
+        return own
+    others = {name: other for name, other in classes.items() if other is not node}  # a class that is its own base ends
+    bases = (others[base.id] for base in node.bases if isinstance(base, ast.Name) and base.id in others)
+    return next((init for base in bases if (init := _init(base, others)) is not None), None)
 
 
 def _takes_env(arguments: ast.arguments, position: int) -> bool:

@@ -61,7 +61,7 @@ class ObservationManager:
         self.groups = {name: self._group(terms, configs[name]) for name, terms in groups.items()}
         self._final = {name: torch.zeros_like(group.buffers[0]) for name, group in self.groups.items()}
         self._final_views = {name: _split(self._final[name], group.pipelines) for name, group in self.groups.items()}
-        self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self._fresh: Selection | None = None
 
     def compute(self) -> dict[str, Tensor]:
         """Observations of the state as it is. (num_envs, d) each"""
@@ -71,7 +71,7 @@ class ObservationManager:
             self._fill(group, group.views[group.next], draws, advance=True)
             result[name] = group.buffers[group.next]
             self._require_finite(name, group, result[name])
-        self._fresh.zero_()
+        self._fresh = None
         return result
 
     def compute_final(self) -> dict[str, Tensor]:
@@ -93,7 +93,7 @@ class ObservationManager:
 
     def reset(self, selection: Selection) -> None:
         """New episodes begin: histories and delays start from their first value."""
-        selection.write(self._fresh, True)
+        self._fresh = selection
         for group in self.groups.values():
             for pipeline in group.pipelines:
                 pipeline.term.reset(selection)
@@ -118,7 +118,7 @@ class ObservationManager:
         for name, group in self.groups.items():
             if _remembers(group):
                 group.buffers[group.next].copy_(state[f"last.{name}"])
-        self._fresh.zero_()
+        self._fresh = None
 
     def _tensors(self) -> dict[str, Tensor]:
         return {
@@ -139,9 +139,8 @@ class ObservationManager:
         return draws
 
     def _fill(self, group: _Group, views: list[Tensor], draws: Draws, *, advance: bool) -> None:
-        fresh = self._fresh if self._watch is not None or bool(self._fresh.any()) else None
         for pipeline, view in zip(group.pipelines, views, strict=True):
-            pipeline.write(view, draws, fresh, advance)
+            pipeline.write(view, draws, self._fresh, advance)
 
     def _group(self, terms: list[BoundTerm], config: ObservationGroupConfig) -> _Group:
         pipelines = []

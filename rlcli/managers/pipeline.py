@@ -40,10 +40,10 @@ _BIAS, _LAG, _REDRAW, _REDRAWN = (np.uint64(0x4F42_5330 + i) for i in range(4))
 class Stage(Protocol):
     """One thing that is done to a term's value."""
 
-    def __call__(self, value: Tensor, draws: Draws, fresh: Tensor | None, advance: bool) -> None:
+    def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         """Change the value (num_envs, k) in place.
 
-        `fresh` says where an episode has just begun, (num_envs,) bool; None: nowhere, as far as the host knows.
+        `fresh` are the environments whose episode has just begun; None: nobody, as far as the host knows.
         """
         ...
 
@@ -107,7 +107,7 @@ class Pipeline:
         """Whether what it gives depends on earlier steps."""
         return bool(self.tensors())
 
-    def write(self, view: Tensor, draws: Draws, fresh: Tensor | None, advance: bool) -> None:
+    def write(self, view: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         """Compute the term into its columns. view (num_envs, size)"""
         value = view if self._value is None else self._value
         value.copy_(self.term.call())
@@ -117,7 +117,7 @@ class Pipeline:
             view[:, : -self.width].copy_(self._frames[:, self.width :])
             view[:, -self.width :].copy_(value)
             if fresh is not None:
-                torch.where(fresh[:, None], value.repeat(1, self.history), view, out=view)
+                fresh.write(view, fresh.peek(value).repeat(1, self.history))
             if advance:
                 self._frames.copy_(view)
 
@@ -205,7 +205,7 @@ class _Noise(_Stage):
     def __init__(self, draw: Callable[[Selection], Tensor], operation: str, stream: np.uint64) -> None:
         self._draw, self._operation, self._stream = draw, operation, stream
 
-    def __call__(self, value: Tensor, draws: Draws, fresh: Tensor | None, advance: bool) -> None:
+    def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         _apply(self._operation, value, self._draw(draws(self._stream)))
 
 
@@ -213,7 +213,7 @@ class _Bias(_Stage):
     def __init__(self, draw: Callable[[Selection], Tensor], operation: str, stream: np.uint64, bias: Tensor) -> None:
         self._draw, self._operation, self._stream, self._bias = draw, operation, stream ^ _BIAS, bias
 
-    def __call__(self, value: Tensor, draws: Draws, fresh: Tensor | None, advance: bool) -> None:
+    def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         _apply(self._operation, value, self._bias)
 
     def reset(self, selection: Selection) -> None:
@@ -227,7 +227,7 @@ class _Clip(_Stage):
     def __init__(self, bounds: Any) -> None:
         self._bounds = bounds  # a pair, or a tensor of two
 
-    def __call__(self, value: Tensor, draws: Draws, fresh: Tensor | None, advance: bool) -> None:
+    def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         low, high = self._bounds
         value.clamp_(low, high)
 
@@ -236,7 +236,7 @@ class _Scale(_Stage):
     def __init__(self, factor: Tensor) -> None:
         self._factor = factor
 
-    def __call__(self, value: Tensor, draws: Draws, fresh: Tensor | None, advance: bool) -> None:
+    def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         value.mul_(self._factor)
 
 
@@ -244,7 +244,7 @@ class _Shift(_Stage):
     def __init__(self, offset: Tensor) -> None:
         self._offset = offset
 
-    def __call__(self, value: Tensor, draws: Draws, fresh: Tensor | None, advance: bool) -> None:
+    def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         value.add_(self._offset)
 
 
@@ -256,7 +256,7 @@ class _DigitalFilter(_Stage):
         self._now = config.b[0]
         self._weights = [*config.b[1:], *(-a for a in config.a)]
 
-    def __call__(self, value: Tensor, draws: Draws, fresh: Tensor | None, advance: bool) -> None:
+    def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         given = value.clone()
         value.mul_(self._now)
         for weight, before in zip(self._weights, self._past.unbind(1), strict=True):
@@ -279,7 +279,7 @@ class _Integrator(_Stage):
     def __init__(self, past: Tensor, step_dt: float) -> None:
         self._past, self._half_step = past, 0.5 * step_dt
 
-    def __call__(self, value: Tensor, draws: Draws, fresh: Tensor | None, advance: bool) -> None:
+    def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         integral, before = self._past.unbind(1)
         given = value.clone()
         value.add_(before).mul_(self._half_step).add_(integral)
@@ -302,9 +302,10 @@ class _Delay(_Stage):
         self._frames = torch.zeros(num_envs, high + 1, width, device=device)
         self._lag = torch.full((num_envs,), self._low, dtype=torch.int64, device=device)
 
-    def __call__(self, value: Tensor, draws: Draws, fresh: Tensor | None, advance: bool) -> None:
-        shifted = torch.cat([self._frames[:, 1:], value[:, None]], dim=1)
-        frames = shifted if fresh is None else torch.where(fresh[:, None, None], value[:, None], shifted)
+    def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
+        frames = torch.cat([self._frames[:, 1:], value[:, None]], dim=1)
+        if fresh is not None:
+            fresh.write(frames, fresh.peek(value)[:, None].expand(-1, frames.shape[1], -1))
         if advance:
             self._frames.copy_(frames)
             if self._redraw:

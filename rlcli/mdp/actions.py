@@ -286,16 +286,17 @@ class EmaJointPositionToLimits(JointPositionToLimits):
 
 
 class _BinaryJoint(_JointAction):
-    """One column opens or closes several joints: open where it is not negative."""
+    """One column opens or closes several joints."""
 
     def __init__(
         self,
         env: ManagedEnv,
-        entity: Entity,
-        joints: Columns,
+        *,
+        entity: Entity = "robot",
+        joints: Joints,
         open_command: dict[str, float],
         close_command: dict[str, float],
-        threshold: float,
+        threshold: float = 0.0,
     ) -> None:
         super().__init__(env, entity, joints, 1.0, None)
         self._open, self._close = (self._all(c, w, env) for c, w in ((open_command, "open"), (close_command, "close")))
@@ -323,18 +324,6 @@ class BinaryJointPosition(_BinaryJoint):
     actuator = "position"
     unit = "m or rad"
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        joints: Joints,
-        open_command: dict[str, float],
-        close_command: dict[str, float],
-        threshold: float = 0.0,
-    ) -> None:
-        super().__init__(env, entity, joints, open_command, close_command, threshold)
-
 
 class BinaryJointVelocity(_BinaryJoint):
     """A gripper by velocity: `open_command` where raw >= threshold, else `close_command` [m/s or rad/s].
@@ -344,18 +333,6 @@ class BinaryJointVelocity(_BinaryJoint):
 
     actuator = "velocity"
     unit = "m/s or rad/s"
-
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        joints: Joints,
-        open_command: dict[str, float],
-        close_command: dict[str, float],
-        threshold: float = 0.0,
-    ) -> None:
-        super().__init__(env, entity, joints, open_command, close_command, threshold)
 
 
 class DifferentialInverseKinematics(_JointAction):

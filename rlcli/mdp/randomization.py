@@ -10,7 +10,7 @@ them one draw. What cannot be negative is kept from it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import mujoco
 import torch
@@ -377,72 +377,48 @@ class RandomizeSiteQuat(_Turn):
         super().__init__(env, entity, "site_quat", sites, [roll, pitch, yaw], distribution, shared)
 
 
-class RandomizeJointDamping(_Randomization):
+class _JointNumber(_Randomization):
+    """A number of each joint that cannot be negative."""
+
+    number: ClassVar[str]
+    """The model's field."""
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        joints: Joints = ".*",
+        range: tuple[float, float],
+        distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
+        operation: Literal["add", "scale", "set"] = "scale",
+        shared: bool = False,
+    ) -> None:
+        super().__init__(env, entity, self.number, joints, range, distribution, operation, shared, lowest=0.0)
+
+
+class RandomizeJointDamping(_JointNumber):
     """Viscous damping of joints [N s/m or N m s/rad]."""
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        joints: Joints = ".*",
-        range: tuple[float, float],
-        distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
-        operation: Literal["add", "scale", "set"] = "scale",
-        shared: bool = False,
-    ) -> None:
-        super().__init__(env, entity, "dof_damping", joints, range, distribution, operation, shared, lowest=0.0)
+    number = "dof_damping"
 
 
-class RandomizeJointArmature(_Randomization):
+class RandomizeJointArmature(_JointNumber):
     """Rotor inertia of joints [kg or kg m^2]."""
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        joints: Joints = ".*",
-        range: tuple[float, float],
-        distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
-        operation: Literal["add", "scale", "set"] = "scale",
-        shared: bool = False,
-    ) -> None:
-        super().__init__(env, entity, "dof_armature", joints, range, distribution, operation, shared, lowest=0.0)
+    number = "dof_armature"
 
 
-class RandomizeJointFrictionLoss(_Randomization):
+class RandomizeJointFrictionLoss(_JointNumber):
     """Dry friction of joints [N or N m]."""
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        joints: Joints = ".*",
-        range: tuple[float, float],
-        distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
-        operation: Literal["add", "scale", "set"] = "scale",
-        shared: bool = False,
-    ) -> None:
-        super().__init__(env, entity, "dof_frictionloss", joints, range, distribution, operation, shared, lowest=0.0)
+    number = "dof_frictionloss"
 
 
-class RandomizeJointStiffness(_Randomization):
+class RandomizeJointStiffness(_JointNumber):
     """Spring stiffness of joints [N/m or N m/rad]."""
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        joints: Joints = ".*",
-        range: tuple[float, float],
-        distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
-        operation: Literal["add", "scale", "set"] = "scale",
-        shared: bool = False,
-    ) -> None:
-        super().__init__(env, entity, "jnt_stiffness", joints, range, distribution, operation, shared, lowest=0.0)
+    number = "jnt_stiffness"
 
 
 class RandomizeJointRange:
@@ -653,74 +629,48 @@ class RandomizeGravity(_Randomization):
         super().__init__(env, entity, "opt.gravity", None, range, distribution, operation, axes=axes)
 
 
-class RandomizeTendonStiffness(_Randomization):
+class _TendonNumber(_Randomization):
+    """A number of each tendon that cannot be negative."""
+
+    number: ClassVar[str]
+    """The model's field."""
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        tendons: Tendons = ".*",
+        range: tuple[float, float],
+        distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
+        operation: Literal["add", "scale", "set"] = "scale",
+        shared: bool = False,
+    ) -> None:
+        super().__init__(env, entity, self.number, tendons, range, distribution, operation, shared, lowest=0.0)
+
+
+class RandomizeTendonStiffness(_TendonNumber):
     """Stiffness of tendons [N/m]."""
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        tendons: Tendons = ".*",
-        range: tuple[float, float],
-        distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
-        operation: Literal["add", "scale", "set"] = "scale",
-        shared: bool = False,
-    ) -> None:
-        super().__init__(env, entity, "tendon_stiffness", tendons, range, distribution, operation, shared, lowest=0.0)
+    number = "tendon_stiffness"
 
 
-class RandomizeTendonDamping(_Randomization):
+class RandomizeTendonDamping(_TendonNumber):
     """Damping of tendons [N s/m]."""
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        tendons: Tendons = ".*",
-        range: tuple[float, float],
-        distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
-        operation: Literal["add", "scale", "set"] = "scale",
-        shared: bool = False,
-    ) -> None:
-        super().__init__(env, entity, "tendon_damping", tendons, range, distribution, operation, shared, lowest=0.0)
+    number = "tendon_damping"
 
 
-class RandomizeTendonFrictionLoss(_Randomization):
+class RandomizeTendonFrictionLoss(_TendonNumber):
     """Dry friction of tendons [N]."""
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        tendons: Tendons = ".*",
-        range: tuple[float, float],
-        distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
-        operation: Literal["add", "scale", "set"] = "scale",
-        shared: bool = False,
-    ) -> None:
-        super().__init__(
-            env, entity, "tendon_frictionloss", tendons, range, distribution, operation, shared, lowest=0.0
-        )
+    number = "tendon_frictionloss"
 
 
-class RandomizeTendonArmature(_Randomization):
+class RandomizeTendonArmature(_TendonNumber):
     """Armature of tendons [kg]."""
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        tendons: Tendons = ".*",
-        range: tuple[float, float],
-        distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform",
-        operation: Literal["add", "scale", "set"] = "scale",
-        shared: bool = False,
-    ) -> None:
-        super().__init__(env, entity, "tendon_armature", tendons, range, distribution, operation, shared, lowest=0.0)
+    number = "tendon_armature"
 
 
 class RandomizePairFriction(_Randomization):

@@ -259,3 +259,18 @@ def test_an_unknown_success_condition_is_called_by_its_section(tmp_path):
     task = edited(PENDULUM_TASK, success={"func": "joints_nera", "tolerance": 0.1})
     with pytest.raises(ConfigError, match="no success term 'joints_nera'; did you mean 'joints_near'"):
         build(pendulum(tmp_path, task))
+
+
+def test_a_class_has_the_parameters_of_a_base_in_the_same_file(tmp_path):
+    file = tmp_path / "terms.py"
+    file.write_text(
+        "class _Base:\n    def __init__(self, env, *, gain: float = 2.0): ...\n"
+        "class Louder(_Base):\n    'Louder.'\nclass Loudest(Louder):\n    'Loudest.'\n"
+        "class Circle(Circle):\n    'No base that it could inherit from.'\n"
+    )
+    terms = read_terms(file)
+    assert sorted(terms) == ["louder", "loudest"]
+    assert [(t.summary, t.parameters[0].name, t.parameters[0].default) for t in terms.values()] == [
+        ("Louder.", "gain", 2.0),
+        ("Loudest.", "gain", 2.0),
+    ]
