@@ -87,6 +87,9 @@ def bare(env, controls):
     engine = env.engine
     with wp.ScopedDevice(DEVICE):
         model = mjw.put_model(engine.model)
+        for name in engine.expansions():  # what is randomised differs between the worlds here, too
+            theirs, attribute = engine._owner(name)
+            setattr(model.opt if name.startswith("opt.") else model, attribute, getattr(theirs, attribute))
         model.opt.warn_overflow = 0
         room = engine.capacity
         data = mjw.make_data(engine.model, nworld=env.num_envs, nconmax=room.contacts, njmax=room.constraints)
@@ -139,8 +142,10 @@ def measure_env(task, num_envs):
     env.close()
 
 
-def measure_train(num_envs, name="all on", task="cartpole", iterations=40, change=lambda trainer: None, **flags):
-    settings = {f"agent.{key}": value for key, value in {**EQUAL, **flags}.items()}
+def measure_train(
+    num_envs, name="all on", task="cartpole", iterations=40, change=lambda trainer: None, equal=EQUAL, **flags
+):
+    settings = {f"agent.{key}": value for key, value in {**equal, **flags}.items()}
     settings["scene.num_envs"] = num_envs
     resolved = resolve(find_task(task), agent="ppo", device=DEVICE, flags=settings)
     env = make_env(resolved, seed=1, device=DEVICE)
@@ -283,6 +288,7 @@ def main():
         if "train" in parts:
             for n in sizes:
                 alone("train-one", n)
+                alone("train-one", n, "update compiled and tuned")
             if args.peer_path:
                 peer(args.peer_path, "train", "--num-envs", *sizes)
                 peer(args.peer_path, "train", "--num-envs", *sizes, "--logs")

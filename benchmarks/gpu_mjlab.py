@@ -10,6 +10,8 @@ rsl_rl say goes to stderr.
     python benchmarks/gpu_mjlab.py solve --num-envs 4096 --seed 0 --budget-s 300 --device cuda:0
     python benchmarks/gpu_mjlab.py trace --states states.npz --output steps.npz     (see gpu_mdp_check.py)
 
+`env` and `train` take `--task velocity`: mjlab's own task of a Go1 (gpu_mjlab_velocity.py, gpu_velocity.py).
+
 mjlab is set up as its own cartpole is: its terms where it has them, CUDA graphs on, contacts off, no terrain, no
 sensors, its torch settings (TF32), episodes begun at random ages. Where there was a choice, it is the faster one: room
 for the model's one constraint, one observation group for actor and critic, and rsl_rl's log writer, episode sums and
@@ -38,6 +40,8 @@ from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+
+import gpu_mjlab_velocity as velocity
 
 LOADED = time.time()
 MODEL = Path(__file__).resolve().parents[1] / "tasks" / "rlcli_tasks" / "cartpole" / "cartpole.xml"
@@ -163,11 +167,11 @@ def ppo_cfg(seed: int) -> Any:
     )
 
 
-def make_env(num_envs: int, device: str, seed: int | None = None, endless: bool = False) -> Any:
+def make_env(num_envs: int, device: str, seed: int | None = None, endless: bool = False, task: str = "cartpole") -> Any:
     """The environment; `endless` ones neither end nor reset episodes, for whoever judges the states himself."""
     from mjlab.envs import ManagerBasedRlEnv
 
-    cfg = cartpole_cfg(num_envs, seed)
+    cfg = velocity.env_cfg(num_envs, seed) if task == "velocity" else cartpole_cfg(num_envs, seed)
     if endless:
         cfg.terminations = {}
     return ManagerBasedRlEnv(cfg, device=device)
@@ -177,7 +181,8 @@ def make_runner(env: Any, options: argparse.Namespace) -> Any:
     """rsl_rl's runner as mjlab's `train` makes it, without a log folder unless it is asked for."""
     from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 
-    cfg = {**asdict(ppo_cfg(options.seed)), "torch_compile_mode": options.torch_compile, "logger": "tensorboard"}
+    agent = velocity.ppo_cfg(options.seed) if _task(options) == "velocity" else ppo_cfg(options.seed)
+    cfg = {**asdict(agent), "torch_compile_mode": options.torch_compile, "logger": "tensorboard"}
     folder = tempfile.mkdtemp() if getattr(options, "logs", False) else None
     runner = MjlabOnPolicyRunner(RslRlVecEnvWrapper(env), cfg, folder, options.device)
     runner.logger.git_status_repos = []
@@ -203,11 +208,12 @@ def env(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
     import torch
 
     begin = time.perf_counter()
-    environment = make_env(num_envs, options.device, options.seed)
+    environment = make_env(num_envs, options.device, options.seed, task=options.task)
     environment.reset()
     ages = environment.episode_length_buf
     environment.episode_length_buf = torch.randint_like(ages, int(environment.max_episode_length))
-    actions = torch.rand(16, num_envs, 1, device=options.device) * 2.0 - 1.0
+    columns = environment.action_manager.total_action_dim
+    actions = torch.rand(16, num_envs, columns, device=options.device) * 2.0 - 1.0
 
     def block(steps: int) -> None:
         with torch.inference_mode():
@@ -218,6 +224,7 @@ def env(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
     ready = time.perf_counter() - begin
     seconds = [_timed(options.device, lambda: block(options.steps))[1] for _ in range(options.repeats)]
     return {
+        "task": options.task,
         "num_envs": num_envs,
         "env_steps_per_s": num_envs * options.steps / statistics.median(seconds),
         "env_steps_per_s_min": num_envs * options.steps / max(seconds),
@@ -233,7 +240,7 @@ def env(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
 def train(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
     """Training iterations, timed as rsl_rl times them itself."""
     begin = time.perf_counter()
-    environment = make_env(num_envs, options.device, options.seed)
+    environment = make_env(num_envs, options.device, options.seed, task=options.task)
     runner = make_runner(environment, options)
     times: list[tuple[float, float]] = []
     ends: list[float] = []
@@ -255,8 +262,10 @@ def train(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
     whole = [collect + learn for collect, learn in times]
     if options.logs:  # what writing the logs takes counts too
         whole = [after - before for before, after in pairwise(ends)]
-    rates = [STEPS_PER_ENV * num_envs / seconds for seconds in whole]
+    steps = velocity.STEPS_PER_ENV if options.task == "velocity" else STEPS_PER_ENV
+    rates = [steps * num_envs / seconds for seconds in whole]
     return {
+        "task": options.task,
         "num_envs": num_envs,
         "env_steps_per_s": statistics.median(rates),
         "env_steps_per_s_min": min(rates),
@@ -374,6 +383,10 @@ def process_start(given: float | None) -> tuple[float, str]:
     return LOADED, "script"
 
 
+def _task(options: argparse.Namespace) -> str:
+    return getattr(options, "task", "cartpole")
+
+
 def _read_model() -> Any:
     import mujoco
 
@@ -434,11 +447,14 @@ def _options() -> argparse.Namespace:
     solving.add_argument("--success", type=float, default=0.99)
     solving.add_argument("--started", type=float, help="Unix time to count from; default: when the process was created")
     training.add_argument("--logs", action="store_true", help="write rsl_rl's logs, and count the time it takes")
+    for either in (stepping, training):
+        either.add_argument("--task", choices=["cartpole", "velocity"], default="cartpole")
     for trainer in (training, solving):
         trainer.add_argument("--torch-compile", metavar="MODE", help="rsl_rl's torch_compile_mode; mjlab leaves it off")
     tracing = command(trace)
     tracing.add_argument("--states", type=Path, required=True, help="npz: qpos, qvel, age, action")
     tracing.add_argument("--output", type=Path, required=True)
+    velocity.add_commands(command)
     return parser.parse_args()
 
 

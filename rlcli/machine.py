@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 from rlcli.errors import DeviceError
 
@@ -11,6 +12,35 @@ def available_cores() -> int:
     """Cores this process may use; processes that a launcher started together share them."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+
+
+def core_quota(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> float | None:
+    """Cores' worth of time that a container's control group grants this process; None where there is no limit."""
+    try:
+        places = [line.split(":", 2) for line in own.read_text(encoding="utf-8").splitlines()]
+    except (OSError, ValueError):
+        return None
+    quotas = []
+    for _, controllers, place in (parts for parts in places if len(parts) == 3):
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        root = (
+            groups / controllers if controllers else groups
+        )  # version 1 has a folder a controller, version 2 has none
+        folder = root / place.strip("/")
+        quotas += [_quota(each) for each in (folder, *folder.parents) if each.is_relative_to(root)]
+    return min((quota for quota in quotas if quota is not None), default=None)
+
+
+def _quota(group: Path) -> float | None:
+    try:
+        if (group / "cpu.max").is_file():
+            limit, period = (group / "cpu.max").read_text(encoding="utf-8").split()
+        else:
+            limit, period = ((group / f"cpu.cfs_{name}_us").read_text(encoding="utf-8") for name in ("quota", "period"))
+        return int(limit) / int(period) if limit != "max" and int(limit) > 0 else None
+    except (OSError, ValueError, ZeroDivisionError):
+        return None
 
 
 def require_device(device: str) -> None:

@@ -6,17 +6,24 @@ user's cache folder, keyed by distribution, version and the state of its files.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
+import tempfile
+import threading
+import time
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, fields, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rlcli.registry import Entry, package_folder
+from rlcli.machine import available_cores
+from rlcli.registry import OWN, TASKS, Entry, package_folder
 
 TIMEOUT_S = 30.0
 _BUILDER = "rlcli.envs.describe"
@@ -50,15 +57,45 @@ _KINDS: dict[str, Any] = {
 def cached(entries: Iterable[Entry]) -> dict[str, Details]:
     """What is known already, by qualified name."""
     own = _raw(_cache_file())
-    rows = {entry.qualified: _details(_shipped(entry) or own.get(_key(entry))) for entry in entries}
+    rows = {entry.qualified: _known(entry, own) for entry in entries}
     return {name: row for name, row in rows.items() if row is not None}
 
 
-def probe(entries: Iterable[Entry], timeout_s: float = TIMEOUT_S) -> dict[str, Details]:
-    """Load every task in a process of its own, and remember what it says. A broken one is a row with its reason."""
+def _known(entry: Entry, own: dict[str, Any]) -> Details | None:
+    shipped, probed = _details(_shipped(entry)), _details(own.get(_key(entry)))
+    if entry.distribution != OWN and probed is not None and probed.broken:
+        return probed  # its authors did not ship this
+    return shipped or probed
+
+
+def probe(
+    entries: Iterable[Entry], timeout_s: float = TIMEOUT_S, group: str = TASKS, stop: threading.Event | None = None
+) -> dict[str, Details]:
+    """Load every task in a process other than this one, and remember what it says. A broken one is a row with a reason.
+
+    The tasks of a distribution share a process; who ends it, or takes longer than `timeout_s`, is alone to blame, and
+    the others go on in a new one. Several distributions are loaded at a time. `stop` ends it early.
+    """
     entries = list(entries)
-    found = {entry.qualified: _probe_one(entry, timeout_s) for entry in entries}
-    known = {_key(entry): found[entry.qualified].record() for entry in entries}
+    owners: dict[str, list[Entry]] = {}
+    for entry in entries:
+        owners.setdefault(entry.distribution, []).append(entry)
+    stop = stop or threading.Event()
+    with ThreadPoolExecutor(max(1, min(len(owners), available_cores()))) as pool:
+        rows = pool.map(lambda owned: _probe_distribution(owned, timeout_s, group, stop), owners.values())
+        try:
+            found = {name: row for part in rows for name, row in part.items()}
+        except BaseException:  # Ctrl-C
+            stop.set()
+            raise
+    if stop.is_set():
+        raise InterruptedError("the probe was ended before it was done")
+    if group == TASKS:
+        _remember({_key(entry): found[entry.qualified].record() for entry in entries})
+    return {entry.qualified: found[entry.qualified] for entry in entries}
+
+
+def _remember(known: dict[str, Any]) -> None:
     file = _cache_file()
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -67,24 +104,104 @@ def probe(entries: Iterable[Entry], timeout_s: float = TIMEOUT_S) -> dict[str, D
         temporary.replace(file)
     except OSError:
         pass  # a cache that cannot be kept is only slower
+
+
+def _probe_distribution(
+    entries: list[Entry], timeout_s: float, group: str, stop: threading.Event
+) -> dict[str, Details]:
+    found: dict[str, Details] = {}
+    while left := [entry.qualified for entry in entries if entry.qualified not in found]:
+        if stop.is_set():
+            break
+        found.update(_probe_names(left, timeout_s, group, stop))
     return found
 
 
-def _probe_one(entry: Entry, timeout_s: float) -> Details:
-    command = [sys.executable, "-m", _BUILDER, entry.qualified]
+def _probe_names(names: list[str], timeout_s: float, group: str, stop: threading.Event) -> dict[str, Details]:
+    """What one process says of the first of these, and of as many more as it comes to."""
+    with tempfile.TemporaryDirectory(prefix="rlcli-probe-", ignore_cleanup_errors=True) as folder:
+        file, said = Path(folder) / "rows", Path(folder) / "stderr"
+        with said.open("wb") as stderr:
+            process = subprocess.Popen(
+                [sys.executable, "-m", _BUILDER, group, str(file), *names],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=stderr,
+                start_new_session=True,
+            )
+        try:
+            code = _wait(process, file, len(names), timeout_s, stop)
+        finally:
+            _end(process)
+        rows = _rows(file)
+        lines = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    found = dict(zip(names, rows, strict=False))
+    if len(found) == len(names):
+        if code is None:
+            reason = (
+                f"loaded, but a process that loads it did not end within {timeout_s:g} s (does a thread still run?)"
+            )
+            found[names[-1]] = replace(found[names[-1]], broken=found[names[-1]].broken or reason)
+        return found
+    if code is None:
+        reason = f"did not load within {timeout_s:g} s"
+    elif code < 0:
+        reason = f"crashed ({_signal(-code)})"
+    else:
+        reason = f"ended the process (exit {code})"
+    if code and lines and not lines[-1].startswith(" "):
+        reason = f"{reason}: {lines[-1][:200]}"
+    found[names[len(found)]] = Details(broken=reason)
+    return found
+
+
+def _wait(
+    process: subprocess.Popen[bytes], file: Path, wanted: int, timeout_s: float, stop: threading.Event
+) -> int | None:
+    """The exit code of a process that adds rows to a file; None if it took too long for one, or to end."""
+    rows, deadline = 0, time.monotonic() + timeout_s
+    while process.poll() is None:
+        if rows < wanted and len(_rows(file)) > rows:
+            rows, deadline = len(_rows(file)), time.monotonic() + timeout_s
+        if time.monotonic() > deadline or stop.is_set():
+            return None
+        time.sleep(0.02)
+    return process.returncode
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a process and what it started."""
+    with contextlib.suppress(OSError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+    process.wait()
+
+
+def _rows(file: Path) -> list[Details]:
+    """The complete lines of a file that are rows."""
     try:
-        done = subprocess.run(command, capture_output=True, timeout=timeout_s, stdin=subprocess.DEVNULL)
-    except subprocess.TimeoutExpired:
-        return Details(broken=f"did not load within {timeout_s:g} s")
+        lines = file.read_bytes().split(b"\n")[:-1]
+    except OSError:
+        return []
+    rows = []
+    for line in lines:
+        try:
+            row = _details(json.loads(line))
+        except ValueError:
+            row = None
+        if row is None:
+            break
+        rows.append(row)
+    return rows
+
+
+def _signal(number: int) -> str:
     try:
-        row = _details(json.loads(done.stdout.splitlines()[-1]))
-    except (IndexError, ValueError):
-        row = None
-    if row is not None and done.returncode == 0:
-        return row
-    lines = done.stderr.decode(errors="replace").strip().splitlines()
-    reason = f"crashed (signal {-done.returncode})" if done.returncode < 0 else f"exit {done.returncode}"
-    return Details(broken=f"{reason}: {lines[-1][:200]}" if lines else reason)
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
 
 
 def _key(entry: Entry) -> str:
@@ -113,7 +230,7 @@ def _cache_file() -> Path:
 def _raw(file: Path) -> dict[str, Any]:
     try:
         value = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return value if isinstance(value, dict) else {}
 

@@ -26,6 +26,11 @@ from rlcli.task import API_VERSION, TaskSpec
 
 TASKS = "rlcli.tasks"
 TRAINERS = "rlcli.trainers"
+OWN = "rlcli"
+"""The distribution of the built-in tasks and trainers; a plugin cannot take their names."""
+
+_entry_points: Any = vars(metadata.Distribution)["entry_points"].fget
+"""As the standard library reads them, malformed or not, inside `malformed_metadata_ignored` too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,11 +96,14 @@ class TaskSource:
         return record | ({"python": self.python} if self.python and folder else {})
 
 
-def catalog(group: str = TASKS) -> tuple[list[Entry], list[Broken]]:
-    """Every entry of a group, sorted by name then distribution, and the distributions that could not be read."""
+def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], list[Broken]]:
+    """Every entry of a group, sorted by name then distribution, and the distributions that could not be read.
+
+    Those that RLCLI_PLUGINS leaves out are only there if `hidden`.
+    """
     entries: dict[tuple[str, str], Entry] = {}
     broken: dict[str, Broken] = {}
-    wanted = _wanted()
+    wanted = None if hidden else _wanted()
     for distribution in metadata.distributions():
         folder = Path(str(getattr(distribution, "_path", "?"))).name
         try:
@@ -107,12 +115,58 @@ def catalog(group: str = TASKS) -> tuple[list[Entry], list[Broken]]:
                 raise ValueError("no Name and Version in its METADATA")
             if wanted is not None and _normal(name) not in wanted:
                 continue
-            for point in distribution.entry_points:
+            for point in _entry_points(distribution):
                 if point.group == group:
                     entries.setdefault((point.name, _normal(name)), Entry(point.name, point.value, name, version))
         except Exception as error:
             broken.setdefault(folder, Broken(folder, f"malformed metadata ({type(error).__name__}: {error})"))
     return sorted(entries.values(), key=lambda e: (e.name, e.distribution)), list(broken.values())
+
+
+def unreadable_distributions() -> list[Broken]:
+    """Every installed distribution whose metadata is malformed, whether it has to do with rlcli or not."""
+    found: dict[str, Broken] = {}
+    for distribution in metadata.distributions():
+        folder = Path(str(getattr(distribution, "_path", "?")))
+        try:
+            _entry_points(distribution)
+            if not distribution.metadata["Name"] or not distribution.version:
+                raise ValueError("no Name and Version in its METADATA")
+        except Exception as error:
+            reason = f"malformed metadata ({type(error).__name__}: {error}) in {folder}"
+            found.setdefault(folder.name, Broken(folder.name, reason))
+    return list(found.values())
+
+
+def unknown_wanted() -> list[str]:
+    """Names in RLCLI_PLUGINS that are no installed distribution with tasks or trainers."""
+    wanted = _wanted()
+    if not wanted:
+        return []
+    installed = {_normal(entry.distribution) for group in (TASKS, TRAINERS) for entry in catalog(group, hidden=True)[0]}
+    return sorted(wanted - installed - {OWN})
+
+
+@contextlib.contextmanager
+def malformed_metadata_ignored() -> Iterator[None]:
+    """Malformed metadata of an installed package stops nobody who reads the entry points of all packages.
+
+    torch does when it is imported, TensorBoard too; without this one bad file of a stranger ends every command.
+    `catalog` says which distribution it is.
+    """
+    before = vars(metadata.Distribution)["entry_points"]
+
+    def readable(distribution: metadata.Distribution) -> Any:
+        try:
+            return _entry_points(distribution)
+        except Exception:
+            return metadata.EntryPoints()
+
+    setattr(metadata.Distribution, "entry_points", property(readable))  # noqa: B010 - a property, to a type checker
+    try:
+        yield
+    finally:
+        setattr(metadata.Distribution, "entry_points", before)  # noqa: B010
 
 
 def find_task(name: str) -> TaskSource:
@@ -315,12 +369,18 @@ def find_entry(group: str, name: str, *, what: str) -> Entry:
     """One entry of a group by its name or `distribution:name`."""
     entries, _ = catalog(group)
     matches = [e for e in entries if name in (e.name, e.qualified)]
-    if len(matches) == 1:
-        return matches[0]
+    own = [e for e in matches if e.distribution == OWN]
+    if len(matches) == 1 or own:
+        return (own or matches)[0]
     if matches:
         owners = " and ".join(f"{e.distribution} {e.version}" for e in matches)
         choices = " or ".join(e.qualified for e in matches)
         raise TaskError(f"{what} '{name}' is offered by {owners}", hint=f"name one: {choices}")
+    if any(name in (e.name, e.qualified) for e in catalog(group, hidden=True)[0]):
+        setting = f"RLCLI_PLUGINS={os.environ.get('RLCLI_PLUGINS')}"
+        raise TaskError(
+            f"{what} '{name}' is installed, but {setting} leaves its plugin out", hint="unset RLCLI_PLUGINS"
+        )
     names = list(dict.fromkeys(e.name for e in entries))
     installed = listing(sorted({f"{e.distribution} {e.version}" for e in entries}))
     near = did_you_mean(name, [*names, *(e.qualified for e in entries)] if ":" in name else names)
@@ -340,7 +400,8 @@ def load_entry(entry: Entry, kind: type) -> Any:
         said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise TaskError(
             f"plugin {entry.distribution} {entry.version} is broken: '{entry.name}' = {entry.value}:"
-            f" {said}{_place(error)}"
+            f" {said}{_place(error)}",
+            hint=_newer_rlcli(entry),
         ) from error
     if not isinstance(value, kind):
         raise TaskError(
@@ -348,6 +409,24 @@ def load_entry(entry: Entry, kind: type) -> Any:
             f" {type(value).__name__}, not a {kind.__name__}"
         )
     return value
+
+
+def _newer_rlcli(entry: Entry) -> str | None:
+    """What to do about a plugin that asks for a newer rlcli in its metadata."""
+    import rlcli
+
+    requirements: list[str] = []
+    with contextlib.suppress(Exception):  # malformed metadata
+        requirements = metadata.requires(entry.distribution) or []
+    for line in requirements:
+        wanted = re.match(r"rlcli\s*(?:\[[^]]*\])?\s*\(?(?:>=|==|~=|>)\s*([0-9]+(?:\.[0-9]+)*)", line)
+        if wanted and _numbers(wanted[1]) > _numbers(rlcli.__version__):
+            return f"it asks for rlcli {wanted[1]}, this is {rlcli.__version__}: pip install --upgrade rlcli"
+    return None
+
+
+def _numbers(version: str) -> list[int]:
+    return [int(number) for number in re.findall(r"[0-9]+", version)]
 
 
 def load_object(reference: str) -> Any:
@@ -361,7 +440,7 @@ def load_object(reference: str) -> Any:
 
 def load_module(name: str) -> Any:
     """Import a module by its dotted name, or a file of a task folder by its path. Its prints go to stderr."""
-    with _stdout_to_stderr():
+    with _contained():
         if not name.endswith(".py"):
             return importlib.import_module(name)
         file = Path(name)
@@ -418,7 +497,7 @@ def import_file(file: Path) -> Any:
 
     Modules beside a file of no package are importable too, as for a script.
     """
-    with _stdout_to_stderr():
+    with _contained():
         top = file.parent
         while (top.parent / "__init__.py").is_file() and (top / "__init__.py").is_file():
             top = top.parent
@@ -535,7 +614,7 @@ def _module_file(module: str, entry: Entry) -> Path:
 def _find(module: str, entry: Entry) -> ModuleSpec | None:
     """Where a module lies; its parent packages are imported for that."""
     try:
-        with _stdout_to_stderr():
+        with _contained():
             return importlib.util.find_spec(module)
     except KeyboardInterrupt:
         raise
@@ -556,6 +635,37 @@ def _place(error: BaseException) -> str:
 
 
 @contextlib.contextmanager
-def _stdout_to_stderr() -> Iterator[None]:
-    with contextlib.redirect_stdout(sys.stderr):
+def _contained() -> Iterator[None]:
+    """What a plugin prints while it is imported, from C too, goes to stderr; where it went with chdir is undone."""
+    folder = _folder_now()
+    with contextlib.redirect_stdout(sys.stderr), _descriptor_to_stderr():
+        try:
+            yield
+        finally:
+            if folder is not None and _folder_now() != folder:
+                os.chdir(folder)
+
+
+def _folder_now() -> str | None:
+    try:
+        return os.getcwd()
+    except OSError:  # it was removed
+        return None
+
+
+@contextlib.contextmanager
+def _descriptor_to_stderr() -> Iterator[None]:
+    """For what writes to file descriptor 1 without asking Python."""
+    try:
+        if sys.__stdout__ is not None:
+            sys.__stdout__.flush()
+        kept = os.dup(1)
+        os.dup2(2, 1)
+    except (OSError, ValueError):  # one of them is closed
         yield
+        return
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)

@@ -37,6 +37,11 @@ class TaskSpec:
     def __post_init__(self) -> None:
         if isinstance(self.terms, str):
             raise TypeError(f"terms is a tuple of modules: ({self.terms!r},)")
+        if not isinstance(self.api, int) or self.api < 1:
+            raise TypeError(f"api is the number of a plugin interface, 1 or more, not {self.api!r}")
+        for name in ("package", "summary", "config"):
+            if not isinstance(getattr(self, name), str):
+                raise TypeError(f"{name} is a string, not {getattr(self, name)!r}")
 
 
 # In a YAML file these are names or regular expressions; a term receives what they resolve to in the compiled

@@ -16,7 +16,7 @@ LAYERS = [
     {"config", "registry", "probe"},
     {"sim"},
     {"managers", "mdp", "envs", "oige"},
-    {"rl", "viewer", "adapters", "testing", "pytest_plugin", "isaaclab"},
+    {"rl", "viewer", "adapters", "testing", "pytest_plugin", "isaaclab", "diagnosis", "scaffold"},
     {"cli"},
 ]
 ANYWHERE = {"rlcli", "rlcli.__main__"}
@@ -30,6 +30,8 @@ LIGHT = [
     "config",
     "registry",
     "probe",
+    "diagnosis.py",
+    "scaffold.py",
     "cli",
     "rl/trainer.py",
     "rl/sb3_config.py",

@@ -15,6 +15,7 @@ from typer._click.exceptions import ClickException, NoArgsIsHelpError, UsageErro
 from rlcli.cli.console import console, discard
 from rlcli.cli.options import CHOOSE
 from rlcli.errors import ConfigError, RlcliError
+from rlcli.registry import malformed_metadata_ignored
 
 COMMANDS = {
     "list-tasks": "list_tasks",
@@ -26,6 +27,8 @@ COMMANDS = {
     "export": "export",
     "replay": "replay",
     "check": "check",
+    "new": "new",
+    "doctor": "doctor",
 }
 """Command -> module of `rlcli.cli` that registers it."""
 
@@ -77,7 +80,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
-    code = _run(_with_values(arguments))
+    with console.stdout_kept(), malformed_metadata_ignored():
+        code = _run(_with_values(arguments))
     try:
         if sys.stdout is not None:
             sys.stdout.flush()

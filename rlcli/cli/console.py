@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,22 @@ class Console:
     follows: bool = False
     """Another process of the same run says what there is to say; only what is wrong with this one is said here."""
 
+    out: Any = None
+    """Where the JSON document goes; None is stdout."""
+
+    @contextlib.contextmanager
+    def stdout_kept(self) -> Iterator[None]:
+        """With --json, what others print on stdout goes to stderr: only the document is left there."""
+        if not self.json or sys.stdout is None or sys.stderr is None:
+            yield
+            return
+        self.out = sys.stdout
+        try:
+            with contextlib.redirect_stdout(sys.stderr):
+                yield
+        finally:
+            self.out = None
+
     def data(self, text: str) -> None:
         """The result, as text for people; left out with --json."""
         if not self.json and not self.follows:
@@ -34,7 +51,7 @@ class Console:
         """The result, as JSON; left out without --json."""
         if self.json and not self.follows:
             _write(
-                sys.stdout,
+                self.out or sys.stdout,
                 json.dumps({"schema": SCHEMA_VERSION, "command": command, **content}, indent=2, default=str),
             )
 
@@ -61,7 +78,7 @@ class Console:
         if self.json and not self.follows:
             error = {"kind": kind, "exit_code": code, "message": message, "hint": hint, "problems": problems}
             with contextlib.suppress(OSError):  # stdout may be what failed
-                _write(sys.stdout, json.dumps({"schema": SCHEMA_VERSION, "error": error}, indent=2))
+                _write(self.out or sys.stdout, json.dumps({"schema": SCHEMA_VERSION, "error": error}, indent=2))
         lines = message.splitlines() or [""]
         _write(sys.stderr, "\n".join(f"error: {line}" for line in lines))
         if hint:

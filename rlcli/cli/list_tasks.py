@@ -9,7 +9,7 @@ import typer
 from rlcli.cli.console import console
 from rlcli.cli.options import Debug, Json
 from rlcli.probe import TIMEOUT_S, Details, cached, probe
-from rlcli.registry import catalog
+from rlcli.registry import OWN, catalog, unknown_wanted
 
 
 def command(
@@ -27,6 +27,7 @@ def command(
     """List installed tasks."""
     entries, broken = catalog()
     shared = {e.name for e in entries if sum(other.name == e.name for other in entries) > 1}
+    built_in = {e.name for e in entries if e.distribution == OWN}
     details = cached(entries)
     if pattern:
         entries = [
@@ -39,7 +40,7 @@ def command(
         ["TASK", "PLUGIN", "WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "SUMMARY"],
         [
             [
-                entry.qualified if entry.name in shared else entry.name,
+                entry.qualified if entry.name in shared and entry.distribution != OWN else entry.name,
                 f"{entry.distribution} {entry.version}",
                 known.workflow or "?",
                 _number(known.observation_size),
@@ -55,13 +56,15 @@ def command(
     )
     for bad in broken:
         console.warn(f"{bad.distribution}: {bad.reason}; its tasks are not listed")
+    for name in unknown_wanted():
+        console.warn(f"RLCLI_PLUGINS names '{name}', which is no installed distribution with tasks or trainers")
     console.document(
         "list-tasks",
         tasks=[
             {
                 "name": entry.name,
                 "qualified": entry.qualified,
-                "ambiguous": entry.name in shared,
+                "ambiguous": entry.name in shared - built_in,
                 "distribution": entry.distribution,
                 "version": entry.version,
                 **known.record(),

@@ -1,4 +1,4 @@
-"""`python -m rlcli.envs.describe TASK`: what a task is, found by building it; `rlcli.probe` reads the last line.
+"""`python -m rlcli.envs.describe GROUP FILE NAME...`: what tasks are, found by building them, for `rlcli.probe`.
 
 `--index DISTRIBUTION` prints the `index.json` that a distribution ships for `list-tasks`.
 """
@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 
-from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
 from rlcli.errors import RlcliError
 from rlcli.probe import Details
-from rlcli.registry import catalog, find_task
+from rlcli.registry import TASKS, TRAINERS, catalog, find_entry, find_task, load_entry, malformed_metadata_ignored
+from rlcli.trainers import TrainerSpec
 
 
 def describe(name: str) -> Details:
@@ -21,6 +22,9 @@ def describe(name: str) -> Details:
     Raises:
         RlcliError: if it cannot be built.
     """
+    from rlcli.config.load import resolve
+    from rlcli.envs.vec_env import make_env
+
     source = find_task(name)
     task = resolve(source)
     env = make_env(resolve(source, flags={"scene.num_envs": 1}))
@@ -34,19 +38,45 @@ def describe(name: str) -> Details:
     )
 
 
+def try_trainer(name: str) -> Details:
+    """Load a trainer's record, the models of its settings and its class.
+
+    Raises:
+        RlcliError: if one of them cannot be loaded.
+    """
+    entry = find_entry(TRAINERS, name, what="trainer")
+    spec = load_entry(entry, TrainerSpec)
+    for reference in (*spec.algorithms.values(), spec.trainer):
+        load_entry(replace(entry, value=reference), object)
+    return Details(summary=spec.summary)
+
+
 def main(arguments: list[str]) -> None:
-    """Print a task's details, or why it is broken, as one line of JSON; or the index of a distribution."""
+    """`GROUP FILE NAME...`: append a line of JSON to FILE for each name: its details, or why it is broken.
+
+    `--index DISTRIBUTION` prints the index of a distribution.
+    """
     if len(arguments) == 2 and arguments[0] == "--index":
         names = [entry.qualified for entry in catalog()[0] if entry.distribution == arguments[1]]
         index = {name.partition(":")[2]: describe(name).record() for name in names}
         sys.stdout.write(json.dumps(index, indent=1) + "\n")
         return
+    group, file, *names = arguments
+    with malformed_metadata_ignored():
+        for name in names:
+            details = _details(name, describe if group == TASKS else try_trainer)
+            with open(file, "ab") as rows:
+                rows.write(json.dumps(details.record()).encode() + b"\n")
+
+
+def _details(name: str, load: Callable[[str], Details]) -> Details:
     try:
-        details = describe(arguments[0])
+        return load(name)
     except RlcliError as error:
         first, *more = error.message.splitlines()
-        details = Details(broken=f"{first[:200]} (and {len(more)} more)" if more else first[:200])
-    sys.stdout.write("\n" + json.dumps(details.record()) + "\n")
+        return Details(broken=f"{first[:300]} (and {len(more)} more)" if more else first[:300])
+    except BaseException as error:
+        return Details(broken=f"{type(error).__name__}: {error}"[:300])
 
 
 if __name__ == "__main__":

@@ -178,8 +178,7 @@ class ManagedEnv(VecEnv):
         return self.engine.select(mask, self.seed, self._steps.expand(self.num_envs).contiguous())
 
     def _written(self, selection: Selection) -> None:
-        self.engine.forward(selection)
-        self.sim.refresh_rows(selection)
+        self.sim.moved(selection)
         for sensor in self.sensors.values():
             sensor.moved(selection)
 

@@ -226,6 +226,7 @@ class VecEnv(ABC):
         self._start_over()
         self._restart(self._everyone())
         self._between()
+        self.sim.settle()
         return self._observe()
 
     def step(self, action: Tensor) -> StepResult:
@@ -268,6 +269,7 @@ class VecEnv(ABC):
             self._conclude(ended)
             self._restart(ended)
         self._between()
+        self.sim.settle()
         obs = self._observe()
         self.seconds["step"] += time.perf_counter() - start
         return StepResult(obs, reward, terminated, truncated, final_obs, episodes)
@@ -490,8 +492,7 @@ class VecEnv(ABC):
         self._restart_workflow(selection)
         selection.write(self.episode_length_buf, 0)
         selection.write(self._success_hold, 0.0)
-        self.engine.forward(selection)
-        self.sim.refresh_rows(selection)
+        self.sim.moved(selection)
         for sensor in self.sensors.values():
             sensor.reset(selection)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -68,6 +69,7 @@ class BatchEngine:
         self._step_stage = _NONE
         self._forward_stage = _NONE
         self._own_constants = False
+        self.forces_after_reset = forces_after_reset
         self._reset_stage = _ACC if forces_after_reset else _VEL
         self._force_sensors = force_sensors(model)
 
@@ -152,24 +154,30 @@ class BatchEngine:
         """Compute what is bound of the derived fields of the selected worlds."""
         if self._forward_stage == _NONE:
             return
+        forces = self._forces(selection) if self._reset_stage < self._forward_stage else []
+        kept = [field[where].clone() for field, where in forces]
         try:
             self._batch.forward(_ids(selection).astype(np.int32), stage=min(self._forward_stage, self._reset_stage))
         except SimulationError as error:
             raise _engine_error(error) from None
-        if self._reset_stage < self._forward_stage:
-            self._clear_forces(selection)
+        for (field, where), values in zip(forces, kept, strict=True):
+            field[where] = values
 
-    def _clear_forces(self, selection: Selection) -> None:
-        """No force has acted on a start state yet."""
-        for name, field in self._fields.items():
-            if name in _ACCELERATION:
-                field[_ids(selection)] = 0.0
-            elif self._senses(name):
-                field[_ids(selection)[:, None], self._force_sensors] = 0.0
+    def _forces(self, selection: Selection) -> list[tuple[Tensor, Any]]:
+        """Bound fields of the acceleration stage, and where in them what belongs to the selected worlds lies."""
+        ids = _ids(selection)
+        return [
+            (field, ids if name in _ACCELERATION else (ids[:, None], self._force_sensors))
+            for name, field in self._fields.items()
+            if self._of_substep(name)
+        ]
 
     def reset(self, selection: Selection) -> None:
         """Put the selected worlds into the default state: the whole row, controls and warm start included."""
         self._batch.state[_ids(selection)] = self._default
+        if not self.forces_after_reset:
+            for field, where in self._forces(selection):  # no force has acted on a start state yet
+                field[where] = 0.0
 
     def set_default(self, qpos: Tensor, qvel: Tensor) -> None:
         """The joint state that `reset` restores."""

@@ -29,6 +29,8 @@ class Engine(Protocol):
     warnings: dict[str, int]
     asynchronous: bool
     """Whether reading a value waits for a device: then nothing on the path of a step may."""
+    forces_after_reset: bool
+    """Whether `forward` computes fields of the acceleration stage; else `reset` puts them to 0."""
 
     @property
     def divergences(self) -> int:

@@ -43,7 +43,25 @@ class SimData:
         self.qpos = self._copies[0][:, : qpos.shape[1]]
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
+        self._moved: Selection | None = None
         self._derived: dict[str, tuple[int, Tensor]] = {}
+
+    def moved(self, selection: Selection) -> None:
+        """The selected worlds have been put elsewhere: what derives from their state is that of the new one.
+
+        An engine that computes all worlds at once does so when it is next read: once, however often worlds move.
+        """
+        if not self.engine.asynchronous:
+            self.engine.forward(selection)
+        else:
+            self._moved = selection if self._moved is None else self._moved.joined(selection)
+        self.refresh_rows(selection)
+
+    def settle(self) -> None:
+        """Compute what is left to compute of worlds that have moved."""
+        if self._moved is not None:
+            selection, self._moved = self._moved, None
+            self.engine.forward(selection)
 
     def refresh(self) -> None:
         """Copy the state of every world."""
@@ -64,6 +82,7 @@ class SimData:
 
     def derived(self, name: str) -> Tensor:
         """A derived field as float32, cast once a step. (num_envs, ...)"""
+        self.settle()
         stamp, value = self._derived.get(name, (-1, None))
         if stamp != self.stamp or value is None:
             value = self.engine.field(name).float()

@@ -87,6 +87,10 @@ class MaskSelection:
         """The masked rows' numbers; waits for the device. (rows,) int64"""
         return self.mask.nonzero()[:, 0]
 
+    def joined(self, other: MaskSelection) -> MaskSelection:
+        """The rows that are in either."""
+        return MaskSelection(self.mask | other.mask, self._seed, self._counters)
+
     def stream(self, stream: np.uint64) -> MaskSelection:
         """The same rows drawing from another stream."""
         return MaskSelection(self.mask, self._seed, self._counters, stream)

@@ -76,6 +76,10 @@ class Selection(Protocol):
         """Those of the rows where `mask` (num_envs,) holds; None where that is known to be nobody."""
         ...
 
+    def joined(self, other: Any) -> Selection:
+        """The rows that are in this selection or in another of the same engine."""
+        ...
+
     def env_ids(self) -> Tensor:
         """The rows' numbers, for code that wants ids; on a GPU this waits for the device. (rows,) int64"""
         ...
@@ -156,6 +160,12 @@ class IdSelection:
         if not chosen.any():
             return None
         return IdSelection(self.ids[chosen], self._seed, self._counters[chosen], self._stream, self._device)
+
+    def joined(self, other: IdSelection) -> IdSelection:
+        """The rows that are in either; one that is in both draws as it does here."""
+        ids, first = np.unique(np.concatenate([self.ids, other.ids]), return_index=True)
+        counters = np.concatenate([self._counters, other._counters])[first]
+        return IdSelection(ids, self._seed, counters, self._stream, self._device)
 
     def env_ids(self) -> Tensor:
         """The rows' numbers. (rows,) int64"""

@@ -16,7 +16,8 @@ from rlcli.sim.scene import ContactSlots, RayMount
 from rlcli.sim.selection import Columns, Selection
 
 _TIMES = ("air_time", "contact_time", "last_air_time", "last_contact_time")
-_KEPT = (*_TIMES, "first_contact", "first_air", "found", "force_history")
+_FLAGS = ("first_contact", "first_air", "found")
+_KEPT = (*_TIMES, *_FLAGS, "force_history")
 """What a contact sensor carries from step to step."""
 
 
@@ -41,24 +42,26 @@ class ContactSensor:
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(n, *shape, dtype=dtype, device=device)
 
+        self._times, self._flags = zeros(len(_TIMES), k), zeros(len(_FLAGS), k, dtype=torch.bool)
+        times, flags = self._times.unbind(1), self._flags.unbind(1)
         self.force_history = zeros(slots.config.history, k, 3)
         """Net contact force on each body over the last steps, newest first, world frame. (num_envs, h, k, 3) [N]"""
         self.force = self.force_history[:, 0]
         """Net contact force on each body in the last substep, world frame. (num_envs, k, 3) [N]"""
-        self.found = zeros(k, dtype=torch.bool)
-        """Whether each body is in contact. (num_envs, k)"""
-        self.air_time = zeros(k)
+        self.air_time = times[0]
         """How long each body has been in the air; 0 in contact. (num_envs, k) [s]"""
-        self.contact_time = zeros(k)
+        self.contact_time = times[1]
         """How long each body has been in contact; 0 in the air. (num_envs, k) [s]"""
-        self.last_air_time = zeros(k)
+        self.last_air_time = times[2]
         """How long each body was in the air before its last contact. (num_envs, k) [s]"""
-        self.last_contact_time = zeros(k)
+        self.last_contact_time = times[3]
         """How long each body was in contact before it last lifted off. (num_envs, k) [s]"""
-        self.first_contact = zeros(k, dtype=torch.bool)
+        self.first_contact = flags[0]
         """Whether contact began in the last step. (num_envs, k)"""
-        self.first_air = zeros(k, dtype=torch.bool)
+        self.first_air = flags[1]
         """Whether contact ended in the last step. (num_envs, k)"""
+        self.found = flags[2]
+        """Whether each body is in contact. (num_envs, k)"""
 
     def update(self, dt: float) -> None:
         """Take in what a step has measured."""
@@ -69,8 +72,7 @@ class ContactSensor:
         self.found.copy_(found)
         torch.logical_and(found, self.air_time > 0.0, out=self.first_contact)
         torch.logical_and(~found, self.contact_time > 0.0, out=self.first_air)
-        self.air_time += dt
-        self.contact_time += dt
+        self._times[:, :2] += dt
         torch.where(self.first_contact, self.air_time, self.last_air_time, out=self.last_air_time)
         torch.where(self.first_air, self.contact_time, self.last_contact_time, out=self.last_contact_time)
         self.air_time *= ~found
@@ -78,11 +80,12 @@ class ContactSensor:
 
     def reset(self, selection: Selection) -> None:
         """Begin new episodes: no times, no history, and the forces of the start state."""
-        for name in (*_TIMES, "first_contact", "first_air", "force_history"):
-            selection.write(getattr(self, name), 0)
-        force, found = self._measured(selection.peek(self._sim.derived("sensordata")))
-        selection.write(self.force, force)
-        selection.write(self.found, found)
+        for values in (self._times, self._flags, self.force_history):
+            selection.write(values, 0)
+        if self._sim.engine.forces_after_reset:
+            force, found = self._measured(selection.peek(self._sim.derived("sensordata")))
+            selection.write(self.force, force)
+            selection.write(self.found, found)
 
     def moved(self, selection: Selection) -> None:
         """Forces are those of the last step, wherever an event has put the bodies since."""
@@ -191,6 +194,7 @@ class RaySensor:
                 buffer.copy_(values)
 
     def _rays(self, position: Tensor, quat: Tensor, selection: Selection | None = None) -> tuple[Tensor, ...]:
+        self._sim.settle()
         axes = self._axes(quat)
         position = position + _turned(axes, self._offset)[:, 0]
         points = position[:, None] + _turned(axes, self._starts)

@@ -46,6 +46,17 @@ _ACCELERATION = frozenset(
     ]
 )
 """Fields of the acceleration stage: read as the last substep left them."""
+_MOTION = frozenset(["cvel", "cdof", "cdof_dot"])
+"""Fields of the velocity stage that the motion of bodies alone gives: no inertias, no contacts, no constraints."""
+_SENSORS_OF_MOTION = frozenset(
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
+    for name in (
+        *("MAGNETOMETER", "CAMPROJECTION", "RANGEFINDER", "JOINTPOS", "TENDONPOS", "BALLQUAT", "FRAMEPOS", "FRAMEQUAT"),
+        *("FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS", "SUBTREECOM", "CLOCK", "INSIDESITE", "VELOCIMETER", "GYRO"),
+        *("JOINTVEL", "BALLANGVEL", "FRAMELINVEL", "FRAMEANGVEL", "SUBTREELINVEL", "SUBTREEANGMOM"),
+    )
+)
+"""Sensors before the acceleration stage that read nothing else."""
 _KINEMATICS, _VELOCITY, _FORCE = range(3)
 """Groups of derived fields."""
 _FULL = {
@@ -110,13 +121,19 @@ class WarpEngine:
         self._start_inputs: dict[str, Tensor] = {}
         self._last_derived: dict[str, Tensor] = {}
         self._derived: set[int] = set()
+        self._motion_alone = True
         self._overwritten: dict[str, wp.array] = {}
-        self._forces_after_reset = forces_after_reset
+        self.forces_after_reset = forces_after_reset
         force_columns = force_sensors(model)
         self._sensor_stages = {_FORCE} if force_columns else set()
         if len(force_columns) < model.nsensordata:
             self._sensor_stages.add(_VELOCITY)
         self._force_columns = as_index(force_columns, self.device)
+        self._senses_motion_alone = _SENSORS_OF_MOTION.issuperset(
+            int(kind)
+            for kind, stage in zip(model.sensor_type, model.sensor_needstage, strict=True)
+            if int(stage) < int(mujoco.mjtStage.mjSTAGE_ACC)
+        )
         self._expanded: dict[str, Tensor] = {}
         self._graphs: dict[tuple[int, bool], Any] = {}
         self._rays: dict[tuple[int, int], tuple[wp.array, wp.array, wp.array]] = {}
@@ -157,6 +174,7 @@ class WarpEngine:
             if name in _INPUTS:  # nobody has written to it yet
                 self._start_inputs[name] = self._fields[name].view(self.num_envs, -1).clone()
             self._derived |= self._stages(name)
+            self._motion_alone = all(map(self._is_motion, self._fields))
             if name in ("cacc", "cfrc_int"):  # the velocity stage uses their memory for its own accelerations
                 self._overwritten[name] = wp.empty_like(array)
             self._graphs.clear()
@@ -165,7 +183,7 @@ class WarpEngine:
                     mjw.forward(self._model, self._data)  # a field asked for late is that of the state
                 for other, values in kept.items():
                     self._fields[other].copy_(values)
-                if self._fields[name].dtype == torch.float32:
+                if _FORCE in self._stages(name):
                     self._last_derived[name] = self._fields[name].clone()
         return self._fields[name]
 
@@ -223,20 +241,6 @@ class WarpEngine:
         What is bound of the derived fields is that of the state before, too: terms judge by it.
         """
         with self._launching():
-            wp.launch(
-                kernels.guard,
-                dim=self.num_envs,
-                inputs=[self._arrays[name] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "act")]
-                + [self._data.overflow],
-                outputs=[
-                    wp.from_torch(self._last_qpos),
-                    wp.from_torch(self._last_qvel),
-                    wp.from_torch(self._diverged),
-                    wp.from_torch(self._count),
-                    wp.from_torch(self._overflowed),
-                ],
-                device=self._device,
-            )
             for name, last in self._last_derived.items():
                 self._launch_rows(kernels.hold, self._diverged, self._fields[name], last)
         return self._diverged
@@ -272,6 +276,10 @@ class WarpEngine:
             )
         for name, start in self._start_inputs.items():
             selection.write(self._fields[name].view(self.num_envs, -1), start)
+        if not self.forces_after_reset:
+            for name in self._of_substep():  # no force has acted on a start state yet
+                columns = self._force_columns if name == "sensordata" else ALL
+                selection.write(self._fields[name].view(self.num_envs, -1), 0.0, columns)
 
     def set_default(self, qpos: Tensor, qvel: Tensor) -> None:
         """The joint state that `reset` restores."""
@@ -397,12 +405,36 @@ class WarpEngine:
         for _ in range(nstep):
             mjw.step(self._model, self._data)
         if derive:
+            self._guard()
             self._derive()
+
+    def _guard(self) -> None:
+        """Put worlds that have left all bounds back, before anything is derived from where they are."""
+        wp.launch(
+            kernels.guard,
+            dim=self.num_envs,
+            inputs=[self._arrays[name] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "act")]
+            + [self._data.overflow],
+            outputs=[
+                wp.from_torch(self._last_qpos),
+                wp.from_torch(self._last_qvel),
+                wp.from_torch(self._diverged),
+                wp.from_torch(self._count),
+                wp.from_torch(self._overflowed),
+            ],
+            device=self._device,
+        )
 
     def _derive(self) -> None:
         """Bring the derived fields that somebody reads up to the state; those of forces are the last substep's."""
         m, d = self._model, self._data
-        if _VELOCITY in self._derived:
+        if _VELOCITY in self._derived and self._motion_alone:
+            mjw.fwd_kinematics(m, d)
+            mjw.com_vel(m, d)
+            if "sensordata" in self._fields:
+                mjw.sensor_pos(m, d)
+                mjw.sensor_vel(m, d)
+        elif _VELOCITY in self._derived:
             mjw.fwd_position(m, d, factorize=False)
             for name, kept in self._overwritten.items():
                 wp.copy(kept, getattr(d, name))
@@ -426,16 +458,19 @@ class WarpEngine:
             return self._sensor_stages
         return {_KINEMATICS if name in _KINEMATIC else _FORCE if name in _ACCELERATION else _VELOCITY}
 
+    def _is_motion(self, name: str) -> bool:
+        """Whether a field can be brought up to the state without contacts, constraints and inertias."""
+        if name == "sensordata":
+            return self._senses_motion_alone
+        return _VELOCITY not in self._stages(name) or name in _MOTION
+
     def _of_substep(self) -> list[str]:
         return [name for name in self._fields if _FORCE in self._stages(name)]
 
     def _forward(self, selection: Selection) -> None:
-        if _FORCE not in self._derived or not self._forces_after_reset:
+        if _FORCE not in self._derived or not self.forces_after_reset:
             with self._launching():
                 self._derive()
-            for name in self._of_substep():  # no force has acted on a start state yet
-                columns = self._force_columns if name == "sensordata" else ALL
-                selection.write(self._fields[name].view(self.num_envs, -1), 0.0, columns)
             return
         before = self._before_forward()
         with self._launching():

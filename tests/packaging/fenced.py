@@ -68,4 +68,9 @@ def run_commands(found, folder, *, site=None):
 
 def success_rate(output):
     """The first success rate that was printed: that of the trained policy."""
-    return float(re.findall(r"^success rate +(\S+)", output, re.MULTILINE)[0])
+    return success_rates(output)[0]
+
+
+def success_rates(output):
+    """The success rate of each evaluation."""
+    return [float(rate) for rate in re.findall(r"^success rate +(\S+)", output, re.MULTILINE)]

@@ -9,7 +9,7 @@ import zipfile
 from email.parser import Parser
 
 import pytest
-from fenced import REPOSITORY, blocks, run_commands, success_rate, write_files
+from fenced import REPOSITORY, blocks, run_commands, success_rate, success_rates
 
 ACROBOT = REPOSITORY / "plugins" / "rlcli-example-acrobot"
 pytestmark = pytest.mark.slow
@@ -128,12 +128,18 @@ def test_every_command_of_the_plugins_readme_runs(site, tmp_path):
     assert (folder / "acrobot.gif").stat().st_size > 10_000
 
 
-def test_the_plugin_of_the_page_works_as_written(site, tmp_path):
+def test_the_plugins_of_the_page_are_made_installed_and_learned_as_written(site, tmp_path):
     own = tmp_path / "site"
     shutil.copytree(site, own)
     found = blocks(REPOSITORY / "docs" / "write-a-plugin.md")
-    write_files(found, tmp_path)
     output = run_commands(found, tmp_path, site=own)
-    assert "my-arm: 0 errors, 0 warnings" in output
-    assert "1 passed" in output
-    assert success_rate(output) > 0.9
+    for name in ("my-arm", "my-direct-arm"):
+        assert f"{name}: 0 errors, 0 warnings" in output
+        assert (tmp_path / name / f"{name}.gif").stat().st_size > 10_000
+    assert "4 passed" in output
+    assert "2 passed" in output
+    assert min(success_rates(output)) > 0.9
+    shown = [block for block in found if block.file]
+    assert len(shown) == 6
+    for block in shown:
+        assert (tmp_path / block.file).read_text(encoding="utf-8") == block.text, block.file

@@ -6,6 +6,7 @@ import sys
 import textwrap
 
 import pytest
+from broken_plugins import BROKEN, FILES, SPEC
 
 
 @pytest.fixture
@@ -24,16 +25,16 @@ def plugins(tmp_path, monkeypatch):
         folder.mkdir(exist_ok=True)
         (folder / "__init__.py").write_text(textwrap.dedent(source))
         for file, text in (files or {}).items():
-            (folder / file).write_text(text)
+            (folder / file).write_bytes(text if isinstance(text, bytes) else text.encode())
         info = site / f"{package}-{version}.dist-info"
         info.mkdir()
         if metadata is None:
             metadata = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
-        if metadata:
-            (info / "METADATA").write_text(metadata)
+        if metadata is not None:
+            (info / "METADATA").write_bytes(metadata if isinstance(metadata, bytes) else metadata.encode())
         task = task or f"{name}-task"
         points = f"[rlcli.tasks]\n{task} = {package}:SPEC\n" if entry_points is None else entry_points
-        (info / "entry_points.txt").write_text(points)
+        (info / "entry_points.txt").write_bytes(points if isinstance(points, bytes) else points.encode())
         (info / "RECORD").write_text("")
         return folder
 
@@ -43,7 +44,16 @@ def plugins(tmp_path, monkeypatch):
             del sys.modules[module]
 
 
-SPEC = "from rlcli.task import TaskSpec\nSPEC = TaskSpec(package=__name__, summary='A plugin.')\n"
+@pytest.fixture
+def broken_plugins(plugins):
+    """broken_plugins(names...) installs these of `BROKEN`, and a distribution `good` whose task works."""
+
+    def install(*names):
+        plugins("good", SPEC, files=FILES)
+        for name in names:
+            plugins(name, BROKEN[name].source, **BROKEN[name].options)
+
+    return install
 
 
 @pytest.fixture

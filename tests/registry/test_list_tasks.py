@@ -7,19 +7,9 @@ import time
 from pathlib import Path
 
 import pytest
+from broken_plugins import MODEL, TASK
 
 HEAVY = ["torch", "mujoco", "numpy", "stable_baselines3"]
-MODEL = "<mujoco><worldbody><body><joint name='j' type='slide'/><geom size='.1' mass='1'/></body></worldbody></mujoco>"
-TASK = """\
-summary: {summary}
-decimation: 1
-episode_length_s: 1.0
-sim: {{dt: 0.01}}
-scene: {{num_envs: 5, entities: {{robot: {{model: model.xml}}}}}}
-actions: {{push: {{func: joint_effort, joints: [j]}}}}
-observations: {{policy: {{pos: {{func: joint_pos_rel}}, vel: {{func: joint_vel_rel}}}}}}
-rewards: {{alive: {{func: is_alive, weight: 1.0}}}}
-"""
 
 
 def rows(done):
@@ -104,15 +94,15 @@ def test_probing_fills_the_cache_and_reports_broken_tasks_as_rows(plugins, spec,
     found = rows(cli("list-tasks", "task", "--probe", "--json"))
     good = found["good-task"]
     assert (good["summary"], good["workflow"], good["num_envs"]) == ("Slide.", "managed", 5)
-    assert (good["observation_size"], good["action_size"], good["agent"], good["broken"]) == (2, 1, None, None)
+    assert (good["observation_size"], good["action_size"], good["agent"], good["broken"]) == (2, 1, "ppo", None)
     assert "SystemExit: 3" in found["exits-task"]["broken"]
-    assert found["crashes-task"]["broken"] == "exit 7"
-    assert found["killed-task"]["broken"] == "crashed (signal 9)"
+    assert found["crashes-task"]["broken"] == "ended the process (exit 7)"
+    assert found["killed-task"]["broken"] == "crashed (SIGKILL)"
     assert "out of cheese" in found["raises-task"]["broken"]
     assert found["invalid-task"]["broken"].endswith("task.yaml:1:1: missing key 'sim' (and 6 more)")
     again = rows(cli("list-tasks", "--json"))
     assert {name: again[name] for name in found} == found
-    assert "broken: exit 7" in cli("list-tasks").stdout
+    assert "broken: ended the process (exit 7)" in cli("list-tasks").stdout
 
 
 def test_a_task_that_hangs_is_given_up(plugins, cli):
@@ -175,3 +165,10 @@ def test_a_broken_plugin_exits_with_4_and_no_traceback(plugins, cli, source):
     assert "plugin odd 1.0 is broken" in error["message"]
     assert "Traceback" not in done.stderr
     assert cli("show", "cartpole").returncode == 0
+
+
+def test_what_a_probe_found_broken_is_said_whatever_the_plugin_ships(plugins, cli):
+    plugins("bad", "raise ValueError('out of cheese')\n", files={"index.json": '{"bad-task": {"summary": "Fine."}}'})
+    assert rows(cli("list-tasks", "--json"))["bad-task"]["broken"] is None
+    assert "out of cheese" in rows(cli("list-tasks", "bad", "--probe", "--json"))["bad-task"]["broken"]
+    assert "out of cheese" in rows(cli("list-tasks", "--json"))["bad-task"]["broken"]

@@ -227,3 +227,14 @@ def test_nobody_selected_is_nothing_done():
     assert float(nobody.mean(torch.ones(N))) == 0.0
     assert int(nobody.count) == 0
     assert len(nobody.env_ids()) == 0
+
+
+def test_joined_selections_hold_the_rows_of_both_and_draw_as_before():
+    chosen = torch.zeros_like(MASK)
+    chosen[[1, 5]] = True
+    by_id, by_mask = both()
+    others = both(mask=chosen)
+    joined_ids, joined_mask = by_id.joined(others[0]), by_mask.joined(others[1])
+    assert joined_ids.env_ids().tolist() == (MASK | chosen).nonzero()[:, 0].tolist()
+    assert joined_mask.env_ids().tolist() == joined_ids.env_ids().tolist()
+    assert torch.equal(joined_ids.uniform(0.0, 1.0), joined_mask.uniform(0.0, 1.0)[joined_ids.env_ids()])

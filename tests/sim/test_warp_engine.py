@@ -11,6 +11,7 @@ from worlds import CRITTER, PENDULUM_TASK, build, critter, edited, pendulum
 from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DivergedError
 from rlcli.sim.engine import open_engine
+from rlcli.sim.entity import SimData
 
 torch.set_num_threads(1)
 
@@ -411,3 +412,79 @@ def test_a_solver_that_it_lacks_is_refused_by_name_with_the_way_out():
 def test_the_cpu_engine_is_refused_a_gpu_before_anything_else():
     with pytest.raises(ConfigError, match="batch"):
         open_engine(mujoco.MjModel.from_xml_string(XML), 2, SimConfig(dt=0.002, engine="batch"), device="cuda")
+
+
+ONLY_MOTION = XML.replace(
+    "</mujoco>",
+    '<sensor><gyro site="imu"/><velocimeter site="imu"/><subtreecom body="torso"/>'
+    '<subtreelinvel body="torso"/></sensor></mujoco>',
+)
+
+
+@pytest.mark.parametrize("also", [(), ("qfrc_bias",), ("actuator_velocity",)])
+def test_motion_is_the_cpu_engines_whatever_else_is_read(also):
+    """What needs neither contacts nor inertias is computed without them, unless something else is bound that does."""
+    names = ("site_xpos", "cvel", "subtree_com", "sensordata", *also)
+    host, device = pair(ONLY_MOTION, names)
+    for engine in (host, device):
+        scatter(engine, height=0.5)
+        engine.step(3)
+    assert_equal(host, device, names, 2e-5, "after a step")
+    for engine in (host, device):
+        chosen = some(engine, 1, 3)
+        engine.reset(chosen)
+        engine.field("qvel")[1] = 0.5
+        engine.forward(chosen)
+    assert_equal(host, device, names, 2e-5, "after a reset")
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_without_forces_after_a_reset_a_forward_pass_leaves_those_of_the_last_substep(kind):
+    names = ("actuator_force", "qacc", "sensordata")
+    engine = pair(fields=names, forces_after_reset=False)[kind]
+    scatter(engine)
+    engine.step(2)
+    felt = snapshot(engine, ("actuator_force", "qacc"))
+    accelerations = engine.field("sensordata")[:, :3].clone()
+    assert felt["actuator_force"][2].any()
+    engine.field("qvel")[2, :3] += 1.0  # pushed, not reset
+    engine.forward(some(engine, 2))
+    assert_rows(felt, snapshot(engine, felt), range(N))
+    assert torch.equal(engine.field("sensordata")[:, :3], accelerations)
+    engine.reset(some(engine, 2))
+    engine.forward(some(engine, 2))
+    assert not engine.field("actuator_force")[2].any()
+    assert not engine.field("sensordata")[2, :3].any()
+    assert torch.equal(engine.field("sensordata")[3, :3], accelerations[3])
+
+
+def test_a_world_that_diverges_is_seen_where_it_was_and_the_others_where_they_are():
+    names = ("xpos", "cvel", "sensordata")
+    _, device = pair(fields=names)
+    scatter(device, height=0.5)
+    device.step(2)
+    assert not device.diverged().any()
+    before = snapshot(device, names)
+    device.field("qvel")[3, 0] = torch.nan
+    device.step(1)
+    assert device.diverged().tolist() == [i == 3 for i in range(N)]
+    now = snapshot(device, names)
+    for name in names:
+        torch.testing.assert_close(now[name][3], before[name][3], rtol=1e-5, atol=1e-5)
+        assert not torch.equal(now[name][2], before[name][2]), name
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_worlds_that_move_twice_are_seen_where_they_are(kind):
+    engine = pair(fields=("xpos",))[kind]
+    sim = SimData(engine)
+    for world, height in ((1, 2.0), (3, 3.0)):
+        chosen = some(engine, world)
+        engine.field("qpos")[world, 2] = height
+        sim.moved(chosen)
+    sim.settle()
+    start = float(engine.model.qpos0[2])
+    torch.testing.assert_close(sim.derived("xpos")[:, 1, 2], torch.tensor([start, 2.0, start, 3.0, start]))
+    engine.field("qpos")[0, 2] = 4.0
+    sim.moved(some(engine, 0))
+    assert float(sim.derived("xpos")[0, 1, 2]) == pytest.approx(4.0), "what is read is current without more ado"

@@ -1,0 +1,35 @@
+"""`rlcli doctor`: what works here and what does not, of the machine, the installation and every plugin."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from rlcli.cli.console import console
+from rlcli.cli.options import Debug, Json, RunsDir
+from rlcli.probe import TIMEOUT_S
+
+
+def command(
+    timeout: Annotated[
+        float, typer.Option("--probe-timeout", help="Seconds that each task, trainer, driver is given.")
+    ] = TIMEOUT_S,
+    runs_dir: RunsDir = None,
+    json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Look at this machine, this installation and every plugin; for bug reports."""
+    from rlcli.diagnosis import examine
+    from rlcli.rl.run import default_runs_dir
+
+    checks = examine(runs_dir or default_runs_dir(), timeout)
+    console.table(["CHECK", "STATE", "FOUND"], [[check.name, check.state, check.found] for check in checks])
+    for check in checks:
+        if check.hint:
+            console.data(f"{check.state}: {check.name}: {check.hint}")
+    broken = [check for check in checks if check.state == "broken"]
+    console.document("doctor", healthy=not broken, checks=[asdict(check) for check in checks])
+    if broken:
+        raise typer.Exit(9)

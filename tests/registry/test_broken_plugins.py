@@ -1,0 +1,172 @@
+"""What a broken plugin costs: its own row. Everything else goes on as if it were not there."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from broken_plugins import BROKEN
+
+BUILT_IN = {"cartpole", "cartpole-direct", "ant-direct"}
+TRAIN = ("train", "good-task", "--num-envs", "2", "--max-iterations", "1", "--logger", "none")
+
+
+def document(done):
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    return json.loads(done.stdout)
+
+
+def of(listed, name):
+    """The row of a broken plugin in what `list-tasks --json` printed."""
+    (row,) = [row for row in listed["tasks"] if row["distribution"] == name]
+    return row
+
+
+def check_listed(listed, names):
+    assert {*BUILT_IN, "good-task"} <= {
+        row["name"] for row in listed["tasks"] if row["distribution"] in ("rlcli", "good")
+    }
+    unreadable = {row["distribution"].replace("_", "-") for row in listed["broken"]}
+    assert unreadable == {f"{name}-1.0.dist-info" for name in names if BROKEN[name].unreadable}
+    for name in names:
+        if not (BROKEN[name].unreadable or BROKEN[name].foreign):
+            assert of(listed, name)["name"] == BROKEN[name].options.get("task", f"{name}-task")
+
+
+def test_there_are_at_least_24_broken_plugins():
+    assert len(BROKEN) >= 24
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_plugin_leaves_the_list_whole(broken_plugins, cli, name):
+    broken_plugins(name)
+    check_listed(document(cli("list-tasks", "--json")), [name])
+    listed = cli("list-tasks")
+    assert (listed.returncode, "Traceback" in listed.stderr) == (0, False)
+    assert "good-task" in listed.stdout
+    assert BROKEN[name].foreign or name.replace("-", "_") in (listed.stdout + listed.stderr).replace("-", "_")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_plugin_leaves_training_whole(broken_plugins, cli, name):
+    broken_plugins(name)
+    trained = document(cli(*TRAIN, "--json"))
+    assert (trained["state"], trained["iteration"]) == ("finished", 1)
+
+
+@pytest.mark.slow
+def test_all_together_break_nothing_either(broken_plugins, cli, capsys):
+    broken_plugins(*BROKEN)
+    start = time.perf_counter()
+    done = cli("list-tasks")
+    took = time.perf_counter() - start
+    with capsys.disabled():
+        print(f"list-tasks with {len(BROKEN)} broken plugins: {took:.2f} s")
+    assert "good-task" in done.stdout
+    check_listed(document(cli("list-tasks", "--json")), BROKEN)
+    assert document(cli(*TRAIN, "--json"))["state"] == "finished"
+    trained = cli(*TRAIN)
+    assert trained.returncode == 0, trained.stderr
+    bare = cli("list-tasks", "--json", RLCLI_PLUGINS="none")
+    assert {row["distribution"] for row in json.loads(bare.stdout)["tasks"]} == {"rlcli"}
+
+
+@pytest.mark.slow
+def test_probing_says_of_each_what_is_wrong_with_it(broken_plugins, cli):
+    broken_plugins(*BROKEN)
+    listed = document(cli("list-tasks", "--probe", "--probe-timeout", "20", "--json"))
+    check_listed(listed, BROKEN)
+    for name, case in BROKEN.items():
+        if case.said is not None:
+            assert case.said in of(listed, name)["broken"], name
+        elif not (case.unreadable or case.foreign):
+            assert (of(listed, name)["broken"], of(listed, name)["observation_size"]) == (None, 2), name
+    assert {row["broken"] for row in listed["tasks"] if row["distribution"] in ("rlcli", "good")} == {None}
+    again = document(cli("list-tasks", "--json"))
+    assert again == listed
+
+
+@pytest.mark.parametrize("name", ["exits-with-0", "raises", "newer-api", "unknown-field", "api-is-text"])
+def test_a_broken_plugin_that_is_asked_for_ends_with_its_reason(broken_plugins, cli, name):
+    broken_plugins(name)
+    done = cli("show", f"{name}-task", "--json")
+    error = json.loads(done.stdout)["error"]
+    assert (done.returncode, error["kind"]) == (4, "task")
+    assert BROKEN[name].said in error["message"]
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["prints", "prints-from-c"])
+def test_what_a_plugin_prints_is_not_in_the_document(broken_plugins, cli, name):
+    broken_plugins(name)
+    done = cli("show", f"{name}-task", "--json")
+    assert document(done)["config"]["summary"] == "Slide."
+    assert "hubbub" in done.stderr
+
+
+def test_what_a_task_prints_while_it_runs_is_not_in_the_document(plugins, cli):
+    terms = "def one(env):\n    import torch\n    print('hubbub')\n    return torch.ones(env.num_envs)\n"
+    from broken_plugins import FILES, IMPORT
+
+    task = FILES["task.yaml"].replace("func: is_alive", "func: one")
+    source = IMPORT + "SPEC = TaskSpec(__name__, 'x', terms=('noisy.terms',))\n"
+    plugins("noisy", source, files={**FILES, "task.yaml": task, "terms.py": terms})
+    done = cli("eval", "noisy-task", "--policy", "zero", "--episodes", "2", "--num-envs", "2", "--json")
+    assert document(done)["command"] == "eval"
+    assert "hubbub" in done.stderr
+
+
+def test_a_built_in_task_keeps_its_name(broken_plugins, cli):
+    broken_plugins("takes-a-built-in-name")
+    assert "on a cart" in cli("show", "cartpole").stdout
+    listed = cli("list-tasks")
+    assert "takes-a-built-in-name:cartpole" in listed.stdout
+    assert not [line for line in listed.stdout.splitlines() if line.startswith("rlcli:")]
+    ambiguous = {row["name"]: row["ambiguous"] for row in document(cli("list-tasks", "--json"))["tasks"]}
+    assert not ambiguous["cartpole"]
+
+
+def test_a_hidden_plugin_is_said_to_be_hidden(broken_plugins, cli):
+    broken_plugins()
+    done = cli("show", "good-task", RLCLI_PLUGINS="none")
+    assert done.returncode == 4
+    assert "RLCLI_PLUGINS=none leaves its plugin out" in done.stderr
+    assert cli("show", "good-task", RLCLI_PLUGINS="GOOD").returncode == 0
+    assert "RLCLI_PLUGINS names 'nmae'" in cli("list-tasks", RLCLI_PLUGINS="good,nmae").stderr
+
+
+def test_a_plugin_that_wants_a_newer_rlcli_is_told_which(plugins, cli):
+    metadata = "Metadata-Version: 2.1\nName: early\nVersion: 1.0\nRequires-Dist: rlcli>=99.1\n"
+    plugins("early", "from rlcli.task import Wings\n", metadata=metadata)
+    done = cli("show", "early-task")
+    assert done.returncode == 4
+    assert "it asks for rlcli 99.1, this is" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["doctor", "list-tasks"])
+def test_ctrl_c_ends_the_probes_too(broken_plugins, tmp_path, command):
+    """A plugin that hangs is not waited for, and its process does not stay."""
+    broken_plugins("hangs")
+    here = tmp_path / "here"
+    here.mkdir()
+    arguments = ["list-tasks", "hangs", "--probe"] if command == "list-tasks" else ["doctor"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rlcli", *arguments, "--probe-timeout", "500"],
+        cwd=here,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(here)},
+    )
+    deadline = time.monotonic() + 60
+    while not list(here.glob("rlcli-probe-*")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, "Traceback" in err) == (130, False)
+    assert not list(here.glob("rlcli-probe-*"))
