@@ -308,12 +308,18 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
             return python_task(f"{root / 'task.py'}:TASK", root.name)
         if (root / "__init__.py").is_file() and b"register(" in (root / "__init__.py").read_bytes():
             return python_task(str(root))
+        classes = _environments(root)
+        if len(classes) > 1:
+            names = listing(f"{root.name}/{found}" for found in classes)
+            raise TaskError(f"'{root}' holds several tasks", hint=f"name one: {names}")
+        if classes:
+            return python_task(f"{root / classes[0]}", root.name)
     if not config.is_file():
         found = listing(sorted(p.name for p in root.iterdir())) if root.is_dir() else "no such folder"
         raise TaskError(f"'{folder}' is not a task: it has no {file} ({found})")
     name = oige.task_name(config)
     if name is not None:
-        return _oige_task(root, config, name)
+        return _oige_task(config.parent, config, name)
     terms, task = root / "terms.py", root / "task.py"
     return TaskSource(
         name=root.name,
@@ -329,10 +335,11 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
 
 
 def _oige_config(root: Path) -> Path | None:
-    """The one YAML of a folder that has OmniIsaacGymEnvs' form; None if there is none."""
-    found = [file for file in sorted(root.glob("*.yaml")) if oige.is_oige_file(file)]
+    """The one YAML of a folder, or of its `cfg/task`, that has OmniIsaacGymEnvs' form; None if there is none."""
+    files = sorted(root.glob("*.yaml")) or sorted(root.glob("cfg/task/*.yaml"))
+    found = [file for file in files if oige.is_oige_file(file)]
     if len(found) > 1:
-        names = listing(f"{root.name}/{file.name}" for file in found)
+        names = listing(f"{root.name}/{file.relative_to(root)}" for file in found)
         raise TaskError(f"'{root}' holds several tasks", hint=f"name one file: {names}")
     return found[0] if found else None
 
@@ -340,9 +347,9 @@ def _oige_config(root: Path) -> Path | None:
 def _oige_task(root: Path, config: Path, name: str) -> TaskSource:
     file: Path | None
     try:
-        file, class_name = oige.find_class(root, name)
+        file, class_name = oige.find_class(oige.home(config), name)
     except LookupError as problem:
-        if next(root.rglob("*.py"), None) is not None:
+        if next(oige.home(config).rglob("*.py"), None) is not None:
             raise TaskError(f"'{config}' is not a task: {problem.args[0]}") from None
         file, class_name = None, f"{name}Task"  # the YAML can be checked without
     return TaskSource(
@@ -560,13 +567,37 @@ def _package(folder: Path) -> str:
     return name
 
 
+def _environments(root: Path) -> list[str]:
+    """`file.py:Class` of a folder's environments in Isaac Lab's words, without what a file only builds upon."""
+    files = sorted(root.glob("*.py")) if root.is_dir() else []
+    classes = [
+        (file.name, node.name, {ast.unparse(base).rpartition(".")[2] for base in node.bases})
+        for file in files
+        for node in _body(file)
+        if isinstance(node, ast.ClassDef)
+    ]
+    kinds, before = {"ManagerBasedRLEnvCfg"}, 0
+    while len(kinds) > before:
+        before = len(kinds)
+        kinds |= {name for _, name, bases in classes if bases & kinds}
+    inner = {(file, base) for file, _, bases in classes for base in bases}
+    return [
+        f"{file}:{name}"
+        for file, name, bases in classes
+        if bases & kinds and (file, name) not in inner and not name.upper().endswith("_PLAY")
+    ]
+
+
+def _body(file: Path) -> list[ast.stmt]:
+    try:
+        return ast.parse(file.read_bytes()).body
+    except (OSError, SyntaxError, ValueError):
+        return []
+
+
 def _defines(file: Path, name: str) -> bool:
     """Whether a Python file has a top-level assignment or definition of this name."""
-    try:
-        tree = ast.parse(file.read_bytes())
-    except (OSError, SyntaxError, ValueError):
-        return False
-    for node in tree.body:
+    for node in _body(file):
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
         if getattr(node, "name", None) == name or any(isinstance(t, ast.Name) and t.id == name for t in targets):
             return True

@@ -406,6 +406,12 @@ def relative(prim_path: str) -> str:
     return "/".join(parts)
 
 
+def home(config: FilePath) -> FilePath:
+    """The folder that the files of a task lie below: that of its YAML, or the package whose `cfg/task` holds it."""
+    inside = config.parent.parts[-2:] == ("cfg", "task")
+    return config.parent.parent.parent if inside else config.parent
+
+
 def find_class(folder: FilePath, name: str) -> tuple[FilePath, str]:
     """The file and the class of a task in a folder: in `task.py`, else in any Python file below.
 
@@ -419,6 +425,8 @@ def find_class(folder: FilePath, name: str) -> tuple[FilePath, str]:
         classes += [(file, *found) for found in _classes(file)]
     for wanted in ("Task", f"{name}Task", f"{name}LocomotionTask", name):
         exact = [(file, cls) for file, cls, _ in classes if cls == wanted]
+        outer = min((len(file.parts) for file, _ in exact), default=0)
+        exact = [found for found in exact if len(found[0].parts) == outer]  # variants lie further below
         if len(exact) == 1:
             return exact[0]
     bases = {base for _, _, all_bases in classes for base in all_bases}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import shutil
@@ -16,11 +17,14 @@ from rlcli.config.notes import Note
 from rlcli.errors import ConfigError, Problem, TaskError, UsageError
 
 _IMPORT = re.compile(r"^(\s*)from\s+(?:omni|pxr|omniisaacgymenvs)(?:\.[\w.]+)?\s+import\s+(.*)$")
+_VOCABULARY = [Path(__file__).parent.parent / "oige" / name for name in ("__init__.py", "maths.py", "rotations.py")]
+_DEFINED = (ast.ClassDef, ast.FunctionDef)
+_WORDS = (*_DEFINED, ast.Constant)
 _MODULE = re.compile(r"^(\s*)import\s+(carb|omni|pxr)\b[\w.]*\s*$")
 
 
 def convert(files: list[Path], output: Path | None) -> Imported:
-    """Write `task.yaml` and, with their import lines changed, the Python files that lie beside the task's YAML.
+    """Write `task.yaml` and, with their import lines changed, the Python files of the task's class.
 
     Args:
         files: the task's YAML and, optionally, the rl_games YAML of its agent; without one, `<Task>PPO.yaml`
@@ -43,7 +47,7 @@ def convert(files: list[Path], output: Path | None) -> Imported:
     target = folder / "task.yaml"
     if target.exists():
         raise UsageError(f"{target} exists", hint="-o another folder")
-    class_file, class_name = _class(source.parent, name)
+    class_file, class_name = _class(oige.home(source), name)
     found = oige.translate(
         document,
         str(source),
@@ -60,7 +64,7 @@ def convert(files: list[Path], output: Path | None) -> Imported:
     if class_file is None:
         messages.append(f"put the Python file of {name}Task into {folder}: it is the task's logic")
     elif source.parent.resolve() != folder.resolve():
-        written += _code(source.parent, folder)
+        written += _code(class_file, oige.home(source), folder)
     return Imported(folder, written, sorted(found.notes, key=_place), messages)
 
 
@@ -101,13 +105,40 @@ def _models(models: dict[str, Any], source: Path, folder: Path) -> list[Path]:
     return written
 
 
-def _code(source: Path, folder: Path) -> list[Path]:
+def _code(class_file: Path, home: Path, folder: Path) -> list[Path]:
+    """Copy the files beside a task's YAML, and of a package the class's file with what it uses, in their folders."""
+    beside = sorted(home.glob("*.py"))
     written = []
-    for file in sorted(source.glob("*.py")):
-        target = folder / file.name
+    for file in beside if class_file in beside else _used(class_file, home):
+        target = folder / file.relative_to(home)
+        target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(changed_imports(file.read_text(encoding="utf-8")), encoding="utf-8")
         written.append(target)
     return written
+
+
+def _used(start: Path, home: Path) -> list[Path]:
+    """A file and those of a package that its import lines lead to, and theirs, but not what `rlcli.oige` offers."""
+    words = [node for file in _VOCABULARY for node in ast.walk(_tree(file))]
+    own = {getattr(node, "name", getattr(node, "value", None)) for node in words if isinstance(node, _WORDS)}
+    deepest_first = sorted(home.rglob("*.py"), key=lambda file: (-len(file.parts), file))[-500:]
+    trees = {file: _tree(file) for file in deepest_first}
+    owner = {node.name: file for file in trees for node in trees[file].body if isinstance(node, _DEFINED)}
+    found = [start]
+    for file in found:
+        imports = [node for node in ast.walk(trees[file]) if isinstance(node, ast.ImportFrom)]
+        names = [alias.name for node in imports for alias in node.names]
+        if "*" in names:
+            names += [node.id for node in ast.walk(trees[file]) if isinstance(node, ast.Name)]
+        found += dict.fromkeys(owner[n] for n in names if n in owner and n not in own and owner[n] not in found)
+    return found
+
+
+def _tree(file: Path) -> ast.Module:
+    try:
+        return ast.parse(file.read_text(encoding="utf-8"))
+    except (OSError, SyntaxError, UnicodeDecodeError):
+        return ast.Module([], [])
 
 
 def _place(note: Note) -> tuple[str, int]:

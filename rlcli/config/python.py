@@ -25,6 +25,7 @@ from rlcli.registry import TaskSource, import_file, load_object
 
 _OWN = "rlcli.mdp."
 _AGENTS = "agents/*.py"
+_RUNNER = b"RslRlOnPolicyRunnerCfg"
 
 
 @dataclass(slots=True)
@@ -183,11 +184,15 @@ def _find(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     if agents or not hasattr(value, "__rlcli_task__"):
         return value, agents
     folder = FilePath(place).parent
-    return value, _beside([module]) or _beside(map(import_file, sorted(folder.glob(_AGENTS))))
+    files = [
+        *sorted(folder.glob(_AGENTS)),
+        *sorted(file for file in folder.glob("*.py") if _RUNNER in file.read_bytes()),
+    ]
+    return value, _beside([module]) or _beside(map(import_file, files))
 
 
 def _beside(modules: Iterable[Any]) -> dict[str, Any]:
-    """The agents that stand beside a configuration in its module, or in the `agents` folder next to it."""
+    """The agents that stand beside a configuration: in its module, in the `agents` folder, or in a file next to it."""
     found = {
         name: item
         for module in modules

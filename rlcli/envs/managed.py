@@ -143,6 +143,7 @@ class ManagedEnv(VecEnv):
         return returns, terms, self.termination_manager.causes(ended)
 
     def _start_over(self) -> None:
+        self.curriculum_manager.advance(self._steps)  # the clock may have been set back
         self.event_manager.start_over(self._everyone())
 
     def _metrics_of(self, ended: Selection) -> dict[str, Tensor]:

@@ -19,6 +19,7 @@ from rlcli.isaaclab import assets
 from rlcli.isaaclab.configclass import is_missing
 from rlcli.isaaclab.managers import SceneEntityCfg
 from rlcli.isaaclab.mdp import MdpFunction
+from rlcli.isaaclab.randomization import EVENTS, translated
 from rlcli.isaaclab.table import ACTIONS, COMMANDS, TERMS, Entry, seconds
 
 Key = tuple[str, ...]
@@ -140,7 +141,9 @@ def task(
     made["actions"] = {name: convert.action(node) for name, node in top.node("actions").nodes()}
     made["observations"] = {name: convert.group(node) for name, node in top.node("observations").nodes()}
     for section in ("events", "rewards", "terminations", "curriculum"):
-        made[section] = {name: convert.term(section, node) for name, node in top.node(section).nodes()}
+        made[section] = {
+            name: term for node in top.node(section).nodes() for name, term in convert.terms(section, *node)
+        }
     made["commands"] = {name: convert.command(node) for name, node in top.node("commands").nodes()}
     scene.finish(convert.joints_driven)
     for section in ("events", "curriculum", "commands"):
@@ -349,6 +352,67 @@ class SceneReader:
             self.report.problem(key, str(problem), problem.hint)
             return wanted
 
+    def geoms_of(self, entity: str, bodies: list[str], key: Key) -> list[str]:
+        """The geoms of bodies, by names or regexes of the bodies."""
+        from rlcli.sim.names import NameProblem, match
+
+        model = self._models.get(entity)
+        if model is None:
+            return [".*"]
+        try:
+            chosen = {model["body"][place] for place in match(bodies, model["body"], "body")}
+        except NameProblem as problem:
+            self.report.problem(key, str(problem), problem.hint)
+            return []
+        return [geom for geom, body in model["geoms"] if body in chosen]
+
+    def drives_of(self, entity: str, joints: list[str] | None) -> tuple[Any, Any]:
+        """Of joints (None: all), the actuators of MuJoCo's own, and the joints that actuator models drive."""
+        from rlcli.sim.names import NameProblem, match
+
+        model = self._models.get(entity)
+        if model is None:
+            return ".*", None
+        names: list[str] = model["joint"]
+        try:
+            chosen = [names[place] for place in match(joints or ".*", names, "joint")]
+            models = self.entities[entity].get("actuators", {}).values()
+            explicit = [names[place] for one in models for place in match(one["joints"], names, "joint")]
+        except NameProblem:
+            return ".*", None  # the actuator's own joints are told elsewhere
+        moved = [p for p, values in self._drives.get(entity, []) if values.get("stiffness") or values.get("damping")]
+        native = [n for n in chosen if n not in explicit and any(re.fullmatch(p, n) for p in moved)]
+        return [model["actuators"].get(n, n) for n in native], [n for n in chosen if n in explicit]
+
+    def sensor_part(self, name: str, bodies: Any, preserve: bool, key: Key) -> str:
+        """The sensor of some of a contact sensor's bodies: one of its own, unless those are all of them."""
+        sensor = self.sensors.get(name)
+        if sensor is None or sensor["kind"] != "contact" or bodies is None:
+            return name  # what is not there, is told when the environment is built
+        from rlcli.sim.names import NameProblem, match
+
+        names = self.names(sensor["entity"], "body")
+        if names is None:
+            return name
+        try:
+            seen = [names[place] for place in sorted(match(sensor["bodies"], names, "body"))]
+            places = match([bodies] if isinstance(bodies, str) else list(bodies), seen, "body")
+        except NameProblem as problem:
+            self.report.problem(key, str(problem), problem.hint)
+            return name
+        chosen = [seen[place] for place in (places if preserve else sorted(places))]
+        if chosen == seen:
+            return name
+        part = {**sensor, "bodies": chosen}
+        words = [bodies] if isinstance(bodies, str) else list(bodies)
+        wanted = base = "_".join([name, *(re.sub(r"\W+", "_", word).strip("_") for word in words[:2])])
+        number = 1
+        while self.sensors.get(wanted, part) != part:
+            number += 1
+            wanted = f"{base}_{number}"
+        self.sensors[wanted] = part
+        return wanted
+
     # --- parts ---
 
     def _entity(self, name: str, item: Node, spawn: Node | None) -> None:
@@ -384,12 +448,8 @@ class SceneReader:
             entity["pos"] = position
         if rotation != [1.0, 0.0, 0.0, 0.0]:
             entity["quat"] = rotation
-        for key in ("lin_vel", "ang_vel"):
-            if any(init.data.get(key) or ()):
-                init.say("ignored", key, "an entity starts at rest; a reset event gives it a velocity")
-            else:
-                init.skip(key)
         self._init_joints(name, entity, init)
+        self._init_velocity(entity, init)
         factor = item.get("soft_joint_pos_limit_factor", 1.0)
         if factor != 1.0:
             entity["soft_joint_pos_limit_factor"] = _float(factor)
@@ -417,6 +477,7 @@ class SceneReader:
         init = item.node("init_state")
         made["pos"] = [_float(v) for v in init.get("pos", (0.0, 0.0, 0.0))]
         made["quat"] = [_float(v) for v in init.get("rot", (1.0, 0.0, 0.0, 0.0))]
+        self._init_velocity(made, init)
         spawn.skip("func", "visible", "semantic_tags", "copy_from_source", "activate_contact_sensors", "axis")
         spawn.skip("visual_material_path", "physics_material_path", "visual_material", "collision_props")
         return made
@@ -425,9 +486,11 @@ class SceneReader:
         import mujoco
 
         from rlcli.registry import model_file
+        from rlcli.sim.scene import name_all
 
         try:
             spec = mujoco.MjSpec.from_file(str(model_file(self.root, model)))
+            name_all(spec)
             compiled = spec.compile()
         except (ValueError, TaskError):
             return  # the scene says what is wrong with it
@@ -435,7 +498,11 @@ class SceneReader:
         joints = [j for j in range(compiled.njnt) if compiled.jnt_type[j] in scalar]
         dofs = [int(compiled.jnt_dofadr[j]) for j in joints]
         names = [compiled.joint(j).name for j in joints]
-        driven = {compiled.joint(int(compiled.actuator_trnid[a, 0])).name for a in range(compiled.nu)}
+        driven = {
+            compiled.joint(int(compiled.actuator_trnid[a, 0])).name: compiled.actuator(a).name
+            for a in range(compiled.nu)
+            if compiled.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
+        }
         self._models[name] = {
             "joint": names,
             "body": [compiled.body(b).name for b in range(1, compiled.nbody)],
@@ -443,7 +510,11 @@ class SceneReader:
             "armature": dict(zip(names, compiled.dof_armature[dofs].tolist(), strict=True)),
             "friction_loss": dict(zip(names, compiled.dof_frictionloss[dofs].tolist(), strict=True)),
             "qpos": {n: float(compiled.qpos0[compiled.jnt_qposadr[j]]) for n, j in zip(names, joints, strict=True)},
-            "driven": driven,
+            "driven": set(driven),
+            "actuators": driven,
+            "geoms": [
+                (compiled.geom(g).name, compiled.body(int(compiled.geom_bodyid[g])).name) for g in range(compiled.ngeom)
+            ],
         }
 
     def _init_joints(self, name: str, entity: dict[str, Any], init: Node) -> None:
@@ -459,6 +530,12 @@ class SceneReader:
             made[key] = wanted
         if made:
             entity["init"] = made
+
+    def _init_velocity(self, entity: dict[str, Any], init: Node) -> None:
+        for key in ("lin_vel", "ang_vel"):
+            value = [_float(v) for v in init.get(key, (0.0, 0.0, 0.0))]
+            if any(value):
+                entity.setdefault("init", {})[key] = value
 
     def _says(self, entity: str, pattern: str, value: float, known: Mapping[str, float]) -> bool:
         """Whether the joints that a pattern matches have this value already."""
@@ -849,6 +926,18 @@ class Terms:
         node.skip("concatenate_dim", "flatten_history_dim")
         return made
 
+    def terms(self, section: str, name: str, node: Node) -> Iterator[tuple[str, dict[str, Any]]]:
+        """The terms that one becomes, mostly one; several get an addition to its name."""
+        theirs = _builtin_name(node.data.get("func"))
+        if section == "events" and theirs in EVENTS:
+            node.get("func")
+            parts = translated(theirs, node.node("params"), self.scene)
+            common = self._common(section, node)
+        else:
+            parts, common = {"": self.term(section, node)}, {}
+        for addition, made in parts.items():
+            yield name if len(parts) == 1 else f"{name}_{addition}", {"func": made["func"], **common, **made}
+
     def term(self, section: str, node: Node) -> dict[str, Any]:
         """A term with a function and parameters."""
         function, params = node.need("func"), node.node("params")
@@ -860,6 +949,10 @@ class Terms:
         name = _builtin_name(function)
         if name == "modify_reward_weight":
             return self._reward_stage(params)
+        if name in ("modify_env_param", "modify_term_cfg", "initial_final_interpolate_fn"):
+            hint = "the terms 'stages' and 'interpolate' change a value by its address, on the device"
+            self.report.problem(node.key, f"'{name}' calls a function of its own on the configuration", hint)
+            return {"func": "stages", "address": "", "steps": [], "values": []}
         ours, entry = self._find(section, name)
         made: dict[str, Any]
         if ours is not None and name is not None:
@@ -939,19 +1032,43 @@ class Terms:
         return made
 
     def _params(self, signature: Signature, entry: Entry, params: Node) -> dict[str, Any]:
-        made: dict[str, Any] = {}
-        by_alias = {p.alias: p for p in signature.parameters if p.alias}
+        made: dict[str, Any] = dict(entry.fixed)
+        by_alias: dict[str, Any] = {}
+        for parameter in signature.parameters:
+            by_alias.setdefault(parameter.alias or "", parameter)
         known = {p.name: p for p in signature.parameters}
+        command = by_alias.get("Command")
         for key in params.data:
             value = params.get(key)
             target = entry.params.get(key, key)
+            if key == "command_name" and command is not None:
+                target = command.name
             if is_entity(value):
                 made |= self._selected(key, value, by_alias, known, (*params.key, key))
+            elif key == "gear_ratio" and isinstance(value, Mapping):
+                made["gear_ratio"] = self._ratios(params, value)
             elif callable(target):
                 made |= _numbers(target(value))
             elif value is not None or (target in known and known[target].required):
                 made[target] = _numbers(value)
+        if command is not None and command.required and command.name not in made:
+            made[command.name] = "base_velocity"  # some of Isaac Lab's terms know it by that name alone
         return made
+
+    def _ratios(self, params: Node, ratios: Mapping[str, float]) -> Any:
+        """Gear ratios as shares of the largest one, a joint each; 1 for a joint that is not named."""
+        from rlcli.sim.names import NameProblem, match_values
+
+        names = self.scene.names("robot", "joint")
+        largest = max([*ratios.values(), 1.0 if ".*" not in ratios else 0.0])
+        if names is None or set(ratios) == {".*"}:
+            return 1.0
+        try:
+            found = match_values(ratios, names, "joint")
+        except NameProblem as problem:
+            self.report.problem((*params.key, "gear_ratio"), str(problem), problem.hint)
+            return 1.0
+        return [_float((1.0 if ratio is None else ratio) / largest) for ratio in found]
 
     def _selected(
         self, key: str, value: Any, by_alias: Mapping[str, Any], known: Mapping[str, Any], at: Key
@@ -962,21 +1079,24 @@ class Terms:
         made: dict[str, Any] = {}
         name = given["name"]
         sensor = next((by_alias[a] for a in ("ContactSensor", "RaySensor") if a in by_alias), None)
-        if sensor is not None and name in self.scene.sensors:
-            made[sensor.name] = name
-        else:
-            entity = known[stem] if stem in known and known[stem].alias == "Entity" else by_alias.get("Entity")
-            if entity is not None and (entity.required or entity.default != name):
-                made[entity.name] = name
-            elif entity is None:
-                self.report.entries[at] = ("ignored", "the term has no entity")
         preserve = bool(given.get("preserve_order"))
+        if sensor is not None and (name in self.scene.sensors or key == "sensor_cfg"):
+            made[sensor.name] = self.scene.sensor_part(name, given.get("body_names"), preserve, at)
+            return made
+        entity = known[stem] if stem in known and known[stem].alias == "Entity" else by_alias.get("Entity")
+        if entity is not None and (entity.required or entity.default != name):
+            made[entity.name] = name
+        elif entity is None:
+            self.report.entries[at] = ("ignored", "the term has no entity")
         for kind, alias in (("joint", "Joints"), ("body", "Bodies")):
             names = given.get(f"{kind}_names")
             if names is not None and alias in by_alias:
                 made[by_alias[alias].name] = self.scene.ordered(name, kind, names, preserve, at)
             elif names is not None:
                 self.report.entries[(*at, f"{kind}_names")] = ("ignored", f"the term selects no {alias.lower()}")
+        for kind, alias in (("site", "Sites"), ("sensor", "Sensors")):
+            if given.get(f"{kind}_names") is not None and alias in by_alias:
+                made[by_alias[alias].name] = given[f"{kind}_names"]
         return made
 
     def _own(self, section: str, function: Any, name: str | None, node: Node, params: Node) -> dict[str, Any]:

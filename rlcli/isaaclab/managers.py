@@ -20,6 +20,10 @@ class SceneEntityCfg:
     fixed_tendon_ids: Any = slice(None)
     object_collection_names: Any = None
     object_collection_ids: Any = slice(None)
+    site_names: Any = None
+    """Sites of the MJCF, for terms that Isaac Lab gives a frame transformer."""
+    sensor_names: Any = None
+    """Sensors of the MJCF, for terms that Isaac Lab gives an IMU."""
     preserve_order: bool = False
 
     def resolve(self, scene: Any) -> None:

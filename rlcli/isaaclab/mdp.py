@@ -14,7 +14,7 @@ from rlcli.config.terms import SECTIONS, builtin_terms
 from rlcli.errors import did_you_mean
 from rlcli.isaaclab.configclass import MISSING, configclass
 from rlcli.isaaclab.managers import ActionTermCfg, CommandTermCfg, SceneEntityCfg
-from rlcli.isaaclab.table import TERMS
+from rlcli.isaaclab.table import TERMS, Entry
 
 
 class MdpFunction:
@@ -36,32 +36,60 @@ class MdpFunction:
         if signature.is_class or section == "events":
             raise TypeError(f"mdp.{self.__name__} has a memory or changes the simulation: name it in the configuration")
         module = importlib.import_module(f"rlcli.mdp.{signature.file.stem}")
-        entry = TERMS.get(section, {}).get(self.__name__)
-        names = {p.name: p.name for p in signature.parameters} | {
-            theirs: to for theirs, to in (entry.params if entry else {}).items() if isinstance(to, str)
-        }
-        others = [p for p in signature.parameters if p.alias is None]
+        entry = TERMS.get(section, {}).get(self.__name__, Entry())
+        known = {p.name: p for p in signature.parameters}
+        first: dict[str, str] = {}
+        for p in signature.parameters:
+            first.setdefault(p.alias or "", p.name)
+        plain = iter([p.name for p in signature.parameters if p.alias is None])
+        named = [("", value) for value in args] + list(params.items())
         given: dict[str, Any] = {}
-        plain = iter(others)
-        for value in (*args, *params.values()):
+        for name, value in named:
             if isinstance(value, SceneEntityCfg):
-                given["entity"] = env.entities[value.name]
-                chosen = {p.alias: p.name for p in signature.parameters}
-                for alias, index in (("Joints", value.joint_ids), ("Bodies", value.body_ids)):
-                    if alias in chosen:
-                        given[chosen[alias]] = index
-        for value in args:
-            if not isinstance(value, SceneEntityCfg):
-                given[next(plain).name] = value
-        for name, value in params.items():
-            if not isinstance(value, SceneEntityCfg):
-                given[names.get(name, name)] = value
+                given |= _elements(env, name, value, known, first)
+            elif name == "command_name" or (not name and isinstance(value, str) and "Command" in first):
+                given[first["Command"]] = env.command_manager.get_term(value)
+            elif name:
+                to = entry.params.get(name, name)
+                given |= to(value) if callable(to) else {to: value}
+            else:
+                given[next(plain)] = value
         for p in signature.parameters:
             if p.name not in given and not p.required:
                 whole = {"Entity": lambda default: env.entities[default]}.get(p.alias or "")
                 every = slice(None) if p.alias in ("Joints", "Bodies", "Sites", "Actuators") else p.default
                 given[p.name] = whole(p.default) if whole else every
         return getattr(module, signature.attribute)(env.managed, **given)
+
+
+def _elements(
+    env: Any, name: str, value: SceneEntityCfg, known: dict[str, Any], first: dict[str, str]
+) -> dict[str, Any]:
+    """What a `SceneEntityCfg` picks, as a built-in term takes it."""
+    sensor = next((first[kind] for kind in ("ContactSensor", "RaySensor") if kind in first), None)
+    if sensor is not None and value.name not in env.entities:
+        whole = env.managed.sensors[value.name]
+        every = isinstance(value.body_ids, slice)
+        return {sensor: whole if every else SensorPart(whole, value.body_ids)}
+    stem = name.removesuffix("_cfg")
+    entity = stem if stem in known and known[stem].alias == "Entity" else first.get("Entity")
+    made = {} if entity is None else {entity: env.entities[value.name]}
+    for kind, index in (("Joints", value.joint_ids), ("Bodies", value.body_ids)):
+        if kind in first:
+            made[first[kind]] = index
+    return made
+
+
+class SensorPart:
+    """Some bodies of a contact sensor."""
+
+    def __init__(self, whole: Any, ids: Any) -> None:
+        self._whole, self._ids = whole, ids
+        self.names = [whole.names[i] for i in ids.tolist()]
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._whole, name)
+        return value[:, :, self._ids] if name == "force_history" else value[:, self._ids]
 
 
 def found(name: str) -> tuple[str, str]:
@@ -183,6 +211,15 @@ class BinaryJointPositionActionCfg(BinaryJointActionCfg):
     """Open or closed positions [m or rad]."""
 
     class_type: Any = "BinaryJointPositionAction"
+
+
+@configclass
+class AbsBinaryJointPositionActionCfg(BinaryJointActionCfg):
+    """Open or closed positions [m or rad], by the action's value against a threshold."""
+
+    class_type: Any = "AbsBinaryJointPositionAction"
+    threshold: float = 0.5
+    positive_threshold: bool = True
 
 
 @configclass

@@ -63,6 +63,7 @@ class LiveValues:
                 names = [name for name in names if name not in _FIXED]
             if key not in names:
                 where = f"'{'.'.join(path[:depth])}' has" if depth else "the task has"
+                names = [name for name in names if _may_change(_member(value, name))]
                 near = did_you_mean(key, names)
                 have = f"what may change there: {listing(names)}" if names else None
                 hint = f"{near}; {have}" if near and have else near or have
@@ -99,6 +100,11 @@ def _names(value: Any) -> list[str]:
 
 def _member(value: Any, key: str) -> Any:
     return getattr(value, key) if isinstance(value, StrictModel) else value[key]
+
+
+def _may_change(value: Any) -> bool:
+    """Whether a number is there, or further below."""
+    return _is_number(value) or any(_may_change(_member(value, name)) for name in _names(value))
 
 
 def _is_number(value: Any) -> bool:

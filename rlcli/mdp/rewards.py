@@ -67,33 +67,56 @@ def joint_pos_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joint
     return ((low - position).clamp_(min=0.0) + (position - high).clamp_(min=0.0)).sum(dim=1)
 
 
-def joint_pos_limits_penalty_ratio(
-    env: ManagedEnv,
-    *,
-    entity: Entity = "robot",
-    joints: Joints = ".*",
-    threshold: float = 0.98,
-    gear_ratio: float = 1.0,
-) -> Tensor:
-    """How far beyond `threshold` of their range joints are, as a share of what is left of it, summed. (num_envs,)"""
-    low, high = (limit[:, joints] for limit in entity.data.joint_limits())
-    scaled = ((2.0 * entity.data.joint_pos[:, joints] - low - high) / (high - low)).abs()
-    violation = (scaled - threshold) / (1.0 - threshold)
-    # a joint without limits has no scale (nan), and is never beyond it
-    return torch.where(scaled > threshold, violation * gear_ratio, 0.0).sum(dim=1)
+class JointPosLimitsPenaltyRatio:
+    """How far beyond `threshold` of their range joints are, as a share of what is left of it, summed. (num_envs,)
+
+    gear_ratio: what each joint counts, one for all or one each, in the order of `joints`.
+    """
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        joints: Joints = ".*",
+        threshold: float = 0.98,
+        gear_ratio: float | list[float] = 1.0,
+    ) -> None:
+        self._entity, self._joints, self._threshold = entity, joints, threshold
+        self._ratio = _spread(gear_ratio, entity, joints, env.device, "gear_ratio")
+
+    def __call__(self) -> Tensor:
+        """(num_envs,)"""
+        low, high = (limit[:, self._joints] for limit in self._entity.data.joint_limits())
+        scaled = ((2.0 * self._entity.data.joint_pos[:, self._joints] - low - high) / (high - low)).abs()
+        violation = (scaled - self._threshold) / (1.0 - self._threshold)
+        # a joint without limits has no scale (nan), and is never beyond it
+        return torch.where(scaled > self._threshold, violation * self._ratio, 0.0).sum(dim=1)
 
 
-def power_consumption(
-    env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", gear_ratio: float = 1.0
-) -> Tensor:
+class PowerConsumption:
     """Sum of |raw action x joint velocity x gear ratio|; `joints` are the driven ones, in the action's order [rad/s].
 
-    (num_envs,)
+    gear_ratio: one for all or one each, in the order of `joints`. (num_envs,)
     """
-    action, velocity = env.action_manager.action, entity.data.joint_vel[:, joints]
-    if action.shape != velocity.shape:
-        raise ValueError(f"selects {velocity.shape[1]} joints, the action has {action.shape[1]} columns")
-    return (action * velocity * gear_ratio).abs().sum(dim=1)
+
+    def __init__(
+        self,
+        env: ManagedEnv,
+        *,
+        entity: Entity = "robot",
+        joints: Joints = ".*",
+        gear_ratio: float | list[float] = 1.0,
+    ) -> None:
+        self._env, self._entity, self._joints = env, entity, joints
+        self._ratio = _spread(gear_ratio, entity, joints, env.device, "gear_ratio")
+
+    def __call__(self) -> Tensor:
+        """(num_envs,)"""
+        action, velocity = self._env.action_manager.action, self._entity.data.joint_vel[:, self._joints]
+        if action.shape != velocity.shape:
+            raise ValueError(f"selects {velocity.shape[1]} joints, the action has {action.shape[1]} columns")
+        return (action * velocity * self._ratio).abs().sum(dim=1)
 
 
 def action_rate_l2(env: ManagedEnv) -> Tensor:
@@ -949,12 +972,14 @@ def _on_the_move(entity: Entity, command: Command, velocity_threshold: float) ->
     return (length(command.command) > 0.0) | (speed > velocity_threshold)
 
 
-def _spread(std: float | list[float] | Tensor, entity: Entity, joints: Joints, device: torch.device) -> Tensor:
+def _spread(
+    given: float | list[float] | Tensor, entity: Entity, joints: Joints, device: torch.device, what: str = "std"
+) -> Tensor:
     """One value a joint. (k,) or (1,)"""
     count = len(entity.data.joint_vel_limits[joints])
-    values = std if isinstance(std, Tensor) else torch.tensor(std, device=device)
+    values = given if isinstance(given, Tensor) else torch.tensor(given, dtype=torch.float32, device=device)
     if values.dim() and len(values) != count:
-        raise ValueError(f"has {len(values)} values of std for {count} joints")
+        raise ValueError(f"has {len(values)} values of {what} for {count} joints")
     return values.view(-1)
 
 

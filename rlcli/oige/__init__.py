@@ -1,7 +1,8 @@
+# ruff: noqa: F401
 """OmniIsaacGymEnvs' vocabulary, flat: change a task's import lines to `from rlcli.oige import ...`, and it runs here.
 
-A name that is not one of these is looked for in the Python files beside the file that imports it: a task's shared
-modules and view classes are imported from here too.
+A name that is not one of these is looked for in the Python files beside the file that imports it, and below the folder
+of the task's YAML: a task's shared modules and view classes are imported from here too.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from rlcli.oige.task import RLTask, SimConfig, World
 from rlcli.oige.usd import ArticulationAction, Gf, PhysxSchema, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, carb, omni
 from rlcli.oige.views import ArticulationView, RigidPrimView, XFormPrimView
 
-__all__ = [
+NAMES = [
     *TENSOR_NAMES,
     *ROTATION_NAMES,
     "Ant", "ArticulationAction", "ArticulationView", "Cartpole", "Crazyflie", "DynamicCuboid", "DynamicCylinder",
@@ -51,8 +52,9 @@ __all__ = [
     "PhysxSchema", "Quadcopter", "RLTask", "RigidPrim", "RigidPrimView", "Robot", "Sdf", "SimConfig", "Usd", "UsdGeom",
     "UsdLux", "UsdPhysics", "VisualCuboid", "VisualSphere", "World", "XFormPrim", "XFormPrimView",
     "add_reference_to_stage", "carb", "define_prim", "find_matching_prim_paths", "get_assets_root_path",
-    "get_current_stage", "get_prim_at_path", "is_prim_path_valid", "omni", "torch_utils",  # noqa: F405
+    "get_current_stage", "get_prim_at_path", "is_prim_path_valid", "omni", "torch_utils",
 ]  # fmt: skip
+"""What is offered here itself."""
 
 
 def __getattr__(name: str) -> Any:
@@ -60,8 +62,12 @@ def __getattr__(name: str) -> Any:
         import sys
 
         return sys.modules[__name__]
+    if name == "__all__":  # `import *` gives a task's file what it uses of its neighbours, too
+        from rlcli.oige.neighbours import used
+
+        return [*NAMES, *used(NAMES)]
     if name.startswith("__"):
         raise AttributeError(name)
     from rlcli.oige.neighbours import find
 
-    return find(name, __all__)
+    return find(name, NAMES)

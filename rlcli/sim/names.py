@@ -62,6 +62,6 @@ def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
     found = [position for position, name in enumerate(names) if regex.fullmatch(name)]
     if not found:
         near = did_you_mean(pattern, names)
-        have = f"{what}s: {listing(names)}"
+        have = f"{'bodies' if what == 'body' else f'{what}s'}: {listing(names)}"
         raise NameProblem(f"no {what} matches '{pattern}'", f"{near}; {have}" if near else have)
     return found

@@ -167,7 +167,7 @@ class Scene:
     def attach(self, name: str, entity: EntityConfig, child: mujoco.MjSpec) -> None:
         """Add an entity to the scene; `child` is its model, which `entity.model` need not name."""
         self.config.entities[name] = entity
-        _name_all(child)
+        name_all(child)
         if child.compiler.settotalmass > 0:
             _settle_masses(child)
         models = [other for other, config in self.config.entities.items() if config.model is not None]
@@ -523,7 +523,7 @@ def _shape(entity: EntityConfig) -> mujoco.MjSpec:
     return child
 
 
-def _name_all(child: mujoco.MjSpec) -> None:
+def name_all(child: mujoco.MjSpec) -> None:
     """Give what the MJCF leaves unnamed a name: an entity knows its elements by the prefix of their names."""
     for kind, elements in (
         ("body", child.bodies[1:]),

@@ -98,6 +98,20 @@ def test_files_without_a_package_find_each_other_and_the_agents_folder(package):
     assert resolved.task.rewards["pole_pos"].params["asset_cfg"].joint_names == ["cart_to_pole"]
 
 
+def test_a_folder_with_one_environment_is_a_task_and_a_runner_beside_it_its_agent(package):
+    folder = package("other")
+    (folder / "__init__.py").unlink()
+    (folder / "agents" / "rsl_rl_ppo_cfg.py").rename(folder / "rsl_rl_ppo_cfg.py")
+    play = "from rlcli.isaaclab import *\nfrom cartpole_env_cfg import CartpoleEnvCfg\n\n@configclass\nclass Cfg_PLAY("
+    (folder / "play_env_cfg.py").write_text(f"{play}CartpoleEnvCfg):\n    pass\n")
+    resolved = resolve(find_task(str(folder)))
+    assert (resolved.source.name, resolved.agent_name, resolved.agent.num_steps) == ("other", "rsl-rl", 16)
+    (folder / "a_env_cfg.py").write_text(f"{play.replace('Cfg_PLAY', 'Tilted')}CartpoleEnvCfg):\n    pass\n")
+    with pytest.raises(TaskError, match="holds several tasks") as caught:
+        find_task(str(folder))
+    assert "other/a_env_cfg.py:Tilted, other/cartpole_env_cfg.py:CartpoleEnvCfg" in caught.value.hint
+
+
 def test_the_environment_is_made_from_the_class_and_by_gymnasium(package):
     import gymnasium
 

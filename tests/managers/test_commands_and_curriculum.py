@@ -230,3 +230,12 @@ def test_a_command_that_nobody_declares_is_refused_with_those_that_exist(tmp_pat
     (problem,) = refusal.value.problems
     assert "no command 'velocty'" in problem.message
     assert "velocity" in problem.hint
+
+
+def test_a_reset_with_a_seed_sets_schedules_back_to_their_start(tmp_path):
+    ramp = {"func": "interpolate", "address": "commands.velocity.lin_vel_x", "end": 5, "to": [5.0, 6.0]}
+    env = walker(tmp_path, 4, curriculum={"ramp": ramp})
+    first = env.reset(seed=3)["policy"].clone()
+    run(env, 8)
+    assert env.reset()["policy"][:, -3].min() > 4.0  # the episode is new, the training is not
+    assert torch.equal(env.reset(seed=3)["policy"], first)

@@ -216,7 +216,7 @@ def test_unlimited_joints_never_violate_their_limits(tmp_path):
     env.sim.refresh()
     robot = env.entities["robot"]
     assert rewards.joint_pos_limits(env, entity=robot, joints=slice(0, 1)).tolist() == [0, 0, 0]
-    assert rewards.joint_pos_limits_penalty_ratio(env, entity=robot, joints=slice(0, 1)).tolist() == [0, 0, 0]
+    assert rewards.JointPosLimitsPenaltyRatio(env, entity=robot, joints=slice(0, 1))().tolist() == [0, 0, 0]
 
 
 def test_soft_limits_are_drawn_in_about_the_middle(tmp_path):

@@ -36,6 +36,56 @@ def test_a_task_runs_with_its_import_lines_alone_changed(env):
     assert set(env.extras()) == {"Task/angle"}
 
 
+STAR = TASK.replace("from rlcli.oige import limit_of_the_angle\n", "").replace(
+    "from rlcli.oige import ArticulationView, DynamicSphere, RigidPrimView, RLTask, Robot, get_prim_at_path\n", ""
+)
+
+
+def as_package(folder):
+    """The arm's files in the folders that the original has: classes, modules that they share, and `cfg`."""
+    arm_folder(folder, task=STAR)
+    for file, place in (
+        ("arm.py", "tasks"),
+        ("shared.py", "robots/articulations/views"),
+        ("Arm.yaml", "cfg/task"),
+        ("arm.xml", "cfg/task"),
+        ("ArmPPO.yaml", "cfg/train"),
+    ):
+        (folder / place).mkdir(parents=True, exist_ok=True)
+        (folder / file).rename(folder / place / file)
+    return folder
+
+
+@pytest.mark.parametrize("name", [".", "cfg/task/Arm.yaml"])
+def test_a_package_of_tasks_keeps_its_folders_and_one_star_imports_all(tmp_path, name):
+    folder = as_package(tmp_path / "arms")
+    action = torch.linspace(-1.0, 1.0, 4)[:, None]
+    lives = []
+    for env in (build(folder / name), build(arm_folder(tmp_path / "arm"))):
+        torch.manual_seed(0)
+        env.reset()
+        lives.append([(step.obs["policy"].clone(), step.reward.clone()) for step in map(env.step, [action] * 15)])
+    assert all(
+        torch.equal(a, b) for ours, theirs in zip(*lives, strict=True) for a, b in zip(ours, theirs, strict=True)
+    )
+    assert resolve(find_task(str(folder / name))).agent.num_epochs == 3  # of cfg/train
+
+
+def test_a_star_imports_nothing_of_a_neighbour_that_the_file_defines_itself(tmp_path):
+    own = STAR.replace("class ArmTask(", "def limit_of_the_angle():\n    return 0.0\n\n\nclass ArmTask(")
+    env = build(arm_folder(tmp_path / "arm", task=own))
+    env.reset()
+    assert env.step(IDLE).terminated.all()  # its own limit, not that of the neighbour
+
+
+def test_several_tasks_of_a_package_are_told_apart_by_their_files(tmp_path):
+    folder = as_package(tmp_path / "arms")
+    (folder / "cfg" / "task" / "Leg.yaml").write_text(YAML.replace("name: Arm", "name: Leg"))
+    with pytest.raises(TaskError, match="several tasks") as caught:
+        find_task(str(folder))
+    assert "arms/cfg/task/Arm.yaml" in caught.value.hint
+
+
 def test_running_into_the_length_of_an_episode_truncates_and_failing_terminates(env):
     position = env.engine.field("qpos")
     left = env.task._arms._qpos_columns[env.task._left]

@@ -36,6 +36,24 @@ def test_an_imported_task_is_the_task_it_came_from_step_by_step(tmp_path):
     assert torch.equal(*lives)
 
 
+def test_of_a_package_the_class_comes_with_the_files_that_it_uses(tmp_path):
+    source = arm_folder(tmp_path / "arms")
+    for file, place in (("arm.py", "tasks"), ("shared.py", "views"), ("Arm.yaml", "cfg/task"), ("arm.xml", "cfg/task")):
+        (source / place).mkdir(parents=True, exist_ok=True)
+        (source / file).rename(source / place / file)
+    (source / "ArmPPO.yaml").unlink()
+    shared = (source / "views" / "shared.py").read_text()
+    (source / "tasks" / "warp").mkdir()
+    for name, text in (("arm.py", TASK), ("shared.py", shared), ("other.py", "class OtherTask:\n    pass\n")):
+        (source / "tasks" / "warp" / name).write_text(text)
+    assert main(["import", "oige", str(source / "cfg" / "task" / "Arm.yaml"), "-o", str(tmp_path / "mine")]) == 0
+    files = {str(file.relative_to(tmp_path / "mine")) for file in (tmp_path / "mine").rglob("*.*")}
+    assert files == {"task.yaml", "arm.xml", "tasks/arm.py", "views/shared.py"}
+    env = make_env(resolve(find_task(str(tmp_path / "mine"))), seed=1)
+    env.reset()
+    assert env.step(torch.ones(4, 1)).obs["policy"].isfinite().all()
+
+
 def test_every_key_is_in_the_report(tmp_path, capsys):
     source = arm_folder(tmp_path / "arm")
     assert imported(source, tmp_path / "mine", "--json") == 0

@@ -115,6 +115,6 @@ def test_functions_of_a_task_that_is_scripted_can_call_them():
 
 
 def test_everything_that_is_offered_is_there():
-    assert all(hasattr(oige, name) for name in oige.__all__)
+    assert all(hasattr(oige, name) for name in oige.NAMES)
     with pytest.raises(ImportError, match="cannot import name 'quat_rotat'"):
         exec("from rlcli.oige import quat_rotat")

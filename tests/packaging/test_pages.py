@@ -58,6 +58,39 @@ def test_the_scenes_of_the_page_build_and_run(number, tmp_path):
     assert (env.terrain is None) == ("terrain" not in part["scene"])
 
 
+def test_the_sections_on_what_is_seen_asked_driven_and_changed_work_together(tmp_path):
+    found = blocks(DOCS / "write-a-task.md", "## What the policy sees", "## Check it")
+    parts = [yaml.safe_load(block.text) for block in found if block.language == "yaml"]
+    assert [list(part) for part in parts] == [
+        ["observations"],
+        ["commands", "observations", "rewards"],
+        ["scene", "actions"],
+        ["curriculum"],
+    ]
+    task = {"rewards": {"effort": {"func": "action_l2", "weight": -0.01}},
+            "terminations": {"fallen": {"func": "bad_orientation", "limit_angle": 1.2}}}  # fmt: skip
+    task = yaml.safe_load(edited(CRITTER_TASK, **task)) | {"observations": {}, "actions": {}}
+    for part in parts:
+        task = merged(task, part)
+    task["curriculum"]["smooth"] |= {"begin": 0, "end": 10}
+    task["scene"]["entities"]["robot"]["joints"] = {}
+    env = build(write(tmp_path / "task", yaml.safe_dump(task, sort_keys=False), critter_xml=CRITTER), 3)
+    obs = env.reset()
+    assert obs["policy"].shape == (3, 3 + 3 + 3 * 4 + 4 + 4 + 3 + 3)
+    assert obs["critic"].shape == (3, 3 + 4)
+    for _ in range(12):
+        step = env.step(torch.zeros(3, 4))
+    assert step.obs["policy"].isfinite().all()
+    assert env.extras()["Curriculum/smooth"] == pytest.approx(-0.1)
+    assert [actuator.joints for actuator in env.entities["robot"].actuators] == [[0, 1], [2, 3]]
+
+
+def merged(task, part):
+    """A mapping with another one laid over it, nested ones within."""
+    both = {key: merged(task[key], part[key]) for key in task.keys() & part.keys() if isinstance(part[key], dict)}
+    return {**task, **part, **both}
+
+
 @pytest.mark.slow
 def test_the_examples_for_isaac_labs_users_train_as_written(tmp_path):
     found = blocks(DOCS / "from-isaac-lab.md")
