@@ -81,6 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
+    console.quiet = console.verbose = False  # what an earlier command of this process was told
     with console.stdout_kept(), malformed_metadata_ignored():
         code = _run(_with_values(arguments))
     try:

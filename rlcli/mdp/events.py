@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import listing
-from rlcli.mdp.ranges import Pair, ranges
+from rlcli.mdp.ranges import Pair, Ranges
 from rlcli.sim.names import NameProblem
 from rlcli.sim.rotations import from_euler, multiply, random_quaternion
 from rlcli.sim.selection import Columns, Selection
@@ -234,7 +234,7 @@ def _drawn_wrench(env: ManagedEnv, selection: Selection, bodies: int, force: Pai
 
 def _bounds(env: ManagedEnv, *pairs: Pair) -> tuple[Tensor, Tensor]:
     """Lower and upper ends of several ranges, for draws of shape (rows, ranges, k). (ranges, 1) each"""
-    low, high = ranges(env.device, *pairs).now()
+    low, high = Ranges(env.device, *pairs).now()
     return low[:, None], high[:, None]
 
 

@@ -17,8 +17,7 @@ class Ranges:
     """The lower and the upper ends of several ranges."""
 
     def __init__(self, device: torch.device, *pairs: Pair) -> None:
-        fixed = [(0.0, 0.0) if isinstance(pair, Tensor) else tuple(pair) for pair in pairs]
-        self._fixed = torch.tensor(fixed, dtype=torch.float32, device=device)
+        self._fixed = _table(device, *((0.0, 0.0) if isinstance(pair, Tensor) else tuple(pair) for pair in pairs))
         self._live = [pair if isinstance(pair, Tensor) else None for pair in pairs]
         self._any_live = any(pair is not None for pair in self._live)
 
@@ -32,6 +31,6 @@ class Ranges:
 
 
 @functools.lru_cache(maxsize=1024)
-def ranges(device: torch.device, *pairs: Pair) -> Ranges:
-    """The same object for the same ranges, for terms that are functions."""
-    return Ranges(device, *pairs)
+def _table(device: torch.device, *pairs: tuple[float, float]) -> Tensor:
+    """The numbers on the device, made once: a step that is recorded must not make tensors of numbers. (ranges, 2)"""
+    return torch.tensor(pairs, dtype=torch.float32, device=device)

@@ -11,6 +11,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 WAITS = {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "item", "unique", "_unique2"}
 """Operations whose result the host must have before it goes on."""
+COPIES = {"lift_fresh", "lift", "from_file"}
+"""Operations that make a tensor of what the host has; none of them can be recorded."""
 _MASKED = ("index", "index_put", "index_put_")
 
 
@@ -28,6 +30,8 @@ class NoHost(TorchDispatchMode):
         name = func.overloadpacket.__name__
         if name in WAITS:
             raise HostReadError(f"'{name}' waits for the device")
+        if name in COPIES:
+            raise HostReadError(f"'{name}' makes a tensor of numbers of the host, which waits for the device")
         if name in _MASKED and any(isinstance(i, Tensor) and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
             raise HostReadError(f"'{name}' with a mask is a search, which waits for the device")
         return func(*args, **(kwargs or {}))

@@ -147,7 +147,8 @@ def test_validate_keeps_the_class_of_an_installed_direct_task(in_process):
     assert "did you mean 'reset_dist'?" in err
 
 
-def test_validate_names_agents_that_it_could_not_check(in_process, small):
+def test_validate_names_agents_that_it_could_not_check(in_process, small, monkeypatch):
+    monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")
     task = small(
         ("max_iterations: 1}", "max_iterations: 1}\n  other: {trainer: rsl-rl, algorithm: ppo, max_iterations: 1}")
     )

@@ -134,7 +134,8 @@ def test_an_unknown_agent_does_not_hide_other_mistakes(problems_of):
     assert any("decimation" in line for line in found)
 
 
-def test_a_known_trainer_that_is_not_installed_names_the_pip_line(task):
+def test_a_known_trainer_that_is_not_installed_names_the_pip_line(task, monkeypatch):
+    monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")
     source = task(TASK.replace("two: {trainer: sb3", "two: {trainer: rsl-rl"))
     with pytest.raises(DependencyError) as caught:
         resolve(source, agent="two")
@@ -153,7 +154,8 @@ def test_every_agent_and_the_play_patch_are_checked_at_once(task):
     assert [problem.path for problem in caught.value.problems] == ["scene.num_envs", "agents.two.gamma"]
 
 
-def test_agents_that_cannot_be_checked_are_named(task):
+def test_agents_that_cannot_be_checked_are_named(task, monkeypatch):
+    monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")
     assert check_all(task(TASK.replace("two: {trainer: sb3", "two: {trainer: rsl-rl"))) == ["two"]
     assert check_all(task()) == []
 

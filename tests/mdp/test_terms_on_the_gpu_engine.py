@@ -9,29 +9,13 @@ import pytest
 import torch
 from mdp_table import OBSERVATIONS, REWARDS, ROWS, TERMINATIONS
 from mdp_worlds import FILES, bound, hand_made, sensors, whole_task
-from torch.utils._python_dispatch import TorchDispatchMode
 from worlds import build, edited, write
 
 from rlcli.mdp import observations, rewards
 from rlcli.sim.entity import Entity
+from rlcli.testing.host import NoHost
 
 torch.set_num_threads(1)
-WAITS = {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "item", "unique", "_unique2"}
-"""Operations whose result the host must have before it goes on."""
-COPIES = {"lift_fresh", "lift", "from_file"}
-"""Operations that bring numbers of the host onto the device."""
-
-
-class Recorded(TorchDispatchMode):
-    """Refuses what a CUDA graph cannot record."""
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        name = func.overloadpacket.__name__
-        assert name not in WAITS | COPIES, name
-        if name in ("index", "index_put", "index_put_"):
-            masks = [i for i in args[1] if i is not None and i.dtype in (torch.bool, torch.uint8)]
-            assert not masks, f"{name} with a mask is a search"
-        return func(*args, **(kwargs or {}))
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +32,7 @@ def test_a_term_can_be_recorded_and_gives_the_cpu_engines_value(both, row):
         call = term(env, **given) if inspect.isclass(term) else lambda env=env, given=given: term(env, **given)
         first = call().clone()
         env.sim.stamp += 1  # nothing is remembered from the first call
-        with Recorded() if env.engine.asynchronous else contextlib.nullcontext():
+        with NoHost() if env.engine.asynchronous else contextlib.nullcontext():
             again = call()
         assert torch.equal(first, again) or term is rewards.ActionAccL2
         values.append(first.float())
@@ -117,7 +101,7 @@ def test_the_detector_sees_what_a_graph_cannot_record():
         lambda: values + torch.tensor([1.0, 2.0, 3.0, 4.0]),
     ]
     for reading in readings:
-        with pytest.raises(AssertionError), Recorded():
+        with pytest.raises(AssertionError), NoHost():
             reading()
 
 
@@ -141,7 +125,7 @@ def test_steps_with_terms_of_forces_on_bodies_are_recorded(tmp_path):
     env.reset()
     action = torch.ones(3, 1)
     env.step(action)
-    with Recorded():
+    with NoHost():
         results = [env.step(action) for _ in range(12)]
     assert all(r.reward.isfinite().all() for r in results)
     assert results[-1].obs["policy"].abs().max() > 0.1
@@ -155,7 +139,7 @@ def test_a_task_with_every_term_and_real_sensors_and_commands_is_recorded(tmp_pa
     env.reset()
     action = 0.3 * torch.ones(3, 4)
     env.step(action)
-    with Recorded():
+    with NoHost():
         results = [env.step(action) for _ in range(12)]
     env.check()
     assert sum(int(r.episodes.mask.sum()) for r in results) >= 6
