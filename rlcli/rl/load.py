@@ -24,23 +24,26 @@ def source_of(run: Run) -> TaskSource:
     Raises:
         TaskError: if the task is not installed any more.
     """
-    record = run.record["task"]
+    return replace(recorded_task(run.record["task"], f"the task of {run.folder}"), config=run.config)
+
+
+def recorded_task(record: Mapping[str, Any], what: str) -> TaskSource:
+    """The task that a `TaskSource.record` stands for, as it is installed now; `what` names it in messages.
+
+    Raises:
+        TaskError: if the task is not installed any more.
+    """
     try:
         if record.get("python"):
-            source = python_task(str(record["python"]), str(record["name"]))
-        elif record.get("folder"):
+            return python_task(str(record["python"]), str(record["name"]))
+        if record.get("folder"):
             file = Path(str(record.get("file") or "task.yaml")).name
-            source = folder_task(Path(str(record["folder"])), file)
-        else:
-            source = find_task(f"{record['distribution']}:{record['name']}")
+            return folder_task(Path(str(record["folder"])), file)
+        return find_task(f"{record['distribution']}:{record['name']}")
     except TaskError as error:
-        raise TaskError(
-            f"the task of {run.folder} is not there: {error.message}",
-            hint=f"install {record.get('distribution')} {record.get('version')}"
-            if record.get("distribution")
-            else error.hint,
-        ) from None
-    return replace(source, config=run.config)
+        owner = record.get("distribution")
+        hint = f"install {owner} {record.get('version')}" if owner else error.hint
+        raise TaskError(f"{what} is not there: {error.message}", hint=hint) from None
 
 
 def resolve_run(

@@ -24,9 +24,9 @@ import rlcli
 from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
 from rlcli.envs.vec_env import StepResult, VecEnv
-from rlcli.errors import CheckpointError, TaskError
-from rlcli.registry import TaskSource, find_task, folder_task
+from rlcli.errors import CheckpointError
 from rlcli.rl.files import write_atomic
+from rlcli.rl.load import recorded_task
 
 FORMAT = 1
 _STATES = ("qpos", "qvel", "act", "ctrl")
@@ -192,7 +192,7 @@ class Recording:
             TaskError: if the task is not installed any more.
             ConfigError: if the installed one does not take this configuration.
         """
-        source = _source(self.document["task"])
+        source = recorded_task(self.document["task"], "the recorded task")
         with tempfile.TemporaryDirectory() as folder:
             config = Path(folder) / "task.yaml"
             config.write_text(self.document["config"])
@@ -317,12 +317,3 @@ def _digest(tensors: Mapping[str, Tensor], document: Mapping[str, Any]) -> str:
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
         digest.update(value.flatten().view(torch.uint8).numpy().tobytes() if value.numel() else b"")
     return digest.hexdigest()
-
-
-def _source(record: Mapping[str, Any]) -> TaskSource:
-    try:
-        if record.get("folder"):
-            return folder_task(Path(str(record["folder"])))
-        return find_task(f"{record['distribution']}:{record['name']}")
-    except TaskError as error:
-        raise TaskError(f"the recorded task is not there: {error.message}", hint=error.hint) from None
