@@ -82,8 +82,8 @@ def probe(
         owners.setdefault(entry.distribution, []).append(entry)
     stop = stop or threading.Event()
     with ThreadPoolExecutor(max(1, min(len(owners), available_cores()))) as pool:
-        rows = pool.map(lambda owned: _probe_distribution(owned, timeout_s, group, stop), owners.values())
-        try:
+        try:  # around the start as well: the first process may run before the last thread does
+            rows = pool.map(lambda owned: _probe_distribution(owned, timeout_s, group, stop), owners.values())
             found = {name: row for part in rows for name, row in part.items()}
         except BaseException:  # Ctrl-C
             stop.set()

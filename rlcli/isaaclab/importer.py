@@ -15,8 +15,9 @@ from rlcli.config.imported import Imported
 from rlcli.config.load import check_all
 from rlcli.errors import ConfigError, Problem, UsageError
 from rlcli.isaaclab.configclass import to_dict
-from rlcli.isaaclab.convert import Report, agent, task
+from rlcli.isaaclab.convert import agent, task
 from rlcli.isaaclab.envs import ManagerBasedRLEnvCfg
+from rlcli.isaaclab.settings import Report
 from rlcli.registry import folder_task, model_file
 
 MAX_BYTES = 4 * 1024 * 1024

@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rlcli.isaaclab.convert import Node, SceneReader
+    from rlcli.isaaclab.scene_reader import SceneReader
+    from rlcli.isaaclab.settings import Node
 
 Made = dict[str, Any]
 Parts = dict[str, Made]

@@ -89,7 +89,8 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
 
     def __rlcli_agent__(self, notes: list[Note] | None = None) -> dict[str, Any]:
         """The settings of the agent that this is here."""
-        from rlcli.isaaclab.convert import Report, agent
+        from rlcli.isaaclab.convert import agent
+        from rlcli.isaaclab.settings import Report
 
         report = Report()
         data = agent(to_dict(self), report)

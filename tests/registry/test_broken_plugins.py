@@ -6,9 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from broken_plugins import BROKEN
+
+from rlcli.probe import probe
+from rlcli.registry import catalog
 
 BUILT_IN = {"cartpole", "cartpole-direct", "ant-direct"}
 TRAIN = ("train", "good-task", "--num-envs", "2", "--max-iterations", "1", "--logger", "none")
@@ -170,3 +174,19 @@ def test_ctrl_c_ends_the_probes_too(broken_plugins, tmp_path, command):
     _, err = process.communicate(timeout=60)
     assert (process.returncode, "Traceback" in err) == (130, False)
     assert not list(here.glob("rlcli-probe-*"))
+
+
+def test_ctrl_c_while_probes_start_ends_them(broken_plugins, monkeypatch):
+    """The first process runs before the last thread is started: an interrupt may come in between."""
+    broken_plugins("hangs")
+    submit = ThreadPoolExecutor.submit
+
+    def interrupted(*arguments, **options):
+        submit(*arguments, **options)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", interrupted)
+    before = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        probe([entry for entry in catalog()[0] if entry.name == "hangs-task"], timeout_s=60.0)
+    assert time.monotonic() - before < 30.0

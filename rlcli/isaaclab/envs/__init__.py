@@ -61,7 +61,8 @@ class ManagerBasedRLEnvCfg(ManagerBasedEnvCfg):
     def __rlcli_task__(self, root: Path) -> Any:
         """The task that this is here."""
         from rlcli.config.python import PythonTask
-        from rlcli.isaaclab.convert import Report, task
+        from rlcli.isaaclab.convert import task
+        from rlcli.isaaclab.settings import Report
 
         report = Report()
         data = task(to_dict(self), report, root)
