@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 RUNS ?= runs
 
-.PHONY: demo test test-all check bench setup clean
+.PHONY: demo test test-all test-faults test-faults-long check bench setup clean
 
 # The installation is repeated when what is installed changes.
 $(VENV)/.demo: pyproject.toml constraints.txt
@@ -34,7 +34,14 @@ test: $(VENV)/.dev
 	$(BIN)/python -m pytest -m 'not slow' -n 2 tests
 
 test-all: $(VENV)/.dev
-	$(BIN)/python -m pytest -n 2 tests
+	RLCLI_TEST_SIZE=full $(BIN)/python -m pytest -n 2 tests
+
+# Kills, faults of the machine, signals, divergence, hostile files, exact resume: all cases, and what a night is for.
+test-faults: $(VENV)/.dev
+	RLCLI_TEST_SIZE=full $(BIN)/python -m pytest -n 2 tests/faults
+
+test-faults-long: $(VENV)/.dev
+	RLCLI_TEST_SIZE=long $(BIN)/python -m pytest -n 2 --timeout 7200 tests/faults
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -1,0 +1,21 @@
+"""How many cases of a suite run: a sample in `make test`, all in `make test-faults`, more in `make test-faults-long`."""
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+SIZE = os.environ.get("RLCLI_TEST_SIZE", "sample")
+assert SIZE in ("sample", "full", "long"), f"RLCLI_TEST_SIZE is '{SIZE}': sample, full or long"
+
+
+def amount(sample: int, full: int, long: int | None = None) -> int:
+    """The number of cases at the size that was asked for."""
+    return {"sample": sample, "full": full, "long": full if long is None else long}[SIZE]
+
+
+def chosen(cases: Sequence[Any], sample: int) -> list[Any]:
+    """All cases, or an evenly spread sample of them."""
+    cases = list(cases)
+    if SIZE != "sample" or sample >= len(cases):
+        return cases
+    return [cases[index * len(cases) // sample] for index in range(sample)]
