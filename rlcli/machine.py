@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from pathlib import Path
 
 from rlcli.errors import DeviceError
@@ -30,6 +32,22 @@ def core_quota(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/se
         folder = root / place.strip("/")
         quotas += [_quota(each) for each in (folder, *folder.parents) if each.is_relative_to(root)]
     return min((quota for quota in quotas if quota is not None), default=None)
+
+
+def read_plain(file: Path, most: int) -> bytes:
+    """What a plain file holds; a pipe or a device in its place is not waited for.
+
+    Raises:
+        OSError: if it is missing, is not a plain file, or is larger than `most` bytes.
+    """
+    descriptor = os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    with open(descriptor, "rb") as opened:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "it is not a plain file", str(file))
+        data = opened.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"larger than {most} bytes", str(file))
+    return data
 
 
 def _quota(group: Path) -> float | None:

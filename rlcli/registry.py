@@ -299,6 +299,8 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
     """
     root = folder.resolve()
     config = root / file
+    if (root / "run.json").exists():
+        raise TaskError(f"'{folder}' is a run, not a task", hint=f"--checkpoint {folder}")
     if file == "task.yaml" and root.is_dir() and not config.is_file():
         config = _oige_config(root) or config
     if root.is_file():

@@ -26,9 +26,9 @@ def command(
     debug: Debug = False,
 ) -> None:
     """Check that a task keeps its contract."""
-    from rlcli.registry import find_task
+    from rlcli.rl.trust import named_task
 
-    find_task(task)  # what is not there is said before anything heavy is imported
+    named_task(task)  # what is not there is said before anything heavy is imported
     import torch
 
     from rlcli.testing import check_task, record_layout

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -91,10 +92,11 @@ class Console:
         if sys.stdout is not None and sys.stdout.isatty():
             from rich.console import Console as Rich
             from rich.table import Table
+            from rich.text import Text
 
             table = Table(*columns, title=title, title_justify="left")
             for row in rows:
-                table.add_row(*row)
+                table.add_row(*(Text(plain(cell)) for cell in row))
             Rich().print(table)
             return
         widths = [max(len(cell) for cell in column) for column in zip(columns, *rows, strict=True)]
@@ -104,6 +106,14 @@ class Console:
 
 
 console = Console()
+
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+"""What a terminal would obey, what turns the direction of text, and halves of characters; not tab and newline."""
+
+
+def plain(text: str) -> str:
+    """Text as it can be shown: what stands in a stranger's file may not steer the terminal."""
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def discard(stream: Any) -> None:
@@ -115,6 +125,7 @@ def discard(stream: Any) -> None:
 def _write(stream: Any, text: str) -> None:
     if stream is None:  # closed by whoever started us
         return
+    text = plain(text)
     try:
         print(text, file=stream, flush=True)
     except BrokenPipeError:

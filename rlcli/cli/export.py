@@ -29,7 +29,7 @@ def command(
     from rlcli.errors import UsageError
     from rlcli.rl.checkpoint import open_checkpoint
     from rlcli.rl.export import FORMATS, check_target, export
-    from rlcli.rl.run import default_runs_dir
+    from rlcli.rl.run import Run, default_runs_dir, require_own
 
     console.quiet = quiet
     if task is None and checkpoint is None:
@@ -39,6 +39,7 @@ def command(
     if output is None:
         if run is None:
             raise UsageError(f"{folder} lies outside a run", hint="say where to write with --output FILE")
+        require_own(Run(run), "exports")
         output = run / "exports" / f"policy{FORMATS[format_]}"
     console.info(f"checkpoint {folder} ({why})")
     done = export(open_checkpoint(folder), output, format_)

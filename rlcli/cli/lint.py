@@ -27,9 +27,9 @@ def command(
     debug: Debug = False,
 ) -> None:
     """Look for what will get in the way of learning: rewards, resets, observations, actions, time step, discount."""
-    from rlcli.registry import find_task
+    from rlcli.rl.trust import named_task
 
-    find_task(task)  # what is not there is said before anything heavy is imported
+    named_task(task)  # what is not there is said before anything heavy is imported
     import torch
 
     from rlcli.testing import lint_task

@@ -95,6 +95,9 @@ def _default_video(session: Any) -> Path:
     """`videos/STEP.mp4` in the run; for a policy without a run, a file in the current folder."""
     if session.run is None or session.checkpoint is None:
         return _FALLBACK_VIDEO
+    from rlcli.rl.run import require_own
+
+    require_own(session.run, "videos")
     return session.run.folder / "videos" / f"{session.checkpoint.name}.mp4"
 
 

@@ -43,9 +43,9 @@ def open_session(
     """
     from rlcli.config.load import resolve
     from rlcli.errors import UsageError, did_you_mean
-    from rlcli.registry import find_task
     from rlcli.rl.load import resolve_run
     from rlcli.rl.run import default_runs_dir, find_checkpoint
+    from rlcli.rl.trust import named_task
 
     if policy not in POLICIES:
         raise UsageError(
@@ -58,13 +58,14 @@ def open_session(
     values = flags(scene__num_envs=num_envs)
     run = folder = None
     if policy == "trained" or checkpoint is not None:
-        name = None if task is None else find_task(task).name
+        named = None if task is None else named_task(task)
+        name = None if named is None else named.name
         run, folder, why = find_checkpoint(checkpoint or "latest", runs_dir or default_runs_dir(), name)
         console.info(f"checkpoint {folder} ({why})")
-        resolved = resolve_run(run, play=True, config_file=config, overrides=overrides, flags=values)
+        resolved = resolve_run(run, play=True, config_file=config, overrides=overrides, flags=values, named=named)
     else:
         assert task is not None
-        resolved = resolve(find_task(task), play=True, config_file=config, overrides=overrides, flags=values)
+        resolved = resolve(named_task(task), play=True, config_file=config, overrides=overrides, flags=values)
     check(resolved)
     tell_notes(resolved)
     return _build(resolved, run, folder, policy, stochastic, seed)

@@ -35,6 +35,7 @@ from rlcli.cli.options import (
 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
+    from rlcli.registry import TaskSource
     from rlcli.rl.run import Run
     from rlcli.rl.stop import StopRequest
 
@@ -75,10 +76,10 @@ def command(
     """Train a policy."""
     from rlcli.config.load import resolve
     from rlcli.errors import UsageError
-    from rlcli.registry import find_task
     from rlcli.rl import distributed
     from rlcli.rl.run import default_runs_dir
     from rlcli.rl.stop import StopRequest
+    from rlcli.rl.trust import named_task
 
     console.quiet, console.verbose = quiet, verbose
     # libgomp's threads spin while they wait; on a busy machine that makes an update ten times slower
@@ -94,14 +95,15 @@ def command(
         "--init-from": init_from,
         "--name": name,
     }
+    named = None if task is None or (resume is not None and "=" in task) else named_task(task)
     resolved = None
     if resume is not None:
         _refuse_changes([task, *(overrides or [])], fixed)
-    elif task is None:
+    elif named is None:
         raise UsageError("which task?", hint="rlcli train TASK (rlcli list-tasks shows them), or --resume RUN")
     else:
         resolved = resolve(
-            find_task(task),
+            named,
             agent=agent,
             device=device,
             config_file=config,
@@ -117,13 +119,13 @@ def command(
     def begin() -> _Job | None:
         if resolved is None:
             assert resume is not None
-            return _resumed(resume, runs, find_task(task).name if task else None, budget, logger)
+            return _resumed(resume, runs, named, budget, logger)
         record = {"seed": draw_seed(42 if seed is None else seed), "device": device}
         return _created(resolved, runs, name, record, logger, init_from)
 
     with StopRequest() as stop:
         try:
-            job = _together(begin, resolved, budget, device)
+            job = _together(begin, resolved, named, budget, device)
             if job is not None:
                 _train(job, device, stop)
         finally:
@@ -208,13 +210,17 @@ def _require_parallel(resolved: Resolved, gpus: int = 1) -> None:
 
 
 def _together(
-    begin: Callable[[], _Job | None], resolved: Resolved | None, budget: dict[str, Any], device: str
+    begin: Callable[[], _Job | None],
+    resolved: Resolved | None,
+    named: TaskSource | None,
+    budget: dict[str, Any],
+    device: str,
 ) -> _Job | None:
     """What is to be done: the process that leads says it, the others hear it."""
     from rlcli.rl import distributed
 
     if not distributed.leads():
-        return _followed(distributed.join(device).share(), resolved, budget)
+        return _followed(distributed.join(device).share(), resolved, named, budget)
     try:
         job = begin()
     except Exception:
@@ -232,7 +238,9 @@ def _together(
     return job
 
 
-def _followed(word: dict[str, Any] | None, resolved: Resolved | None, budget: dict[str, Any]) -> _Job | None:
+def _followed(
+    word: dict[str, Any] | None, resolved: Resolved | None, named: TaskSource | None, budget: dict[str, Any]
+) -> _Job | None:
     """The job of a process that does not lead: nothing of it is written."""
     from rlcli.rl.checkpoint import open_checkpoint
     from rlcli.rl.load import resolve_run
@@ -244,7 +252,7 @@ def _followed(word: dict[str, Any] | None, resolved: Resolved | None, budget: di
     if resolved is not None:
         return _Job(Run(folder, word["record"]), resolved, [], init_from=word["init_from"], writes=False)
     run = open_run(folder)
-    resolved = resolve_run(run, play=False, flags=budget)
+    resolved = resolve_run(run, play=False, flags=budget, named=named)
     return _Job(run, resolved, [], resume_from=open_checkpoint(Path(word["resume_from"])), writes=False)
 
 
@@ -299,25 +307,27 @@ def _created(
 
 
 def _resumed(
-    reference: str, runs: Path, task: str | None, budget: dict[str, Any], logger: list[str] | None
+    reference: str, runs: Path, named: TaskSource | None, budget: dict[str, Any], logger: list[str] | None
 ) -> _Job | None:
     """A run to go on with; None if there is nothing left to do."""
     from rlcli.config.dump import to_data, to_yaml
+    from rlcli.rl.checkpoint import open_checkpoint
     from rlcli.rl.files import write_atomic
     from rlcli.rl.load import resolve_run
     from rlcli.rl.loggers import check_loggers
-    from rlcli.rl.run import find_checkpoint
+    from rlcli.rl.run import find_checkpoint, require_own
 
-    run, folder, why = find_checkpoint(reference, runs, task)
+    run, folder, why = find_checkpoint(reference, runs, None if named is None else named.name)
     if run.record.get("state") == "finished" and not budget:
         console.info(f"{run.folder} ({why}) is finished; --max-iterations N trains on")
         console.data(str(run.folder))
-        step = int(folder.name)
+        step = open_checkpoint(folder).step
         console.document("train", run=str(run.folder), state="finished", checkpoint=str(folder), step=step)
         return None
-    resolved = resolve_run(run, play=False, flags=budget)
+    resolved = resolve_run(run, play=False, flags=budget, named=named)
     _require_parallel(resolved)
-    loggers = check_loggers(logger) if logger else list(run.record.get("loggers", []))
+    loggers = check_loggers(logger or run.record.get("loggers") or ["none"])
+    require_own(run, ".")
     run.lock()
     try:
         from rlcli.rl import checkpoint

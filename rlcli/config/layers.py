@@ -11,6 +11,7 @@ from typing import Any
 from rlcli.config import strict_yaml
 from rlcli.config.strict_yaml import Document, Path, YamlError
 from rlcli.errors import ConfigError, Problem
+from rlcli.machine import read_plain
 
 _KEY = re.compile(r'"([^"]+)"|([^.="\s]+)')
 _OVERRIDE = re.compile(rf"\s*((?:{_KEY.pattern})(?:\.(?:{_KEY.pattern}))*)\s*=(.*)", re.DOTALL)
@@ -118,15 +119,20 @@ class Layers:
             del self.origins[known]
 
 
-def read(file: FilePath, name: str | None = None) -> Document:
+def read(file: FilePath, name: str | None = None, *, pipe: bool = False) -> Document:
     """Read a strict YAML file.
+
+    Args:
+        file: the file.
+        name: how messages call it.
+        pipe: whether it may be a pipe, as a shell makes one for `--config <(...)`.
 
     Raises:
         ConfigError: if it cannot be read or parsed, with the position.
     """
     name = name or str(file)
     try:
-        return strict_yaml.load(file.read_bytes())
+        return strict_yaml.load(file.read_bytes() if pipe else read_plain(file, strict_yaml.MAX_BYTES))
     except OSError as error:
         raise ConfigError([Problem(name, "", f"cannot be read: {error.strerror or error}")]) from None
     except YamlError as error:

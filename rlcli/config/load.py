@@ -97,7 +97,7 @@ def resolve(
     """
     check = _Check(source)
     document = check.document()
-    extra = read(config_file) if config_file else Document({})
+    extra = read(config_file, pipe=True) if config_file else Document({})
     origin = marked(extra, str(config_file), "config")
     changes = check.changes(overrides, flags or {})
 

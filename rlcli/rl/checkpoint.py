@@ -17,10 +17,13 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from rlcli.errors import CheckpointError
+from rlcli.machine import read_plain
 from rlcli.rl.files import disk_error, sync_folder, to_json, write_atomic, write_synced
 from rlcli.rl.trainer import TrainerState
 
 FORMAT = 1
+MOST_JSON = 64 * 1024 * 1024
+"""Bytes of a manifest."""
 PARTS = ("policy", "trainer", "env", "rng")
 """Tensor files of every checkpoint: the policy alone, critics and optimisers, environment, generators. A trainer may
 add parts of its own: the replay buffer."""
@@ -75,9 +78,11 @@ class Checkpoint:
         if entry is None:
             raise CheckpointError(f"{self.folder} has no {name}")
         try:
-            data = file.read_bytes()
-        except OSError as error:
+            data = read_plain(file, entry["size"])
+        except FileNotFoundError as error:
             raise CheckpointError(f"{file} cannot be read: {error.strerror}") from None
+        except OSError as error:
+            raise CheckpointError(f"{file} is corrupt: {error.strerror}") from None
         if len(data) != entry["size"] or hashlib.sha256(data).hexdigest() != entry["sha256"]:
             raise CheckpointError(
                 f"{file} is corrupt: it is not what the manifest says ({len(data)} bytes of {entry['size']})",
@@ -135,9 +140,11 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     """
     file = folder / "manifest.json"
     try:
-        manifest = _json(file.read_bytes(), file)
-    except OSError:
+        manifest = _json(read_plain(file, MOST_JSON), file)
+    except FileNotFoundError:
         raise CheckpointError(f"{folder} is not a checkpoint: it has no manifest.json") from None
+    except OSError as error:
+        raise CheckpointError(f"{file} cannot be read: {error.strerror}") from None
     if manifest.get("format") != FORMAT:
         raise CheckpointError(
             f"{folder} has checkpoint format {manifest.get('format')}; this rlcli reads {FORMAT}",

@@ -418,7 +418,8 @@ def _placed(file: Path) -> Iterator[Path]:
     try:
         made = [folder for folder in (file.parent, *file.parent.parents) if not folder.exists()]
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_synced(temporary, b"")  # a place that cannot be written shows before the work is done
+        temporary.unlink(missing_ok=True)
+        temporary.touch(exist_ok=False)  # a place that cannot be written shows before the work is done
         yield temporary
         os.replace(temporary, file)
         made = []

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import MachineError
+from rlcli.machine import read_plain
 
 
 def write_atomic(file: Path, content: bytes | str) -> None:
@@ -19,6 +20,7 @@ def write_atomic(file: Path, content: bytes | str) -> None:
     data = content.encode() if isinstance(content, str) else content
     temporary = file.with_name(f".{file.name}.tmp-{os.getpid()}")
     try:
+        temporary.unlink(missing_ok=True)  # a link in its place would be followed
         write_synced(temporary, data)
         os.replace(temporary, file)
     except OSError as error:
@@ -48,6 +50,24 @@ def sync_folder(folder: Path) -> None:
 def to_json(value: Any) -> str:
     """JSON with a final newline; numbers that are not finite are refused."""
     return json.dumps(value, indent=2, allow_nan=False) + "\n"
+
+
+def read_json(file: Path, most: int) -> Any:
+    """The JSON in a plain file of `most` bytes; no NaN, nothing nested beyond measure.
+
+    Raises:
+        OSError: if there is no such file, or it is larger.
+        ValueError: if it is not JSON.
+    """
+    data = read_plain(file, most)
+    try:
+        return json.loads(data, parse_constant=_refuse)
+    except (ValueError, RecursionError):
+        raise ValueError("not JSON") from None
+
+
+def _refuse(constant: str) -> Any:
+    raise ValueError(constant)
 
 
 def disk_error(path: Path, error: OSError) -> MachineError:

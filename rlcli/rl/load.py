@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,41 +11,75 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.config.load import Resolved, resolve
 from rlcli.errors import CheckpointError, TaskError
-from rlcli.registry import TaskSource, find_task, folder_task, python_task
+from rlcli.registry import TASKS, TaskSource, find_entry, folder_task, installed_task, python_task
+from rlcli.rl import trust
 from rlcli.rl.checkpoint import Checkpoint
 from rlcli.rl.policy import Policy, load_policy
-from rlcli.rl.run import Run
+from rlcli.rl.run import Run, require_inside
 
 if TYPE_CHECKING:
     from rlcli.envs.vec_env import Layout
 
 
-def source_of(run: Run) -> TaskSource:
+def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
     """The task of a run: its code and models as installed, its configuration as the run recorded it.
 
-    Raises:
-        TaskError: if the task is not installed any more.
-    """
-    return replace(recorded_task(run.record["task"], f"the task of {run.folder}"), config=run.config)
-
-
-def recorded_task(record: Mapping[str, Any], what: str) -> TaskSource:
-    """The task that a `TaskSource.record` stands for, as it is installed now; `what` names it in messages.
+    Args:
+        run: the run.
+        named: the task that the command line names, if it does: of a task that is not installed its code is taken.
 
     Raises:
         TaskError: if the task is not installed any more.
+        CheckpointError: if the run names code that the user never has.
     """
+    source = recorded_task(run.record["task"], f"the task of {run.folder}", str(run.folder), named)
     try:
+        require_inside(run.folder, run.config)
+    except OSError as error:
+        raise CheckpointError(f"{run.config} cannot be read: {error.strerror}") from None
+    return replace(source, config=run.config)
+
+
+def recorded_task(
+    record: Mapping[str, Any], what: str, run: str | None = None, named: TaskSource | None = None
+) -> TaskSource:
+    """The task that a `TaskSource.record` stands for, as it is installed now.
+
+    Args:
+        record: the record.
+        what: how messages name the task.
+        run: the run that holds the record, if one does.
+        named: see `source_of`.
+
+    Raises:
+        TaskError: if the task is not installed any more.
+        CheckpointError: if the record names code that the user never has.
+    """
+    owner = record.get("distribution")
+    try:
+        if owner:
+            return installed_task(find_entry(TASKS, f"{owner}:{record['name']}", what="task"))
+        if named is not None and named.distribution is None:
+            return named
+        if not trust.is_known(record):
+            raise _unknown(record, what, run)
         if record.get("python"):
             return python_task(str(record["python"]), str(record["name"]))
-        if record.get("folder"):
-            file = Path(str(record.get("file") or "task.yaml")).name
-            return folder_task(Path(str(record["folder"])), file)
-        return find_task(f"{record['distribution']}:{record['name']}")
+        file = Path(str(record.get("file") or "task.yaml")).name
+        return folder_task(Path(str(record["folder"])), file)
     except TaskError as error:
-        owner = record.get("distribution")
         hint = f"install {owner} {record.get('version')}" if owner else error.hint
         raise TaskError(f"{what} is not there: {error.message}", hint=hint) from None
+
+
+def _unknown(record: Mapping[str, Any], what: str, run: str | None) -> CheckpointError:
+    place = trust.place(record)
+    name = shlex.quote(place if os.sep in place or "/" in place else f"./{place}")
+    allow = f"rlcli check {name}" if run is None else f"rlcli play {name} --checkpoint {shlex.quote(run)}"
+    return CheckpointError(
+        f"{what} is not loaded: it names code that you have not used on this machine, {place}",
+        hint=f"if you trust that code, or have it elsewhere, name it once: {allow}",
+    )
 
 
 def resolve_run(
@@ -53,9 +89,10 @@ def resolve_run(
     config_file: Path | None = None,
     overrides: Sequence[str] = (),
     flags: Mapping[str, Any] | None = None,
+    named: TaskSource | None = None,
 ) -> Resolved:
-    """The configuration of a run, with what the command line changes for playing."""
-    return resolve(source_of(run), play=play, config_file=config_file, overrides=overrides, flags=flags)
+    """The configuration of a run, with what the command line changes for playing; `named`: see `source_of`."""
+    return resolve(source_of(run, named), play=play, config_file=config_file, overrides=overrides, flags=flags)
 
 
 def policy_of(checkpoint: Checkpoint) -> Policy:

@@ -25,6 +25,7 @@ from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
 from rlcli.envs.vec_env import StepResult, VecEnv
 from rlcli.errors import CheckpointError
+from rlcli.registry import TaskSource
 from rlcli.rl.files import write_atomic
 from rlcli.rl.load import recorded_task
 
@@ -185,14 +186,18 @@ class Recording:
     tensors: dict[str, Tensor]
     episodes: list[Episode]
 
-    def resolved(self) -> Resolved:
+    def resolved(self, named: TaskSource | None = None) -> Resolved:
         """The configuration that was recorded, with the task's code and models as installed.
+
+        Args:
+            named: the task that the command line names, if it does: of a task that is not installed its code is taken.
 
         Raises:
             TaskError: if the task is not installed any more.
+            CheckpointError: if it is code that the user never named.
             ConfigError: if the installed one does not take this configuration.
         """
-        source = recorded_task(self.document["task"], "the recorded task")
+        source = recorded_task(self.document["task"], f"the task of {self.file}", named=named)
         with tempfile.TemporaryDirectory() as folder:
             config = Path(folder) / "task.yaml"
             config.write_text(self.document["config"])

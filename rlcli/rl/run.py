@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
+import errno
 import os
 import platform
 import re
 import shutil
+import stat
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,10 +20,16 @@ from filelock import FileLock, Timeout
 
 import rlcli
 from rlcli.errors import CheckpointError, MachineError, UsageError, did_you_mean, listing
-from rlcli.rl.files import disk_error, to_json, write_atomic
+from rlcli.rl.files import disk_error, read_json, to_json, write_atomic
 
 CONFIG = "config.yaml"
 RECORD = "run.json"
+MAX_SEED = 2**62
+_TASK = re.compile(r"[^/\\:]{1,255}")
+_MOST = 4 * 1024 * 1024
+"""Bytes of a run.json."""
+_MANY = 100_000
+_MOST_THREADS = 4096
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
 
 
@@ -116,17 +123,47 @@ def open_run(folder: Path) -> Run:
     """
     file = folder / RECORD
     try:
-        record = json.loads(file.read_bytes())
-    except OSError:
+        require_inside(folder, file)
+        record = read_json(file, _MOST)
+    except FileNotFoundError:
         raise CheckpointError(f"{folder} is not a run: it has no {RECORD}") from None
-    except ValueError:
-        raise CheckpointError(f"{file} is corrupt: not JSON") from None
-    task = record.get("task") if isinstance(record, dict) else None
-    if not isinstance(task, dict) or not isinstance(task.get("name"), str):
-        raise CheckpointError(f"{file} is corrupt: it does not name a task")
-    if not (task.get("folder") or task.get("distribution")) or not isinstance(record.get("seed"), int):
-        raise CheckpointError(f"{file} is corrupt: it does not say where the task is from, or has no seed")
+    except OSError as error:
+        raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
+    except ValueError as error:
+        raise CheckpointError(f"{file} is corrupt: {error}") from None
+    _check(record, file)
     return Run(folder, record)
+
+
+def require_own(run: Run, *parts: str) -> None:
+    """What is about to be written lies in the run: no link leads out of it, no pipe or device stands in a file's place.
+
+    Args:
+        run: the run.
+        parts: files and folders in it; of a folder all that it holds.
+
+    Raises:
+        CheckpointError: naming what does not belong in a run.
+    """
+    seen = 0
+    pending = [run.folder / part for part in parts]
+    while pending:
+        path = pending.pop()
+        seen += 1
+        try:
+            require_inside(run.folder, path)
+            mode = path.stat().st_mode
+            if stat.S_ISDIR(mode):
+                pending += path.iterdir()
+            elif not stat.S_ISREG(mode):
+                raise OSError(errno.EINVAL, "it is not a plain file")
+            if seen > _MANY:
+                raise OSError(errno.EFBIG, f"the run holds more than {_MANY} files")
+        except FileNotFoundError:
+            continue
+        except (OSError, RuntimeError) as error:
+            said = getattr(error, "strerror", None) or error
+            raise CheckpointError(f"{path} cannot be written to: {said}", hint="it was not made by rlcli") from None
 
 
 def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[Run, str]:
@@ -194,6 +231,16 @@ def find_checkpoint(reference: str, runs_dir: Path, task: str | None = None) -> 
     )
 
 
+def require_inside(folder: Path, file: Path) -> None:
+    """A file of a folder lies in it, links followed.
+
+    Raises:
+        OSError: if a link leads elsewhere.
+    """
+    if not file.resolve().is_relative_to(folder.resolve()):
+        raise OSError(errno.ELOOP, "it is a link that leads elsewhere", str(file))
+
+
 def environment_record(engine_threads: int, torch_threads: int) -> dict[str, Any]:
     """What results depend on besides the configuration."""
     packages = ("mujoco", "torch", "numpy", "stable-baselines3", "safetensors")
@@ -213,6 +260,45 @@ def environment_record(engine_threads: int, torch_threads: int) -> dict[str, Any
 def default_runs_dir() -> Path:
     """RLCLI_RUNS_DIR, or `runs` in the current folder."""
     return Path(os.environ.get("RLCLI_RUNS_DIR") or "runs")
+
+
+_TYPES: dict[str, tuple[type, ...]] = {
+    "agent": (str, type(None)),
+    "best": (int, type(None)),
+    "iteration": (int,),
+    "loggers": (list,),
+    "rlcli": (str,),
+    "started": (str,),
+    "state": (str,),
+    "step": (int,),
+    "torch_threads": (int,),
+    "versions": (dict,),
+}
+
+
+def _check(record: Any, file: Path) -> None:
+    """The entries of run.json that are read again are what they should be."""
+    task = record.get("task") if isinstance(record, dict) else None
+    if not isinstance(task, dict) or not isinstance(task.get("name"), str):
+        raise CheckpointError(f"{file} is corrupt: it does not name a task")
+    wrong = [key for key, value in task.items() if value is not None and not isinstance(value, str)]
+    wrong += [key for key, value in task.items() if isinstance(value, str) and not _is_word(value)]
+    if wrong or not _TASK.fullmatch(task["name"]):
+        raise CheckpointError(f"{file} is corrupt: its task's {(wrong or ['name'])[0]} is malformed")
+    if not (task.get("folder") or task.get("distribution")) or type(record.get("seed")) is not int:
+        raise CheckpointError(f"{file} is corrupt: it does not say where the task is from, or has no seed")
+    if not 0 <= record["seed"] <= MAX_SEED:
+        raise CheckpointError(f"{file} is corrupt: its seed is out of range")
+    for key, types in _TYPES.items():
+        if key in record and type(record[key]) not in types:
+            raise CheckpointError(f"{file} is corrupt: its {key} is a {type(record[key]).__name__}")
+    if not 0 < record.get("torch_threads", 1) <= _MOST_THREADS:
+        raise CheckpointError(f"{file} is corrupt: its torch_threads is out of range")
+
+
+def _is_word(text: str) -> bool:
+    """Whether text can be a name or a path."""
+    return len(text) <= 4096 and text.isprintable()
 
 
 def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, str]:

@@ -67,6 +67,7 @@ class VideoWriter:
             }
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
+            self._temporary.unlink(missing_ok=True)  # a link in its place would be followed
             self._writer: Any = imageio.get_writer(self._temporary, **settings)
         except OSError as error:
             raise disk_error(file, error) from error

@@ -373,7 +373,12 @@ def _mirror(env: VecEnv, reference: str) -> Any:
     if not module:
         module, _, name = reference.rpartition(".")
     if module.endswith(".py"):
-        module = str(env.resolved.source.root / module)
+        root = env.resolved.source.root.resolve()
+        file = (root / module).resolve()
+        if not file.is_relative_to(root):
+            at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
+            raise _problem(env, at, f"'{module}' lies outside the task's folder {root}", "put it beside the task")
+        module = str(file)
     try:
         found = load_object(f"{module}:{name}")
     except (ImportError, AttributeError, OSError, ValueError) as error:

@@ -1,0 +1,16 @@
+"""What all tests share: nothing is noted in the folders of whoever runs them."""
+
+import os
+
+import pytest
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_state(tmp_path_factory):
+    """Tasks that the tests use are noted in a folder of the tests."""
+    before = os.environ.get("RLCLI_STATE_DIR")
+    os.environ["RLCLI_STATE_DIR"] = str(tmp_path_factory.mktemp("state"))
+    yield
+    del os.environ["RLCLI_STATE_DIR"]
+    if before is not None:
+        os.environ["RLCLI_STATE_DIR"] = before
