@@ -80,6 +80,7 @@ Number = Annotated[float, _Fraction()]
 Positive = Annotated[float, Field(gt=0), _Fraction()]
 NotNegative = Annotated[float, Field(ge=0), _Fraction()]
 Count = Annotated[int, Field(ge=1)]
+_Threads = Annotated[int, Field(ge=1, le=4096)]
 _Share = Annotated[float, Field(ge=0, le=1), _Fraction()]
 Vec3 = tuple[Number, Number, Number]
 Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_rotation)]
@@ -329,7 +330,7 @@ class SimConfig(StrictModel):
     """Line-search iterations of the solver; null takes the first entity's MJCF."""
     engine: Literal["auto", "batch", "warp"] = "auto"
     """What steps the worlds: auto is batch (MuJoCo's threads) on a CPU and warp (MuJoCo Warp) on a GPU."""
-    engine_threads: Count | None = None
+    engine_threads: _Threads | None = None
     """Threads that step physics; null is every core this process may use."""
     forces_after_reset: bool = True
     """Compute accelerations and forces of a start state; false: they are 0 until an episode's first step, which saves
@@ -894,7 +895,7 @@ class AgentConfig(StrictModel):
     """Environment steps to train for."""
     save_interval: Count | None = None
     """Iterations between checkpoints; null: every 60 s and at the end."""
-    torch_threads: Count | None = None
+    torch_threads: _Threads | None = None
     """Threads of the update; null: min(4, cores). Results are equal only for an equal number."""
     action_bound: Positive | None = 1.0
     """The policy's actions are clipped to +-this in training, play and export alike; null: unbounded."""

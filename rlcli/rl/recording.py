@@ -11,7 +11,7 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ import rlcli
 from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
 from rlcli.envs.vec_env import StepResult, VecEnv
-from rlcli.errors import CheckpointError
+from rlcli.errors import CheckpointError, ConfigError
 from rlcli.registry import TaskSource
 from rlcli.rl.files import write_atomic
 from rlcli.rl.load import recorded_task
@@ -200,8 +200,16 @@ class Recording:
         source = recorded_task(self.document["task"], f"the task of {self.file}", named=named)
         with tempfile.TemporaryDirectory() as folder:
             config = Path(folder) / "task.yaml"
-            config.write_text(self.document["config"])
-            return resolve(replace(source, config=config))
+            config.write_text(self.document["config"], encoding="utf-8")
+            try:
+                resolved = resolve(replace(source, config=config))
+            except ConfigError as error:
+                raise ConfigError(
+                    replace(p, where=p.where.replace(str(config), str(self.file))) for p in error.problems
+                ) from None
+        if resolved.task.scene.num_envs != self.document["num_envs"]:
+            raise CheckpointError(f"{self.file} is corrupt: it and its configuration name different environments")
+        return resolved
 
     @property
     def steps(self) -> int:
@@ -227,6 +235,8 @@ def read_recording(file: Path) -> Recording:
         CheckpointError: if it is missing, corrupt or of another format.
     """
     try:
+        if not file.is_file() and file.exists():
+            raise ValueError("it is not a plain file")
         with safe_open(file, "pt") as opened:
             header = (opened.metadata() or {}).get("rlcli")
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 (not a mapping)
@@ -241,7 +251,41 @@ def read_recording(file: Path) -> Recording:
         raise CheckpointError(f"{file} has recording format {document.get('format')}; this rlcli reads {FORMAT}")
     if document.pop("sha256", None) != _digest(tensors, document):
         raise CheckpointError(f"{file} is corrupt: it is not what was written")
+    _check(file, document, tensors)
     return Recording(file, document, tensors, [Episode(**entry) for entry in document["episodes"]])
+
+
+def _check(file: Path, document: dict[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    """The document has the fields that are read, and its episodes lie within the recording.
+
+    Raises:
+        CheckpointError: naming the first that does not.
+    """
+    task, episodes = document.get("task"), document.get("episodes")
+    names = [value for value in task.values() if value is not None] if isinstance(task, dict) else [None]
+    if not all(isinstance(name, str) and name.isprintable() for name in names) or not task.get("name"):  # type: ignore[union-attr]
+        raise CheckpointError(f"{file} is corrupt: its task is malformed")
+    if not (task.get("folder") or task.get("distribution")):  # type: ignore[union-attr]
+        raise CheckpointError(f"{file} is corrupt: it does not say where the task is from")
+    if not isinstance(document.get("config"), str):
+        raise CheckpointError(f"{file} is corrupt: its configuration is malformed")
+    actions = tensors.get("session.actions")
+    if actions is None or actions.dim() != 3 or document.get("num_envs") != actions.shape[1]:
+        raise CheckpointError(f"{file} is corrupt: its actions are not those of its environments")
+    steps, envs = actions.shape[:2]
+    for number, entry in enumerate(episodes if isinstance(episodes, list) else [None]):
+        spans = [entry.get(key) for key in ("env", "begin", "length")] if isinstance(entry, dict) else []
+        whole = len(spans) == 3 and all(type(value) is int and value >= 0 for value in spans)
+        if not whole or set(entry) != {field.name for field in fields(Episode)}:
+            raise CheckpointError(f"{file} is corrupt: its episode {number} is malformed")
+        env, begin, length = spans
+        if env >= envs or begin + length > steps:
+            raise CheckpointError(f"{file} is corrupt: its episode {number} does not lie in the recording")
+        sizes = {name: length + (name in _STATES) for name in (*_STATES, "actions", "rewards")}
+        for name, size in sizes.items():
+            tensor = tensors.get(f"episode.{number}.{name}")
+            if tensor is None or tensor.dim() < 1 or len(tensor) != size:
+                raise CheckpointError(f"{file} is corrupt: the {name} of its episode {number} are not there")
 
 
 def replay(

@@ -132,7 +132,7 @@ CONFIG = {
     "an object": _config("trainer: sb3", "trainer: !!python/object/apply:os.system ['touch {canary}']"),
     "a class": _config("trainer: sb3", "trainer: sb3\n    policy_class: evil.TASK"),
     "an override that is code": _config("trainer: sb3", "trainer: sb3\n    learning_rate: __import__('evil')"),
-    "a million environments": _config("num_envs: ", "num_envs: 99999"),
+    "a billion environments": lambda at: _everywhere(at.run / "config.yaml", "num_envs: ", "num_envs: 9999999"),
     "threads without end": _config("engine_threads: ", "engine_threads: 100000000 # "),
     "an alias": _config("trainer: sb3", "trainer: &a sb3"),
     "a terminal's commands": _config("trainer: sb3", 'trainer: "\\e]0;owned\\a\\e[2J"'),
@@ -144,6 +144,10 @@ CONFIG = {
     "a folder": lambda at: ((at.run / "config.yaml").unlink(), (at.run / "config.yaml").mkdir()),
 }
 """Refused by whatever reads the configuration, with 3 or 5."""
+
+
+def _everywhere(file, old, new):
+    file.write_text(file.read_text().replace(old, new))
 
 
 def _grow(file):

@@ -105,7 +105,7 @@ def refused(said, codes, *words):
 ATTACKS = [(kind, name) for kind in ("CODE", "RECORD") for name in getattr(strangers, kind)]
 
 
-@pytest.mark.parametrize(("kind", "name"), chosen(ATTACKS, 18))
+@pytest.mark.parametrize(("kind", "name"), chosen(ATTACKS, 10))
 def test_what_a_stranger_names_is_not_run_and_a_message_says_so(kind, name, at, good, cli):
     getattr(strangers, kind)[name](at)
     before = strangers.outside(at)
@@ -122,18 +122,16 @@ def test_what_a_stranger_names_is_not_run_and_a_message_says_so(kind, name, at, 
     assert {name: held for name, held in strangers.outside(at).items() if name in before} == before
 
 
-@pytest.mark.parametrize("name", chosen(list(strangers.CONFIG), 8))
+@pytest.mark.parametrize("name", chosen(list(strangers.CONFIG), 4))
 def test_a_strangers_configuration_reaches_nothing_but_what_is_installed(name, at, good, cli):
     strangers.CONFIG[name](at)
     for command, line in commands(at.run, good.run).items():
-        line = [word for word in line if "num_envs" not in str(word)] if "million" in name else line
+        line = [word for word in line if "num_envs" not in str(word)] if "billion" in name else line
         refused(cli(*line), (3, 5), *(() if command == "play latest" else ("stranger",)))
-    for line in reading(at.run, good.run).values():
-        assert cli(*line).code in (0, 2, 3, 4, 5, 9, 10)
     assert not at.canary.exists()
 
 
-@pytest.mark.parametrize("name", chosen(list(strangers.LINKS), 4))
+@pytest.mark.parametrize("name", chosen(list(strangers.LINKS), 2))
 def test_nothing_outside_a_strangers_run_is_written_or_removed(name, at, good, cli):
     strangers.LINKS[name](at)
     before = strangers.outside(at)
@@ -167,7 +165,7 @@ RECORDINGS = {
     "a task without a name": {"task": {"distribution": "rlcli"}},
     "a configuration that is a number": {"config": 7},
     "a configuration with an object": {"config": "a: !!python/object/apply:os.system ['touch {canary}']"},
-    "a configuration of a hundred megabytes": {"config": " " * (100 << 20)},
+    "a configuration of ten megabytes": {"config": " " * (10 << 20)},
     "episodes that are text": {"episodes": "all"},
     "an episode that is a number": {"episodes": [7]},
     "an episode with other fields": {"episodes": [{"evil": 1}]},
@@ -206,7 +204,7 @@ def forge(file, changes, at):
     return forged
 
 
-@pytest.mark.parametrize("name", chosen(list(RECORDINGS), 6))
+@pytest.mark.parametrize("name", chosen(list(RECORDINGS), 4))
 def test_a_strangers_recording_runs_nothing(name, at, good, cli):
     refused(cli("replay", forge(good.recording, RECORDINGS[name], at)), (3, 4, 5), "forged.safetensors")
     assert not at.canary.exists()
@@ -228,6 +226,7 @@ def test_a_pipe_in_place_of_a_checkpoints_file_is_not_waited_for(name, at, good,
         refused(cli(*line), (5,))
 
 
+@pytest.mark.slow
 def test_modules_in_the_current_folder_are_not_imported(at, good):
     """A fresh process in the stranger's folder, with modules of well-known names and a plugin's metadata beside it."""
     shutil.copytree(at.evil, at.run, dirs_exist_ok=True)
@@ -255,6 +254,7 @@ scene: {num_envs: 4, entities: {robot: {model: model.xml}}}
 actions: {effort: {func: joint_effort, joints: [slide]}}
 observations: {policy: {pos: {func: joint_pos}}}
 rewards: {mine: {func: mine, weight: 1.0}}
+terminations: {time_out: {func: time_out, time_out: true}}
 agents: {ppo: {trainer: sb3, algorithm: ppo, max_iterations: 1, n_steps: 8, num_minibatches: 2}}
 """
 TERMS = "def mine(env):\n    return env.entities['robot'].data.joint_pos[:, 0]\n"
