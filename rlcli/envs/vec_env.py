@@ -549,7 +549,9 @@ class VecEnv(ABC):
 
     def _open(self, resolved: Resolved) -> None:
         config = self.config
-        scene = Scene(config.scene, config.sim, resolved.source.root)
+        scene = Scene(
+            config.scene, config.sim, resolved.source.root, installed=resolved.source.distribution is not None
+        )
         self._binder = Binder(self, resolved)
         self._prepare(scene)
         self._binder.problems += [resolved.problem(p.path, str(p), p.hint) for p in scene.problems]

@@ -109,14 +109,14 @@ def _write(folder: Path, data: dict[str, Any], report: Report) -> list[str]:
 
 def _stands_alone(model: Path, folder: Path) -> bool:
     """Whether a copy of an MJCF compiles; one with meshes beside it does not."""
-    import mujoco
+    from rlcli.sim.mjcf import read_mjcf
 
     copy = folder / model.name
     if copy.exists():
         return True
     try:
         shutil.copyfile(model, copy)
-        mujoco.MjModel.from_xml_path(str(copy))
+        read_mjcf(copy, [folder]).compile()
     except (OSError, ValueError):
         copy.unlink(missing_ok=True)
         return False

@@ -227,10 +227,11 @@ class SceneReader:
         import mujoco
 
         from rlcli.registry import model_file
+        from rlcli.sim.mjcf import model_roots, read_mjcf
         from rlcli.sim.scene import name_all
 
         try:
-            spec = mujoco.MjSpec.from_file(str(model_file(self.root, model)))
+            spec = read_mjcf(model_file(self.root, model), model_roots(self.root, model))
             name_all(spec)
             compiled = spec.compile()
         except (ValueError, TaskError):

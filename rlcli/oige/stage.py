@@ -11,9 +11,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from rlcli.config.oige import relative
+from rlcli.config.oige import home, relative
 from rlcli.config.schema import EntityConfig
 from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
+from rlcli.sim.mjcf import BadModel, package_roots, read_mjcf
 from rlcli.sim.scene import Scene
 
 MODELS = Path(__file__).parent / "models"
@@ -114,10 +115,9 @@ class Stage:
             have = listing(sorted(str(p.relative_to(self.root)) for p in self.root.rglob("*.xml")))
             raise ConfigError([Problem(where, "", f"no file '{file}'", f"MJCF files of the task: {have}")])
         try:
-            prim.child = mujoco.MjSpec.from_file(str(file))
-        except ValueError as error:
-            text = " ".join(str(error).split())
-            raise ConfigError([Problem(where, "", f"'{file}' is not a valid MJCF: {text}")]) from None
+            prim.child = read_mjcf(file, [*package_roots(self.root), home(self.root / "task.yaml"), MODELS])
+        except BadModel as error:
+            raise ConfigError([Problem(where, "", f"'{file}' is not a valid MJCF: {error}")]) from None
         prim.label = str(entry.get("model", file.name))
         prim.names = {"joints": entry.get("joints", {}), "bodies": entry.get("bodies", {})}
         self._rename(prim, where)

@@ -262,10 +262,11 @@ def _check(file: Path, document: dict[str, Any], tensors: Mapping[str, Tensor]) 
         CheckpointError: naming the first that does not.
     """
     task, episodes = document.get("task"), document.get("episodes")
-    names = [value for value in task.values() if value is not None] if isinstance(task, dict) else [None]
-    if not all(isinstance(name, str) and name.isprintable() for name in names) or not task.get("name"):  # type: ignore[union-attr]
+    task = task if isinstance(task, dict) else {}
+    names = [value for value in task.values() if value is not None]
+    if not task.get("name") or not all(isinstance(name, str) and name.isprintable() for name in names):
         raise CheckpointError(f"{file} is corrupt: its task is malformed")
-    if not (task.get("folder") or task.get("distribution")):  # type: ignore[union-attr]
+    if not (task.get("folder") or task.get("distribution")):
         raise CheckpointError(f"{file} is corrupt: it does not say where the task is from")
     if not isinstance(document.get("config"), str):
         raise CheckpointError(f"{file} is corrupt: its configuration is malformed")
@@ -274,11 +275,11 @@ def _check(file: Path, document: dict[str, Any], tensors: Mapping[str, Tensor]) 
         raise CheckpointError(f"{file} is corrupt: its actions are not those of its environments")
     steps, envs = actions.shape[:2]
     for number, entry in enumerate(episodes if isinstance(episodes, list) else [None]):
-        spans = [entry.get(key) for key in ("env", "begin", "length")] if isinstance(entry, dict) else []
+        spans: list[Any] = [entry.get(key) for key in ("env", "begin", "length")] if isinstance(entry, dict) else []
         whole = len(spans) == 3 and all(type(value) is int and value >= 0 for value in spans)
         if not whole or set(entry) != {field.name for field in fields(Episode)}:
             raise CheckpointError(f"{file} is corrupt: its episode {number} is malformed")
-        env, begin, length = spans
+        env, begin, length = map(int, spans)
         if env >= envs or begin + length > steps:
             raise CheckpointError(f"{file} is corrupt: its episode {number} does not lie in the recording")
         sizes = {name: length + (name in _STATES) for name in (*_STATES, "actions", "rewards")}

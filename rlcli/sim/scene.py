@@ -22,6 +22,7 @@ from rlcli.config.schema import (
 from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
 from rlcli.registry import model_file
 from rlcli.sim.engine import quiet_mujoco
+from rlcli.sim.mjcf import BadModel, model_roots, read_mjcf
 from rlcli.sim.names import NameProblem, match
 from rlcli.sim.terrain import BODY as TERRAIN
 from rlcli.sim.terrain import Ground, add_ground, make_ground, misfits
@@ -94,11 +95,12 @@ class SceneProblem(ValueError):
 class Scene:
     """A scene under construction; `spec` is open to a direct task's `set_up_scene` until it is compiled."""
 
-    def __init__(self, config: SceneConfig, sim: SimConfig, root: Path) -> None:
+    def __init__(self, config: SceneConfig, sim: SimConfig, root: Path, *, installed: bool = False) -> None:
         quiet_mujoco()  # attaching a model whose options differ from the scene's logs each of them
         self.config = config.model_copy(update={"entities": dict(config.entities)})
         self.sim = sim
         self.root = root.resolve()
+        self.installed = installed
         self.spec = mujoco.MjSpec()
         self.spec.copy_during_attach = True
         self.problems: list[SceneProblem] = []
@@ -211,8 +213,9 @@ class Scene:
             )
             return None
         try:
-            return mujoco.MjSpec.from_file(str(file))
-        except ValueError as error:
+            installed = self.installed or ":" in entity.model
+            return read_mjcf(file, model_roots(self.root, entity.model), installed=installed)
+        except BadModel as error:
             self.problems.append(
                 SceneProblem((*path, "model"), f"'{entity.model}' is not a valid MJCF: {_one_line(error)}")
             )

@@ -17,6 +17,7 @@ from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DivergedError, listing
 from rlcli.registry import model_file
+from rlcli.sim.mjcf import model_roots, read_mjcf
 from rlcli.testing.subject import (
     NUM_ENVS,
     STEPS,
@@ -35,7 +36,8 @@ def names(subject: Subject) -> Iterator[Finding]:
     for entity, config in subject.resolved.task.scene.entities.items():
         if config.model is None:
             continue  # a shape has the names that rlcli gives it
-        spec = mujoco.MjSpec.from_file(str(model_file(subject.source.root, config.model)))
+        root = subject.source.root
+        spec = read_mjcf(model_file(root, config.model), model_roots(root, config.model))
         scalar = [joint for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]  # a root needs no name
         for word, elements in (("joint", scalar), ("actuator", list(spec.actuators)), ("body", spec.bodies[1:])):
             unnamed = [element for element in elements if not element.name]

@@ -1,0 +1,297 @@
+"""MJCF of a stranger: nothing outside the task is opened, nothing runs for ever, the message says what and where."""
+
+import os
+import random
+import signal
+import struct
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from fault_sizes import amount, chosen
+
+from rlcli.cli.app import main
+from rlcli.config.load import resolve
+from rlcli.envs.vec_env import make_env
+from rlcli.errors import ConfigError
+from rlcli.registry import folder_task
+from rlcli.sim import mjcf
+from rlcli.sim.mjcf import BadModel, read_mjcf
+
+TASK = """
+summary: A block.
+decimation: 1
+episode_length_s: 0.05
+sim: {dt: 0.01}
+scene: {num_envs: 2, entities: {robot: {model: model.xml}}}
+actions: {effort: {func: joint_effort, joints: [slide]}}
+observations: {policy: {pos: {func: joint_pos}}}
+rewards: {alive: {func: is_alive, weight: 1.0}}
+terminations: {time_out: {func: time_out, time_out: true}}
+"""
+BLOCK = '<body name="block"><joint name="slide" type="slide"/><geom type="box" size="0.3 0.3 0.3" mass="1"/></body>'
+
+
+def model(inner="", body="", asset=""):
+    return f"<mujoco>{inner}<asset>{asset}</asset><worldbody>{BLOCK}{body}</worldbody></mujoco>"
+
+
+def png(width, height):
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", width, height) + b"\x08\x02\0\0\0" + b"\0" * 40
+
+
+def linked(folder, name, target):
+    (folder / name).symlink_to(target)
+
+
+NAMED = {
+    "an include of a user's file": (model('<include file="/etc/passwd"/>'), "lies outside"),
+    "an include of a folder above": (model('<include file="../outside.xml"/>'), "lies outside"),
+    "an include far above": (model(f'<include file="{"../" * 30}etc/passwd"/>'), "lies outside"),
+    "an include behind an asset folder": (
+        model('<compiler assetdir=".."/><include file="outside.xml"/>'),
+        "lies outside",
+    ),
+    "an include by a link": (model('<include file="link.xml"/>'), "lies outside"),
+    "an include by a linked folder": (model('<include file="up/outside.xml"/>'), "lies outside"),
+    "an include of an include outside": (model('<include file="parts/leads_out.xml"/>'), "lies outside"),
+    "an include in references": (model('<include file="&#46;&#46;/outside.xml"/>'), "lies outside"),
+    "an include of itself": (model('<include file="model.xml"/>'), "MJCF"),
+    "an include of text": (model('<include file="notes.txt"/>'), "not MJCF"),
+    "a pipe": (model('<include file="pipe.xml"/>'), "not a plain file"),
+    "a folder as model": (model('<include file="folder.xml"/>'), "folder.xml"),
+    "a mesh outside": (model(asset='<mesh name="m" file="../outside.obj"/>'), "lies outside"),
+    "an absolute mesh": (model(asset='<mesh name="m" file="/etc/passwd"/>'), "lies outside"),
+    "a device as mesh": (model(asset='<mesh name="m" file="/dev/zero" content_type="model/obj"/>'), "lies outside"),
+    "a mesh behind a mesh folder": (
+        model('<compiler meshdir="../"/>', asset='<mesh name="m" file="outside.obj"/>'),
+        "lies outside",
+    ),
+    "a mesh folder that is said later": (
+        f'<mujoco><asset><mesh name="m" file="outside.obj"/></asset><worldbody>{BLOCK}</worldbody>'
+        '<compiler meshdir=".."/></mujoco>',
+        "lies outside",
+    ),
+    "a mesh that is a pipe": (model(asset='<mesh name="m" file="pipe.obj"/>'), "not a plain file"),
+    "a texture outside": (model(asset='<texture name="t" type="2d" file="../outside.png"/>'), "lies outside"),
+    "a side of a cube outside": (model(asset='<texture name="t" fileright="../outside.png"/>'), "lies outside"),
+    "a height field outside": (model(asset='<hfield name="h" file="../outside.png" size="1 1 1 1"/>'), "lies outside"),
+    "a skin outside": (model("<deformable><skin file='../outside.skn'/></deformable>"), "lies outside"),
+    "a flex outside": (model(body='<flexcomp name="f" type="mesh" file="../outside.obj"/>'), "lies outside"),
+    "a model outside": (model(asset='<model name="m" file="../outside.xml"/>'), "lies outside"),
+    "a compiled model as asset": (model(asset='<model name="m" file="bin.mjb"/>'), "compiled models"),
+    "a resource of another kind": (model(asset='<mesh name="m" file="http://example.invalid/m.obj"/>'), "not the name"),
+    "a picture of four terapixels": (model(asset='<texture name="t" type="2d" file="huge.png"/>'), "too much"),
+    "a thousand million copies": (model(body='<replicate count="1000000000"><geom size="1"/></replicate>'), "too much"),
+    "copies of copies of copies": (
+        model(body='<replicate count="1000">' * 3 + '<geom size="1"/>' + "</replicate>" * 3),
+        "too much",
+    ),
+    "a flex of 3000 cubed": (
+        model(body='<flexcomp name="f" type="grid" count="3000 3000 3000" spacing="1 1 1" dim="3"/>'),
+        "too much",
+    ),
+    "a height field of 100,000 squared": (
+        model(asset='<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/>'),
+        "too much",
+    ),
+    "a texture of 100,000 squared": (
+        model(asset='<texture name="t" type="2d" builtin="flat" width="100000" height="1000000"/>'),
+        "too much",
+    ),
+    "a time step of nothing": (model('<option timestep="0"/>'), "timestep is 0"),
+    "a time step below nothing": (model('<option timestep="-1"/>'), "timestep is -1"),
+    "a time step that is no number": (model('<option timestep="nan"/>'), "not a finite number"),
+    "endless iterations": (model('<option iterations="1000000000"/>'), "iterations is 1000000000"),
+    "endless line search": (model('<option ls_iterations="1000000000"/>'), "ls_iterations"),
+    "iterations below nothing": (model('<option iterations="-4"/>'), "iterations is -4"),
+    "gravity that is no number": (model('<option gravity="0 nan 0"/>'), "not a finite number"),
+    "an endless impratio": (model('<option impratio="inf"/>'), "not a finite number"),
+    "a tolerance that is no number": (model('<option tolerance="NaN"/>'), "not a finite number"),
+    "a keyframe of the wrong size": (model('<keyframe><key name="k" qpos="1 2 3"/></keyframe>'), "keyframe 'k'"),
+    "a terabyte": (model('<size memory="1T"/>'), "size memory"),
+    "a hundred gigabytes": (model('<size memory="100G"/>'), "size memory"),
+    "a hundred million keyframes": (model('<size nkey="100000000"/>'), "size nkey"),
+    "user data without end": (model('<size nuserdata="1000000000"/>'), "size nuserdata"),
+    "a hundred thousand bodies in bodies": (model(body="<body>" * 100_000 + "</body>" * 100_000), "nested deeper"),
+    "an entity bomb": (
+        '<!DOCTYPE m [<!ENTITY a "b"><!ENTITY c "&a;&a;">]>' + model(body="&c;"),
+        "DOCTYPE",
+    ),
+    "a file as entity": ('<!DOCTYPE m [<!ENTITY a SYSTEM "/etc/passwd">]>' + model(body="&a;"), "DOCTYPE"),
+    "no XML": ("garbage", "not well-formed"),
+    "nothing": ("", "not well-formed"),
+    "XML cut short": (model()[:-30], "not well-formed"),
+    "two documents": (model() + "<include file='../outside.xml'/>", "not well-formed"),
+    "a null byte": (model() + "\0", "not well-formed"),
+    "an unknown element": (model("<evil/>"), "evil"),
+    "twenty megabytes of spaces": (model(" " * (20 << 20)), "larger than"),
+}
+
+
+@pytest.fixture
+def task(tmp_path):
+    """A task folder with some traps beside and in it."""
+    folder = tmp_path / "task"
+    (folder / "parts").mkdir(parents=True)
+    (folder / "task.yaml").write_text(TASK)
+    (folder / "notes.txt").write_text("<mujoco/>")
+    (folder / "bin.mjb").write_bytes(b"\0" * 100)
+    (folder / "huge.png").write_bytes(png(2_000_000, 2_000_000))
+    (folder / "folder.xml").mkdir()
+    (folder / "parts" / "leads_out.xml").write_text('<mujoco><include file="../../outside.xml"/></mujoco>')
+    (tmp_path / "outside.xml").write_text("<mujoco/>")
+    for name in ("obj", "png", "skn"):
+        (tmp_path / f"outside.{name}").write_text("v 0 0 0")
+    linked(folder, "link.xml", tmp_path / "outside.xml")
+    linked(folder, "up", tmp_path)
+    for name in ("pipe.xml", "pipe.obj"):
+        os.mkfifo(folder / name)
+    return folder
+
+
+@pytest.mark.parametrize("name", chosen(list(NAMED), 16))
+def test_a_bad_model_is_refused_by_name_before_it_is_opened(name, task):
+    text, reason = NAMED[name]
+    (task / "model.xml").write_text(text)
+    begin = time.perf_counter()
+    with pytest.raises(ConfigError) as caught:
+        make_env(resolve(folder_task(task)))
+    assert time.perf_counter() - begin < 20
+    assert "model" in str(caught.value)
+    assert reason in str(caught.value)
+    assert "task.yaml:6:" in str(caught.value)
+
+
+def test_the_command_says_it_with_exit_code_3(task, capsys, monkeypatch):
+    monkeypatch.chdir(task.parent)
+    (task / "model.xml").write_text(model('<include file="../outside.xml"/>'))
+    assert main(["validate", "./task", "--deep"]) == 3
+    said = capsys.readouterr().err
+    assert "model.xml:1: include: '../outside.xml' lies outside of" in said
+
+
+def test_a_compiled_model_is_not_opened(task):
+    (task / "task.yaml").write_text(TASK.replace("model.xml", "bin.mjb"))
+    with pytest.raises(ConfigError, match=r"compiled ones \(.mjb\) are not opened"):
+        make_env(resolve(folder_task(task)))
+
+
+def test_parts_of_the_task_its_package_and_its_links_are_opened(tmp_path):
+    package = tmp_path / "robots"
+    folder = package / "block"
+    (folder / "parts").mkdir(parents=True)
+    (package / "common").mkdir()
+    for place in (package, folder):
+        (place / "__init__.py").touch()
+    (folder / "task.yaml").write_text(TASK)
+    (package / "common" / "floor.xml").write_text('<mujoco><worldbody><geom size="1"/></worldbody></mujoco>')
+    (folder / "parts" / "eye.xml").write_text('<mujoco><worldbody><site name="eye"/></worldbody></mujoco>')
+    linked(folder, "light.xml", folder / "parts" / "light.xml")
+    (folder / "parts" / "light.xml").write_text("<mujoco><worldbody><light/></worldbody></mujoco>")
+    includes = '<include file="../common/floor.xml"/><include file="parts/eye.xml"/><include file="light.xml"/>'
+    (folder / "model.xml").write_text(model(includes))
+    env = make_env(resolve(folder_task(folder)))
+    assert (env.engine.model.nsite, env.engine.model.nbody) == (1, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the limits of a process are the system's")
+def test_a_model_that_asks_for_much_is_compiled_under_limits_first(tmp_path, monkeypatch):
+    file = tmp_path / "model.xml"
+    many = '<replicate count="25000" offset="1 0 0"><geom size="0.1"/></replicate>'
+    file.write_text(model(body=many))
+    assert len(read_mjcf(file, [tmp_path]).geoms) > 25_000  # much, and within the limits
+    monkeypatch.setattr(mjcf, "TIME_S", 1)
+    file.write_text(model(body=many.replace("25000", "400000")))
+    begin = time.perf_counter()
+    with pytest.raises(BadModel, match=r"model\.xml: compiling it takes more than"):
+        read_mjcf(file, [tmp_path])
+    assert time.perf_counter() - begin < 20
+
+
+def test_a_machine_without_limits_still_reads_models(tmp_path, monkeypatch):
+    file = tmp_path / "model.xml"
+    file.write_text(model())
+    monkeypatch.setattr(mjcf, "MUCH", 0)
+    hidden = "import sys; sys.modules['resource'] = None\n"
+    monkeypatch.setattr(mjcf, "_APART", hidden + mjcf._APART)
+    assert len(read_mjcf(file, [tmp_path]).geoms) == 1
+
+
+# --- mutants ---
+
+SEEDS = [Path(__file__).parents[2] / place for place in (
+    "tasks/rlcli_tasks/ant/ant.xml", "tasks/rlcli_tasks/cartpole/cartpole.xml", "rlcli/oige/models/humanoid.xml",
+)]  # fmt: skip
+WORDS = [
+    b"nan", b"inf", b"-1", b"0", b"1e400", b"1e30", b"1000000000", b"99999999999999999999", b'"', b"<", b">", b"/>",
+    b"<replicate count='100000'>", b"</replicate>", b"<include file='/etc/passwd'/>", b"\0", b"\xff", b"&amp;",
+    b"<!--", b"-->", b"<![CDATA[", b"<body>", b"</body>", b"<joint type='free'/>", b"<geom size='0 0 0'/>", b" ",
+    b"<flexcomp name='f' type='grid' count='9 9 9' spacing='.1 .1 .1'/>", b"<option timestep='nan'/>",
+]  # fmt: skip
+BATCH = 40
+
+
+def mutant(draw):
+    data = bytearray(draw.choice(SEEDS).read_bytes())
+    for _ in range(draw.randint(1, 6)):
+        at, kind = draw.randrange(len(data)), draw.randrange(5)
+        if kind == 0:
+            data[at] = draw.randrange(256)
+        elif kind == 1:
+            data[at:at] = draw.choice(WORDS)
+        elif kind == 2:
+            del data[at : at + draw.randint(1, 40)]
+        elif kind == 3:
+            other = draw.randrange(len(data))
+            data[at:at] = data[other : other + draw.randint(1, 200)]
+        else:
+            digits = [i for i in range(at, min(at + 300, len(data))) if 48 <= data[i] < 58]
+            if digits:
+                data[digits[0] : digits[0] + 1] = draw.choice(WORDS[:8])
+    return bytes(data)
+
+
+def try_mutants(seed, folder):
+    """In a child under limits: read and compile; 0 if each was taken or refused in words, and not all were alike."""
+    import resource
+    import warnings
+
+    resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    warnings.simplefilter("ignore")
+    draw, taken = random.Random(seed), 0
+    file = folder / "model.xml"
+    for _ in range(BATCH):
+        data = mutant(draw)
+        file.write_bytes(data)
+        try:
+            read_mjcf(file, [folder]).compile()
+            taken += 1
+        except BadModel as error:
+            assert str(error), data
+        except ValueError:
+            pass  # MuJoCo's words, which the scene passes on
+    return 0 if taken < BATCH else 3
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="children are forked")
+@pytest.mark.parametrize("first", range(0, amount(1, 10, 500), 10))
+def test_mutants_are_taken_or_refused_in_words_and_none_crashes_or_hangs(first, tmp_path):
+    for seed in range(first, min(first + 10, amount(1, 10, 500))):
+        child = os.fork()
+        if child == 0:
+            code = 1
+            try:
+                null = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(null, 1)
+                os.chdir(tmp_path)
+                code = try_mutants(seed, tmp_path)
+            finally:
+                os._exit(code)
+        _, status = os.waitpid(child, 0)
+        ended = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
+        assert not ended, (seed, signal.Signals(ended).name, (tmp_path / "model.xml").read_bytes()[:400])
+        assert os.WEXITSTATUS(status) == 0, (seed, (tmp_path / "model.xml").read_bytes()[:400])
