@@ -18,7 +18,7 @@ from rlcli.rl.trainer import Report, Trainer
 from rlcli.rl.trials import Trials
 
 SAVE_EVERY_S = 60.0
-LONG_S = 0.5
+LONG_S = 0.1
 """An iteration that takes longer can be interrupted: its beginning is copied for that."""
 DIVERGED_SHARE = 0.01
 """Share of an iteration's environment steps that may diverge before the run stops."""
