@@ -292,6 +292,8 @@ def _check(record: Any, file: Path) -> None:
     for key, types in _TYPES.items():
         if key in record and type(record[key]) not in types:
             raise CheckpointError(f"{file} is corrupt: its {key} is a {type(record[key]).__name__}")
+    if not all(isinstance(name, str) for name in record.get("loggers", [])):
+        raise CheckpointError(f"{file} is corrupt: its loggers are malformed")
     if not 0 < record.get("torch_threads", 1) <= _MOST_THREADS:
         raise CheckpointError(f"{file} is corrupt: its torch_threads is out of range")
 
