@@ -67,7 +67,12 @@ def open_session(
         resolved = resolve(find_task(task), play=True, config_file=config, overrides=overrides, flags=values)
     check(resolved)
     tell_notes(resolved)
-    return _build(resolved, run, folder, policy, stochastic, seed)
+    session = _build(resolved, run, folder, policy, stochastic, seed)
+    from rlcli.rl.dump import Watch
+
+    home = runs_dir or default_runs_dir() if run is None else run.folder
+    Watch(session.env, home / "dumps", console.warn)
+    return session
 
 
 def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic: bool, seed: int) -> Session:

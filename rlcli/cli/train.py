@@ -352,6 +352,10 @@ def _train(job: _Job, device: str, stop: StopRequest) -> None:
         f"{job.resolved.source.name}: {env.num_envs} environments, {size} observations, {actions} actions,"
         f" {env.engine.threads} engine threads, agent {job.resolved.agent_name}, seed {run.record['seed']}"
     )
+    if job.writes:
+        from rlcli.rl.dump import Watch
+
+        Watch(env, run.folder / "dumps", console.warn)
     try:
         _fit(job, trainer, env, stop)
     finally:

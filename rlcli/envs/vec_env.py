@@ -332,6 +332,11 @@ class VecEnv(ABC):
             causes[cause] = causes.get(cause, 0) + count
         return causes
 
+    @property
+    def calls_per_step(self) -> int:
+        """Calls of the engine in an environment step: one, or one a physics step where actuator models act between."""
+        return self.config.decimation if self._actuators else 1
+
     def is_playing(self) -> bool:
         """False while paused; no step runs then."""
         return self._playing
@@ -716,7 +721,7 @@ class VecEnv(ABC):
         self._aside = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._any_aside = False
         self._ids = torch.arange(self.num_envs, device=self.device)
-        self._steps = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._steps: Tensor = torch.zeros((), dtype=torch.int64, device=self.device)
 
 
 def grid(num_envs: int, spacing: float) -> Tensor:

@@ -39,6 +39,14 @@ _ACCELERATION = frozenset(
 """Fields of the acceleration stage: read as the last substep left them, so they ask for no stage of their own."""
 
 _W = mujoco.mjtWarning
+_FLAGS = frozenset(
+    [
+        *("geom_contype", "geom_conaffinity", "geom_priority", "geom_group", "jnt_limited", "jnt_actgravcomp"),
+        *("jnt_actfrclimited", "tendon_limited", "tendon_actfrclimited", "actuator_ctrllimited", "actuator_actlimited"),
+        *("actuator_forcelimited", "eq_active0", "opt.disableactuator"),
+    ]
+)
+"""Integers of a model that are no address, number or kind of anything."""
 _DIVERGED = {
     "BADCTRL": int(_W.mjWARN_BADCTRL),
     "BADQPOS": int(_W.mjWARN_BADQPOS),
@@ -125,6 +133,24 @@ class BatchEngine:
     def trace(self, env: int) -> list[Call]:
         """The last calls of a world in its running episode, the oldest first."""
         return self._history.of(env)
+
+    @property
+    def follows_constants(self) -> bool:
+        """Whether `set_constants` has been called."""
+        return self._own_constants
+
+    def row(self, env: int) -> np.ndarray:
+        """A copy of a world's integration state. (nstate,)"""
+        return self._batch.state[env].copy()
+
+    def own_model(self, env: int) -> dict[str, np.ndarray]:
+        """Copies of the model fields of a world's own."""
+        return {name: np.array(values[env]) for name, values in self._batch._expanded.items()}
+
+    def put(self, env: int, row: np.ndarray) -> None:
+        """Give a world an integration state; derived fields stay behind."""
+        self._batch.state[env] = row
+        self._batch.warning[env] = 0
 
     def attach(self) -> None:
         """Nothing to do: calls return when their work is done."""
@@ -257,14 +283,15 @@ class BatchEngine:
         """What went wrong in a world, and where it came from, as far as that can be seen afterwards."""
         if cause == ENGINE_ERROR:
             return Divergence(env, cause, f"{self._error}; {_MORE_MEMORY}")
-        place = ""
+        place, index = "", -1
         if cause in FIELD_OF:
-            place = self.state_layout.place(FIELD_OF[cause], int(self._batch.warning[env, _DIVERGED[cause], 0]))
+            index = int(self._batch.warning[env, _DIVERGED[cause], 0])
+            place = self.state_layout.place(FIELD_OF[cause], index)
         before = self._history.last(env)
         known = np.concatenate([before, self._default[len(before) :]]) if before is not None else self._default
         unfit = [f"model field {name}" for name in self._unfit_model(env)] + self.state_layout.unfit(known)
         source = f"{unfit[0]} was not finite before the step" if unfit else ""
-        return Divergence(env, cause, "; ".join(part for part in (place, source) if part))
+        return Divergence(env, cause, "; ".join(part for part in (place, source) if part), index)
 
     def forward(self, selection: Selection) -> None:
         """Compute what is bound of the derived fields of the selected worlds."""
@@ -362,7 +389,7 @@ class BatchEngine:
         self._batch.warning[:] = state["warning"].numpy()
         for name, values in state.items():
             if name.startswith("model."):
-                self.expand(name.removeprefix("model.")).copy_(values)
+                self.take_model(name.removeprefix("model."), values)
         if bool(state["constants"]):
             self.set_constants()
         substep = {n.removeprefix("substep."): values for n, values in state.items() if n.startswith("substep.")}
@@ -372,6 +399,19 @@ class BatchEngine:
             self._batch.forward(stage=self._forward_stage)
         for name, values in substep.items():
             self._fields[name].copy_(values)
+
+    def take_model(self, name: str, values: Tensor) -> None:
+        """Take the values of a model field from a file.
+
+        Raises:
+            ValueError: for one that does not fit, or that could send MuJoCo outside of its arrays.
+        """
+        target = self.expand(name)
+        if target.shape != values.shape or target.dtype != values.dtype:
+            raise ValueError(f"model field '{name}' is {tuple(values.shape)}, not {tuple(target.shape)}")
+        if not target.dtype.is_floating_point and name not in _FLAGS and not torch.equal(target, values):
+            raise ValueError(f"model field '{name}' is part of the model's structure, and not the model's")
+        target.copy_(values)
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """One world as MjModel and MjData, forwarded; asked again for the same world, the same two objects, updated."""

@@ -28,6 +28,8 @@ class Divergence:
     """MuJoCo's warning without its prefix (`BADQACC`), `FIELD not finite`, or `engine error`."""
     detail: str = ""
     """Where, as far as it is known at once."""
+    index: int = -1
+    """Of a warning: the index in the field that it is about."""
 
     def __str__(self) -> str:
         """`environment 3: BADQACC (joint 'swing')`."""
@@ -108,25 +110,29 @@ class StateLayout:
         self._columns = columns
         """Field -> first column and size, in the order of the columns."""
 
-    def slice(self, name: str) -> slice:
+    def columns(self, name: str) -> slice:
         """The columns of a field."""
         start, size = self._columns[name]
         return slice(start, start + size)
 
+    def fields(self) -> list[tuple[str, slice]]:
+        """Every field with its columns."""
+        return [(name, self.columns(name)) for name in self._columns]
+
     def until(self, name: str) -> int:
         """Columns up to a field and with it."""
-        return self.slice(name).stop
+        return self.columns(name).stop
 
     def unfit(self, row: np.ndarray) -> list[str]:
         """Fields of a state that are not finite, what is written to a simulation before what comes out of it."""
         return [
-            name for name in _INPUTS_FIRST if name in self._columns and not np.isfinite(row[self.slice(name)]).all()
+            name for name in _INPUTS_FIRST if name in self._columns and not np.isfinite(row[self.columns(name)]).all()
         ]
 
     def unbounded(self, row: np.ndarray) -> tuple[str, int] | None:
         """The first position or velocity that MuJoCo would not take: field and index."""
         for name in ("qpos", "qvel"):
-            bad = ~(np.abs(row[self.slice(name)]) <= LIMIT)
+            bad = ~(np.abs(row[self.columns(name)]) <= LIMIT)
             if bad.any():
                 return name, int(bad.argmax())
         return None
