@@ -407,6 +407,7 @@ class VecEnv(ABC):
         for name, model in self._actuators.items():
             model.load_state_dict(_below(state, f"actuator.{name}."))
         self.sim.refresh()
+        self.sim.keep()
         if self.terrain is not None:
             self.terrain.load_state_dict(_below(state, "terrain."))
         for name, sensor in self.sensors.items():

@@ -123,8 +123,8 @@ class Sb3Trainer:
         torch.set_num_threads(1)
         try:
             self._collect()
-        except DivergedError:
-            require_finite(self._learned(), self.iteration + 1)  # where the action comes from, it may have gone wrong
+        except (DivergedError, ValueError):  # where the action comes from, it may have gone wrong
+            require_finite(self._learned(), self.iteration + 1)
             raise
         self._record()
         collected = time.perf_counter()
@@ -285,6 +285,8 @@ class Sb3Trainer:
         for name in _MUST_BE_FINITE:
             if not math.isfinite(metrics.get(name, 0.0)):
                 raise DivergedError(f"{name} is not finite in iteration {self.iteration}", hint=LEARNER_HINT)
+        if not math.isfinite(recorded.get("train/loss", 0.0)):
+            raise DivergedError(f"the loss is not finite in iteration {self.iteration}", hint=LEARNER_HINT)
         if self._gradients.first is not None:
             raise DivergedError(
                 f"the gradient of '{self._gradients.first}' is not finite, in iteration {self.iteration};"

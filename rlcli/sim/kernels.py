@@ -104,10 +104,10 @@ def guard(
             column = i
     for i in range(qpos.shape[1]):
         x = qpos[world, i]
-        if not wp.isfinite(x):
+        if bad != 1 and not wp.isfinite(x):
             bad = wp.int32(1)
             column = i
-        elif wp.abs(x) > _TOO_LARGE:
+        elif bad != 1 and wp.abs(x) > _TOO_LARGE:
             bad = wp.int32(2)
             column = i
     diverged[world] = bad != 0
