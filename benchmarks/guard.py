@@ -1,6 +1,6 @@
 """What the divergence guard costs in an environment step, history included: `python benchmarks/guard.py`.
 
-Every part of the guard is timed where it runs, inside the step, as trainers run it. The share is the median over blocks.
+Each part of the guard is timed where it runs, inside the step, as trainers run it. The share is the median of blocks.
 """
 
 from __future__ import annotations
