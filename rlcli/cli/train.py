@@ -277,9 +277,10 @@ def _created(
     init_from: str | None,
 ) -> _Job:
     """A new run, its folder written before anything heavy is imported."""
-    from rlcli.config.dump import to_data, to_yaml
+    from rlcli.config.dump import given, to_data, to_yaml
+    from rlcli.rl.environment import environment_record, file_digest
     from rlcli.rl.loggers import check_loggers
-    from rlcli.rl.run import create_run, environment_record, find_checkpoint
+    from rlcli.rl.run import create_run, find_checkpoint
 
     loggers = check_loggers(logger)
     initial = None
@@ -291,7 +292,9 @@ def _created(
         "agent": resolved.agent_name,
         "loggers": loggers,
         "init_from": str(initial) if initial else None,
-        **environment_record(*_threads(resolved)),
+        "init_from_sha256": file_digest(initial / "policy.safetensors") if initial else None,
+        "given": given(resolved),
+        **environment_record(resolved, *_threads(resolved)),
     }
     run = create_run(runs, resolved.source.name, name, to_yaml(to_data(resolved)), record)
     console.info(f"run {run.folder}")
@@ -440,7 +443,7 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
 
     try:
         if job.writes:
-            run.update(state="running")
+            run.update(state="running", **_environment(job, env, trainer))
             sinks += open_loggers(run, job.loggers, resume=resume)
         with TrainingView(f"rlcli train {job.resolved.source.name}") as view:
             fit(
@@ -460,6 +463,23 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
             close("stopped" if isinstance(error, Stopped | KeyboardInterrupt) else "failed")
         raise
     close("finished")
+
+
+def _environment(job: _Job, env: Any, trainer: Any) -> dict[str, Any]:
+    """What run.json says of where the bits are from; of a resumed run what differs from where it began."""
+    from rlcli.rl.environment import built_record, differences, environment_record
+
+    record = job.run.record
+    built = built_record(env.engine.model, record["device"])
+    if job.resume_from is None:
+        return built
+    now = environment_record(job.resolved, env.engine.threads, int(record["torch_threads"])) | built
+    now["engine_threads"] = record.get("engine_threads")  # as many as there are; they change no bit
+    changed = {name: after for name, _, after in differences(record, now)}
+    if not changed:
+        return {}
+    console.warn(f"resumed in another environment, the bits may differ: {', '.join(changed)}")
+    return {"resumed": [*record.get("resumed", []), {"step": trainer.env_steps, "changed": changed}]}
 
 
 def _report(job: _Job, trainer: Any) -> None:
