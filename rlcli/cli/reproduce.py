@@ -28,6 +28,7 @@ def command(
 ) -> None:
     """Train a run again, and compare."""
     from rlcli.cli.diff import report
+    from rlcli.cli.train import train_again
     from rlcli.machine import available_cores
     from rlcli.rl.environment import environment_record
     from rlcli.rl.load import resolve_run
@@ -40,7 +41,7 @@ def command(
     console.info(f"reproducing {original.folder} ({why})")
 
     from rlcli.rl.compare import compare, reached
-    from rlcli.rl.reproduction import changed, require_reproducible, train_again
+    from rlcli.rl.reproduction import changed, create_again, milestones, require_reproducible
 
     require_reproducible(original)
     last = reached(original)
@@ -50,7 +51,8 @@ def command(
     now = environment_record(resolved, engine, int(original.record.get("torch_threads") or min(4, available_cores())))
     rows = changed(original, now)
 
-    def accept(more: list[tuple[str, Any, Any]]) -> None:
+    def accept(built: dict[str, Any]) -> None:
+        more = changed(original, built)
         rows.extend(more)
         _require(more, force)
 
@@ -58,13 +60,8 @@ def command(
     if original.record.get("resumed"):
         console.warn("the run was resumed in another environment than it began in; its later bits may not come again")
 
-    from rlcli.cli.live import TrainingView
-    from rlcli.rl.stop import StopRequest
-
-    with StopRequest() as stop, TrainingView(f"rlcli reproduce {original.record['task']['name']}") as view:
-        run, step = train_again(
-            original, resolved, runs, name, until, now, accept=accept, stop=stop, show=view.show, tell=console.warn
-        )
+    run, initial = create_again(original, runs, name, now)
+    step = train_again(run, resolved, initial, milestones(original, until), accept)
     console.info(f"trained {until} of {last} iterations again in {run.folder}")
     sections = compare(original, run, sections=("metrics", "weights", "policy"), until=step)
     more = {"iterations": until, "environment": [_entry(row) for row in rows]}

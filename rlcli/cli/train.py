@@ -141,6 +141,8 @@ class _Job:
     """The checkpoint to go on from exactly."""
     init_from: Any = None
     """The checkpoint folder to take weights from."""
+    stages: list[int] = field(default_factory=list)
+    """Iterations to save at, the last one to end at, instead of the agent's budget and what it keeps."""
     writes: bool = True
     """Whether this process writes the run."""
     begin: float = field(default_factory=time.monotonic)
@@ -323,10 +325,11 @@ def _resumed(
     loggers = check_loggers(logger) if logger else list(run.record.get("loggers", []))
     run.lock()
     try:
-        from rlcli.rl import checkpoint
+        from rlcli.rl.checkpoint import open_checkpoint
+        from rlcli.rl.saving import clean
 
-        checkpoint.clean(run.checkpoints)
-        saved = checkpoint.open_checkpoint(folder)
+        clean(run.checkpoints)
+        saved = open_checkpoint(folder)
         if budget:
             write_atomic(run.config, to_yaml(to_data(resolved)))
     except BaseException:
@@ -371,8 +374,9 @@ def _build(job: _Job, device: str) -> Any:
     from rlcli.errors import CheckpointError
     from rlcli.registry import load_object
     from rlcli.rl import distributed
-    from rlcli.rl.checkpoint import drop_after, open_checkpoint
+    from rlcli.rl.checkpoint import open_checkpoint
     from rlcli.rl.load import require_fit, require_same_policy, require_trainer
+    from rlcli.rl.saving import drop_after
 
     resolved, record = job.resolved, job.run.record
     assert resolved.trainer is not None
@@ -421,6 +425,7 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
     from rlcli.cli.live import TrainingView
     from rlcli.errors import RlcliError, Stopped
     from rlcli.rl.loggers import open_loggers
+    from rlcli.rl.saving import Keep, Saver
     from rlcli.rl.train import Budget, fit
 
     run, agent = job.run, job.resolved.agent
@@ -432,32 +437,38 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
         "layout": env.layout.record(),
         "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
     }
+    keep = Keep() if job.stages else Keep.of(agent.keep_last, agent.keep_every, agent.save_interval)
+    budgets = [Budget(end, None) for end in job.stages] or [Budget(agent.max_iterations, agent.max_steps)]
+    saver = Saver(run.checkpoints, keep, manifest, resumed=job.resume_from)
     sinks: list[Any] = []
 
     def close(state: str) -> None:
         for sink in sinks:
             sink.close()
-        if not job.writes:
-            return
-        run.update(state=state, step=trainer.env_steps, iteration=trainer.iteration)
+        if job.writes and saver.at is not None:
+            run.update(state=state, iteration=saver.at[0], step=saver.at[1])
 
     try:
         if job.writes:
             run.update(state="running", **_environment(job, env, trainer))
             sinks += open_loggers(run, job.loggers, resume=resume)
+        trials = _trials(job, saver, stop)
+        env.before_step, stop.can_interrupt = stop.check, not env.engine.asynchronous
         with TrainingView(f"rlcli train {job.resolved.source.name}") as view:
-            fit(
-                trainer,
-                run,
-                Budget(agent.max_iterations, agent.max_steps),
-                loggers=sinks,
-                save_interval=agent.save_interval,
-                manifest=manifest,
-                show=view.show,
-                tell=console.warn,
-                divergences=lambda: env.divergences,
-                stop=stop,
-            )
+            for budget in budgets:
+                fit(
+                    trainer,
+                    run,
+                    budget,
+                    saver,
+                    loggers=sinks,
+                    save_interval=agent.save_interval,
+                    trials=trials,
+                    show=view.show,
+                    tell=console.warn,
+                    divergences=lambda: env.divergences,
+                    stop=stop,
+                )
     except BaseException as error:
         with contextlib.suppress(OSError, RlcliError):  # the first error is the one to report
             close("stopped" if isinstance(error, Stopped | KeyboardInterrupt) else "failed")
@@ -473,13 +484,38 @@ def _environment(job: _Job, env: Any, trainer: Any) -> dict[str, Any]:
     built = built_record(env.engine.model, record["device"])
     if job.resume_from is None:
         return built
-    now = environment_record(job.resolved, env.engine.threads, int(record["torch_threads"])) | built
+    now = environment_record(job.resolved, env.engine.threads, record.get("torch_threads") or 0) | built
     now["engine_threads"] = record.get("engine_threads")  # as many as there are; they change no bit
     changed = {name: after for name, _, after in differences(record, now)}
     if not changed:
         return {}
     console.warn(f"resumed in another environment, the bits may differ: {', '.join(changed)}")
     return {"resumed": [*record.get("resumed", []), {"step": trainer.env_steps, "changed": changed}]}
+
+
+def _trials(job: _Job, saver: Any, stop: StopRequest) -> Any:
+    """What evaluates between iterations, if the agent wants it; one process does."""
+    from rlcli.envs.vec_env import make_env
+    from rlcli.random import derive
+    from rlcli.rl.load import resolve_run
+    from rlcli.rl.loggers import read_metrics
+    from rlcli.rl.trials import Trials
+
+    run, agent = job.run, job.resolved.agent
+    assert agent is not None
+    if agent.eval_interval is None or not job.writes:
+        return None
+
+    def make() -> Any:
+        num_envs = min(agent.eval_episodes, job.resolved.task.scene.num_envs)
+        resolved = resolve_run(run, play=True, flags={"scene.num_envs": num_envs})
+        env = make_env(resolved, seed=derive(run.record["seed"], "evaluation"))
+        env.before_step = stop.check
+        return env
+
+    history = read_metrics(run.metrics)
+    saver.best = run.record.get("best")
+    return Trials(make, agent.eval_episodes, agent.eval_interval, history)
 
 
 def _report(job: _Job, trainer: Any) -> None:
@@ -519,3 +555,30 @@ def _warn_physics(env: Any) -> None:
     for name, count in env.engine.warnings.items():
         if count:
             console.warn(f"{count} times: {advice[name]}")
+
+
+def train_again(
+    run: Run, resolved: Resolved, init_from: Path | None, stages: list[int], accept: Callable[[dict[str, Any]], None]
+) -> int:
+    """Train a run that was created, up to the last of some iterations, saved at each: what `reproduce` does.
+
+    `accept` hears what the environment is like once it is built, and raises if that will not do; a run that never
+    began is removed. Returns the environment steps taken.
+    """
+    from rlcli.rl.environment import built_record
+    from rlcli.rl.stop import StopRequest
+
+    job = _Job(run, resolved, [], init_from=init_from, stages=stages)
+    with StopRequest() as stop:
+        try:
+            trainer, env = _build(job, "cpu")
+            accept(built_record(env.engine.model, "cpu"))
+        except BaseException:
+            run.discard()
+            raise
+        try:
+            _fit(job, trainer, env, stop)
+        finally:
+            run.unlock()
+            env.close()
+    return int(trainer.env_steps)

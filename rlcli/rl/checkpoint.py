@@ -1,29 +1,46 @@
-"""Checkpoints: folders of safetensors and JSON, complete or absent, verified before use, never unpickled."""
+"""Reading checkpoints: folders of safetensors and JSON, verified before use, never unpickled."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import secrets
-import shutil
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import safetensors.torch
+import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
 from rlcli.errors import CheckpointError
-from rlcli.rl.files import disk_error, sync_folder, to_json, write_atomic, write_synced
-from rlcli.rl.trainer import TrainerState
+from rlcli.rl.trainer import Rows, TrainerState
 
 FORMAT = 1
 PARTS = ("policy", "trainer", "env", "rng")
 """Tensor files of every checkpoint: the policy alone, critics and optimisers, environment, generators. A trainer may
-add parts of its own: the replay buffer."""
+add parts of its own."""
+LOG_FOLDER = "logs"
+"""Beside the checkpoints: rows that several of them share, such as a replay buffer's, in files that never change."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """A file with some rows of a log."""
+
+    start: int
+    stop: int
+    size: int
+    sha256: str
+
+    @property
+    def file(self) -> str:
+        """Its name."""
+        return f"{self.start:012d}-{self.stop:012d}.safetensors"
+
+    def record(self) -> dict[str, Any]:
+        """As plain JSON."""
+        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +55,11 @@ class Checkpoint:
         """Environment steps at which it was written."""
         return int(self.manifest["step"])
 
+    @property
+    def iteration(self) -> int:
+        """Iteration after which it was written."""
+        return int(self.manifest["iteration"])
+
     def json(self, name: str) -> dict[str, Any]:
         """A JSON file of the checkpoint."""
         return _json(self._data(name), self.folder / name)
@@ -49,10 +71,7 @@ class Checkpoint:
             CheckpointError: if the file is not what safetensors reads.
         """
         name = f"{part}.safetensors"
-        try:
-            return safetensors.torch.load(self._data(name))
-        except (SafetensorError, ValueError, KeyError) as error:
-            raise CheckpointError(f"{self.folder / name} is corrupt: {error}") from None
+        return _tensors(self._data(name), self.folder / name)
 
     def state(self) -> TrainerState:
         """Everything a trainer goes on from."""
@@ -67,64 +86,46 @@ class Checkpoint:
                     raise CheckpointError(
                         f"{self.folder / part}.safetensors: '{name}' holds values that are not finite"
                     )
-        return TrainerState(tensors, self.json("state.json"))
+        return TrainerState(tensors, self.json("state.json"), {name: self._rows(name) for name in self.shards()})
+
+    def shards(self) -> dict[str, list[Shard]]:
+        """The files with the rows of each log, oldest first.
+
+        Raises:
+            CheckpointError: if the manifest does not say so properly.
+        """
+        try:
+            return {
+                str(name): [Shard(**{**entry}) for entry in log["shards"]]
+                for name, log in self.manifest.get("logs", {}).items()
+            }
+        except (AttributeError, KeyError, TypeError):
+            raise CheckpointError(f"{self.folder}/manifest.json is corrupt: its list of rows is malformed") from None
+
+    def _rows(self, name: str) -> Rows:
+        log, shards = self.manifest["logs"][name], self.shards()[name]
+        first, stop = log["first"], log["stop"]
+        edges = [shard.start for shard in shards[1:]] + [stop]
+        if [shard.stop for shard in shards] != edges or (shards and shards[0].start > first):
+            raise CheckpointError(f"{self.folder}/manifest.json is corrupt: rows of '{name}' are missing")
+
+        def read(start: int, end: int) -> dict[str, Tensor]:
+            parts = []
+            for shard in shards:
+                if shard.start < end and start < shard.stop:
+                    file = self.folder.parent / LOG_FOLDER / name / shard.file
+                    columns = _tensors(_verified(file, shard.size, shard.sha256), file)
+                    rows = slice(max(start, shard.start) - shard.start, min(end, shard.stop) - shard.start)
+                    parts.append({column: values[rows] for column, values in columns.items()})
+            return {column: torch.cat([part[column] for part in parts]) for column in parts[0]} if parts else {}
+
+        return Rows(first, stop, read)
 
     def _data(self, name: str) -> bytes:
-        file = self.folder / name
         entry = self.manifest["files"].get(name)
         if entry is None:
             raise CheckpointError(f"{self.folder} has no {name}")
-        try:
-            data = file.read_bytes()
-        except OSError as error:
-            raise CheckpointError(f"{file} cannot be read: {error.strerror}") from None
-        if len(data) != entry["size"] or hashlib.sha256(data).hexdigest() != entry["sha256"]:
-            raise CheckpointError(
-                f"{file} is corrupt: it is not what the manifest says ({len(data)} bytes of {entry['size']})",
-                hint="choose an older checkpoint with RUN@step:N",
-            )
-        return data
-
-
-def save(checkpoints: Path, step: int, state: TrainerState, extra: Mapping[str, Any]) -> Path:
-    """Write a checkpoint: into a temporary folder, every file synced, the manifest last, then one rename.
-
-    Args:
-        checkpoints: the run's folder of checkpoints.
-        step: environment steps.
-        state: what the trainer gave.
-        extra: further JSON-able entries of the manifest.
-
-    Raises:
-        MachineError: if the disk refuses or the folder is gone; nothing half-written is left.
-    """
-    target = checkpoints / f"{step:012d}"
-    if target.exists():
-        return target
-    temporary = checkpoints / f".tmp-{os.getpid()}-{secrets.token_hex(4)}"
-    values = dict(state.values)
-    contents: dict[str, bytes] = {"policy.json": to_json(values["policy"]).encode()}
-    contents["state.json"] = to_json(values).encode()
-    for part in state.tensors:
-        tensors = {name: value.detach().contiguous() for name, value in state.tensors[part].items()}
-        contents[f"{part}.safetensors"] = safetensors.torch.save(tensors)
-    files = {name: {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in contents.items()}
-    manifest = {"format": FORMAT, "step": step, **extra, "files": files}
-    try:
-        temporary.mkdir()
-        for name, data in contents.items():
-            write_synced(temporary / name, data)
-        write_synced(temporary / "manifest.json", to_json(manifest).encode())
-        sync_folder(temporary)
-        os.rename(temporary, target)
-        sync_folder(checkpoints)
-    except BaseException as error:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if isinstance(error, OSError):
-            raise disk_error(target, error) from error
-        raise
-    write_atomic(checkpoints / "latest", target.name + "\n")
-    return target
+        return _verified(self.folder / name, entry["size"], entry["sha256"])
 
 
 def open_checkpoint(folder: Path) -> Checkpoint:
@@ -162,20 +163,30 @@ def steps(checkpoints: Path) -> list[int]:
     return sorted(int(name) for name in names if name.isdecimal() and name == f"{int(name):012d}")
 
 
-def drop_after(checkpoints: Path, step: int) -> list[int]:
-    """Remove the checkpoints after a step: training goes on from there, and they are no longer its future."""
-    later = [have for have in steps(checkpoints) if have > step]
-    for have in later:
-        shutil.rmtree(checkpoints / f"{have:012d}")
-    return later
+def sha256(data: bytes) -> str:
+    """The hash that a manifest keeps of a file."""
+    return hashlib.sha256(data).hexdigest()
 
 
-def clean(checkpoints: Path) -> None:
-    """Remove what killed writers left."""
-    for leftover in checkpoints.glob(".tmp-*"):
-        shutil.rmtree(leftover, ignore_errors=True)
-    for file in [*checkpoints.glob(".*.tmp-*"), *checkpoints.parent.glob(".*.tmp-*")]:
-        file.unlink(missing_ok=True)
+def _verified(file: Path, size: int, digest: str) -> bytes:
+    """The content of a file, if it is what the manifest says."""
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{file} cannot be read: {error.strerror}") from None
+    if len(data) != size or sha256(data) != digest:
+        raise CheckpointError(
+            f"{file} is corrupt: it is not what the manifest says ({len(data)} bytes of {size})",
+            hint="choose an older checkpoint with RUN@step:N",
+        )
+    return data
+
+
+def _tensors(data: bytes, file: Path) -> dict[str, Tensor]:
+    try:
+        return safetensors.torch.load(data)
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise CheckpointError(f"{file} is corrupt: {error}") from None
 
 
 def _json(data: bytes, file: Path) -> dict[str, Any]:
