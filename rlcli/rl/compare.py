@@ -25,6 +25,8 @@ SECTIONS = ("configuration", "environment", "metrics", "weights", "policy")
 _CLOCK = "Perf/"
 """Metrics of the clock, which are never equal."""
 _MAX_LINE = 1024**2
+_ROWS = 4096
+"""Of a replay buffer that are compared at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +187,7 @@ def _weights(left: Run, right: Run, until: int | None) -> Section:
             found = _tensors(one, other, part)
             if found is not None:
                 return _first("weights", words, found)
-        found = _values(one, other)
+        found = _values(one, other) or (_logs(one, other) if step == steps[-1] else None)
         if found is not None:
             return _first("weights", words, found)
     return Section("weights", words)
@@ -234,6 +236,26 @@ def _elements(left: Tensor, right: Tensor, where: str) -> Difference | None:
     return Difference(f"{where}{index if index else ''}", one, other)
 
 
+def _logs(one: Checkpoint, other: Checkpoint) -> Difference | None:
+    """The first element of a replay buffer that differs, wherever its rows are cut into files."""
+    if not one.shards() and not other.shards():
+        return None
+    left, right = one.state().logs, other.state().logs
+    for name in sorted(left.keys() | right.keys()):
+        where = f"step {one.step}: {name}"
+        held = [None if name not in side else f"rows {side[name].first} to {side[name].stop}" for side in (left, right)]
+        if held[0] != held[1]:
+            return Difference(where, *held)
+        for start in range(left[name].first, left[name].stop, _ROWS):
+            stop = min(start + _ROWS, left[name].stop)
+            columns, twins = left[name].read(start, stop), right[name].read(start, stop)
+            for column in sorted(columns.keys() | twins.keys()):
+                found = _elements(columns[column], twins[column], f"{where} from row {start}: {column}")
+                if found is not None:
+                    return found
+    return None
+
+
 def _values(one: Checkpoint, other: Checkpoint) -> Difference | None:
     left, right = (dict(_leaves(saved.json("state.json"), ())) for saved in (one, other))
     for path in dict.fromkeys([*left, *right]):
@@ -250,7 +272,7 @@ def _policies(left: Run, right: Run, until: int | None) -> Section:
     words = f"sha256 of step {steps[-1]}"
     if one != other:
         return _first("policy", words, Difference(f"step {steps[-1]}: policy.safetensors sha256", one, other))
-    return Section("policy", f"{words}: {one}")
+    return Section("policy", f"{words}: {str(one)[:12]}...")
 
 
 def _common_steps(left: Run, right: Run, until: int | None) -> list[int]:

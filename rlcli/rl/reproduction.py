@@ -64,11 +64,11 @@ def create_again(original: Run, runs_dir: Path, name: str, now: Mapping[str, Any
         policy = open_checkpoint(initial).manifest["files"].get("policy.safetensors", {}).get("sha256")
         if policy != was.get("init_from_sha256", policy):
             raise CheckpointError(f"{initial}: its policy is not the one that the run began with")
-    kept = {
+    kept: dict[str, Any] = {
         key: was[key]
         for key in ("seed", "device", "task", "agent", "init_from", "init_from_sha256", "given", "torch_threads")
         if key in was
     }
-    record = {**now, **kept, "loggers": [], "reproduces": str(original.folder)}
+    record: dict[str, Any] = {**now, **kept, "loggers": [], "reproduces": str(original.folder)}
     config = original.config.read_text(encoding="utf-8")
     return create_run(runs_dir, was["task"]["name"], name, config, record), initial
