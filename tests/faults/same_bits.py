@@ -41,10 +41,15 @@ _NOISY = {
 
 def make(task: str, folder: Path, num_envs: int, threads: int = 1, seed: int = 42) -> VecEnv:
     """An environment whose episodes are short enough to cross resets."""
-    place: Path | str = task
-    if task == "critter":
-        place = critter(folder, edited(CRITTER_TASK, events=_EVENTS, commands=_COMMANDS, observations=_NOISY))
+    place = place_of(task, folder)
     return build(place, num_envs, f"sim.engine_threads={threads}", "episode_length_s=0.6", seed=seed)
+
+
+def place_of(task: str, folder: Path) -> Path | str:
+    """How a command line names the task; the critter is written to a folder."""
+    if task != "critter":
+        return task
+    return critter(folder, edited(CRITTER_TASK, events=_EVENTS, commands=_COMMANDS, observations=_NOISY))
 
 
 class Life:
