@@ -372,16 +372,19 @@ def _build(job: _Job, device: str) -> Any:
     """The environment and the trainer, at the boundary where training begins."""
     from rlcli.envs.vec_env import make_env
     from rlcli.errors import CheckpointError
+    from rlcli.random import derive
     from rlcli.registry import load_object
     from rlcli.rl import distributed
     from rlcli.rl.checkpoint import open_checkpoint
     from rlcli.rl.load import require_fit, require_same_policy, require_trainer
+    from rlcli.rl.rng import seed_generators
     from rlcli.rl.saving import drop_after
 
     resolved, record = job.resolved, job.run.record
     assert resolved.trainer is not None
     assert resolved.agent is not None
     peers = distributed.current()
+    seed_generators(peers.seed(derive(record["seed"], "task"), "task"))  # some tasks draw from them as they are built
     env = make_env(resolved, seed=peers.seed(record["seed"], "environments"), device=device)
     threads = int(record.get("torch_threads") or _threads(resolved)[1])
     make = load_object(resolved.trainer.trainer)

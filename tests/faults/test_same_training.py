@@ -8,7 +8,9 @@ import pytest
 import torch
 from fault_sizes import amount, chosen
 from same_bits import TASKS, other_work, place_of
+from worlds import write
 
+from rlcli.cli.app import main
 from rlcli.config.load import resolve
 from rlcli.envs.vec_env import make_env
 from rlcli.registry import find_task, load_object
@@ -118,3 +120,54 @@ def agent_file(tmp_path, kind):
     file = tmp_path / "agent.yaml"
     file.write_text(f"scene: {{num_envs: 9}}\nagents: {{x: {{{KINDS[kind]}, max_iterations: 20}}}}\n")
     return file
+
+
+GLOBAL_DRAWS = """
+import random
+import numpy as np
+import torch
+from rlcli.envs.direct import DirectTask
+
+
+class Task(DirectTask):
+    num_observations = 2
+    num_actions = 1
+
+    def post_reset(self):
+        self.offset = np.random.uniform() + random.random() + float(torch.rand(1))
+
+    def pre_physics_step(self, actions): ...
+
+    def get_observations(self):
+        self.obs_buf[:, 0] = self.offset
+        self.obs_buf[:, 1] = torch.rand(self.num_envs)
+
+    def calculate_metrics(self):
+        self.rew_buf[:] = np.random.normal() + random.random()
+
+    def is_done(self): ...
+"""
+
+
+@pytest.mark.parametrize("kind", chosen(["ppo", "sb3-ppo", "sac"], 1))
+def test_a_task_that_draws_from_global_generators_trains_and_plays_the_same_twice(kind, tmp_path, capsys):
+    """As tasks of other frameworks do; draws of a new process differ from those of any other."""
+    model = '<mujoco><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody></mujoco>'
+    yaml = (
+        "decimation: 1\nepisode_length_s: 0.1\nsim: {dt: 0.01}\nscene: {num_envs: 4, entities: {r: {model: m.xml}}}\n"
+    )
+    folder = write(tmp_path / "drawing", f"{yaml}agents: {{x: {{{KINDS[kind]}, max_iterations: 3}}}}\n", task_py=GLOBAL_DRAWS, m_xml=model)  # fmt: skip # noqa: E501
+    runs, figures = [], []
+    for _ in range(2):
+        np.random.seed(None)
+        random.seed(None)
+        torch.seed()
+        assert main(["train", str(folder), "--runs-dir", str(tmp_path / "runs"), "-q", "--logger", "none"]) == 0
+        runs.append(capsys.readouterr().out.strip())
+        np.random.seed(None)
+        random.seed(None)
+        torch.seed()
+        assert main(["eval", "--checkpoint", runs[0], "--episodes", "4", "--json", "-q"]) == 0
+        figures.append(capsys.readouterr().out)
+    assert main(["diff", *runs]) == 0, capsys.readouterr().out
+    assert figures[0] == figures[1]
