@@ -53,7 +53,7 @@ def reference(folder):
 
 
 @pytest.mark.parametrize(
-    ("task", "num_envs", "threads", "seed"), chosen(list(product(TASKS, NUM_ENVS, THREADS, SEEDS)), 6)
+    ("task", "num_envs", "threads", "seed"), chosen(list(product(TASKS, NUM_ENVS, THREADS, SEEDS)), 7)
 )
 def test_lives_equal_plain_steps_at_any_number_of_threads_and_environments(
     task, num_envs, threads, seed, folder, reference

@@ -86,6 +86,7 @@ def test_two_trainings_with_one_seed_are_the_same(task, kind, tmp_path):
     del kept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "threads"), chosen(list(product(["ppo", "sb3-ppo", "sac"], (2, 4))), 1))
 def test_several_torch_threads_give_the_same_every_time(kind, threads, tmp_path):
     size = "{hidden: [256, 256]}"
@@ -98,7 +99,7 @@ def test_several_torch_threads_give_the_same_every_time(kind, threads, tmp_path)
         del kept
 
 
-@pytest.mark.parametrize(("task", "agent"), chosen(BUILT_IN, 2))
+@pytest.mark.parametrize(("task", "agent"), chosen(BUILT_IN, 1))
 def test_the_agents_of_built_in_tasks_train_the_same_twice(task, agent):
     resolved = resolve(find_task(task), agent=agent, overrides=["scene.num_envs=32", "episode_length_s=0.4"])
     first = train(resolved, iterations=3)
@@ -149,6 +150,7 @@ class Task(DirectTask):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", chosen(["ppo", "sb3-ppo", "sac"], 1))
 def test_a_task_that_draws_from_global_generators_trains_and_plays_the_same_twice(kind, tmp_path, capsys):
     """As tasks of other frameworks do; draws of a new process differ from those of any other."""
