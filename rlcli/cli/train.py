@@ -453,7 +453,11 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
 
     try:
         if job.writes:
-            run.update(state="running", **_environment(job, env, trainer))
+            unsaved = env.unsaved()
+            if unsaved:
+                console.warn(f"a resumed run may differ: no checkpoint can hold {', '.join(unsaved)}")
+            exact = not unsaved and env.device.type == "cpu"
+            run.update(state="running", resumes_exactly=exact, **_environment(job, env, trainer))
             sinks += open_loggers(run, job.loggers, resume=resume)
         trials = _trials(job, saver, stop)
         env.before_step, stop.can_interrupt = stop.check, not env.engine.asynchronous
@@ -483,12 +487,14 @@ def _environment(job: _Job, env: Any, trainer: Any) -> dict[str, Any]:
     """What run.json says of where the bits are from; of a resumed run what differs from where it began."""
     from rlcli.rl.environment import built_record, differences, environment_record
 
-    record = job.run.record
-    built = built_record(env.engine.model, record["device"])
+    record, device = job.run.record, str(env.device)
+    built = built_record(env.engine.model, device)
     if job.resume_from is None:
         return built
     now = environment_record(job.resolved, env.engine.threads, record.get("torch_threads") or 0) | built
     now["engine_threads"] = record.get("engine_threads")  # as many as there are; they change no bit
+    same = env.device.type == str(record.get("device", "cpu")).partition(":")[0]
+    now["device"] = record.get("device") if same else device
     changed = {name: after for name, _, after in differences(record, now)}
     if not changed:
         return {}
@@ -516,9 +522,10 @@ def _trials(job: _Job, saver: Any, stop: StopRequest) -> Any:
         env.before_step = stop.check
         return env
 
-    history = read_metrics(run.metrics)
-    saver.best = run.record.get("best")
-    return Trials(make, agent.eval_episodes, agent.eval_interval, history)
+    trials = Trials(make, agent.eval_episodes, agent.eval_interval, read_metrics(run.metrics))
+    saver.best = trials.best
+    run.update(best=trials.best)
+    return trials
 
 
 def _report(job: _Job, trainer: Any) -> None:

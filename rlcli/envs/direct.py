@@ -13,6 +13,7 @@ from rlcli.config.schema import StrictModel, TaskConfig
 from rlcli.envs.articulation import ArticulationView
 from rlcli.envs.vec_env import Layout, TermLayout, VecEnv
 from rlcli.errors import ConfigError, RlcliError, TaskError
+from rlcli.managers.memory import Memory
 from rlcli.managers.termination import DIVERGED
 from rlcli.random import stream
 from rlcli.registry import load_object
@@ -167,6 +168,7 @@ class DirectEnv(VecEnv):
         self._settled = False  # a loaded state holds its second look already
         self._causes: dict[str, Tensor] = {}
         task.post_reset()
+        self._memory = Memory(task, other=("env", "cfg", "params"))
 
     def _layout(self) -> Layout:
         task = self.task
@@ -294,23 +296,19 @@ class DirectEnv(VecEnv):
             self._reset_hook(stale)
             self.episode_length_buf[stale] = 0
 
+    def unsaved(self) -> list[str]:
+        """What the task keeps that cannot be saved."""
+        return self._memory.unsaved()
+
     def _workflow_state(self) -> dict[str, Tensor]:
-        task = self.task
-        buffers = {
-            name: value.clone()
-            for name, value in vars(task).items()
-            if isinstance(value, Tensor) and value.dim() and value.shape[0] == self.num_envs
-        }
-        return {**buffers, "_returns": self._returns.clone(), "_fresh": self._fresh.clone()}
+        own = {"_returns": self._returns.clone(), "_fresh": self._fresh.clone()}
+        return {**own, **{f"task.{name}": value for name, value in self._memory.state_dict().items()}}
 
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
-        for name, value in state.items():
-            owner: Any = self if name in ("_returns", "_fresh") else self.task
-            target = getattr(owner, name, None)
-            if isinstance(target, Tensor) and target.shape == value.shape:
-                target.copy_(value)  # views of it stay valid
-            else:
-                setattr(owner, name, value.clone())  # the task makes it in a step
+        self._returns.copy_(state["_returns"])
+        self._fresh.copy_(state["_fresh"])
+        task = {name.removeprefix("task."): value for name, value in state.items() if name.startswith("task.")}
+        self._memory.load_state_dict(task)
         self._observed, self._settled = True, True
 
 

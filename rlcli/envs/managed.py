@@ -225,7 +225,12 @@ class ManagedEnv(VecEnv):
                 for pipeline in self.observation_manager.pipelines(group)
             ),
         ]
-        return {**parts, **{"term." + ".".join(map(str, t.path)): t for t in terms if t.state_dict()}}
+        return {**parts, **{"term." + ".".join(map(str, t.path)): t for t in terms}}
+
+    def unsaved(self) -> list[str]:
+        """What class terms keep that cannot be saved."""
+        memories = [part.memory for part in self._parts().values() if isinstance(part, BoundTerm) and part.memory]
+        return [what for memory in memories for what in memory.unsaved()]
 
     def _judging_terms(self) -> Iterator[Any]:
         """The functions and classes behind observations, rewards, terminations and success, before they are bound."""
