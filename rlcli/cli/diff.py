@@ -33,7 +33,7 @@ def command(
     debug: Debug = False,
 ) -> None:
     """Tell where two runs first differ."""
-    from rlcli.errors import UsageError, did_you_mean
+    from rlcli.errors import CheckpointError, UsageError, did_you_mean
     from rlcli.rl.compare import SECTIONS, compare
     from rlcli.rl.run import default_runs_dir
 
@@ -50,8 +50,12 @@ def command(
     if until is not None:
         for run in (one, other):
             _require_step(run, until)
-    sections = compare(one, other, sections=only or SECTIONS, until=until)
-    if not report("diff", sections, str(one.folder), str(other.folder), step=until):
+    try:
+        sections = compare(one, other, sections=only or SECTIONS, until=until)
+        equal = report("diff", sections, str(one.folder), str(other.folder), step=until)
+    except RecursionError:
+        raise CheckpointError(f"{one.folder} or {other.folder} is corrupt: values nested too deeply") from None
+    if not equal:
         raise typer.Exit(9)
 
 

@@ -233,6 +233,15 @@ def test_text_of_a_stranger_cannot_drive_the_terminal(cli, run, copy):
     assert "\\x1b[2J" in result.out
 
 
+@pytest.mark.parametrize("depth", [200, 900, 2000, 50_000])
+def test_values_that_are_nested_deeply_crash_nothing(cli, run, copy, depth):
+    deep = "[" * depth + "]" * depth
+    text = (copy / "run.json").read_text()
+    (copy / "run.json").write_text(text.replace('"libc": ', f'"libc": {deep}, "was": ', 1))
+    result = cli("diff", run, copy, "--json")
+    assert result.code in (5, 9), result.err
+
+
 def test_what_cannot_be_compared_is_refused(cli, run, tmp_path):
     assert cli("diff", run, tmp_path).code == 5
     assert cli("diff", run, "nowhere").code == 5
