@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import re
 import shutil
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
-import rlcli
 from rlcli.errors import CheckpointError, MachineError, UsageError, did_you_mean, listing
 from rlcli.rl.files import disk_error, to_json, write_atomic
 
@@ -119,7 +115,7 @@ def open_run(folder: Path) -> Run:
         record = json.loads(file.read_bytes())
     except OSError:
         raise CheckpointError(f"{folder} is not a run: it has no {RECORD}") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise CheckpointError(f"{file} is corrupt: not JSON") from None
     task = record.get("task") if isinstance(record, dict) else None
     if not isinstance(task, dict) or not isinstance(task.get("name"), str):
@@ -192,22 +188,6 @@ def find_checkpoint(reference: str, runs_dir: Path, task: str | None = None) -> 
         f"'{reference}' does not name a checkpoint",
         hint="RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest",
     )
-
-
-def environment_record(engine_threads: int, torch_threads: int) -> dict[str, Any]:
-    """What results depend on besides the configuration."""
-    packages = ("mujoco", "torch", "numpy", "stable-baselines3", "safetensors")
-    return {
-        "rlcli": rlcli.__version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "machine": platform.machine(),
-        "versions": {name: metadata.version(name) for name in packages},
-        "engine_threads": engine_threads,
-        "torch_threads": torch_threads,
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "pid": os.getpid(),
-    }
 
 
 def default_runs_dir() -> Path:
