@@ -284,7 +284,7 @@ def _created(
     loggers = check_loggers(logger)
     initial = None
     if init_from is not None:
-        _, initial, why = find_checkpoint(init_from, runs)
+        _, initial, why = find_checkpoint(init_from, runs, tell=console.warn)
         console.info(f"weights of {initial} ({why})")
     record |= {
         "task": resolved.source.record() | {"file": resolved.source.config.name},
@@ -308,7 +308,7 @@ def _resumed(
     from rlcli.rl.loggers import check_loggers
     from rlcli.rl.run import find_checkpoint
 
-    run, folder, why = find_checkpoint(reference, runs, task)
+    run, folder, why = find_checkpoint(reference, runs, task, whole=True, tell=console.warn)
     if run.record.get("state") == "finished" and not budget:
         console.info(f"{run.folder} ({why}) is finished; --max-iterations N trains on")
         console.data(str(run.folder))
@@ -374,13 +374,16 @@ def _build(job: _Job, device: str) -> Any:
     resolved, record = job.resolved, job.run.record
     assert resolved.trainer is not None
     assert resolved.agent is not None
-    peers = distributed.current()
+    peers, saved = distributed.current(), job.resume_from
+    state = None
+    if saved is not None:  # what a stranger's files hold shows before anything is built
+        require_trainer(saved, resolved.agent.trainer)
+        state = saved.state()
     env = make_env(resolved, seed=peers.seed(record["seed"], "environments"), device=device)
     threads = int(record.get("torch_threads") or _threads(resolved)[1])
     make = load_object(resolved.trainer.trainer)
     trainer = make(env, resolved.agent, seed=record["seed"], device=device, torch_threads=threads)
-    saved = job.resume_from
-    if saved is None:
+    if saved is None or state is None:
         if job.init_from is not None:
             initial = open_checkpoint(job.init_from)
             require_fit(initial, env.layout)
@@ -389,8 +392,6 @@ def _build(job: _Job, device: str) -> Any:
         trainer.start()
         return trainer, env
     require_fit(saved, env.layout)
-    require_trainer(saved, resolved.agent.trainer)
-    state = saved.state()
     _take(saved, lambda: trainer.load(state), "it cannot be resumed")
     if trainer.env_steps != saved.step:
         raise CheckpointError(f"{saved.folder} cannot be resumed: its manifest and its state name different steps")
@@ -406,11 +407,13 @@ def _build(job: _Job, device: str) -> Any:
 
 
 def _take(saved: Any, load: Any, failure: str) -> None:
-    from rlcli.errors import CheckpointError
+    from rlcli.errors import CheckpointError, RlcliError
 
     try:
         load()
-    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+    except RlcliError:
+        raise
+    except Exception as error:  # whatever a stranger's numbers lead to
         raise CheckpointError(f"{saved.folder}: {failure}: {' '.join(str(error).split())}") from error
 
 

@@ -307,6 +307,8 @@ class DirectEnv(VecEnv):
         for name, value in state.items():
             owner: Any = self if name in ("_returns", "_fresh") else self.task
             target = getattr(owner, name, None)
+            if not (target is None or isinstance(target, Tensor)) or value.shape[:1] != (self.num_envs,):
+                raise ValueError(f"env: 'workflow.{name}' {tuple(value.shape)} is no buffer of the task")
             if isinstance(target, Tensor) and target.shape == value.shape:
                 target.copy_(value)  # views of it stay valid
             else:

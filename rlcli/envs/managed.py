@@ -24,6 +24,7 @@ from rlcli.managers.reward import RewardManager
 from rlcli.managers.term import BoundTerm
 from rlcli.managers.termination import TerminationManager
 from rlcli.sim.engine import add_body_forces
+from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import ActuatorNeed, Scene
 from rlcli.sim.selection import Selection
 
@@ -199,6 +200,7 @@ class ManagedEnv(VecEnv):
         return state
 
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
+        require_alike(state, self._workflow_state(), "env: workflow")
         for name, part in self._parts().items():
             prefix = f"{name}."
             part.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})

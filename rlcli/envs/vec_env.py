@@ -29,6 +29,7 @@ from rlcli.sim.engine import open_engine
 from rlcli.sim.entity import Entity, SimData, is_finite
 from rlcli.sim.names import NameProblem
 from rlcli.sim.rotations import rotate_inverse
+from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import Scene
 from rlcli.sim.selection import Selection
 from rlcli.sim.sensors import ContactSensor, RaySensor, make_sensors
@@ -360,7 +361,13 @@ class VecEnv(ABC):
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Take back what `state_dict` gave; returns the observations of that moment."""
+        """Take back what `state_dict` gave; returns the observations of that moment.
+
+        Raises:
+            KeyError: if something is missing.
+            ValueError: if something is of another shape or type: what was saved of other environments.
+        """
+        require_alike(state, {k: v for k, v in self.state_dict().items() if not k.startswith("workflow.")}, "env")
         self.episode_length_buf.copy_(state["episode_length"])
         self.episode_index.copy_(state["episode_index"])
         self._steps.copy_(state["common_step"])

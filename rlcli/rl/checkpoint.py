@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import json
+import math
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Mapping
@@ -17,7 +18,10 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from rlcli.errors import CheckpointError
+from rlcli.machine import memory
 from rlcli.rl.files import disk_error, sync_folder, to_json, write_atomic, write_synced
+from rlcli.rl.policy import Policy, blank_policy, filled, size_of
+from rlcli.rl.reading import JSON_LIMIT, parse_json, read_file
 from rlcli.rl.trainer import TrainerState
 
 FORMAT = 1
@@ -40,44 +44,92 @@ class Checkpoint:
 
     def json(self, name: str) -> dict[str, Any]:
         """A JSON file of the checkpoint."""
-        return _json(self._data(name), self.folder / name)
+        return parse_json(self._data(name, JSON_LIMIT), self.folder / name)
 
-    def tensors(self, part: str) -> dict[str, Tensor]:
+    def tensors(self, part: str, limit: int | None = None) -> dict[str, Tensor]:
         """The tensors of a part.
 
+        Args:
+            part: its name.
+            limit: largest size of its file [bytes]; None: what such a part and this machine's memory allow.
+
         Raises:
-            CheckpointError: if the file is not what safetensors reads.
+            CheckpointError: if the file is larger, or not what safetensors reads.
         """
         name = f"{part}.safetensors"
+        if limit is None:
+            limit = min(_LIMITS.get(part.partition(".")[0], _UNLIMITED), memory() // 3)
+        data = self._data(name, limit)
+        _require_header(data, self.folder / name)
         try:
-            return safetensors.torch.load(self._data(name))
-        except (SafetensorError, ValueError, KeyError) as error:
-            raise CheckpointError(f"{self.folder / name} is corrupt: {error}") from None
+            return safetensors.torch.load(data)
+        except (SafetensorError, RuntimeError, ValueError, KeyError, MemoryError) as error:
+            raise CheckpointError(f"{self.folder / name} is corrupt: {' '.join(str(error).split())}") from None
+
+    def policy(self) -> Policy:
+        """The policy, ready to act; nothing of the task or the simulator is needed.
+
+        Raises:
+            CheckpointError: if it is corrupt.
+        """
+        try:
+            blank = blank_policy(self.json("policy.json"))
+            # as many bytes as its description asks for, and a header; a longer file is not even read
+            return filled(blank, self.tensors("policy", size_of(blank) + _HEADER_LIMIT))
+        except CheckpointError as error:
+            if str(self.folder) in error.message:
+                raise
+            raise CheckpointError(f"{self.folder}: {error.message}", hint=error.hint) from None
 
     def state(self) -> TrainerState:
-        """Everything a trainer goes on from."""
+        """Everything a trainer goes on from.
+
+        Raises:
+            CheckpointError: if something is missing, corrupt, not finite or of a kind that no trainer saves.
+        """
         missing = [part for part in PARTS if f"{part}.safetensors" not in self.manifest["files"]]
         if missing:
             raise CheckpointError(f"{self.folder} has no {missing[0]}.safetensors")
+        values = self.json("state.json")
+        _require_values(values, self.step, self.folder / "state.json")
+        if values["policy"] != self.json("policy.json"):
+            raise CheckpointError(f"{self.folder}/state.json is corrupt: its policy is not that of policy.json")
+        self.policy()
         parts = [name.removesuffix(".safetensors") for name in self.manifest["files"] if name.endswith(".safetensors")]
         tensors = {part: self.tensors(part) for part in parts}
+        seen = tensors["trainer"].get("observations")
+        if seen is not None and (seen.dim() != 2 or seen.shape[1] != values["policy"]["observation_size"]):
+            raise CheckpointError(f"{self.folder}/trainer.safetensors: 'observations' is {tuple(seen.shape)}")
         for part in ("policy", "trainer"):
             for name, value in tensors[part].items():
                 if value.is_floating_point() and not bool(value.isfinite().all()):
                     raise CheckpointError(
                         f"{self.folder / part}.safetensors: '{name}' holds values that are not finite"
                     )
-        return TrainerState(tensors, self.json("state.json"))
+                if name.endswith(("normalizer.var", "normalizer.count")) and bool((value < 0).any()):
+                    raise CheckpointError(f"{self.folder / part}.safetensors: '{name}' is negative")
+        return TrainerState(tensors, values)
 
-    def _data(self, name: str) -> bytes:
+    def verify(self, *, whole: bool) -> None:
+        """Read and check the policy, or everything.
+
+        Raises:
+            CheckpointError: at the first thing that is wrong.
+        """
+        if whole:
+            self.state()
+        else:
+            self.policy()
+
+    def _data(self, name: str, limit: int) -> bytes:
         file = self.folder / name
         entry = self.manifest["files"].get(name)
         if entry is None:
             raise CheckpointError(f"{self.folder} has no {name}")
         try:
-            data = file.read_bytes()
-        except OSError as error:
-            raise CheckpointError(f"{file} cannot be read: {error.strerror}") from None
+            data = read_file(file, limit, size=entry["size"])
+        except FileNotFoundError:
+            raise CheckpointError(f"{file} is missing") from None
         if len(data) != entry["size"] or hashlib.sha256(data).hexdigest() != entry["sha256"]:
             raise CheckpointError(
                 f"{file} is corrupt: it is not what the manifest says ({len(data)} bytes of {entry['size']})",
@@ -135,30 +187,29 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     """
     file = folder / "manifest.json"
     try:
-        manifest = _json(file.read_bytes(), file)
-    except OSError:
+        manifest = parse_json(read_file(file, JSON_LIMIT), file)
+    except (FileNotFoundError, NotADirectoryError):
         raise CheckpointError(f"{folder} is not a checkpoint: it has no manifest.json") from None
-    if manifest.get("format") != FORMAT:
+    if type(manifest.get("format")) is not int or manifest["format"] != FORMAT:
         raise CheckpointError(
-            f"{folder} has checkpoint format {manifest.get('format')}; this rlcli reads {FORMAT}",
+            f"{folder} has checkpoint format {str(manifest.get('format'))[:40]}; this rlcli reads {FORMAT}",
             hint="use the rlcli version that run.json names",
         )
-    files = manifest.get("files")
-    if not isinstance(files, dict) or not all(
-        isinstance(e, dict) and isinstance(e.get("size"), int) and isinstance(e.get("sha256"), str)
-        for e in files.values()
-    ):
-        raise CheckpointError(f"{file} is corrupt: its list of files is malformed")
-    if not isinstance(manifest.get("step"), int):
+    _require_entries(manifest.get("files"), file)
+    step = manifest.get("step")
+    if not _is_count(step):
         raise CheckpointError(f"{file} is corrupt: it has no step")
+    name = folder.name
+    if name.isdecimal() and name.isascii() and len(name) >= 12 and int(name) != step:
+        raise CheckpointError(f"{file} is corrupt: it is of step {step}, and its folder of step {int(name)}")
     return Checkpoint(folder, manifest)
 
 
 def steps(checkpoints: Path) -> list[int]:
     """Steps of the complete checkpoints of a run, ascending."""
-    if not checkpoints.is_dir():
+    if checkpoints.is_symlink() or not checkpoints.is_dir():
         return []
-    names = [file.parent.name for file in checkpoints.glob("*/manifest.json")]
+    names = [file.parent.name for file in checkpoints.glob("*/manifest.json") if not file.parent.is_symlink()]
     return sorted(int(name) for name in names if name.isdecimal() and name == f"{int(name):012d}")
 
 
@@ -178,11 +229,81 @@ def clean(checkpoints: Path) -> None:
         file.unlink(missing_ok=True)
 
 
-def _json(data: bytes, file: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(data)
-    except (ValueError, RecursionError):
-        raise CheckpointError(f"{file} is corrupt: not JSON") from None
-    if not isinstance(value, dict):
-        raise CheckpointError(f"{file} is corrupt: not a JSON object")
-    return value
+_FILE = re.compile(r"[a-z][a-z0-9_]{0,63}(\.[0-9]{1,6})?\.(json|safetensors)", re.ASCII)
+_MOST_FILES = 4096
+_HEADER_LIMIT = 4 * 2**20
+_MOST_TENSORS = 20_000
+_MOST_DIMENSIONS = 16
+_LIMITS = {"policy": 2 * 2**30, "trainer": 16 * 2**30, "env": 16 * 2**30, "rng": 2**20}
+"""Part -> largest size of its file [bytes]."""
+_UNLIMITED = 2**62
+_MOST_STEPS = 2**62
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < _MOST_STEPS
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _require_entries(files: Any, file: Path) -> None:
+    """The manifest's list of files: plain names, sizes and digests."""
+    good = isinstance(files, dict) and all(
+        isinstance(entry, dict)
+        and _is_count(entry.get("size"))
+        and isinstance(entry.get("sha256"), str)
+        and len(entry["sha256"]) <= 64
+        for entry in files.values()
+    )
+    if not good:
+        raise CheckpointError(f"{file} is corrupt: its list of files is malformed")
+    if len(files) > _MOST_FILES:
+        raise CheckpointError(f"{file} is corrupt: it lists {len(files)} files")
+    for name in files:
+        if not _FILE.fullmatch(name):
+            raise CheckpointError(f"{file} is corrupt: {name[:80]!r} is no name of a file of a checkpoint")
+
+
+def _require_header(data: bytes, file: Path) -> None:
+    """What the file says of its tensors must be of a size that torch takes; whether it is true, safetensors checks."""
+    length = int.from_bytes(data[:8], "little")
+    if len(data) < 8 or length > min(_HEADER_LIMIT, len(data) - 8):
+        raise CheckpointError(f"{file} is corrupt: it is no safetensors file, or its header is too long")
+    header = parse_json(data[8 : 8 + length], file)
+    if len(header) > _MOST_TENSORS:
+        raise CheckpointError(f"{file} is corrupt: it lists {len(header)} tensors")
+    for name, entry in header.items():
+        shape = entry.get("shape", []) if isinstance(entry, dict) else None
+        if not isinstance(shape, list) or len(shape) > _MOST_DIMENSIONS or not all(map(_is_count, shape)):
+            raise CheckpointError(f"{file} is corrupt: the shape of '{name[:80]}' makes no sense")
+
+
+def _require_values(values: dict[str, Any], step: int, file: Path) -> None:
+    """What every trainer keeps besides tensors; what only one of them keeps, it checks itself."""
+    for key in ("iteration", "env_steps", "updates", "processes", "rnd_updates"):
+        if key in values and not _is_count(values[key]):
+            raise CheckpointError(f"{file} is corrupt: {key} is {_shown(values[key])}, expected a count")
+    if values.get("env_steps", step) != step:
+        raise CheckpointError(f"{file} is corrupt: it is of step {values['env_steps']}, and the manifest of {step}")
+    if "learning_rate" in values and not (_is_number(values["learning_rate"]) and 0 <= values["learning_rate"] < 1e6):
+        raise CheckpointError(f"{file} is corrupt: learning_rate is {_shown(values['learning_rate'])}")
+    if not isinstance(values.get("policy"), dict):
+        raise CheckpointError(f"{file} is corrupt: it does not describe the policy")
+    for key, entry in values.items():
+        if key.partition(".")[0] == "statistics" and not _are_statistics(entry):
+            raise CheckpointError(f"{file} is corrupt: {key} makes no sense")
+
+
+def _are_statistics(entry: Any) -> bool:
+    if not isinstance(entry, dict) or set(entry) != {"recent", "total"} or not _is_count(entry["total"]):
+        return False
+    rows = entry["recent"]
+    return isinstance(rows, list) and all(
+        isinstance(row, list) and len(row) == 4 and all(map(_is_number, row)) and row[0] > 0 for row in rows
+    )
+
+
+def _shown(value: Any) -> str:
+    return repr(value)[:40]

@@ -32,7 +32,8 @@ from rlcli.rl.sb3_config import (
 )
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
-from rlcli.rl.trainer import Report, TrainerState
+from rlcli.rl.trainer import Report, TrainerState, require_slots
+from rlcli.sim.saved import require_alike
 
 _METRICS = {
     "train/policy_gradient_loss": "Loss/surrogate",
@@ -176,6 +177,9 @@ class Sb3Trainer:
     def load(self, state: TrainerState) -> None:
         """Go back to a boundary: the next iteration gives the same bits as it did then."""
         values, rest = state.values, state.tensors["trainer"]
+        weights = {f"weights.{name}": value for name, value in self.model.policy.state_dict().items()}
+        require_alike(rest, weights, "trainer")
+        require_alike(state.tensors["env"], {"episode_starts": torch.ones(self.env.num_envs, dtype=torch.bool)}, "env")
         self._load_weights(state.tensors["policy"], rest)
         for name, optimizer in self._optimizers().items():
             _load_optimizer(optimizer, f"optimizer.{name}.", rest)
@@ -414,3 +418,4 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, prefix: str, tensors: Mapp
             index, slot = name.removeprefix(prefix).split(".")
             state.setdefault(int(index), {})[slot] = value.clone()
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+    require_slots(optimizer)

@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBu
 from torch import Tensor
 
 from rlcli.rl.policy import Normalizer
+from rlcli.sim.saved import require_alike
 
 
 class TorchRolloutBuffer(RolloutBuffer):
@@ -121,11 +122,19 @@ class TorchReplayBuffer(ReplayBuffer):
         return {**stored, "position": torch.tensor([self.pos, int(self.full)])}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
+        """Take back what `state_dict` gave.
+
+        Raises:
+            ValueError: if it is of another buffer.
+        """
+        position, full = (int(value) for value in state["position"])
+        rows = self.buffer_size if full else position
+        if not 0 <= position < self.buffer_size or full not in (0, 1):
+            raise ValueError(f"replay: it goes on at row {position} of {self.buffer_size}")
+        require_alike(state, {name: getattr(self, name)[:rows] for name in _REPLAY}, "replay")
         for name in _REPLAY:
             getattr(self, name)[: len(state[name])].copy_(state[name])
-        self.pos, full = state["position"].tolist()
-        self.full = bool(full)
+        self.pos, self.full = position, bool(full)
 
 
 _REPLAY = ("obs", "next_obs", "action", "reward", "done")

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from rlcli.errors import DivergedError, did_you_mean
 from rlcli.sim.engine import force_sensors, quiet_mujoco
+from rlcli.sim.saved import require_alike
 from rlcli.sim.selection import IdSelection, Selection
 
 _STATE = mujoco.mjtState
@@ -273,12 +274,18 @@ class BatchEngine:
         return {"state": self._state.clone(), "warning": warning, "constants": constants, **expanded, **substep}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Take back what `state_dict` gave; derived fields are computed anew."""
+        """Take back what `state_dict` gave; derived fields are computed anew.
+
+        Raises:
+            ValueError: if a model field is not one that may differ between worlds, or of another shape.
+        """
         self._state.copy_(state["state"])
         self._batch.warning[:] = state["warning"].numpy()
         for name, values in state.items():
             if name.startswith("model."):
-                self.expand(name.removeprefix("model.")).copy_(values)
+                field = self.expand(name.removeprefix("model."))
+                require_alike({name: values}, {name: field}, "engine")
+                field.copy_(values)
         if bool(state["constants"]):
             self.set_constants()
         substep = {n.removeprefix("substep."): values for n, values in state.items() if n.startswith("substep.")}
