@@ -141,6 +141,8 @@ class _Job:
     """The checkpoint to go on from exactly."""
     init_from: Any = None
     """The checkpoint folder to take weights from."""
+    config: str | None = None
+    """The configuration of a run that goes on, where its budget changes."""
     writes: bool = True
     """Whether this process writes the run."""
     begin: float = field(default_factory=time.monotonic)
@@ -303,7 +305,6 @@ def _resumed(
 ) -> _Job | None:
     """A run to go on with; None if there is nothing left to do."""
     from rlcli.config.dump import to_data, to_yaml
-    from rlcli.rl.files import write_atomic
     from rlcli.rl.load import resolve_run
     from rlcli.rl.loggers import check_loggers
     from rlcli.rl.run import find_checkpoint
@@ -324,13 +325,11 @@ def _resumed(
 
         checkpoint.clean(run.checkpoints)
         saved = checkpoint.open_checkpoint(folder)
-        if budget:
-            write_atomic(run.config, to_yaml(to_data(resolved)))
     except BaseException:
         run.unlock()
         raise
     console.info(f"resuming {folder} ({why})")
-    return _Job(run, resolved, loggers, resume_from=saved)
+    return _Job(run, resolved, loggers, resume_from=saved, config=to_yaml(to_data(resolved)) if budget else None)
 
 
 def _train(job: _Job, device: str, stop: StopRequest) -> None:
@@ -369,6 +368,7 @@ def _build(job: _Job, device: str) -> Any:
     from rlcli.registry import load_object
     from rlcli.rl import distributed
     from rlcli.rl.checkpoint import drop_after, open_checkpoint
+    from rlcli.rl.files import write_atomic
     from rlcli.rl.load import require_fit, require_same_policy, require_trainer
 
     resolved, record = job.resolved, job.run.record
@@ -400,6 +400,8 @@ def _build(job: _Job, device: str) -> Any:
         console.info(
             f"saved by {processes} processes, going on in {peers.size}: every environment begins a new episode"
         )
+    if job.config is not None:  # only now is it sure that the run goes on
+        write_atomic(job.run.config, job.config)
     dropped = drop_after(job.run.checkpoints, saved.step) if job.writes else []
     if dropped:
         console.info(f"removed {len(dropped)} later checkpoints: they are not what comes next")

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 
 from rlcli.errors import CheckpointError
 
-JSON_LIMIT = 16 * 2**20
+JSON_LIMIT = 4 * 2**20
 """Largest JSON file [bytes]."""
 _DEPTH = 32
 _DIGITS = 20
@@ -40,10 +40,11 @@ def read_file(file: Path, limit: int, *, size: int | None = None) -> bytes:
     except (OSError, ValueError) as error:
         why = "it is no plain file" if _kind(error) in _ODD else getattr(error, "strerror", None) or error
         raise CheckpointError(f"{file} cannot be read: {why}") from None
+    status = os.fstat(handle)
+    if not stat.S_ISREG(status.st_mode):
+        os.close(handle)
+        raise CheckpointError(f"{file} is no plain file")
     with os.fdopen(handle, "rb") as opened:
-        status = os.fstat(opened.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise CheckpointError(f"{file} is no plain file")
         if size is not None and status.st_size != size:
             raise CheckpointError(
                 f"{file} is corrupt: it is not what the manifest says ({status.st_size} bytes of {size})",

@@ -228,7 +228,7 @@ class Sb3Trainer:
         for name in weights:
             if name in self._actor_names:
                 weights[name] = policy[self._actor_names[name]]
-            elif f"weights.{name}" in rest:
+            elif rest:
                 weights[name] = rest[f"weights.{name}"]
         self.model.policy.load_state_dict(weights)
         if not rest and hasattr(self.model, "actor_target"):
@@ -417,5 +417,5 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, prefix: str, tensors: Mapp
         if name.startswith(prefix):
             index, slot = name.removeprefix(prefix).split(".")
             state.setdefault(int(index), {})[slot] = value.clone()
+    require_slots(optimizer, state)
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    require_slots(optimizer)

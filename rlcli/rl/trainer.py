@@ -39,19 +39,21 @@ _SLOTS = {
 }
 
 
-def require_slots(optimizer: torch.optim.Optimizer) -> None:
-    """What an optimiser was given back must be what it steps with: it looks only when it steps.
+def require_slots(optimizer: torch.optim.Optimizer, state: Mapping[int, Mapping[str, Tensor]]) -> None:
+    """What an optimiser is given back must be what it steps with: it looks only when it steps.
+
+    Args:
+        optimizer: whose it is.
+        state: its state by the number of the parameter.
 
     Raises:
         ValueError: naming the first slot that is missing or of another shape.
     """
     owned = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    if len(optimizer.state) > sum(parameter in optimizer.state for parameter in owned):
-        raise ValueError("trainer: the optimiser's state is of more parameters than there are")
-    for number, parameter in enumerate(owned):
-        slots = optimizer.state.get(parameter)
-        if not slots:
-            continue
+    for number, slots in state.items():
+        if not 0 <= number < len(owned):
+            raise ValueError(f"trainer: the optimiser has no parameter {number}")
+        parameter = owned[number]
         missing = _SLOTS.get(type(optimizer).__name__, set()) - set(slots)
         if missing:
             raise ValueError(f"trainer: the optimiser's state of parameter {number} has no {sorted(missing)[0]}")

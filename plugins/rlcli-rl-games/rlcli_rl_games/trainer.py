@@ -595,8 +595,8 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tens
     for name, value in tensors.items():
         index, slot = name.split(".")
         state.setdefault(int(index), {})[slot] = value.clone()
+    require_slots(optimizer, state)
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    require_slots(optimizer)
 
 
 @contextlib.contextmanager
