@@ -321,10 +321,11 @@ def _resumed(
     loggers = check_loggers(logger) if logger else list(run.record.get("loggers", []))
     run.lock()
     try:
-        from rlcli.rl import checkpoint
+        from rlcli.rl.checkpoint import open_checkpoint
+        from rlcli.rl.saving import clean
 
-        checkpoint.clean(run.checkpoints)
-        saved = checkpoint.open_checkpoint(folder)
+        clean(run.checkpoints)
+        saved = open_checkpoint(folder)
     except BaseException:
         run.unlock()
         raise
@@ -367,9 +368,10 @@ def _build(job: _Job, device: str) -> Any:
     from rlcli.errors import CheckpointError
     from rlcli.registry import load_object
     from rlcli.rl import distributed
-    from rlcli.rl.checkpoint import drop_after, open_checkpoint
+    from rlcli.rl.checkpoint import open_checkpoint
     from rlcli.rl.files import write_atomic
     from rlcli.rl.load import require_fit, require_same_policy, require_trainer
+    from rlcli.rl.saving import drop_after
 
     resolved, record = job.resolved, job.run.record
     assert resolved.trainer is not None
@@ -393,7 +395,7 @@ def _build(job: _Job, device: str) -> Any:
         return trainer, env
     require_fit(saved, env.layout)
     _take(saved, lambda: trainer.load(state), "it cannot be resumed")
-    if trainer.env_steps != saved.step:
+    if (trainer.iteration, trainer.env_steps) != (saved.iteration, saved.step):
         raise CheckpointError(f"{saved.folder} cannot be resumed: its manifest and its state name different steps")
     processes = state.values.get("processes", 1)
     if processes != peers.size:
@@ -423,6 +425,7 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
     from rlcli.cli.live import TrainingView
     from rlcli.errors import RlcliError, Stopped
     from rlcli.rl.loggers import open_loggers
+    from rlcli.rl.saving import Keep, Saver
     from rlcli.rl.train import Budget, fit
 
     run, agent = job.run, job.resolved.agent
@@ -434,27 +437,31 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
         "layout": env.layout.record(),
         "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
     }
+    keep = Keep.of(agent.keep_last, agent.keep_every, agent.save_interval)
+    saver = Saver(run.checkpoints, keep, manifest, resumed=job.resume_from)
     sinks: list[Any] = []
 
     def close(state: str) -> None:
         for sink in sinks:
             sink.close()
-        if not job.writes:
-            return
-        run.update(state=state, step=trainer.env_steps, iteration=trainer.iteration)
+        if job.writes and saver.at is not None:
+            run.update(state=state, iteration=saver.at[0], step=saver.at[1])
 
     try:
         if job.writes:
             run.update(state="running")
             sinks += open_loggers(run, job.loggers, resume=resume)
+        trials = _trials(job, saver, stop)
+        env.before_step, stop.can_interrupt = stop.check, not env.engine.asynchronous
         with TrainingView(f"rlcli train {job.resolved.source.name}") as view:
             fit(
                 trainer,
                 run,
                 Budget(agent.max_iterations, agent.max_steps),
+                saver,
                 loggers=sinks,
                 save_interval=agent.save_interval,
-                manifest=manifest,
+                trials=trials,
                 show=view.show,
                 tell=console.warn,
                 divergences=lambda: env.divergences,
@@ -465,6 +472,31 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
             close("stopped" if isinstance(error, Stopped | KeyboardInterrupt) else "failed")
         raise
     close("finished")
+
+
+def _trials(job: _Job, saver: Any, stop: StopRequest) -> Any:
+    """What evaluates between iterations, if the agent wants it; one process does."""
+    from rlcli.envs.vec_env import make_env
+    from rlcli.random import derive
+    from rlcli.rl.load import resolve_run
+    from rlcli.rl.loggers import read_metrics
+    from rlcli.rl.trials import Trials
+
+    run, agent = job.run, job.resolved.agent
+    assert agent is not None
+    if agent.eval_interval is None or not job.writes:
+        return None
+
+    def make() -> Any:
+        num_envs = min(agent.eval_episodes, job.resolved.task.scene.num_envs)
+        resolved = resolve_run(run, play=True, flags={"scene.num_envs": num_envs})
+        env = make_env(resolved, seed=derive(run.record["seed"], "evaluation"))
+        env.before_step = stop.check
+        return env
+
+    history = read_metrics(run.metrics)
+    saver.best = run.record.get("best")
+    return Trials(make, agent.eval_episodes, agent.eval_interval, history)
 
 
 def _report(job: _Job, trainer: Any) -> None:

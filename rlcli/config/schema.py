@@ -894,6 +894,15 @@ class AgentConfig(StrictModel):
     """Environment steps to train for."""
     save_interval: Count | None = None
     """Iterations between checkpoints; null: every 60 s and at the end."""
+    keep_last: Count | None = None
+    """Newest checkpoints that stay, beside the first and the best; null: 10, or all where `save_interval` is set."""
+    keep_every: Count | None = None
+    """Checkpoints of every such iteration are written, and stay."""
+    eval_interval: Count | None = None
+    """Iterations between evaluations of the policy, as `rlcli eval` does it; the best one's checkpoint is RUN@best.
+    null: none."""
+    eval_episodes: Count = 100
+    """Episodes of such an evaluation."""
     torch_threads: Count | None = None
     """Threads of the update; null: min(4, cores). Results are equal only for an equal number."""
     action_bound: Positive | None = 1.0

@@ -194,6 +194,8 @@ class VecEnv(ABC):
         self.num_envs = self.config.scene.num_envs
         self.final_obs_of = "finished"
         self.seconds = {"physics": 0.0, "step": 0.0}
+        self.before_step: Callable[[], None] | None = None
+        """Called before anything is done in a step, which it may prevent by raising."""
         self.after_physics: Callable[[], None] | None = None
         """Called in every step with the state that it is judged by, before anything ends or begins."""
         self._playing = True
@@ -244,6 +246,8 @@ class VecEnv(ABC):
         """
         if not self._playing:
             raise RuntimeError("the environment is paused")
+        if self.before_step is not None:
+            self.before_step()
         start = time.perf_counter()
         if tuple(action.shape) != (self.num_envs, self.layout.action_size):
             raise ValueError(

@@ -1,33 +1,50 @@
-"""Checkpoints: folders of safetensors and JSON, complete or absent, verified before use, never unpickled."""
+"""Reading checkpoints: folders of safetensors and JSON, verified before use, never unpickled."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-import os
 import re
-import secrets
-import shutil
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import safetensors.torch
+import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
 from rlcli.errors import CheckpointError
 from rlcli.machine import memory
-from rlcli.rl.files import disk_error, sync_folder, to_json, write_atomic, write_synced
 from rlcli.rl.policy import Policy, blank_policy, filled, size_of
 from rlcli.rl.reading import JSON_LIMIT, parse_json, read_file
-from rlcli.rl.trainer import TrainerState
+from rlcli.rl.trainer import Rows, TrainerState
 
 FORMAT = 1
 PARTS = ("policy", "trainer", "env", "rng")
 """Tensor files of every checkpoint: the policy alone, critics and optimisers, environment, generators. A trainer may
-add parts of its own: the replay buffer."""
+add parts of its own."""
+LOG_FOLDER = "logs"
+"""Beside the checkpoints: rows that several of them share, such as a replay buffer's, in files that never change."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """A file with some rows of a log."""
+
+    start: int
+    stop: int
+    size: int
+    sha256: str
+
+    @property
+    def file(self) -> str:
+        """Its name."""
+        return f"{self.start:012d}-{self.stop:012d}.safetensors"
+
+    def record(self) -> dict[str, Any]:
+        """As plain JSON."""
+        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +58,14 @@ class Checkpoint:
     def step(self) -> int:
         """Environment steps at which it was written."""
         return int(self.manifest["step"])
+
+    @property
+    def iteration(self) -> int:
+        """Iteration after which it was written."""
+        iteration = self.manifest.get("iteration")
+        if not _is_count(iteration):
+            raise CheckpointError(f"{self.folder}/manifest.json is corrupt: it has no iteration")
+        return int(iteration)
 
     def json(self, name: str) -> dict[str, Any]:
         """A JSON file of the checkpoint."""
@@ -59,12 +84,7 @@ class Checkpoint:
         name = f"{part}.safetensors"
         if limit is None:
             limit = min(_LIMITS.get(part.partition(".")[0], _UNLIMITED), memory() // 3)
-        data = self._data(name, limit)
-        _require_header(data, self.folder / name)
-        try:
-            return safetensors.torch.load(data)
-        except (SafetensorError, RuntimeError, ValueError, KeyError, MemoryError) as error:
-            raise CheckpointError(f"{self.folder / name} is corrupt: {' '.join(str(error).split())}") from None
+        return _tensors(self._data(name, limit), self.folder / name)
 
     def policy(self) -> Policy:
         """The policy, ready to act; nothing of the task or the simulator is needed.
@@ -108,7 +128,7 @@ class Checkpoint:
                     )
                 if name.endswith(("normalizer.var", "normalizer.count")) and bool((value < 0).any()):
                     raise CheckpointError(f"{self.folder / part}.safetensors: '{name}' is negative")
-        return TrainerState(tensors, values)
+        return TrainerState(tensors, values, {name: self._rows(name) for name in self.shards()})
 
     def verify(self, *, whole: bool) -> None:
         """Read and check the policy, or everything.
@@ -116,67 +136,60 @@ class Checkpoint:
         Raises:
             CheckpointError: at the first thing that is wrong.
         """
-        if whole:
-            self.state()
-        else:
+        if not whole:
             self.policy()
+            return
+        for rows in self.state().logs.values():
+            for start in range(rows.first, rows.stop, _ROWS_AT_ONCE):
+                rows.read(start, min(start + _ROWS_AT_ONCE, rows.stop))
+
+    def shards(self) -> dict[str, list[Shard]]:
+        """The files with the rows of each log, oldest first.
+
+        Raises:
+            CheckpointError: if the manifest does not say so properly.
+        """
+        logs = self.manifest.get("logs", {})
+        if not _are_logs(logs):
+            raise CheckpointError(f"{self.folder}/manifest.json is corrupt: its list of rows is malformed")
+        return {name: [Shard(**entry) for entry in log["shards"]] for name, log in logs.items()}
+
+    def _rows(self, name: str) -> Rows:
+        log, shards = self.manifest["logs"][name], self.shards()[name]
+        first, stop = log["first"], log["stop"]
+        edges = [shard.start for shard in shards[1:]] + [stop]
+        if [shard.stop for shard in shards] != edges[: len(shards)] or (shards[0].start if shards else stop) > first:
+            raise CheckpointError(f"{self.folder}/manifest.json is corrupt: rows of '{name}' are missing")
+        held, most = sum(shard.size for shard in shards), memory() // 3
+        if held > most:
+            raise CheckpointError(f"{self.folder}: '{name}' has {held:,} bytes; this machine has memory for {most:,}")
+
+        def read(start: int, end: int) -> dict[str, Tensor]:
+            parts = []
+            for shard in shards:
+                if shard.start < end and start < shard.stop:
+                    columns = self._shard(name, shard)
+                    rows = slice(max(start, shard.start) - shard.start, min(end, shard.stop) - shard.start)
+                    parts.append({column: values[rows] for column, values in columns.items()})
+            if any(set(part) != set(parts[0]) for part in parts):
+                raise CheckpointError(f"{self.folder}/manifest.json: the files of '{name}' do not belong together")
+            return {column: torch.cat([part[column] for part in parts]) for column in parts[0]} if parts else {}
+
+        return Rows(first, stop, read)
+
+    def _shard(self, name: str, shard: Shard) -> dict[str, Tensor]:
+        file = self.folder.parent / LOG_FOLDER / name / shard.file
+        columns = _tensors(_verified(file, shard.size, shard.sha256, memory() // 3), file)
+        for column, values in columns.items():
+            if values.shape[:1] != (shard.stop - shard.start,):
+                raise CheckpointError(f"{file} is corrupt: '{column}' has not the rows of its name")
+        return columns
 
     def _data(self, name: str, limit: int) -> bytes:
-        file = self.folder / name
         entry = self.manifest["files"].get(name)
         if entry is None:
             raise CheckpointError(f"{self.folder} has no {name}")
-        try:
-            data = read_file(file, limit, size=entry["size"])
-        except FileNotFoundError:
-            raise CheckpointError(f"{file} is missing") from None
-        if len(data) != entry["size"] or hashlib.sha256(data).hexdigest() != entry["sha256"]:
-            raise CheckpointError(
-                f"{file} is corrupt: it is not what the manifest says ({len(data)} bytes of {entry['size']})",
-                hint="choose an older checkpoint with RUN@step:N",
-            )
-        return data
-
-
-def save(checkpoints: Path, step: int, state: TrainerState, extra: Mapping[str, Any]) -> Path:
-    """Write a checkpoint: into a temporary folder, every file synced, the manifest last, then one rename.
-
-    Args:
-        checkpoints: the run's folder of checkpoints.
-        step: environment steps.
-        state: what the trainer gave.
-        extra: further JSON-able entries of the manifest.
-
-    Raises:
-        MachineError: if the disk refuses or the folder is gone; nothing half-written is left.
-    """
-    target = checkpoints / f"{step:012d}"
-    if target.exists():
-        return target
-    temporary = checkpoints / f".tmp-{os.getpid()}-{secrets.token_hex(4)}"
-    values = dict(state.values)
-    contents: dict[str, bytes] = {"policy.json": to_json(values["policy"]).encode()}
-    contents["state.json"] = to_json(values).encode()
-    for part in state.tensors:
-        tensors = {name: value.detach().contiguous() for name, value in state.tensors[part].items()}
-        contents[f"{part}.safetensors"] = safetensors.torch.save(tensors)
-    files = {name: {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in contents.items()}
-    manifest = {"format": FORMAT, "step": step, **extra, "files": files}
-    try:
-        temporary.mkdir()
-        for name, data in contents.items():
-            write_synced(temporary / name, data)
-        write_synced(temporary / "manifest.json", to_json(manifest).encode())
-        sync_folder(temporary)
-        os.rename(temporary, target)
-        sync_folder(checkpoints)
-    except BaseException as error:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if isinstance(error, OSError):
-            raise disk_error(target, error) from error
-        raise
-    write_atomic(checkpoints / "latest", target.name + "\n")
-    return target
+        return _verified(self.folder / name, entry["size"], entry["sha256"], limit)
 
 
 def open_checkpoint(folder: Path) -> Checkpoint:
@@ -213,24 +226,37 @@ def steps(checkpoints: Path) -> list[int]:
     return sorted(int(name) for name in names if name.isdecimal() and name == f"{int(name):012d}")
 
 
-def drop_after(checkpoints: Path, step: int) -> list[int]:
-    """Remove the checkpoints after a step: training goes on from there, and they are no longer its future."""
-    later = [have for have in steps(checkpoints) if have > step]
-    for have in later:
-        shutil.rmtree(checkpoints / f"{have:012d}")
-    return later
+def sha256(data: bytes) -> str:
+    """The hash that a manifest keeps of a file."""
+    return hashlib.sha256(data).hexdigest()
 
 
-def clean(checkpoints: Path) -> None:
-    """Remove what killed writers left."""
-    for leftover in checkpoints.glob(".tmp-*"):
-        shutil.rmtree(leftover, ignore_errors=True)
-    for file in [*checkpoints.glob(".*.tmp-*"), *checkpoints.parent.glob(".*.tmp-*")]:
-        file.unlink(missing_ok=True)
+def _verified(file: Path, size: int, digest: str, limit: int) -> bytes:
+    """The content of a file, if it is what the manifest says."""
+    try:
+        data = read_file(file, limit, size=size)
+    except FileNotFoundError:
+        raise CheckpointError(f"{file} is missing") from None
+    if len(data) != size or sha256(data) != digest:
+        raise CheckpointError(
+            f"{file} is corrupt: it is not what the manifest says ({len(data)} bytes of {size})",
+            hint="choose an older checkpoint with RUN@step:N",
+        )
+    return data
+
+
+def _tensors(data: bytes, file: Path) -> dict[str, Tensor]:
+    _require_header(data, file)
+    try:
+        return safetensors.torch.load(data)
+    except (SafetensorError, RuntimeError, ValueError, KeyError, MemoryError) as error:
+        raise CheckpointError(f"{file} is corrupt: {' '.join(str(error).split())}") from None
 
 
 _FILE = re.compile(r"[a-z][a-z0-9_]{0,63}(\.[0-9]{1,6})?\.(json|safetensors)", re.ASCII)
+_LOG = re.compile(r"[a-z][a-z0-9_]{0,63}", re.ASCII)
 _MOST_FILES = 4096
+_ROWS_AT_ONCE = 1000
 _HEADER_LIMIT = 4 * 2**20
 _MOST_TENSORS = 20_000
 _MOST_DIMENSIONS = 16
@@ -264,6 +290,32 @@ def _require_entries(files: Any, file: Path) -> None:
     for name in files:
         if not _FILE.fullmatch(name):
             raise CheckpointError(f"{file} is corrupt: {name[:80]!r} is no name of a file of a checkpoint")
+
+
+def _are_logs(logs: Any) -> bool:
+    """Names of folders, counts of rows, and files with some of them."""
+    return isinstance(logs, dict) and all(
+        _LOG.fullmatch(name)
+        and isinstance(log, dict)
+        and _is_count(log.get("first"))
+        and _is_count(log.get("stop"))
+        and log["first"] <= log["stop"]
+        and isinstance(log.get("shards"), list)
+        and len(log["shards"]) <= _MOST_FILES
+        and all(map(_is_shard, log["shards"]))
+        for name, log in logs.items()
+    )
+
+
+def _is_shard(entry: Any) -> bool:
+    return (
+        isinstance(entry, dict)
+        and set(entry) == {"start", "stop", "size", "sha256"}
+        and all(_is_count(entry[key]) for key in ("start", "stop", "size"))
+        and entry["start"] < entry["stop"]
+        and isinstance(entry["sha256"], str)
+        and len(entry["sha256"]) == 64
+    )
 
 
 def _require_header(data: bytes, file: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import json
 import math
 from collections.abc import Sequence
@@ -59,9 +60,11 @@ class TensorBoard:
     def __init__(self, folder: Path, *, resume_after_step: int | None = None) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        purge = None if resume_after_step is None else resume_after_step + 1
         try:
-            self._writer: Any = SummaryWriter(str(folder), purge_step=purge)
+            if resume_after_step is not None:
+                for file in sorted(folder.glob("events.out.tfevents.*")):
+                    _cut_events(file, resume_after_step)
+            self._writer: Any = SummaryWriter(str(folder))
         except OSError as error:
             raise disk_error(folder, error) from error
 
@@ -124,3 +127,17 @@ def _cut(file: Path, iteration: int) -> None:
         write_atomic(file, "".join(json.dumps(row) + "\n" for row in rows))
     except (OSError, MachineError) as error:
         raise disk_error(file, error) if isinstance(error, OSError) else error from error
+
+
+def _cut_events(file: Path, step: int) -> None:
+    """The same of an event file, whose last event may be half written."""
+    from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
+    from tensorboard.compat.proto.event_pb2 import Event
+    from tensorboard.summary.writer.record_writer import RecordWriter
+
+    kept = io.BytesIO()
+    writer = RecordWriter(kept)
+    for data in RawEventFileLoader(str(file)).Load():
+        if Event.FromString(data).step <= step:
+            writer.write(data)
+    write_atomic(file, kept.getvalue())

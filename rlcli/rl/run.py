@@ -120,6 +120,9 @@ def open_run(folder: Path) -> Run:
     except (FileNotFoundError, NotADirectoryError):
         raise CheckpointError(f"{folder} is not a run: it has no {RECORD}") from None
     refuse_links(folder)
+    for inner in ("checkpoints", "checkpoints/logs"):
+        if (folder / inner).is_dir():
+            refuse_links(folder / inner)
     task = record.get("task")
     if not isinstance(task, dict) or not isinstance(task.get("name"), str):
         raise CheckpointError(f"{file} is corrupt: it does not name a task")

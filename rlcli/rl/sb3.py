@@ -159,11 +159,12 @@ class Sb3Trainer:
         tensors = {
             "policy": self._policy_tensors(),
             "trainer": rest,
-            "env": {**self.env.state_dict(), "episode_starts": torch.as_tensor(self.model._last_episode_starts)},
+            "env": {**self.env.state_dict(), "episode_starts": torch.tensor(self.model._last_episode_starts)},
             "rng": rng_state(),
         }
+        logs = {}
         if isinstance(self.config, OffPolicyConfig):
-            tensors["replay"] = self.model.replay_buffer.state_dict()
+            logs["replay"] = self.model.replay_buffer.rows(self._horizon)
         values = {
             "policy": self.spec.model_dump(),
             "iteration": self.iteration,
@@ -172,7 +173,7 @@ class Sb3Trainer:
             "updates": self.model._n_updates,
             "statistics": self.statistics.state(),
         }
-        return TrainerState(tensors, values)
+        return TrainerState(tensors, values, logs)
 
     def load(self, state: TrainerState) -> None:
         """Go back to a boundary: the next iteration gives the same bits as it did then."""
@@ -186,8 +187,8 @@ class Sb3Trainer:
         if "log_ent_coef" in rest:
             self.model.log_ent_coef.data.copy_(rest["log_ent_coef"])
         self._recorded = rest.get("observations", self._recorded)
-        if "replay" in state.tensors:
-            self.model.replay_buffer.load_state_dict(state.tensors["replay"])
+        if "replay" in state.logs:
+            self.model.replay_buffer.load_rows(state.logs["replay"])
         self.iteration, self.model.num_timesteps = values["iteration"], values["env_steps"]
         self.model._n_updates = values["updates"]
         self._set_learning_rate(values["learning_rate"])

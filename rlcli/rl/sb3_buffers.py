@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBu
 from torch import Tensor
 
 from rlcli.rl.policy import Normalizer
+from rlcli.rl.trainer import Rows
 from rlcli.sim.saved import require_alike
 
 
@@ -89,6 +90,8 @@ class TorchReplayBuffer(ReplayBuffer):
         self.action = torch.zeros(rows, envs, self.action_dim)
         self.reward = torch.zeros(rows, envs, 1)
         self.done = torch.zeros(rows, envs, 1)
+        self.added = 0
+        """Steps ever stored."""
 
     def put(self, obs: Tensor, next_obs: Tensor, action: Tensor, reward: Tensor, done: Tensor) -> None:
         """Store one step of every environment."""
@@ -100,9 +103,7 @@ class TorchReplayBuffer(ReplayBuffer):
             (self.done, done[:, None]),
         ):
             storage[self.pos].copy_(values)
-        self.pos += 1
-        if self.pos == self.buffer_size:
-            self.pos, self.full = 0, True
+        self._count(1)
 
     def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
         """Uniformly drawn transitions."""
@@ -115,26 +116,45 @@ class TorchReplayBuffer(ReplayBuffer):
             obs, next_obs = self.normalizer(obs), self.normalizer(next_obs)
         return ReplayBufferSamples(obs, action, next_obs, done, reward)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """What has been stored so far, and where the next step goes."""
-        rows = self.buffer_size if self.full else self.pos
-        stored = {name: getattr(self, name)[:rows].clone() for name in _REPLAY}
-        return {**stored, "position": torch.tensor([self.pos, int(self.full)])}
+    def rows(self, at_risk: int) -> Rows:
+        """What has been stored, readable until `at_risk` more steps are."""
+        first, stop = max(0, self.added - self.buffer_size), self.added
+        overwritten = max(0, stop + at_risk - self.buffer_size - first)
+        kept = self._read(first, first + overwritten)
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state_dict` gave.
+        def read(start: int, end: int) -> dict[str, Tensor]:
+            own = min(max(start, first + overwritten), end)
+            early, late = slice(start - first, own - first), self._read(own, end)
+            return {name: torch.cat([kept[name][early], late[name]]) for name in _COLUMNS}
+
+        return Rows(first, stop, read)
+
+    def load_rows(self, rows: Rows) -> None:
+        """Take back what `rows` gave.
 
         Raises:
-            ValueError: if it is of another buffer.
+            ValueError: if they are of another buffer.
         """
-        position, full = (int(value) for value in state["position"])
-        rows = self.buffer_size if full else position
-        if not 0 <= position < self.buffer_size or full not in (0, 1):
-            raise ValueError(f"replay: it goes on at row {position} of {self.buffer_size}")
-        require_alike(state, {name: getattr(self, name)[:rows] for name in _REPLAY}, "replay")
-        for name in _REPLAY:
-            getattr(self, name)[: len(state[name])].copy_(state[name])
-        self.pos, self.full = position, bool(full)
+        count = rows.stop - rows.first
+        if not 0 <= count <= self.buffer_size:
+            raise ValueError(f"replay: {count} rows, and the buffer holds {self.buffer_size}")
+        saved = rows.read(rows.first, rows.stop)
+        if count:
+            own = {name: getattr(self, name)[:count] for name in _COLUMNS}
+            require_alike({name: saved[name] for name in own}, own, "replay")
+        places = torch.arange(rows.first, rows.stop) % self.buffer_size
+        for name, values in saved.items():
+            getattr(self, name)[places] = values
+        self.added = rows.first
+        self._count(count)
+
+    def _read(self, start: int, stop: int) -> dict[str, Tensor]:
+        places = torch.arange(start, stop) % self.buffer_size
+        return {name: getattr(self, name)[places] for name in _COLUMNS}
+
+    def _count(self, steps: int) -> None:
+        self.added += steps
+        self.pos, self.full = self.added % self.buffer_size, self.added >= self.buffer_size
 
 
-_REPLAY = ("obs", "next_obs", "action", "reward", "done")
+_COLUMNS = ("obs", "next_obs", "action", "reward", "done")

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from rlcli.errors import DivergedError, Stopped
 from rlcli.rl import checkpoint, distributed
 from rlcli.rl.loggers import Logger
 from rlcli.rl.run import Run
-from rlcli.rl.stop import StopRequest
+from rlcli.rl.saving import Saver
+from rlcli.rl.stop import Interrupted, StopRequest
 from rlcli.rl.trainer import Report, Trainer
+from rlcli.rl.trials import Trials
 
 SAVE_EVERY_S = 60.0
+LONG_S = 0.1
+"""An iteration that takes longer can be interrupted: its beginning is copied for that."""
 DIVERGED_SHARE = 0.01
 """Share of an iteration's environment steps that may diverge before the run stops."""
 
@@ -71,58 +75,110 @@ def fit(
     trainer: Trainer,
     run: Run,
     budget: Budget,
+    saver: Saver,
     *,
     loggers: Sequence[Logger] = (),
     save_interval: int | None = None,
-    manifest: dict[str, Any] | None = None,
+    trials: Trials | None = None,
     show: Callable[[Progress], None] = lambda _: None,
     tell: Callable[[str], None] = lambda _: None,
     divergences: Callable[[], int] = lambda: 0,
     stop: StopRequest | None = None,
 ) -> None:
-    """Train until the budget is spent. Checkpoints are written at iteration boundaries only.
+    """Train until the budget is spent. A checkpoint is always of a boundary between iterations.
 
     Several processes do the same at each boundary; the one that leads writes the checkpoints.
 
     Raises:
-        Stopped: on SIGINT or SIGTERM, after the checkpoint of the last boundary was written; at once on the second.
+        Stopped: on a signal, after the checkpoint of the last boundary was written; at once on the second.
         DivergedError: if the learner or too much of the simulation diverges; the last good checkpoint is kept.
         MachineError: if the disk refuses.
     """
-    saved_at = time.monotonic()
-    peers = distributed.current()
-
-    def save() -> None:
-        state = trainer.state()
-        if peers.leads:
-            extra = {**(manifest or {}), "iteration": trainer.iteration}
-            checkpoint.save(run.checkpoints, trainer.env_steps, state, extra)
-
-    stop = stop or StopRequest()
+    peers, stop = distributed.current(), stop or StopRequest()
+    boundaries = _Boundaries(trainer, saver, stop, peers)
     try:
-        if trainer.iteration == 0:
-            save()
+        if saver.at is None:
+            boundaries.save()
         begin, first_step = time.monotonic(), trainer.env_steps
         while not (stopped := _any_asked(stop, peers)) and not budget.spent(trainer):
-            before = divergences()
-            report = trainer.iterate()
-            late = save_interval is None and peers.leads and time.monotonic() - saved_at > SAVE_EVERY_S
-            diverged, overdue = peers.total(divergences() - before, late)
-            _require_stable(diverged, trainer)
+            before, tried = divergences(), trials is not None and trials.due(trainer.iteration + 1)
+            with boundaries.iteration(long=tried):
+                report = trainer.iterate()
+                trial = trials.run(trainer.policy()) if trials is not None and tried else {}
+                better = trials is not None and trials.improves(trial)
+                late = save_interval is None and boundaries.late()
+                diverged, overdue, best = peers.total(divergences() - before, late, better)
+                _require_stable(diverged, trainer)
             for note in report.notes:
                 tell(note)
-            metrics = _with_rates(report, trainer.steps_per_iteration)
+            metrics = {**_with_rates(report, trainer.steps_per_iteration), **trial}
             for logger in loggers:
                 logger.write(trainer.iteration, trainer.env_steps, metrics)
             show(_progress(trainer, budget, report, metrics, time.monotonic() - begin, first_step))
-            if overdue or (save_interval is not None and trainer.iteration % save_interval == 0):
-                save()
-                saved_at = time.monotonic()
-        save()
+            if best or overdue or saver.asked(trainer.iteration, save_interval):
+                boundaries.save()
+            if better:
+                saver.wait()
+                saver.best = trainer.env_steps
+                run.update(best=saver.best)
+            saver.check()
+        boundaries.save()
+        saver.wait()
+    except Interrupted:
+        raise _stopped(f"stopped in iteration {boundaries.number + 1}; resumed, it begins again", run, stop) from None
     except KeyboardInterrupt:
         raise _stopped("stopped at once; what came after the last checkpoint is lost", run, stop) from None
     if stopped and not budget.spent(trainer):
         raise _stopped(f"stopped at iteration {trainer.iteration}, checkpoint written", run, stop)
+
+
+class _Boundaries:
+    """The moments between iterations: what is saved of them, and what a long iteration can go back to."""
+
+    def __init__(self, trainer: Trainer, saver: Saver, stop: StopRequest, peers: distributed.Peers) -> None:
+        self._trainer, self._saver, self._stop, self._peers = trainer, saver, stop, peers
+        self._saved_at = time.monotonic()
+        self._took = 0.0
+        self.number = trainer.iteration
+        """Iterations before the one that runs."""
+
+    def save(self) -> None:
+        """Write this one, unless it is written."""
+        at = (self._trainer.iteration, self._trainer.env_steps)
+        if self._saver.at != at:
+            state = self._trainer.state()  # together: all processes give theirs
+            if self._peers.leads:
+                self._saver.save(state, *at)
+            else:
+                self._saver.at = at
+        self._saved_at = time.monotonic()
+
+    def late(self) -> bool:
+        """Whether the leader has not saved for long."""
+        return self._peers.leads and time.monotonic() - self._saved_at > SAVE_EVERY_S
+
+    @contextlib.contextmanager
+    def iteration(self, long: bool = False) -> Iterator[None]:
+        """Around an iteration: where it takes long, a signal ends it at once, and its beginning is written.
+
+        So it is when the learner diverges. A short one is cheaper finished than copied beforehand; on a GPU and with
+        several processes all are.
+        """
+        at = self._trainer.iteration, self._trainer.env_steps
+        self.number = at[0]
+        prompt, saved = self._stop.can_interrupt and self._peers.size == 1, self._saver.at == at
+        copied = prompt and not saved and (long or self._took > LONG_S)
+        before = self._trainer.state() if copied else None
+        begin = time.monotonic()
+        try:
+            with self._stop.prompt(prompt and (saved or copied)):
+                yield
+        except (Interrupted, DivergedError):
+            if before is not None:
+                self._saver.save(before, *at)
+            self._saver.wait()
+            raise
+        self._took = time.monotonic() - begin
 
 
 def _any_asked(stop: StopRequest, peers: distributed.Peers) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -13,12 +13,25 @@ if TYPE_CHECKING:
     from rlcli.rl.policy import Policy
 
 
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """The newest rows of something that only grows, such as a replay buffer: each is written to the disk once."""
+
+    first: int
+    """The oldest row that is still needed, counted from the first that there ever was."""
+    stop: int
+    """One after the newest."""
+    read: Callable[[int, int], dict[str, Tensor]]
+    """read(start, stop) copies rows of every column, as they were at the boundary. (stop - start, ...)"""
+
+
 @dataclass(slots=True)
 class TrainerState:
-    """Everything a trainer needs to go on exactly: tensors by file, and plain JSON."""
+    """Everything a trainer needs to go on exactly: tensors by file, plain JSON, and rows by the name of their log."""
 
     tensors: dict[str, dict[str, Tensor]] = field(default_factory=dict)
     values: dict[str, Any] = field(default_factory=dict)
+    logs: dict[str, Rows] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -90,7 +103,7 @@ class Trainer(Protocol):
         ...
 
     def state(self) -> TrainerState:
-        """A copy of the state at this boundary."""
+        """A copy of the state at this boundary; rows of logs may be read until the end of the next iteration."""
         ...
 
     def load(self, state: TrainerState) -> None:

@@ -4,6 +4,7 @@ Each maker gets the folder of a good checkpoint and changes it. Where `rehash` i
 change afterwards: whoever can write the files can write their hashes.
 """
 
+import hashlib
 import json
 import os
 import pickle
@@ -132,6 +133,14 @@ def with_hashes(damage, name):
         rehash(folder, name)
 
     return both
+
+
+def both(*damages):
+    def damage(folder):
+        for each in damages:
+            each(folder)
+
+    return damage
 
 
 def missing(name):
@@ -510,17 +519,6 @@ def learners():
     ):
         yield Case(f"{part}: {name}", tensors(part, change), RESUMED)
     for name, part, change in (
-        ("a row more than fits", "replay", every(lambda v: v.repeat(2000, 1, 1) if v.dim() == 3 else v)),
-        ("goes on beyond its end", "replay", put("position", lambda p: torch.tensor([10**9, 0]))),
-        ("goes on before its beginning", "replay", put("position", lambda p: torch.tensor([-3, 0]))),
-        ("says it is full", "replay", put("position", lambda p: torch.tensor([0, 1]))),
-        ("neither full nor not", "replay", put("position", lambda p: torch.tensor([4, 7]))),
-        ("a position of one", "replay", put("position", lambda p: p[:1].clone())),
-        ("no position", "replay", drop("position")),
-        ("no rewards", "replay", drop("reward")),
-        ("rewards of float64", "replay", put("reward", torch.Tensor.double)),
-        ("narrow observations", "replay", put("obs", lambda v: v[..., :1].clone())),
-        ("one environment", "replay", put("obs", lambda v: v[:, :1].clone())),
         ("temperature of two", "trainer", put("log_ent_coef", lambda v: torch.zeros(2))),
         ("temperature of NaN", "trainer", put("log_ent_coef", nan)),
         ("a method of the task", "env", lambda v: v.update({"workflow.reset_idx": torch.zeros(8)})),
@@ -531,11 +529,79 @@ def learners():
         yield Case(f"{part}: {name}", tensors(part, change), RESUMED, "sac")
 
 
+def rows(change):
+    """Change what a file of the replay buffer's rows holds."""
+
+    def damage(folder):
+        document = json.loads((folder / "manifest.json").read_text())
+        (file,) = (folder.parent / "logs/replay").glob("*.safetensors")
+        values = safetensors.torch.load(file.read_bytes())
+        change(values)
+        data = safetensors.torch.save(values)
+        file.write_bytes(data)
+        document["logs"]["replay"]["shards"][0] |= {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        (folder / "manifest.json").write_text(json.dumps(document))
+
+    return damage
+
+
+def on_rows(damage):
+    """Do something to that file, without its manifest."""
+
+    def outer(folder):
+        (file,) = (folder.parent / "logs/replay").glob("*.safetensors")
+        damage(file)
+
+    return outer
+
+
+def logs():
+    log, shard = ("logs", "replay"), ("logs", "replay", "shards", 0)
+    elsewhere = {"first": 0, "stop": 0, "shards": []}
+    for name, damage in (
+        ("no rewards", rows(drop("reward"))),
+        ("rewards of float64", rows(put("reward", torch.Tensor.double))),
+        ("narrow observations", rows(put("obs", lambda v: v[..., :1].clone()))),
+        ("one environment", rows(put("obs", lambda v: v[:, :1].clone()))),
+        ("a row less", rows(every(lambda v: v[1:].clone()))),
+        ("a row less in a column", rows(put("obs", lambda v: v[1:].clone()))),
+        ("no columns", rows(drop(""))),
+        ("cut", on_rows(lambda file: file.write_bytes(file.read_bytes()[:-9]))),
+        ("missing", on_rows(Path.unlink)),
+        ("a pickle", on_rows(lambda file: file.write_bytes(pickle.dumps(Bomb())))),
+        ("a pipe", on_rows(lambda file: (file.unlink(), os.mkfifo(file)))),
+        ("a link", on_rows(lambda file: (file.rename(file.parent / "x"), file.symlink_to(file.parent / "x")))),
+        ("from row text", manifest(setting(*shard, "start", to="../../x"))),
+        ("from row -1", manifest(setting(*shard, "start", to=-1))),
+        ("to row 10**15", manifest(setting(*shard, "stop", to=10**15))),
+        (
+            "all to row 10**15",
+            both(manifest(setting(*shard, "stop", to=10**15)), manifest(setting(*log, "stop", to=10**15))),
+        ),
+        ("no rows", manifest(setting(*log, "shards", to=[]))),
+        ("rows backwards", manifest(setting(*log, "first", to=99))),
+        ("first text", manifest(setting(*log, "first", to="0"))),
+        ("a size of 2**61", manifest(setting(*shard, "size", to=2**61))),
+        ("a hash of nobody", manifest(setting(*shard, "sha256", to="0" * 64))),
+        ("a key more", manifest(setting(*shard, "file", to="../../../etc/passwd"))),
+        ("shards of text", manifest(setting(*log, "shards", to="abc"))),
+        ("a list of logs", manifest(setting("logs", to=[]))),
+        ("a log that is a number", manifest(setting(*log, to=3))),
+        ("5,000 files", manifest(lambda m: setting(*log, "shards", to=m["logs"]["replay"]["shards"] * 5000)(m))),
+        ("elsewhere", manifest(setting("logs", "../../../x", to=elsewhere))),
+        ("of the root", manifest(setting("logs", "/etc", to=elsewhere))),
+        ("with NUL", manifest(setting("logs", "re\0play", to=elsewhere))),
+        ("no iteration", manifest(without("iteration"))),
+        ("iteration of text", manifest(setting("iteration", to="x"))),
+    ):
+        yield Case(f"rows: {name}", damage, RESUMED, "sac")
+
+
 def named():
     """All cases that have a name."""
     found = [Case(name, damage, EVERY) for some in (manifests, policies, weights) for name, damage in some()]
     found += [Case(name, damage, RESUMED) for name, damage in states()]
-    return [*found, *places(), *layouts(), *learners()]
+    return [*found, *places(), *layouts(), *learners(), *logs()]
 
 
 def cut_and_flipped(count):

@@ -1,4 +1,4 @@
-"""How many cases of a suite run: a sample in `make test`, all in `make test-faults`, more in `test-faults-long`."""
+"""How many cases of a suite run: a sample in `make test`, all in `make test-faults`, more with `-long`."""
 
 import os
 from collections.abc import Sequence

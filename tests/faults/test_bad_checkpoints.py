@@ -52,7 +52,7 @@ def stage(runs, tmp_path, monkeypatch):
     def prepare(case):
         run = tmp_path / "runs" / "task" / "run"
         shutil.copytree(runs[case.run], run)
-        folder = max(p for p in (run / "checkpoints").iterdir() if p.is_dir())
+        folder = max(p for p in (run / "checkpoints").iterdir() if p.name.isdecimal())
         case.damage(folder)
         return run, folder
 

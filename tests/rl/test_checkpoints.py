@@ -16,14 +16,14 @@ import torch
 from saved_states import SPEC, rehash, state_of
 
 from rlcli.errors import CheckpointError, MachineError
-from rlcli.rl import checkpoint
+from rlcli.rl import checkpoint, saving
 from rlcli.rl.load import policy_of
 
 
 @pytest.fixture
 def saved(tmp_path):
     (tmp_path / "checkpoints").mkdir()
-    return checkpoint.save(tmp_path / "checkpoints", 768, state_of(), {"seed": 1})
+    return saving.write(tmp_path / "checkpoints", 768, state_of(), {"seed": 1})
 
 
 def load_all(folder):
@@ -48,7 +48,7 @@ def test_the_policy_file_holds_tensors_alone_and_equal_weights_give_equal_bytes(
     files = []
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        files.append(checkpoint.save(tmp_path / name, 5, state_of(), {"path": str(tmp_path / name)}))
+        files.append(saving.write(tmp_path / name, 5, state_of(), {"path": str(tmp_path / name)}))
         time.sleep(0.01)
     first, second = ((file / "policy.safetensors").read_bytes() for file in files)
     assert first == second
@@ -58,7 +58,7 @@ def test_the_policy_file_holds_tensors_alone_and_equal_weights_give_equal_bytes(
 
 def test_a_step_is_saved_once(saved):
     before = {file.name: file.stat().st_mtime_ns for file in saved.iterdir()}
-    assert checkpoint.save(saved.parent, 768, state_of(1), {}) == saved
+    assert saving.write(saved.parent, 768, state_of(1), {}) == saved
     assert {file.name: file.stat().st_mtime_ns for file in saved.iterdir()} == before
 
 
@@ -191,7 +191,7 @@ def test_a_disk_that_refuses_leaves_no_half_checkpoint_and_the_old_one(saved, mo
     else:
         monkeypatch.setattr(os, call, refuse)
     with pytest.raises(MachineError, match=os.strerror(code)) as caught:
-        checkpoint.save(saved.parent, 900, state_of(1), {})
+        saving.write(saved.parent, 900, state_of(1), {})
     assert "000000000900" in str(caught.value)
     assert caught.value.hint
     monkeypatch.undo()
@@ -205,14 +205,14 @@ def test_an_interrupted_save_leaves_nothing(saved, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        checkpoint.save(saved.parent, 900, state_of(1), {})
+        saving.write(saved.parent, 900, state_of(1), {})
     assert checkpoint.steps(saved.parent) == [768]
     assert not list(saved.parent.glob(".tmp-*"))
 
 
 def test_a_vanished_folder_is_not_made_again(tmp_path):
     with pytest.raises(MachineError, match="No such file"):
-        checkpoint.save(tmp_path / "gone" / "checkpoints", 5, state_of(), {})
+        saving.write(tmp_path / "gone" / "checkpoints", 5, state_of(), {})
     assert not (tmp_path / "gone").exists()
 
 
@@ -221,13 +221,13 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from saved_states import state_of
-from rlcli.rl import checkpoint
+from rlcli.rl import checkpoint, saving
 folder = Path(sys.argv[1])
 step = max(checkpoint.steps(folder), default=0)
 print("go", flush=True)
 while True:
     step += 1
-    checkpoint.save(folder, step, state_of(step % 3), {})
+    saving.write(folder, step, state_of(step % 3), {})
 """
 
 
@@ -251,7 +251,7 @@ def test_kills_in_the_middle_of_saving_leave_a_good_last_checkpoint(tmp_path):
     assert checkpoint.steps(folder)
     (folder / ".tmp-1-dead").mkdir(exist_ok=True)
     (folder / ".latest.tmp-1").touch()
-    checkpoint.clean(folder)
+    saving.clean(folder)
     assert not [p for p in folder.iterdir() if p.name.startswith(".")]
 
 
@@ -261,11 +261,11 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from saved_states import state_of
 from rlcli.errors import MachineError
-from rlcli.rl import checkpoint
+from rlcli.rl import checkpoint, saving
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
 try:
-    checkpoint.save(Path(sys.argv[1]), 5, state_of(), {})
+    saving.write(Path(sys.argv[1]), 5, state_of(), {})
 except MachineError as error:
     print(error)
 """
