@@ -65,7 +65,7 @@ class Checkpoint:
         iteration = self.manifest.get("iteration")
         if not _is_count(iteration):
             raise CheckpointError(f"{self.folder}/manifest.json is corrupt: it has no iteration")
-        return int(iteration)
+        return int(iteration or 0)
 
     def json(self, name: str) -> dict[str, Any]:
         """A JSON file of the checkpoint."""
@@ -109,7 +109,9 @@ class Checkpoint:
         """
         missing = [part for part in PARTS if f"{part}.safetensors" not in self.manifest["files"]]
         if missing:
-            raise CheckpointError(f"{self.folder} has no {missing[0]}.safetensors")
+            raise CheckpointError(
+                f"{self.folder} has no {missing[0]}.safetensors", hint="--init-from takes its policy into a new run"
+            )
         values = self.json("state.json")
         _require_values(values, self.step, self.folder / "state.json")
         if values["policy"] != self.json("policy.json"):

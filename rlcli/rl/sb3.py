@@ -82,7 +82,7 @@ class Sb3Trainer:
         self.model.reward_scale, self.model.action_bound = config.reward_scale, config.action_bound
         self.normalizer = Normalizer(self.spec.observation_size) if config.normalize_observations else None
         self.model.normalizer = self.normalizer
-        self._actor_names = _actor_names(config.algorithm, self.model.policy.state_dict())
+        self._actor_names = actor_names(config.algorithm, self.model.policy.state_dict())
         if isinstance(config, OffPolicyConfig):
             self.model.replay_buffer.normalizer = self.normalizer
             self._horizon = config.train_freq
@@ -391,7 +391,7 @@ def _require_batch(env: VecEnv, config: OnPolicyConfig, total: int) -> None:
     raise ConfigError([env.resolved.problem(path, message, "more environments, more n_steps, or fewer minibatches")])
 
 
-def _actor_names(algorithm: str, weights: Mapping[str, Tensor]) -> dict[str, str]:
+def actor_names(algorithm: str, weights: Mapping[str, Tensor]) -> dict[str, str]:
     """SB3's names of the actor's weights -> the saved policy's, its output layer numbered after the hidden ones."""
     hidden, output = {
         "sac": ("actor.latent_pi.", "actor.mu."),
