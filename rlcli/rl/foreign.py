@@ -10,7 +10,7 @@ import re
 import stat
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -171,7 +171,9 @@ def as_run(foreign: Foreign, resolved: Resolved, record: Mapping[str, Any], runs
     from rlcli.rl.saving import write
     from rlcli.rl.trainer import TrainerState
 
-    env = make_env(resolved, seed=0)
+    task = resolved.task
+    one = task.model_copy(update={"scene": task.scene.model_copy(update={"num_envs": 1})})
+    env = make_env(replace(resolved, task=one), seed=0)
     layout = env.layout
     env.close()
     sizes = {"observation_size": layout.size("policy"), "action_size": layout.action_size}
