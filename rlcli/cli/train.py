@@ -449,7 +449,10 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
 
     try:
         if job.writes:
-            run.update(state="running")
+            unsaved = env.unsaved()
+            if unsaved:
+                console.warn(f"a resumed run may differ: no checkpoint can hold {', '.join(unsaved)}")
+            run.update(state="running", resumes_exactly=not unsaved and env.device.type == "cpu")
             sinks += open_loggers(run, job.loggers, resume=resume)
         trials = _trials(job, saver, stop)
         env.before_step, stop.can_interrupt = stop.check, not env.engine.asynchronous
@@ -494,9 +497,10 @@ def _trials(job: _Job, saver: Any, stop: StopRequest) -> Any:
         env.before_step = stop.check
         return env
 
-    history = read_metrics(run.metrics)
-    saver.best = run.record.get("best")
-    return Trials(make, agent.eval_episodes, agent.eval_interval, history)
+    trials = Trials(make, agent.eval_episodes, agent.eval_interval, read_metrics(run.metrics))
+    saver.best = trials.best
+    run.update(best=trials.best)
+    return trials
 
 
 def _report(job: _Job, trainer: Any) -> None:

@@ -13,9 +13,11 @@ from rlcli.config.schema import StrictModel, TaskConfig
 from rlcli.envs.articulation import ArticulationView
 from rlcli.envs.vec_env import Layout, TermLayout, VecEnv
 from rlcli.errors import ConfigError, RlcliError, TaskError
+from rlcli.managers.memory import Memory
 from rlcli.managers.termination import DIVERGED
 from rlcli.random import stream
 from rlcli.registry import load_object
+from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import Scene
 from rlcli.sim.selection import IdSelection, Selection
 
@@ -167,6 +169,7 @@ class DirectEnv(VecEnv):
         self._settled = False  # a loaded state holds its second look already
         self._causes: dict[str, Tensor] = {}
         task.post_reset()
+        self._memory = Memory(task, other=("env", "cfg", "params"))
 
     def _layout(self) -> Layout:
         task = self.task
@@ -294,26 +297,28 @@ class DirectEnv(VecEnv):
             self._reset_hook(stale)
             self.episode_length_buf[stale] = 0
 
+    def unsaved(self) -> list[str]:
+        """What the task keeps that cannot be saved."""
+        return self._memory.unsaved()
+
     def _workflow_state(self) -> dict[str, Tensor]:
-        task = self.task
-        buffers = {
-            name: value.clone()
-            for name, value in vars(task).items()
-            if isinstance(value, Tensor) and value.dim() and value.shape[0] == self.num_envs
-        }
-        return {**buffers, "_returns": self._returns.clone(), "_fresh": self._fresh.clone()}
+        own = {"_returns": self._returns.clone(), "_fresh": self._fresh.clone()}
+        return {**own, **{f"task.{name}": value for name, value in self._memory.state_dict().items()}}
 
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
-        for name, value in state.items():
-            owner: Any = self if name in ("_returns", "_fresh") else self.task
-            target = getattr(owner, name, None)
-            if not (target is None or isinstance(target, Tensor)) or value.shape[:1] != (self.num_envs,):
-                raise ValueError(f"env: 'workflow.{name}' {tuple(value.shape)} is no buffer of the task")
-            if isinstance(target, Tensor) and target.shape == value.shape:
-                target.copy_(value)  # views of it stay valid
-            else:
-                setattr(owner, name, value.clone())  # the task makes it in a step
+        own = {
+            f"task.{name}": value for name in _BUFFERS if isinstance(value := getattr(self.task, name, None), Tensor)
+        }
+        require_alike(state, {**own, "_returns": self._returns, "_fresh": self._fresh}, "env: workflow")
+        self._returns.copy_(state["_returns"])
+        self._fresh.copy_(state["_fresh"])
+        task = {name.removeprefix("task."): value for name, value in state.items() if name.startswith("task.")}
+        self._memory.load_state_dict(task)
         self._observed, self._settled = True, True
+
+
+_BUFFERS = ("obs_buf", "states_buf", "rew_buf", "reset_buf", "progress_buf")
+"""What the loop reads of a task; what else it keeps may be of another shape tomorrow."""
 
 
 def _around_zero(bound: float | None) -> tuple[float, float] | None:

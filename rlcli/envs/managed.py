@@ -200,10 +200,12 @@ class ManagedEnv(VecEnv):
         return state
 
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
-        require_alike(state, self._workflow_state(), "env: workflow")
         for name, part in self._parts().items():
             prefix = f"{name}."
-            part.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+            saved = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+            if not (isinstance(part, BoundTerm) and part.memory):  # an author's own tensors may come and go
+                require_alike(saved, part.state_dict(), f"env: workflow.{name}")
+            part.load_state_dict(saved)
 
     def _parts(self) -> dict[str, Any]:
         parts: dict[str, Any] = {
@@ -227,7 +229,12 @@ class ManagedEnv(VecEnv):
                 for pipeline in self.observation_manager.pipelines(group)
             ),
         ]
-        return {**parts, **{"term." + ".".join(map(str, t.path)): t for t in terms if t.state_dict()}}
+        return {**parts, **{"term." + ".".join(map(str, t.path)): t for t in terms}}
+
+    def unsaved(self) -> list[str]:
+        """What class terms keep that cannot be saved."""
+        memories = [part.memory for part in self._parts().values() if isinstance(part, BoundTerm) and part.memory]
+        return [what for memory in memories for what in memory.unsaved()]
 
     def _judging_terms(self) -> Iterator[Any]:
         """The functions and classes behind observations, rewards, terminations and success, before they are bound."""

@@ -326,6 +326,10 @@ class VecEnv(ABC):
         """Further numbers to log, by the metric's name; as of the last step."""
         return {}
 
+    def unsaved(self) -> list[str]:
+        """What the task keeps from step to step that `state_dict` cannot hold; empty: it goes on exactly."""
+        return []
+
     def close(self) -> None:
         """Let go of the engine."""
         self.engine.close()

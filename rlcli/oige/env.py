@@ -243,10 +243,6 @@ class OigeEnv(DirectEnv):
         for view in self.handle.world.scene.views.values():
             if isinstance(view, ArticulationView):
                 state |= {f"view.{view.name}.{key}": table.clone() for key, table in view.tables().items()}
-        for owner, values in vars(self.task).items():
-            if isinstance(values, dict):
-                tensors = {key: value for key, value in values.items() if isinstance(value, Tensor)}
-                state |= {f"dict.{owner}.{key}": value.clone() for key, value in tensors.items()}
         state |= {f"randomizer.{name}": value for name, value in self._noise.state().items()}
         state["torch_random"] = torch.get_rng_state()
         return state
@@ -260,9 +256,6 @@ class OigeEnv(DirectEnv):
                 found = views.get(view)
                 if isinstance(found, ArticulationView):
                     found.tables()[key].copy_(value)
-            elif name.startswith("dict."):
-                owner, _, key = name.removeprefix("dict.").partition(".")
-                getattr(self.task, owner)[key] = value.clone()
             elif name.startswith("randomizer."):
                 continue
             elif name == "torch_random":

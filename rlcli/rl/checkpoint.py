@@ -181,7 +181,7 @@ class Checkpoint:
 
     def _shard(self, name: str, shard: Shard) -> dict[str, Tensor]:
         file = self.folder.parent / LOG_FOLDER / name / shard.file
-        columns = _tensors(_verified(file, shard.size, shard.sha256, memory() // 3), file)
+        columns = _tensors(_verified(file, shard.size, shard.sha256, min(_MOST_OF_A_SHARD, memory() // 3)), file)
         for column, values in columns.items():
             if values.shape[:1] != (shard.stop - shard.start,):
                 raise CheckpointError(f"{file} is corrupt: '{column}' has not the rows of its name")
@@ -259,6 +259,7 @@ _FILE = re.compile(r"[a-z][a-z0-9_]{0,63}(\.[0-9]{1,6})?\.(json|safetensors)", r
 _LOG = re.compile(r"[a-z][a-z0-9_]{0,63}", re.ASCII)
 _MOST_FILES = 4096
 _ROWS_AT_ONCE = 1000
+_MOST_OF_A_SHARD = 2**30
 _HEADER_LIMIT = 4 * 2**20
 _MOST_TENSORS = 20_000
 _MOST_DIMENSIONS = 16

@@ -60,6 +60,7 @@ class Saver:
         """Iteration and environment steps of the newest checkpoint."""
         self._keep, self._manifest = keep, dict(manifest)
         self._shards: dict[str, list[Shard]] = {} if resumed is None else dict(resumed.shards())
+        self._copied = {name: shards[-1].stop for name, shards in self._shards.items() if shards}
         self._thread: threading.Thread | None = None
         self._failure: BaseException | None = None
 
@@ -99,10 +100,10 @@ class Saver:
             self.wait()
 
     def _copy_new(self, name: str, rows: Rows) -> list[tuple[int, int, dict[str, Tensor]]]:
-        written = self._shards.get(name, [])
-        start = max(rows.first, written[-1].stop if written else 0)
+        start = max(rows.first, self._copied.get(name, 0))
         if start >= rows.stop:
             return []
+        self._copied[name] = rows.stop
         one = rows.read(start, start + 1)
         count = max(1, _SHARD_BYTES // max(1, sum(value.nbytes for value in one.values())))
         return [

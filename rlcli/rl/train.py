@@ -104,7 +104,7 @@ def fit(
             before, tried = divergences(), trials is not None and trials.due(trainer.iteration + 1)
             with boundaries.iteration(long=tried):
                 report = trainer.iterate()
-                trial = trials.run(trainer.policy()) if trials is not None and tried else {}
+                trial = trials.run(trainer.policy) if trials is not None and tried else {}
                 better = trials is not None and trials.improves(trial)
                 late = save_interval is None and boundaries.late()
                 diverged, overdue, best = peers.total(divergences() - before, late, better)

@@ -37,21 +37,24 @@ class Trials:
     ) -> None:
         self._make_env, self._episodes, self._interval = make_env, episodes, interval
         self._env: VecEnv | None = None
-        self._best = max(map(_score, history), default=_NONE)
+        best = max(history, key=_score, default={})  # the earliest of equals
+        self._best = _score(best)
+        self.best: int | None = best["step"] if self._best > _NONE else None
+        """Environment steps of the best iteration of the history."""
 
     def due(self, iteration: int) -> bool:
         """Whether the policy is tried after this iteration."""
         return iteration % self._interval == 0
 
-    def run(self, policy: Policy) -> dict[str, float]:
-        """Metrics of a trial."""
+    def run(self, policy: Callable[[], Policy]) -> dict[str, float]:
+        """Metrics of a trial of the policy as it is now."""
         rng, threads = rng_state(), torch.get_num_threads()
         torch.set_num_threads(1)
         try:
             if self._env is None:
                 self._env = self._make_env()
             torch.manual_seed(self._env.seed)  # of tasks that draw from torch
-            summary = evaluate(self._env, acting(self._env, policy), self._episodes).summary()
+            summary = evaluate(self._env, acting(self._env, policy()), self._episodes).summary()
         finally:
             load_rng_state(rng)
             torch.set_num_threads(threads)

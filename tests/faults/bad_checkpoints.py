@@ -244,6 +244,16 @@ def every(make):
     return lambda values: values.update({name: make(value) for name, value in values.items()})
 
 
+def written(slot, value):
+    """An attribute of the task with a value that is no tensor."""
+
+    def change(values):
+        data = json.dumps({slot: json.dumps(value)}).encode()
+        values["workflow.task.plain"] = torch.frombuffer(bytearray(data), dtype=torch.uint8)
+
+    return change
+
+
 def drop(prefix):
     def change(values):
         for name in [key for key in values if key.startswith(prefix)]:
@@ -521,10 +531,20 @@ def learners():
     for name, part, change in (
         ("temperature of two", "trainer", put("log_ent_coef", lambda v: torch.zeros(2))),
         ("temperature of NaN", "trainer", put("log_ent_coef", nan)),
-        ("a method of the task", "env", lambda v: v.update({"workflow.reset_idx": torch.zeros(8)})),
-        ("a class of the task", "env", lambda v: v.update({"workflow.__class__": torch.zeros(8)})),
-        ("a dictionary of the task", "env", lambda v: v.update({"workflow.__dict__": torch.zeros(8)})),
-        ("a buffer of one", "env", put("workflow.obs_buf", lambda v: v[:1].clone())),
+        ("a method of the task", "env", lambda v: v.update({"workflow.task.reset_idx": torch.zeros(8)})),
+        ("a class of the task", "env", lambda v: v.update({"workflow.task.__class__": torch.zeros(8)})),
+        ("a dictionary of the task", "env", lambda v: v.update({"workflow.task.__dict__": torch.zeros(8)})),
+        ("a buffer of one", "env", put("workflow.task.obs_buf", lambda v: v[:1].clone())),
+        ("the task's environment", "env", written("env", 3)),
+        ("a method as a value", "env", written("reset_idx", 3)),
+        ("the class of the task", "env", written("__class__.reset_idx", 3)),
+        ("names of a module", "env", written("reset_idx.__globals__", ["dict", []])),
+        ("names of its module", "env", written("__init__.__globals__", ["dict", [["os", 1]]])),
+        ("an attribute of the environment", "env", written("env.seed", 3)),
+        ("an object of numpy", "env", written("fresh", ["scalar", "O", 3])),
+        ("bytes of numpy", "env", written("fresh", ["scalar", "V1000000000000", 3])),
+        ("no kind of value", "env", written("fresh", ["exec", ["x"]])),
+        ("values of text", "env", lambda v: v.update({"workflow.task.plain": torch.zeros(5, dtype=torch.uint8)})),
     ):
         yield Case(f"{part}: {name}", tensors(part, change), RESUMED, "sac")
 
