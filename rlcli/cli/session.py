@@ -59,7 +59,8 @@ def open_session(
     run = folder = None
     if policy == "trained" or checkpoint is not None:
         name = None if task is None else find_task(task).name
-        run, folder, why = find_checkpoint(checkpoint or "latest", runs_dir or default_runs_dir(), name)
+        runs = runs_dir or default_runs_dir()
+        run, folder, why = find_checkpoint(checkpoint or "latest", runs, name, tell=console.warn)
         console.info(f"checkpoint {folder} ({why})")
         resolved = resolve_run(run, play=True, config_file=config, overrides=overrides, flags=values)
     else:

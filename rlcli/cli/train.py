@@ -143,6 +143,8 @@ class _Job:
     """The checkpoint folder to take weights from."""
     stages: list[int] = field(default_factory=list)
     """Iterations to save at, the last one to end at, instead of the agent's budget and what it keeps."""
+    config: str | None = None
+    """The configuration of a run that goes on, where its budget changes."""
     writes: bool = True
     """Whether this process writes the run."""
     begin: float = field(default_factory=time.monotonic)
@@ -287,7 +289,7 @@ def _created(
     loggers = check_loggers(logger)
     initial = None
     if init_from is not None:
-        _, initial, why = find_checkpoint(init_from, runs)
+        _, initial, why = find_checkpoint(init_from, runs, tell=console.warn)
         console.info(f"weights of {initial} ({why})")
     record |= {
         "task": resolved.source.record() | {"file": resolved.source.config.name},
@@ -308,12 +310,11 @@ def _resumed(
 ) -> _Job | None:
     """A run to go on with; None if there is nothing left to do."""
     from rlcli.config.dump import to_data, to_yaml
-    from rlcli.rl.files import write_atomic
     from rlcli.rl.load import resolve_run
     from rlcli.rl.loggers import check_loggers
     from rlcli.rl.run import find_checkpoint
 
-    run, folder, why = find_checkpoint(reference, runs, task)
+    run, folder, why = find_checkpoint(reference, runs, task, whole=True, tell=console.warn)
     if run.record.get("state") == "finished" and not budget:
         console.info(f"{run.folder} ({why}) is finished; --max-iterations N trains on")
         console.data(str(run.folder))
@@ -330,13 +331,11 @@ def _resumed(
 
         clean(run.checkpoints)
         saved = open_checkpoint(folder)
-        if budget:
-            write_atomic(run.config, to_yaml(to_data(resolved)))
     except BaseException:
         run.unlock()
         raise
     console.info(f"resuming {folder} ({why})")
-    return _Job(run, resolved, loggers, resume_from=saved)
+    return _Job(run, resolved, loggers, resume_from=saved, config=to_yaml(to_data(resolved)) if budget else None)
 
 
 def _train(job: _Job, device: str, stop: StopRequest) -> None:
@@ -380,6 +379,7 @@ def _build(job: _Job, device: str) -> Any:
     from rlcli.registry import load_object
     from rlcli.rl import distributed
     from rlcli.rl.checkpoint import open_checkpoint
+    from rlcli.rl.files import write_atomic
     from rlcli.rl.load import require_fit, require_same_policy, require_trainer
     from rlcli.rl.rng import seed_generators
     from rlcli.rl.saving import drop_after
@@ -387,14 +387,17 @@ def _build(job: _Job, device: str) -> Any:
     resolved, record = job.resolved, job.run.record
     assert resolved.trainer is not None
     assert resolved.agent is not None
-    peers = distributed.current()
+    peers, saved = distributed.current(), job.resume_from
+    state = None
+    if saved is not None:  # what a stranger's files hold shows before anything is built
+        require_trainer(saved, resolved.agent.trainer)
+        state = saved.state()
     seed_generators(peers.seed(derive(record["seed"], "task"), "task"))  # some tasks draw from them as they are built
     env = make_env(resolved, seed=peers.seed(record["seed"], "environments"), device=device)
     threads = int(record.get("torch_threads") or _threads(resolved)[1])
     make = load_object(resolved.trainer.trainer)
     trainer = make(env, resolved.agent, seed=record["seed"], device=device, torch_threads=threads)
-    saved = job.resume_from
-    if saved is None:
+    if saved is None or state is None:
         if job.init_from is not None:
             initial = open_checkpoint(job.init_from)
             require_fit(initial, env.layout)
@@ -403,16 +406,16 @@ def _build(job: _Job, device: str) -> Any:
         trainer.start()
         return trainer, env
     require_fit(saved, env.layout)
-    require_trainer(saved, resolved.agent.trainer)
-    state = saved.state()
     _take(saved, lambda: trainer.load(state), "it cannot be resumed")
-    if trainer.env_steps != saved.step:
+    if (trainer.iteration, trainer.env_steps) != (saved.iteration, saved.step):
         raise CheckpointError(f"{saved.folder} cannot be resumed: its manifest and its state name different steps")
     processes = state.values.get("processes", 1)
     if processes != peers.size:
         console.info(
             f"saved by {processes} processes, going on in {peers.size}: every environment begins a new episode"
         )
+    if job.config is not None:  # only now is it sure that the run goes on
+        write_atomic(job.run.config, job.config)
     dropped = drop_after(job.run.checkpoints, saved.step) if job.writes else []
     if dropped:
         console.info(f"removed {len(dropped)} later checkpoints: they are not what comes next")
@@ -420,11 +423,13 @@ def _build(job: _Job, device: str) -> Any:
 
 
 def _take(saved: Any, load: Any, failure: str) -> None:
-    from rlcli.errors import CheckpointError
+    from rlcli.errors import CheckpointError, RlcliError
 
     try:
         load()
-    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+    except RlcliError:
+        raise
+    except Exception as error:  # whatever a stranger's numbers lead to
         raise CheckpointError(f"{saved.folder}: {failure}: {' '.join(str(error).split())}") from error
 
 

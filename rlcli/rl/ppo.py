@@ -33,6 +33,7 @@ from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
 from rlcli.rl.trainer import Report, TrainerState
 from rlcli.sim.entity import is_finite
+from rlcli.sim.saved import require_alike
 
 _RECORDED = 256
 """Recent observations that a checkpoint keeps, for checking what is made of the policy later."""
@@ -523,6 +524,7 @@ class PpoTrainer:
         With another number of processes than then, everything that is learned goes on, in new episodes.
         """
         values, saved = state.values, state.tensors["trainer"]
+        require_alike(saved, self._learner(), "trainer")
         self.load_weights(state.tensors["policy"])
         with torch.no_grad():
             for name, value in self._learner().items():
@@ -538,6 +540,8 @@ class PpoTrainer:
         suffix = f".{self.peers.rank}" if self.peers.rank else ""
         self.statistics.load(values[f"statistics{suffix}"])
         env = state.tensors[f"env{suffix}"]
+        carried = {f"memory.{name}": value for name, value in self._memory.items()}
+        require_alike(env, {"begins": self._begins, **carried}, "env")
         self._begins.copy_(env["begins"])
         for name, memory in self._memory.items():
             memory.copy_(env[f"memory.{name}"])

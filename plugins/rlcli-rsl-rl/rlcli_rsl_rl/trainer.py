@@ -21,7 +21,7 @@ from rlcli.registry import load_object
 from rlcli.rl.policy import Policy, PolicySpec
 from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.statistics import EpisodeStatistics
-from rlcli.rl.trainer import Report, TrainerState
+from rlcli.rl.trainer import Report, TrainerState, require_slots
 from rlcli_rsl_rl.config import RunnerConfig
 
 NEEDED = "rsl-rl-lib>=5.5,<6"
@@ -410,4 +410,5 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tens
     for name, value in tensors.items():
         index, slot = name.split(".")
         state.setdefault(int(index), {})[slot] = value.clone()
+    require_slots(optimizer, state)
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
