@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import MachineError
-from rlcli.machine import read_plain
 
 
 def write_atomic(file: Path, content: bytes | str) -> None:
@@ -50,24 +49,6 @@ def sync_folder(folder: Path) -> None:
 def to_json(value: Any) -> str:
     """JSON with a final newline; numbers that are not finite are refused."""
     return json.dumps(value, indent=2, allow_nan=False) + "\n"
-
-
-def read_json(file: Path, most: int) -> Any:
-    """The JSON in a plain file of `most` bytes; no NaN, nothing nested beyond measure.
-
-    Raises:
-        OSError: if there is no such file, or it is larger.
-        ValueError: if it is not JSON.
-    """
-    data = read_plain(file, most)
-    try:
-        return json.loads(data, parse_constant=_refuse)
-    except (ValueError, RecursionError):
-        raise ValueError("not JSON") from None
-
-
-def _refuse(constant: str) -> Any:
-    raise ValueError(constant)
 
 
 def disk_error(path: Path, error: OSError) -> MachineError:

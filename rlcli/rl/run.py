@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import errno
 import os
-import platform
 import re
 import shutil
 import stat
-import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
-import rlcli
 from rlcli.errors import CheckpointError, MachineError, UsageError, did_you_mean, listing
-from rlcli.rl.files import disk_error, read_json, to_json, write_atomic
+from rlcli.rl.files import disk_error, to_json, write_atomic
+from rlcli.rl.reading import JSON_LIMIT, parse_json, read_file, refuse_links
 
 CONFIG = "config.yaml"
 RECORD = "run.json"
@@ -124,13 +121,15 @@ def open_run(folder: Path) -> Run:
     file = folder / RECORD
     try:
         require_inside(folder, file)
-        record = read_json(file, _MOST)
-    except FileNotFoundError:
+        record = parse_json(read_file(file, min(JSON_LIMIT, _MOST)), file)
+    except (FileNotFoundError, NotADirectoryError):
         raise CheckpointError(f"{folder} is not a run: it has no {RECORD}") from None
     except OSError as error:
         raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
-    except ValueError as error:
-        raise CheckpointError(f"{file} is corrupt: {error}") from None
+    refuse_links(folder)
+    for inner in ("checkpoints", "checkpoints/logs"):
+        if (folder / inner).is_dir():
+            refuse_links(folder / inner)
     _check(record, file)
     return Run(folder, record)
 
@@ -192,8 +191,24 @@ def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
     return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name))
 
 
-def find_checkpoint(reference: str, runs_dir: Path, task: str | None = None) -> tuple[Run, Path, str]:
+def find_checkpoint(
+    reference: str,
+    runs_dir: Path,
+    task: str | None = None,
+    *,
+    whole: bool = False,
+    tell: Callable[[str], None] = lambda _: None,
+) -> tuple[Run, Path, str]:
     """A checkpoint by `RUN`, `RUN@best`, `RUN@step:N`, `latest` or its folder; and why it was chosen.
+
+    Of a run that is named without a checkpoint it is the newest good one.
+
+    Args:
+        reference: what was named.
+        runs_dir: the folder of runs.
+        task: of which it must be.
+        whole: good is what can be resumed, not only what can be played.
+        tell: hears of checkpoints that were passed over, and why.
 
     Raises:
         CheckpointError: if there is none.
@@ -209,7 +224,7 @@ def find_checkpoint(reference: str, runs_dir: Path, task: str | None = None) -> 
     if not have:
         raise CheckpointError(f"{run.folder} has no complete checkpoint")
     if not which:
-        return run, run.checkpoints / f"{have[-1]:012d}", f"{why}, its newest checkpoint"
+        return run, *_newest_good(run, have, why, whole, tell)
     if which == "best":
         best = run.record.get("best")
         if best not in have:
@@ -241,20 +256,21 @@ def require_inside(folder: Path, file: Path) -> None:
         raise OSError(errno.ELOOP, "it is a link that leads elsewhere", str(file))
 
 
-def environment_record(engine_threads: int, torch_threads: int) -> dict[str, Any]:
-    """What results depend on besides the configuration."""
-    packages = ("mujoco", "torch", "numpy", "stable-baselines3", "safetensors")
-    return {
-        "rlcli": rlcli.__version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "machine": platform.machine(),
-        "versions": {name: metadata.version(name) for name in packages},
-        "engine_threads": engine_threads,
-        "torch_threads": torch_threads,
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "pid": os.getpid(),
-    }
+def _newest_good(run: Run, have: list[int], why: str, whole: bool, tell: Callable[[str], None]) -> tuple[Path, str]:
+    """The newest checkpoint that is in order; each that is passed over is told of."""
+    from rlcli.rl.checkpoint import open_checkpoint
+
+    for passed, step in enumerate(reversed(have)):
+        folder = run.checkpoints / f"{step:012d}"
+        try:
+            open_checkpoint(folder).verify(whole=whole)
+        except CheckpointError as error:
+            if passed == len(have) - 1:
+                raise
+            tell(f"checkpoint {folder.name} is passed over: {error.message}")
+            continue
+        return folder, f"{why}, its newest {'good ' if passed else ''}checkpoint"
+    raise AssertionError("a run without checkpoints is refused before")
 
 
 def default_runs_dir() -> Path:
