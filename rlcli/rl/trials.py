@@ -12,6 +12,8 @@ from rlcli.rl.rng import load_rng_state, rng_state
 from rlcli.rl.rollout import acting, evaluate
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from rlcli.envs.vec_env import VecEnv
     from rlcli.rl.policy import Policy
 
@@ -37,21 +39,28 @@ class Trials:
     ) -> None:
         self._make_env, self._episodes, self._interval = make_env, episodes, interval
         self._env: VecEnv | None = None
-        self._best = max(map(_score, history), default=_NONE)
+        self._fresh: Mapping[str, Tensor] = {}
+        best = max(history, key=_score, default={})
+        self._best = _score(best)
+        self.best_step: int | None = best["step"] if self._best > _NONE else None
+        """Environment steps of the best trial that `history` tells of."""
 
     def due(self, iteration: int) -> bool:
         """Whether the policy is tried after this iteration."""
         return iteration % self._interval == 0
 
-    def run(self, policy: Policy) -> dict[str, float]:
-        """Metrics of a trial."""
+    def run(self, policy: Callable[[], Policy]) -> dict[str, float]:
+        """Metrics of a trial of the policy that is made for it: making one draws weights."""
         rng, threads = rng_state(), torch.get_num_threads()
         torch.set_num_threads(1)
         try:
             if self._env is None:
                 self._env = self._make_env()
+                self._env.reset(seed=self._env.seed)
+                self._fresh = self._env.state_dict()
+            self._env.load_state_dict(self._fresh)  # a curriculum, too, is where it was
             torch.manual_seed(self._env.seed)  # of tasks that draw from torch
-            summary = evaluate(self._env, acting(self._env, policy), self._episodes).summary()
+            summary = evaluate(self._env, acting(self._env, policy()), self._episodes).summary()
         finally:
             load_rng_state(rng)
             torch.set_num_threads(threads)
