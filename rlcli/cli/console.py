@@ -117,7 +117,9 @@ def _write(stream: Any, text: str) -> None:
         return
     try:
         print(text, file=stream, flush=True)
-    except BrokenPipeError:
-        discard(stream)  # whoever read it is gone; what we do may still matter
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError) and stream is not sys.stderr:
+            raise
+        discard(stream)  # whoever read it is gone, or a log is full; what we do may still matter
     except UnicodeEncodeError:
         print(text.encode(stream.encoding, "backslashreplace").decode(stream.encoding), file=stream, flush=True)
