@@ -70,9 +70,13 @@ def warm_parent() -> Iterator[Callable[..., Child]]:
         return json.loads(server.stdout.readline())
 
     def child(
-        folder: Path, *arguments: object, faults: list[dict[str, Any]] | None = None, ignored: tuple[str, ...] = ()
+        folder: Path,
+        *arguments: object,
+        faults: list[dict[str, Any]] | None = None,
+        ignored: tuple[str, ...] = (),
+        output: Path | None = None,
     ) -> Child:
-        output = folder / f"child-{time.monotonic_ns()}"
+        output = output or folder / f"child-{time.monotonic_ns()}"
         start = {
             "arguments": [str(a) for a in arguments],
             "folder": str(folder),

@@ -6,9 +6,11 @@ error of the machine, every time from then on.
 
 import errno
 import os
+import pkgutil
 import re
 import signal
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -40,19 +42,23 @@ KILLED_AT = {
 """Where a process is killed."""
 
 
+_SLOW = 12
+
+
 def plant(
     kind: str, call: str, pattern: str, when: str = "before", nth: int = 1, code: str = "EIO", seconds: float = 0.0
 ) -> None:
     """Put a fault into this process.
 
     Args:
-        kind: kill, error (raise `code` from now on), short (write half, then `code`), or sleep.
-        call: mkdir, open, write, fsync, rename, replace, unlink, or a dotted Python name (called before).
+        kind: kill, error (raise `code` from now on), short (write half, then `code`), sleep, or slow (for the next
+            dozen times: add a dot to a file `slow`, and sleep).
+        call: mkdir, open, write, fsync, rename, replace, unlink, or `module:name` in Python.
         pattern: what the path must match; of two, "source -> target".
         when: before or after the call, or in the middle of what is written.
         nth: which time.
         code: name of the error.
-        seconds: how long to sleep.
+        seconds: to sleep.
     """
     expression, lock, count = re.compile(pattern), threading.Lock(), [0]
 
@@ -61,13 +67,18 @@ def plant(
             return False
         with lock:
             count[0] += 1
-            return count[0] == nth or (count[0] > nth and kind in ("error", "short"))
+            again = kind in ("error", "short") or (kind == "slow" and count[0] < nth + _SLOW)
+            return count[0] == nth or (count[0] > nth and again)
 
     def strike() -> None:
         if kind == "kill":
             os.kill(os.getpid(), signal.SIGKILL)
         elif kind == "sleep":
-            threading.Event().wait(seconds)
+            time.sleep(seconds)
+        elif kind == "slow":
+            with open("slow", "a") as marks:  # noqa: PTH123
+                marks.write(".")
+            time.sleep(seconds)
         else:
             number = getattr(errno, code)
             raise OSError(number, os.strerror(number))
@@ -78,11 +89,9 @@ def plant(
         _in_opens(due, strike)
     elif call in _OS_CALLS:
         _in_call(os, call, _OS_CALLS[call], due, strike, when)
-    elif "." in call:
-        import importlib
-
-        module, _, name = call.rpartition(".")
-        _in_call(importlib.import_module(module), name, lambda *_, **__: call, due, strike, when)
+    elif ":" in call:
+        owner, _, name = call.rpartition(".")
+        _in_call(pkgutil.resolve_name(owner), name, lambda *_, **__: call, due, strike, when)
     else:
         raise ValueError(call)
 
