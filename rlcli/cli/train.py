@@ -74,7 +74,7 @@ def command(
 ) -> None:
     """Train a policy."""
     from rlcli.config.load import resolve
-    from rlcli.errors import UsageError
+    from rlcli.errors import Stopped, UsageError
     from rlcli.registry import find_task
     from rlcli.rl import distributed
     from rlcli.rl.run import default_runs_dir
@@ -127,6 +127,8 @@ def command(
             job = _together(begin, resolved, budget, device)
             if job is not None:
                 _train(job, device, stop)
+        except KeyboardInterrupt:  # the second one, wherever it came
+            raise Stopped("stopped at once", exit_code=stop.exit_code) from None
         finally:
             distributed.leave()
 
