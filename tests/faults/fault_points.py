@@ -8,6 +8,7 @@ import errno
 import os
 import pkgutil
 import re
+import resource
 import signal
 import threading
 import time
@@ -51,8 +52,9 @@ def plant(
     """Put a fault into this process.
 
     Args:
-        kind: kill, error (raise `code` from now on), short (write half, then `code`), sleep, or slow (for the next
-            dozen times: add a dot to a file `slow`, and sleep).
+        kind: kill, error (raise `code` from now on), short (write half, then `code`), full (the file is /dev/full),
+            limit (files to `code` bytes), clock (moved by `code` seconds), sleep, or slow (for the next dozen times:
+            add a dot to a file `slow`, and sleep).
         call: mkdir, open, write, fsync, rename, replace, unlink, or `module:name` in Python.
         pattern: what the path must match; of two, "source -> target".
         when: before or after the call, or in the middle of what is written.
@@ -75,23 +77,31 @@ def plant(
             os.kill(os.getpid(), signal.SIGKILL)
         elif kind == "sleep":
             time.sleep(seconds)
+        elif kind == "limit":
+            resource.setrlimit(resource.RLIMIT_FSIZE, (int(code), int(code)))
+        elif kind == "clock":
+            real, shift = time.time, float(code)
+            time.time = lambda: real() + shift
         elif kind == "slow":
-            with open("slow", "a") as marks:  # noqa: PTH123
+            with open("slow", "a") as marks:
                 marks.write(".")
             time.sleep(seconds)
         else:
             number = getattr(errno, code)
             raise OSError(number, os.strerror(number))
 
-    if call == "write":
+    if kind == "full":
+        _onto_a_full_device(due)
+    elif call == "write":
         _in_writes(due, strike, halfway=kind == "short" or when == "middle")
     elif call == "open":
         _in_opens(due, strike)
     elif call in _OS_CALLS:
         _in_call(os, call, _OS_CALLS[call], due, strike, when)
     elif ":" in call:
-        owner, _, name = call.rpartition(".")
-        _in_call(pkgutil.resolve_name(owner), name, lambda *_, **__: call, due, strike, when)
+        module, _, place = call.partition(":")
+        owner, _, name = place.rpartition(".")
+        _in_call(pkgutil.resolve_name(f"{module}:{owner}"), name, lambda *_, **__: call, due, strike, when)
     else:
         raise ValueError(call)
 
@@ -124,6 +134,16 @@ def _in_call(
         return result
 
     setattr(owner, name, call)
+
+
+def _onto_a_full_device(due: Callable[[str], bool]) -> None:
+    real = Path.open
+
+    def call(self: Path, mode: str = "r", *arguments: Any, **named: Any) -> Any:
+        target = Path("/dev/full") if mode == "a" and due(str(self)) else self
+        return real(target, mode, *arguments, **named)
+
+    Path.open = call  # type: ignore[method-assign,assignment]
 
 
 def _in_opens(due: Callable[[str], bool], strike: Callable[[], None]) -> None:
