@@ -10,10 +10,11 @@ import time
 from pathlib import Path
 
 import pytest
-import rlcli_tasks.cartpole
 from children import SMALL, warm_parent
 from fault_sizes import chosen
 from run_comparison import assert_same_run, newest
+
+import rlcli_tasks.cartpole
 
 SHORT = ("episode_length_s=0.3", "agent.n_steps=64", "agent.n_epochs=10", "agent.policy.hidden=[8]", "--logger", "none")
 TRAIN = ("cartpole", *SMALL, *SHORT, "--max-iterations", 4, "--seed", 5)
