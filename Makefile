@@ -34,7 +34,8 @@ test: $(VENV)/.dev
 	$(BIN)/python -m pytest -m 'not slow' -n 2 tests
 
 test-all: $(VENV)/.dev
-	RLCLI_TEST_SIZE=full $(BIN)/python -m pytest -n 2 tests
+	RLCLI_TEST_SIZE=full $(BIN)/python -m pytest -n 2 --cov --cov-report=json:.coverage.json tests
+	$(BIN)/python tests/coverage_gate.py .coverage.json
 
 # Kills, faults of the machine, signals, divergence, hostile files, exact resume: all cases, and what a night is for.
 test-faults: $(VENV)/.dev
@@ -53,4 +54,4 @@ bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/train.py
 
 clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache
+	rm -rf $(VENV) .coverage* .pytest_cache .ruff_cache

@@ -13,9 +13,11 @@ from rlcli.config.schema import StrictModel, TaskConfig
 from rlcli.envs.articulation import ArticulationView
 from rlcli.envs.vec_env import Layout, TermLayout, VecEnv
 from rlcli.errors import ConfigError, RlcliError, TaskError
+from rlcli.managers.memory import Memory
 from rlcli.managers.termination import DIVERGED
 from rlcli.random import stream
 from rlcli.registry import load_object
+from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import Scene
 from rlcli.sim.selection import IdSelection, Selection
 
@@ -166,7 +168,11 @@ class DirectEnv(VecEnv):
         self._observed = False
         self._settled = False  # a loaded state holds its second look already
         self._causes: dict[str, Tensor] = {}
+        self._observation_columns = [f"obs_buf[{i}]" for i in range(task.num_observations)]
+        if len(task.observation_names) == task.num_observations:
+            self._observation_columns = list(task.observation_names)
         task.post_reset()
+        self._memory = Memory(task, other=("env", "cfg", "params"))
 
     def _layout(self) -> Layout:
         task = self.task
@@ -192,7 +198,7 @@ class DirectEnv(VecEnv):
         """The task."""
         return [self.task]
 
-    def extras(self) -> dict[str, float]:
+    def _extras(self) -> dict[str, float]:
         """The task's `extras`: numbers, and means of tensors."""
         found = {}
         for name, value in self.task.extras.items():
@@ -226,13 +232,23 @@ class DirectEnv(VecEnv):
             failed = failed | diverged
             if self.config.divergence_reward is not None:
                 reward.masked_fill_(diverged, self.config.divergence_reward)
-        self._returns += reward
+        self._pay(reward, diverged)
         self._observed = True
         return reward, failed, truncated
+
+    def _pay(self, reward: Tensor, diverged: Tensor | None) -> None:
+        """Add a step's reward to the returns; where the simulation diverged, one that is not finite is none."""
+        if diverged is not None and not self.engine.asynchronous:
+            reward.masked_fill_(diverged & ~reward.isfinite(), 0.0)
+        self._require_finite(reward, "the reward")
+        self._returns += reward
 
     def _final(self) -> dict[str, Tensor]:
         self._final_obs.copy_(self.task.obs_buf)
         self._final_states.copy_(self.task.states_buf)
+        self._require_finite(self._final_obs, "the last observation", self._observation_columns)
+        if self.task.num_states:
+            self._require_finite(self._final_states, "the last state (states_buf)")
         return self._group(self._final_obs, self._final_states)
 
     def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
@@ -267,7 +283,9 @@ class DirectEnv(VecEnv):
             task.obs_buf.copy_(torch.where(fresh, task.obs_buf, obs, out=obs))
             task.states_buf.copy_(torch.where(fresh, task.states_buf, states, out=states))
         self._observed, self._settled = False, False
-        self._require_finite(obs, "the observation")
+        self._require_finite(obs, "the observation", self._observation_columns)
+        if task.num_states:
+            self._require_finite(states, "the state (states_buf)")
         return self._group(obs, states)
 
     def _fill(self) -> None:
@@ -294,24 +312,28 @@ class DirectEnv(VecEnv):
             self._reset_hook(stale)
             self.episode_length_buf[stale] = 0
 
+    def unsaved(self) -> list[str]:
+        """What the task keeps that cannot be saved."""
+        return self._memory.unsaved()
+
     def _workflow_state(self) -> dict[str, Tensor]:
-        task = self.task
-        buffers = {
-            name: value.clone()
-            for name, value in vars(task).items()
-            if isinstance(value, Tensor) and value.dim() and value.shape[0] == self.num_envs
-        }
-        return {**buffers, "_returns": self._returns.clone(), "_fresh": self._fresh.clone()}
+        own = {"_returns": self._returns.clone(), "_fresh": self._fresh.clone()}
+        return {**own, **{f"task.{name}": value for name, value in self._memory.state_dict().items()}}
 
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
-        for name, value in state.items():
-            owner: Any = self if name in ("_returns", "_fresh") else self.task
-            target = getattr(owner, name, None)
-            if isinstance(target, Tensor) and target.shape == value.shape:
-                target.copy_(value)  # views of it stay valid
-            else:
-                setattr(owner, name, value.clone())  # the task makes it in a step
+        own = {
+            f"task.{name}": value for name in _BUFFERS if isinstance(value := getattr(self.task, name, None), Tensor)
+        }
+        require_alike(state, {**own, "_returns": self._returns, "_fresh": self._fresh}, "env: workflow")
+        self._returns.copy_(state["_returns"])
+        self._fresh.copy_(state["_fresh"])
+        task = {name.removeprefix("task."): value for name, value in state.items() if name.startswith("task.")}
+        self._memory.load_state_dict(task)
         self._observed, self._settled = True, True
+
+
+_BUFFERS = ("obs_buf", "states_buf", "rew_buf", "reset_buf", "progress_buf")
+"""What the loop reads of a task; what else it keeps may be of another shape tomorrow."""
 
 
 def _around_zero(bound: float | None) -> tuple[float, float] | None:

@@ -24,6 +24,7 @@ from rlcli.managers.reward import RewardManager
 from rlcli.managers.term import BoundTerm
 from rlcli.managers.termination import TerminationManager
 from rlcli.sim.engine import add_body_forces
+from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import ActuatorNeed, Scene
 from rlcli.sim.selection import Selection
 
@@ -125,7 +126,9 @@ class ManagedEnv(VecEnv):
 
     def _judge(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         terminated, truncated = self.termination_manager.compute(diverged)
-        reward = self.reward_manager.compute()
+        reward = self.reward_manager.compute(diverged)
+        self._require_finite(reward, "the reward")
+        self.reward_manager.add_up()
         if diverged is not None:
             self.reward_manager.replace_diverged(diverged, reward)
         self.command_manager.measure()
@@ -188,7 +191,7 @@ class ManagedEnv(VecEnv):
     def _observe_again(self) -> dict[str, Tensor]:
         return self.observation_manager.again()
 
-    def extras(self) -> dict[str, float]:
+    def _extras(self) -> dict[str, float]:
         """What the curriculum's terms gave last."""
         return self.curriculum_manager.values()
 
@@ -201,7 +204,10 @@ class ManagedEnv(VecEnv):
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
         for name, part in self._parts().items():
             prefix = f"{name}."
-            part.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+            saved = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+            if not (isinstance(part, BoundTerm) and part.memory):  # an author's own tensors may come and go
+                require_alike(saved, part.state_dict(), f"env: workflow.{name}")
+            part.load_state_dict(saved)
 
     def _parts(self) -> dict[str, Any]:
         parts: dict[str, Any] = {
@@ -225,7 +231,12 @@ class ManagedEnv(VecEnv):
                 for pipeline in self.observation_manager.pipelines(group)
             ),
         ]
-        return {**parts, **{"term." + ".".join(map(str, t.path)): t for t in terms if t.state_dict()}}
+        return {**parts, **{"term." + ".".join(map(str, t.path)): t for t in terms}}
+
+    def unsaved(self) -> list[str]:
+        """What class terms keep that cannot be saved."""
+        memories = [part.memory for part in self._parts().values() if isinstance(part, BoundTerm) and part.memory]
+        return [what for memory in memories for what in memory.unsaved()]
 
     def _judging_terms(self) -> Iterator[Any]:
         """The functions and classes behind observations, rewards, terminations and success, before they are bound."""

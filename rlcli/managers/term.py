@@ -17,6 +17,7 @@ from rlcli.config.strict_yaml import Path
 from rlcli.config.terms import SELECTORS, Signature
 from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
 from rlcli.managers.live import LiveValues
+from rlcli.managers.memory import Memory
 from rlcli.random import stream
 from rlcli.registry import load_module
 from rlcli.sim.names import NameProblem
@@ -42,6 +43,8 @@ class BoundTerm:
     """Selector parameter -> the names it resolved to."""
     stream: np.uint64
     """The term's random stream."""
+    memory: Memory | None = None
+    """What a class term of a task's own carries from step to step, if it does not say so itself."""
 
     @property
     def instance(self) -> Any:
@@ -59,12 +62,17 @@ class BoundTerm:
 
     def state_dict(self) -> dict[str, Tensor]:
         """What a term with memory carries from step to step."""
-        return self.call.state_dict() if hasattr(self.call, "state_dict") else {}
+        if hasattr(self.call, "state_dict"):
+            state: dict[str, Tensor] = self.call.state_dict()
+            return state
+        return {} if self.memory is None else self.memory.state_dict()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take back what `state_dict` gave."""
         if hasattr(self.call, "load_state_dict"):
             self.call.load_state_dict(state)
+        elif self.memory is not None:
+            self.memory.load_state_dict(state)
 
 
 class Binder:
@@ -92,7 +100,9 @@ class Binder:
             self.problems.append(self.resolved.problem(path, str(problem), getattr(problem, "hint", None)))
             return None
         name = str(path[-1])
-        return BoundTerm(name, path, config, call, elements, stream(".".join(str(step) for step in path)))
+        own = signature.is_class and not hasattr(call, "state_dict") and not type(call).__module__.startswith("rlcli.")
+        memory = Memory(call) if own else None
+        return BoundTerm(name, path, config, call, elements, stream(".".join(str(step) for step in path)), memory)
 
     def bind_all(self, section: str) -> list[BoundTerm]:
         """The terms of a section, in order."""

@@ -63,6 +63,7 @@ class Saver:
         """The same of the newest one on the disk."""
         self._keep, self._manifest = keep, dict(manifest)
         self._shards: dict[str, list[Shard]] = {} if resumed is None else dict(resumed.shards())
+        self._copied = {name: shards[-1].stop for name, shards in self._shards.items() if shards}
         self._thread: threading.Thread | None = None
         self._failure: BaseException | None = None
 
@@ -102,10 +103,10 @@ class Saver:
             self.wait()
 
     def _copy_new(self, name: str, rows: Rows) -> list[tuple[int, int, dict[str, Tensor]]]:
-        written = self._shards.get(name, [])
-        start = max(rows.first, written[-1].stop if written else 0)
+        start = max(rows.first, self._copied.get(name, 0))
         if start >= rows.stop:
             return []
+        self._copied[name] = rows.stop
         one = rows.read(start, start + 1)
         count = max(1, _SHARD_BYTES // max(1, sum(value.nbytes for value in one.values())))
         return [
@@ -256,5 +257,5 @@ def _remove(folder: Path) -> None:
 def _iteration(folder: Path) -> int:
     try:
         return int(json.loads((folder / "manifest.json").read_bytes())["iteration"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return 0  # a multiple of everything: it stays

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from rlcli.rl.rng import load_rng_state, rng_state
+from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.rollout import acting, evaluate
 
 if TYPE_CHECKING:
@@ -40,10 +40,10 @@ class Trials:
         self._make_env, self._episodes, self._interval = make_env, episodes, interval
         self._env: VecEnv | None = None
         self._fresh: Mapping[str, Tensor] = {}
-        best = max(history, key=_score, default={})
+        best = max(history, key=_score, default={})  # the earliest of equals
         self._best = _score(best)
-        self.best_step: int | None = best["step"] if self._best > _NONE else None
-        """Environment steps of the best trial that `history` tells of."""
+        self.best: int | None = best["step"] if self._best > _NONE else None
+        """Environment steps of the best iteration of the history."""
 
     def due(self, iteration: int) -> bool:
         """Whether the policy is tried after this iteration."""
@@ -55,11 +55,12 @@ class Trials:
         torch.set_num_threads(1)
         try:
             if self._env is None:
+                seed_generators(0)  # whenever it is built, of tasks that draw as they are
                 self._env = self._make_env()
                 self._env.reset(seed=self._env.seed)
                 self._fresh = self._env.state_dict()
             self._env.load_state_dict(self._fresh)  # a curriculum, too, is where it was
-            torch.manual_seed(self._env.seed)  # of tasks that draw from torch
+            seed_generators(self._env.seed)
             summary = evaluate(self._env, acting(self._env, policy()), self._episodes).summary()
         finally:
             load_rng_state(rng)

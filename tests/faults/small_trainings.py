@@ -158,7 +158,7 @@ def train(
     if eval_interval is not None:
         history = read_metrics(record.metrics)
         trials = Trials(lambda: make_env(resolved, seed=77), 3, eval_interval, history)
-        saver.best = trials.best_step
+        saver.best = trials.best
     stop = StopRequest(can_interrupt=True)
     env.before_step = _stopper(stop, trainer, within)
 

@@ -381,6 +381,7 @@ def test_a_sac_run_is_evaluated_with_its_own_deviation(tmp_path, sac_task, capsy
 @pytest.mark.slow
 def test_oiges_numbers_learn_to_balance(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run = rlcli(capsys, "train", "cartpole-direct", "--agent", "rl-games", "--logger", "none", "-q").out.strip()
+    words = ("--agent", "rl-games", "--seed", 0, "--logger", "none", "-q")
+    run = rlcli(capsys, "train", "cartpole-direct", *words).out.strip()
     done = rlcli(capsys, "eval", "cartpole-direct", "--checkpoint", run, "--episodes", 200, "--json").out
     assert json.loads(done)["success"]["rate"] > 0.9
