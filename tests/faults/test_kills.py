@@ -52,9 +52,12 @@ RESUMING = [
     "in the middle of TensorBoard's cut", "after TensorBoard's cut",
 ]  # fmt: skip
 ROWS = ["in the middle of replay rows", "before replay rows have their name"]
-WRITING = [point for point in KILLED_AT if point not in (*RESUMING, *ROWS)]
+RECORD = ["before run.json", "in the middle of run.json"]
+WRITING = [point for point in KILLED_AT if point not in (*RESUMING, *ROWS, *RECORD)]
 NAMED = [
     *((point, nth, name) for point in WRITING for nth, name in ((1, "sb3-ppo"), (4, "sac"), (3, "ppo"))),
+    # its first time the run begins to be one
+    *((point, nth, name) for point in RECORD for nth, name in ((2, "sb3-ppo"), (4, "sb3-ppo"), (3, "sac"))),
     *((point, nth, "sac") for point in ROWS for nth in (1, 3, 5)),
     *((point, 1, name) for point in RESUMING for name in ("sb3-ppo", "sac")),
 ]
