@@ -29,6 +29,9 @@ class Console:
     follows: bool = False
     """Another process of the same run says what there is to say; only what is wrong with this one is said here."""
 
+    owns_process: bool = False
+    """Whether the process was started for the command and ends with it."""
+
     out: Any = None
     """Where the JSON document goes; None is stdout."""
 

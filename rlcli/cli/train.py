@@ -94,7 +94,7 @@ def command(
         "--init-from": init_from,
         "--name": name,
     }
-    resolved, stop = None, StopRequest()
+    resolved, stop = None, StopRequest(ends_process=console.owns_process)
     if resume is not None:
         _refuse_changes([task, *(overrides or [])], fixed)
     elif task is None:

@@ -137,7 +137,8 @@ class Saver:
             data = safetensors.torch.save({column: value.contiguous() for column, value in columns.items()})
             shard = Shard(start, stop, len(data), sha256(data))
             try:
-                folder.mkdir(parents=True, exist_ok=True)
+                for own in (folder.parent, folder):  # not what they lie in: a run that has vanished is not made again
+                    own.mkdir(exist_ok=True)
             except OSError as error:
                 raise disk_error(folder, error) from error
             write_atomic(folder / shard.file, data)

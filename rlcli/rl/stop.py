@@ -32,6 +32,8 @@ class StopRequest:
     signal: int | None = None
     can_interrupt: bool = False
     """Whether an iteration may be left in the middle."""
+    ends_process: bool = False
+    """Whether nothing comes after it: once it was asked to stop, a further signal would only spoil the exit code."""
     _prompt: bool = False
     _previous: dict[int, Any] = field(default_factory=dict)
 
@@ -85,8 +87,9 @@ class StopRequest:
         return self
 
     def __exit__(self, *_: object) -> None:
+        over = self.ends_process and self.signal is not None
         for number, handler in self._previous.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_IGN if over else handler)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
         if self.signal is not None:

@@ -78,7 +78,7 @@ def live(arguments: list[str], folder: str, output: str, faults: list[dict[str, 
     from rlcli.cli.app import main
 
     sys.argv = ["rlcli", *arguments]
-    sys.exit(main(arguments))
+    sys.exit(main())
 
 
 if __name__ == "__main__":
