@@ -32,6 +32,19 @@ def core_quota(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/se
     return min((quota for quota in quotas if quota is not None), default=None)
 
 
+def memory(report: Path = Path("/proc/meminfo")) -> int:
+    """Bytes of memory that this process may still ask for, as far as the system says; else half of what there is."""
+    try:
+        lines = report.read_text(encoding="utf-8").splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, ValueError, StopIteration, IndexError):
+        pass
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    except (AttributeError, OSError, ValueError):
+        return 8 * 2**30
+
+
 def _quota(group: Path) -> float | None:
     try:
         if (group / "cpu.max").is_file():

@@ -69,7 +69,7 @@ class Console:
         """Something the user should know, but that stops nothing."""
         if self.follows:
             return
-        _write(sys.stderr, f"warning: {text}")
+        _write(sys.stderr, f"warning: {_harmless(text)}")
 
     def error(self, kind: str, code: int, message: str, hint: str | None, problems: list[dict[str, Any]]) -> None:
         """Why the command failed."""
@@ -80,9 +80,9 @@ class Console:
             with contextlib.suppress(OSError):  # stdout may be what failed
                 _write(self.out or sys.stdout, json.dumps({"schema": SCHEMA_VERSION, "error": error}, indent=2))
         lines = message.splitlines() or [""]
-        _write(sys.stderr, "\n".join(f"error: {line}" for line in lines))
+        _write(sys.stderr, "\n".join(f"error: {_harmless(line)}" for line in lines))
         if hint:
-            _write(sys.stderr, f"hint: {hint}")
+            _write(sys.stderr, f"hint: {_harmless(hint)}")
 
     def table(self, columns: list[str], rows: list[list[str]], title: str | None = None) -> None:
         """A table on stdout; plain columns where stdout is not a terminal."""
@@ -110,6 +110,11 @@ def discard(stream: Any) -> None:
     """Write nothing more to a stream that cannot be written, at exit either."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _harmless(text: str) -> str:
+    """What a stranger's file may have said, without the characters that command a terminal."""
+    return "".join(c if c.isprintable() or c in "\n\t" else repr(c)[1:-1] for c in text)
 
 
 def _write(stream: Any, text: str) -> None:

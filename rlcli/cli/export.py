@@ -72,5 +72,5 @@ def _find(reference: str, runs_dir: Path, task: str | None) -> tuple[Path, Path 
         task = Path(task).resolve().name if is_folder else task.rpartition(":")[2]
         if reference == "latest" and not is_folder and not list_runs(runs_dir, task):
             find_entry(TASKS, given, what="task")  # no run of it: if it is no task either, that is what to say
-    found, folder, why = find_checkpoint(reference, runs_dir, task)
+    found, folder, why = find_checkpoint(reference, runs_dir, task, tell=console.warn)
     return folder, found.folder, why

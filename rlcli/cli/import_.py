@@ -1,19 +1,20 @@
-"""`rlcli import FORM FILE...`: a task of another tool as files of rlcli's own, each key of the source accounted for."""
+"""`rlcli import FORM FILE...`: a task or a policy of another tool in rlcli's own form."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Debug, Json
+from rlcli.cli.options import Agent, Debug, Json, RunsDir
 
 if TYPE_CHECKING:
     from rlcli.config.imported import Imported
+    from rlcli.config.load import Resolved
 
-app = typer.Typer(no_args_is_help=True, help="Bring a task of another tool over.")
+app = typer.Typer(no_args_is_help=True, help="Bring a task or a policy of another tool over.")
 
 Output = Annotated[
     Path | None, typer.Option("--output", "-o", help="Folder to write; a new one named after the task if left out.")
@@ -56,6 +57,100 @@ def isaaclab(
         if not file or not Path(file).is_file():
             raise UsageError(f"--model {name}={file}: there is no such file", hint="--model robot=robot.xml")
     _tell("isaaclab", convert(env, agent, output or Path("imported"), models))
+
+
+TaskOption = Annotated[str, typer.Option("--task", help="The task that it is a policy for.")]
+Activation = Annotated[
+    str | None,
+    typer.Option("--activation", help="elu, relu, tanh or silu: of the hidden layers; weights do not tell."),
+]
+Bound = Annotated[float | None, typer.Option("--action-bound", help="Its actions lay within +-this.")]
+RunName = Annotated[str | None, typer.Option("--name", help="Part of the run folder's name.")]
+
+
+@app.command("sb3")
+def sb3(
+    file: Annotated[Path, typer.Argument(metavar="FILE.zip", help="What model.save of Stable-Baselines3 wrote.")],
+    task: TaskOption,
+    agent: Agent = None,
+    activation: Activation = None,
+    action_bound: Bound = None,
+    normalizer: Annotated[
+        Path | None,
+        typer.Option("--normalizer", metavar="FILE.safetensors", help="mean and var of its VecNormalize."),
+    ] = None,
+    runs_dir: RunsDir = None,
+    name: RunName = None,
+    json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Import the policy of a PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3 as a run; nothing is unpickled."""
+    _check_policy(activation, action_bound)
+    resolved = _resolved(task, agent)
+    from rlcli.rl.foreign import read_sb3
+
+    bound = 1.0 if action_bound is None else action_bound
+    foreign = read_sb3(file, activation=activation, action_bound=bound, normalizer=normalizer)
+    _as_run("sb3", file, foreign, resolved, runs_dir, name)
+
+
+@app.command("rsl-rl")
+def rsl_rl(
+    file: Annotated[Path, typer.Argument(metavar="FILE.pt", help="model_N.pt of RSL-RL.")],
+    task: TaskOption,
+    agent: Agent = None,
+    activation: Activation = None,
+    action_bound: Bound = None,
+    runs_dir: RunsDir = None,
+    name: RunName = None,
+    json: Json = False,
+    debug: Debug = False,
+) -> None:
+    """Import the policy of a checkpoint of RSL-RL as a run; nothing is unpickled."""
+    _check_policy(activation, action_bound)
+    resolved = _resolved(task, agent)
+    from rlcli.rl.foreign import read_rsl_rl
+
+    foreign = read_rsl_rl(file, activation=activation, action_bound=action_bound)
+    _as_run("rsl-rl", file, foreign, resolved, runs_dir, name)
+
+
+def _check_policy(activation: str | None, action_bound: float | None) -> None:
+    from rlcli.errors import UsageError, did_you_mean
+
+    known = ("elu", "relu", "tanh", "silu")
+    if activation is not None and activation not in known:
+        hint = did_you_mean(activation, known) or f"activations: {', '.join(known)}"
+        raise UsageError(f"no activation '{activation}'", hint=hint)
+    if action_bound is not None and not 0.0 < action_bound < float("inf"):
+        raise UsageError(f"--action-bound {action_bound} is no bound", hint="a number above 0")
+
+
+def _resolved(task: str, agent: str | None) -> Resolved:
+    from rlcli.config.load import resolve
+    from rlcli.registry import find_task
+
+    resolved = resolve(find_task(task), agent=agent, device="cpu")
+    resolved.require_agent()
+    return resolved
+
+
+def _as_run(form: str, file: Path, foreign: Any, resolved: Resolved, runs_dir: Path | None, name: str | None) -> None:
+    from rlcli.rl.foreign import as_run
+    from rlcli.rl.run import default_runs_dir
+
+    record = {"imported": {"form": form, "file": file.name, "algorithm": foreign.algorithm}}
+    run = as_run(foreign, resolved, record, runs_dir or default_runs_dir(), name)
+    spec = foreign.spec
+    hidden = " x ".join(map(str, spec["hidden"])) or "none"
+    bound = "unbounded" if spec["action_bound"] is None else f"within +-{spec['action_bound']:g}"
+    console.info(
+        f"{form} {foreign.algorithm}: {spec['observation_size']} observations, hidden layers {hidden}"
+        f" ({spec['activation']}), {spec['action_size']} actions {bound}"
+    )
+    console.info(f"next: rlcli play --checkpoint {run}, or rlcli train {resolved.source.name} --init-from {run}")
+    console.data(str(run))
+    console.document("import", form=form, run=str(run), algorithm=foreign.algorithm, policy=spec)
 
 
 def _tell(form: str, imported: Imported) -> None:

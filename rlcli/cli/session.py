@@ -59,7 +59,8 @@ def open_session(
     run = folder = None
     if policy == "trained" or checkpoint is not None:
         name = None if task is None else find_task(task).name
-        run, folder, why = find_checkpoint(checkpoint or "latest", runs_dir or default_runs_dir(), name)
+        runs = runs_dir or default_runs_dir()
+        run, folder, why = find_checkpoint(checkpoint or "latest", runs, name, tell=console.warn)
         console.info(f"checkpoint {folder} ({why})")
         resolved = resolve_run(run, play=True, config_file=config, overrides=overrides, flags=values)
     else:
@@ -82,6 +83,7 @@ def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic
     from rlcli.random import derive
     from rlcli.rl.checkpoint import open_checkpoint
     from rlcli.rl.load import policy_of, require_fit
+    from rlcli.rl.rng import seed_generators
     from rlcli.rl.rollout import acting, random_policy, zero_policy
 
     torch.set_num_threads(1)
@@ -91,6 +93,7 @@ def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic
         checkpoint = open_checkpoint(folder)
         trained = policy_of(checkpoint)
     # evaluation sees other episodes than training did
+    seed_generators(derive(seed, "task"))  # some tasks draw from them
     env = make_env(resolved, seed=derive(seed, "evaluation"))
     if checkpoint is not None and trained is not None:
         require_fit(checkpoint, env.layout)

@@ -17,6 +17,7 @@ from rlcli.managers.memory import Memory
 from rlcli.managers.termination import DIVERGED
 from rlcli.random import stream
 from rlcli.registry import load_object
+from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import Scene
 from rlcli.sim.selection import IdSelection, Selection
 
@@ -320,11 +321,19 @@ class DirectEnv(VecEnv):
         return {**own, **{f"task.{name}": value for name, value in self._memory.state_dict().items()}}
 
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
+        own = {
+            f"task.{name}": value for name in _BUFFERS if isinstance(value := getattr(self.task, name, None), Tensor)
+        }
+        require_alike(state, {**own, "_returns": self._returns, "_fresh": self._fresh}, "env: workflow")
         self._returns.copy_(state["_returns"])
         self._fresh.copy_(state["_fresh"])
         task = {name.removeprefix("task."): value for name, value in state.items() if name.startswith("task.")}
         self._memory.load_state_dict(task)
         self._observed, self._settled = True, True
+
+
+_BUFFERS = ("obs_buf", "states_buf", "rew_buf", "reset_buf", "progress_buf")
+"""What the loop reads of a task; what else it keeps may be of another shape tomorrow."""
 
 
 def _around_zero(bound: float | None) -> tuple[float, float] | None:

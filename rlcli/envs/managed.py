@@ -24,6 +24,7 @@ from rlcli.managers.reward import RewardManager
 from rlcli.managers.term import BoundTerm
 from rlcli.managers.termination import TerminationManager
 from rlcli.sim.engine import add_body_forces
+from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import ActuatorNeed, Scene
 from rlcli.sim.selection import Selection
 
@@ -203,7 +204,10 @@ class ManagedEnv(VecEnv):
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
         for name, part in self._parts().items():
             prefix = f"{name}."
-            part.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+            saved = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+            if not (isinstance(part, BoundTerm) and part.memory):  # an author's own tensors may come and go
+                require_alike(saved, part.state_dict(), f"env: workflow.{name}")
+            part.load_state_dict(saved)
 
     def _parts(self) -> dict[str, Any]:
         parts: dict[str, Any] = {

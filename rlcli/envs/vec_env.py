@@ -30,6 +30,7 @@ from rlcli.sim.entity import Entity, SimData, is_finite
 from rlcli.sim.guard import LIMIT, SHOWN, Divergence, StateLayout
 from rlcli.sim.names import NameProblem
 from rlcli.sim.rotations import rotate_inverse
+from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import Scene
 from rlcli.sim.selection import Selection
 from rlcli.sim.sensors import ContactSensor, RaySensor, make_sensors
@@ -403,7 +404,14 @@ class VecEnv(ABC):
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Take back what `state_dict` gave; returns the observations of that moment."""
+        """Take back what `state_dict` gave; returns the observations of that moment.
+
+        Raises:
+            KeyError: if something is missing.
+            ValueError: if something is of another shape or type: what was saved of other environments.
+        """
+        require_alike(state, {k: v for k, v in self.state_dict().items() if not k.startswith("workflow.")}, "env")
+        self._require_no_selectors(state)
         self.episode_length_buf.copy_(state["episode_length"])
         self.episode_index.copy_(state["episode_index"])
         self._steps.copy_(state["common_step"])
@@ -422,6 +430,13 @@ class VecEnv(ABC):
             sensor.load_state_dict(_below(state, f"sensors.{name}."))
         self._load_workflow_state(_below(state, "workflow."))
         return self._observe_again()
+
+    def _require_no_selectors(self, state: Mapping[str, Tensor]) -> None:
+        """Integers of a model say which body hangs on which: only those that the task itself changes are taken."""
+        for name, value in state.items():
+            field = name.removeprefix("engine.model.")
+            if field != name and not value.is_floating_point() and self.engine.expanded(field) is None:
+                raise ValueError(f"env: '{name}' differs between environments, which the task does not ask for")
 
     # --- the workflow's part ---
 

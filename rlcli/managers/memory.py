@@ -94,12 +94,17 @@ class Memory:
                 yield slot, json.dumps(_written(value))
 
     def _holder(self, slot: str) -> tuple[Any, str]:
+        """What a slot is an attribute of: only what is found there may be written to, whoever wrote the file."""
         *path, name = slot.split(".")
         holder = self._owner
         for step in path:
-            holder = getattr(holder, step, None)
-        if holder is None:
-            raise ValueError(f"'{slot}' has no place in {type(self._owner).__name__}")
+            holder = vars(holder).get(step)
+            if not _is_helper(holder):
+                raise ValueError(f"'{slot}' has no place in {type(self._owner).__name__}")
+        usual = getattr(type(holder), name, None)  # a method or a property is no memory
+        allowed = name.isidentifier() and not name.startswith("__") and (bool(path) or name not in self._other)
+        if not allowed or not _may_be_memory(usual) or not _may_be_memory(vars(holder).get(name)):
+            raise ValueError(f"'{slot}' is nothing that {type(self._owner).__name__} remembers")
         return holder, name
 
     def _put(self, slot: str, value: Any) -> None:
@@ -108,6 +113,7 @@ class Memory:
         if isinstance(there, random.Random):
             there.setstate(value)
         elif isinstance(there, np.random.Generator):
+            _require_positions(value)
             there.bit_generator.state = value
         elif isinstance(there, list | dict | set | collections.deque) and type(there) is type(value):
             there.clear()  # whoever else holds it sees the same
@@ -126,8 +132,11 @@ class Memory:
         for key in keys[:-1]:
             container = _item(container, key)
         key = keys[-1]
-        if _write_into(_item(container, key), value):
+        there = _item(container, key)
+        if _write_into(there, value):
             return
+        if not (there is None or isinstance(there, Tensor | np.ndarray)):
+            raise ValueError(f"'{path}' is no tensor in {type(self._owner).__name__}")
         if isinstance(container, dict):
             container[key] = value.clone()
         elif isinstance(container, list):
@@ -200,11 +209,29 @@ def _read(written: Any) -> Any:
         return written
     kind, *content = written
     if kind == "scalar":
-        return np.dtype(content[0]).type(content[1])
+        dtype = np.dtype(content[0])
+        if dtype.kind not in "biuf":
+            raise ValueError(f"'{content[0]}' is no kind of number")
+        return dtype.type(content[1])
     if kind == "dict":
         return {_read(key): _read(item) for key, item in content[0]}
     make = {"list": list, "tuple": tuple, "set": set, "deque": collections.deque}[kind]
     return make(_read(item) for item in content[0])
+
+
+def _may_be_memory(value: Any) -> bool:
+    """Whether something is of a kind that is saved."""
+    generators = torch.Generator | np.random.Generator | random.Random
+    plain = type(value) in (bool, int, float, str, type(None), list, tuple, dict, set, collections.deque)
+    return plain or isinstance(value, Tensor | np.ndarray | np.generic | generators)
+
+
+def _require_positions(state: Mapping[str, Any]) -> None:
+    """Where a generator goes on in its table: numpy does not look whether that is inside."""
+    inner = state.get("state")
+    pos = inner.get("pos", 0) if isinstance(inner, dict) else 0
+    if not 0 <= int(pos) <= 624 or not 0 <= int(state.get("buffer_pos", 0)) <= 4:
+        raise ValueError("a generator of numpy would go on outside of its table")
 
 
 def _is_helper(value: Any) -> bool:

@@ -337,10 +337,12 @@ def _onnx_bytes(graph: Deployed, metadata: str) -> bytes:
 def _read_onnx(file: Path) -> tuple[Run, str]:
     import onnxruntime
 
+    data = file.read_bytes()
+    require_self_contained(data, file)
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     names = ["action", "command"]
 
     def run(obs: Tensor) -> dict[str, Tensor]:
@@ -348,6 +350,42 @@ def _read_onnx(file: Path) -> tuple[Run, str]:
         return {name: torch.from_numpy(value) for name, value in zip(names, values, strict=True)}
 
     return run, session.get_modelmeta().custom_metadata_map[KEY]
+
+
+def require_self_contained(data: bytes, file: Path) -> None:
+    """An ONNX file may name other files for its numbers, anywhere on the disk: such a one is not opened.
+
+    Args:
+        data: its content.
+        file: its name, for the message.
+
+    Raises:
+        CheckpointError: if it is no ONNX file, or not the whole of it.
+    """
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        model = onnx.load_from_string(data)
+    except DecodeError:
+        raise CheckpointError(f"{file} is corrupt, or no ONNX file") from None
+    for value in _tensors_elsewhere(model):
+        where = next((entry.value for entry in value.external_data if entry.key == "location"), "?")
+        raise CheckpointError(f"{file} keeps '{value.name[:60]}' in another file, {where[:80]!r}; it is not opened")
+
+
+def _tensors_elsewhere(part: Any) -> Iterator[Any]:
+    """Tensors below a part of an ONNX model whose numbers are in another file."""
+    from google.protobuf.message import Message
+
+    if part.DESCRIPTOR.name == "TensorProto":
+        if part.external_data or part.data_location:
+            yield part
+        return
+    for _, value in part.ListFields():
+        for inner in (value,) if isinstance(value, Message | str | bytes | int | float) else value:
+            if isinstance(inner, Message):
+                yield from _tensors_elsewhere(inner)
 
 
 def _torch_bytes(graph: Deployed, metadata: str) -> bytes:

@@ -11,7 +11,7 @@ from rlcli.config.load import Resolved, resolve
 from rlcli.errors import CheckpointError, TaskError
 from rlcli.registry import TaskSource, find_task, folder_task, python_task
 from rlcli.rl.checkpoint import Checkpoint
-from rlcli.rl.policy import Policy, load_policy
+from rlcli.rl.policy import Policy
 from rlcli.rl.run import Run
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def resolve_run(
 
 def policy_of(checkpoint: Checkpoint) -> Policy:
     """The policy of a checkpoint; nothing of the task or the simulator is needed."""
-    return load_policy(checkpoint.json("policy.json"), checkpoint.tensors("policy"))
+    return checkpoint.policy()
 
 
 def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, PositiveFloat, PositiveInt, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 from torch import Tensor, nn
 
 from rlcli.errors import CheckpointError
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 _LOG_STD_RANGE = (-20.0, 2.0)
+_MOST_BYTES = 2**31
+Width = Annotated[int, Field(ge=1, le=2**24)]
+"""Columns of a layer."""
+Layers = Annotated[list[Width], Field(max_length=100)]
+"""Widths of layers."""
 
 
 class PolicySpec(BaseModel):
@@ -23,13 +28,13 @@ class PolicySpec(BaseModel):
     `deterministic-mlp`, tanh times the bound.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     kind: Literal["gaussian-mlp", "gaussian-lstm", "squashed-gaussian-mlp", "deterministic-mlp"] = "gaussian-mlp"
-    group: str = "policy"
-    observation_size: PositiveInt
-    action_size: PositiveInt
-    hidden: list[PositiveInt]
+    group: Annotated[str, Field(max_length=200)] = "policy"
+    observation_size: Width
+    action_size: Width
+    hidden: Layers
     activation: Literal["elu", "relu", "tanh", "silu"]
     action_bound: PositiveFloat | None
     normalize: bool = False
@@ -37,7 +42,7 @@ class PolicySpec(BaseModel):
     """Normalised observations are clipped to +-this; null: they are not."""
     log_std_range: tuple[float, float] | None = None
     """Of a squashed-gaussian-mlp: tanh maps the logarithm of the deviation into this; null: it is clamped."""
-    memory: list[PositiveInt] = []
+    memory: Layers = []
     """Cells of each layer of the memory."""
 
     @model_validator(mode="after")
@@ -223,18 +228,50 @@ def load_policy(spec: Mapping[str, object], weights: Mapping[str, Tensor]) -> Po
     Raises:
         CheckpointError: if they do not fit each other, or a weight is not finite.
     """
+    return filled(blank_policy(spec), weights)
+
+
+def blank_policy(spec: Mapping[str, object]) -> Policy:
+    """A policy without weights: shapes first, a file must not make anybody allocate what it does not hold.
+
+    Raises:
+        CheckpointError: if this does not describe a policy.
+    """
     try:
-        with torch.device("meta"):  # shapes first: a file must not make this allocate what it does not hold
-            policy = Policy(PolicySpec.model_validate(spec))
+        checked = PolicySpec.model_validate(spec)
     except ValidationError as error:
-        raise CheckpointError(f"policy.json does not describe a policy: {' '.join(str(error).split())}") from None
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(map(str, first["loc"])) or "all"
+        raise CheckpointError(f"policy.json does not describe a policy: {place[:80]}: {first['msg']}") from None
+    with torch.device("meta"):
+        policy = Policy(checked)
+    if size_of(policy) > _MOST_BYTES:
+        raise CheckpointError(
+            f"policy.json describes a policy of {size_of(policy):,} bytes; {_MOST_BYTES:,} are allowed"
+        )
+    return policy
+
+
+def size_of(policy: Policy) -> int:
+    """Bytes of its weights."""
+    return sum(value.numel() * value.element_size() for value in policy.state_dict().values())
+
+
+def filled(policy: Policy, weights: Mapping[str, Tensor]) -> Policy:
+    """A blank policy with its weights, ready to act.
+
+    Raises:
+        CheckpointError: if they do not fit, or a weight is not finite.
+    """
     expected = {name: tuple(value.shape) for name, value in policy.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in weights.items()}
     if expected != found:
         differs = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
         raise CheckpointError(
             "policy.safetensors does not fit policy.json: "
-            + ", ".join(f"{n} is {found.get(n, 'missing')}, expected {expected.get(n, 'nothing')}" for n in differs[:4])
+            + ", ".join(
+                f"{n[:80]} is {found.get(n, 'missing')}, expected {expected.get(n, 'nothing')}" for n in differs[:4]
+            )
         )
     kinds = {name: value.dtype for name, value in policy.state_dict().items()}
     for name, value in weights.items():
@@ -242,5 +279,7 @@ def load_policy(spec: Mapping[str, object], weights: Mapping[str, Tensor]) -> Po
             raise CheckpointError(f"policy.safetensors: '{name}' is {value.dtype}, expected {kinds[name]}")
         if not bool(value.isfinite().all()):
             raise CheckpointError(f"policy.safetensors: '{name}' holds values that are not finite")
+        if name in ("normalizer.var", "normalizer.count") and bool((value < 0).any()):
+            raise CheckpointError(f"policy.safetensors: '{name}' is negative")
     policy.load_state_dict(dict(weights), assign=True)
     return policy.eval().requires_grad_(False)

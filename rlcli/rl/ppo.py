@@ -28,11 +28,12 @@ from rlcli.rl.ppo_config import PpoConfig
 from rlcli.rl.ppo_loss import KL, METRICS, Judged, Parts, log_prob
 from rlcli.rl.ppo_rollout import Rollout, Samples
 from rlcli.rl.ppo_setup import compilation, critic_groups, minibatch_sizes, policy_spec
-from rlcli.rl.rng import load_rng_state, rng_state
+from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
 from rlcli.rl.trainer import Report, TrainerState
 from rlcli.sim.entity import is_finite
+from rlcli.sim.saved import require_alike
 
 _RECORDED = 256
 """Recent observations that a checkpoint keeps, for checking what is made of the policy later."""
@@ -64,7 +65,7 @@ class PpoTrainer:
         shared = self._groups == ("policy",)
 
         torch.set_num_threads(torch_threads)
-        torch.manual_seed(derive(seed, "trainer"))
+        seed_generators(derive(seed, "trainer"))
         self.networks = ActorCritic(obs_size, critic_size, self.spec.action_size, config).to(self.device)
         self._vector, self._shared, places = flatten(self.networks)
         self._gradient, self._shared_kl = self._shared[:-1], self._shared[-1]
@@ -73,7 +74,7 @@ class PpoTrainer:
         joint = config.clip_grad == "joint"
         self._gradient_parts = (self._gradient,) if joint else (self._gradient[:end], self._gradient[end:])
         self.learning_rate = torch.tensor(config.learning_rate, device=self.device)
-        torch.manual_seed(self.peers.seed(derive(seed, "exploration"), "exploration"))
+        seed_generators(self.peers.seed(derive(seed, "exploration"), "exploration"))
         self._ceiling = torch.tensor(config.learning_rate_range[1], device=self.device)
         self._optimizer = adam(self._vector, self.learning_rate, config.adam_eps)
         normalize = config.normalize_observations
@@ -523,6 +524,7 @@ class PpoTrainer:
         With another number of processes than then, everything that is learned goes on, in new episodes.
         """
         values, saved = state.values, state.tensors["trainer"]
+        require_alike(saved, self._learner(), "trainer")
         self.load_weights(state.tensors["policy"])
         with torch.no_grad():
             for name, value in self._learner().items():
@@ -538,6 +540,8 @@ class PpoTrainer:
         suffix = f".{self.peers.rank}" if self.peers.rank else ""
         self.statistics.load(values[f"statistics{suffix}"])
         env = state.tensors[f"env{suffix}"]
+        carried = {f"memory.{name}": value for name, value in self._memory.items()}
+        require_alike(env, {"begins": self._begins, **carried}, "env")
         self._begins.copy_(env["begins"])
         for name, memory in self._memory.items():
             memory.copy_(env[f"memory.{name}"])

@@ -1,4 +1,4 @@
-"""The global random generators of torch, numpy and Python, as tensors of a checkpoint."""
+"""The global random generators of torch, numpy and Python: seeded together, and as tensors of a checkpoint."""
 
 from __future__ import annotations
 
@@ -9,6 +9,15 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 from torch import Tensor
+
+from rlcli.sim.saved import require_alike, require_within
+
+
+def seed_generators(seed: int) -> None:
+    """Seed all three: tasks of others draw from whichever they know, and torch's networks from torch's."""
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)
+    random.seed(seed)
 
 
 def rng_state() -> dict[str, Tensor]:
@@ -27,7 +36,17 @@ def rng_state() -> dict[str, Tensor]:
 
 
 def load_rng_state(state: Mapping[str, Tensor]) -> None:
-    """Take back what `rng_state` gave."""
+    """Take back what `rng_state` gave.
+
+    Raises:
+        KeyError: if something is missing.
+        ValueError: if something is no state of a generator.
+    """
+    require_alike(state, rng_state(), "rng")
+    require_within(state["numpy.position"][:1], 0, len(state["numpy.keys"]), "numpy.position")  # numpy does not look
+    require_within(state["numpy.position"][1:], 0, 1, "numpy.position")
+    for name in ("numpy.keys", "python.words"):
+        require_within(state[name], 0, 2**32 - 1, name)
     torch.set_rng_state(state["torch"])
     position, has_gauss = state["numpy.position"].tolist()
     keys = state["numpy.keys"].numpy().astype(np.uint32)

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import os
-import platform
 import re
 import shutil
-import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
-import rlcli
 from rlcli.errors import CheckpointError, MachineError, UsageError, did_you_mean, listing
 from rlcli.rl.files import disk_error, to_json, write_atomic
+from rlcli.rl.reading import JSON_LIMIT, parse_json, read_file, refuse_links
 
 CONFIG = "config.yaml"
 RECORD = "run.json"
@@ -116,12 +112,14 @@ def open_run(folder: Path) -> Run:
     """
     file = folder / RECORD
     try:
-        record = json.loads(file.read_bytes())
-    except OSError:
+        record = parse_json(read_file(file, JSON_LIMIT), file)
+    except (FileNotFoundError, NotADirectoryError):
         raise CheckpointError(f"{folder} is not a run: it has no {RECORD}") from None
-    except ValueError:
-        raise CheckpointError(f"{file} is corrupt: not JSON") from None
-    task = record.get("task") if isinstance(record, dict) else None
+    refuse_links(folder)
+    for inner in ("checkpoints", "checkpoints/logs"):
+        if (folder / inner).is_dir():
+            refuse_links(folder / inner)
+    task = record.get("task")
     if not isinstance(task, dict) or not isinstance(task.get("name"), str):
         raise CheckpointError(f"{file} is corrupt: it does not name a task")
     if not (task.get("folder") or task.get("distribution")) or not isinstance(record.get("seed"), int):
@@ -155,8 +153,24 @@ def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
     return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name))
 
 
-def find_checkpoint(reference: str, runs_dir: Path, task: str | None = None) -> tuple[Run, Path, str]:
+def find_checkpoint(
+    reference: str,
+    runs_dir: Path,
+    task: str | None = None,
+    *,
+    whole: bool = False,
+    tell: Callable[[str], None] = lambda _: None,
+) -> tuple[Run, Path, str]:
     """A checkpoint by `RUN`, `RUN@best`, `RUN@step:N`, `latest` or its folder; and why it was chosen.
+
+    Of a run that is named without a checkpoint it is the newest good one.
+
+    Args:
+        reference: what was named.
+        runs_dir: the folder of runs.
+        task: of which it must be.
+        whole: good is what can be resumed, not only what can be played.
+        tell: hears of checkpoints that were passed over, and why.
 
     Raises:
         CheckpointError: if there is none.
@@ -172,7 +186,7 @@ def find_checkpoint(reference: str, runs_dir: Path, task: str | None = None) -> 
     if not have:
         raise CheckpointError(f"{run.folder} has no complete checkpoint")
     if not which:
-        return run, run.checkpoints / f"{have[-1]:012d}", f"{why}, its newest checkpoint"
+        return run, *_newest_good(run, have, why, whole, tell)
     if which == "best":
         best = run.record.get("best")
         if best not in have:
@@ -194,20 +208,21 @@ def find_checkpoint(reference: str, runs_dir: Path, task: str | None = None) -> 
     )
 
 
-def environment_record(engine_threads: int, torch_threads: int) -> dict[str, Any]:
-    """What results depend on besides the configuration."""
-    packages = ("mujoco", "torch", "numpy", "stable-baselines3", "safetensors")
-    return {
-        "rlcli": rlcli.__version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "machine": platform.machine(),
-        "versions": {name: metadata.version(name) for name in packages},
-        "engine_threads": engine_threads,
-        "torch_threads": torch_threads,
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "pid": os.getpid(),
-    }
+def _newest_good(run: Run, have: list[int], why: str, whole: bool, tell: Callable[[str], None]) -> tuple[Path, str]:
+    """The newest checkpoint that is in order; each that is passed over is told of."""
+    from rlcli.rl.checkpoint import open_checkpoint
+
+    for passed, step in enumerate(reversed(have)):
+        folder = run.checkpoints / f"{step:012d}"
+        try:
+            open_checkpoint(folder).verify(whole=whole)
+        except CheckpointError as error:
+            if passed == len(have) - 1:
+                raise
+            tell(f"checkpoint {folder.name} is passed over: {error.message}")
+            continue
+        return folder, f"{why}, its newest {'good ' if passed else ''}checkpoint"
+    raise AssertionError("a run without checkpoints is refused before")
 
 
 def default_runs_dir() -> Path:

@@ -247,5 +247,5 @@ def _remove(folder: Path) -> None:
 def _iteration(folder: Path) -> int:
     try:
         return int(json.loads((folder / "manifest.json").read_bytes())["iteration"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return 0  # a multiple of everything: it stays

@@ -33,8 +33,9 @@ from rlcli.rl.sb3_config import (
 )
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
-from rlcli.rl.trainer import Report, TrainerState
+from rlcli.rl.trainer import Report, TrainerState, require_slots
 from rlcli.sim.entity import is_finite
+from rlcli.sim.saved import require_alike
 
 _METRICS = {
     "train/policy_gradient_loss": "Loss/surrogate",
@@ -82,7 +83,7 @@ class Sb3Trainer:
         self.model.reward_scale, self.model.action_bound = config.reward_scale, config.action_bound
         self.normalizer = Normalizer(self.spec.observation_size) if config.normalize_observations else None
         self.model.normalizer = self.normalizer
-        self._actor_names = _actor_names(config.algorithm, self.model.policy.state_dict())
+        self._actor_names = actor_names(config.algorithm, self.model.policy.state_dict())
         if isinstance(config, OffPolicyConfig):
             self.model.replay_buffer.normalizer = self.normalizer
             self._horizon = config.train_freq
@@ -184,6 +185,9 @@ class Sb3Trainer:
     def load(self, state: TrainerState) -> None:
         """Go back to a boundary: the next iteration gives the same bits as it did then."""
         values, rest = state.values, state.tensors["trainer"]
+        weights = {f"weights.{name}": value for name, value in self.model.policy.state_dict().items()}
+        require_alike(rest, weights, "trainer")
+        require_alike(state.tensors["env"], {"episode_starts": torch.ones(self.env.num_envs, dtype=torch.bool)}, "env")
         self._load_weights(state.tensors["policy"], rest)
         for name, optimizer in self._optimizers().items():
             _load_optimizer(optimizer, f"optimizer.{name}.", rest)
@@ -232,7 +236,7 @@ class Sb3Trainer:
         for name in weights:
             if name in self._actor_names:
                 weights[name] = policy[self._actor_names[name]]
-            elif f"weights.{name}" in rest:
+            elif rest:
                 weights[name] = rest[f"weights.{name}"]
         self.model.policy.load_state_dict(weights)
         if not rest and hasattr(self.model, "actor_target"):
@@ -432,7 +436,7 @@ def _require_batch(env: VecEnv, config: OnPolicyConfig, total: int) -> None:
     raise ConfigError([env.resolved.problem(path, message, "more environments, more n_steps, or fewer minibatches")])
 
 
-def _actor_names(algorithm: str, weights: Mapping[str, Tensor]) -> dict[str, str]:
+def actor_names(algorithm: str, weights: Mapping[str, Tensor]) -> dict[str, str]:
     """SB3's names of the actor's weights -> the saved policy's, its output layer numbered after the hidden ones."""
     hidden, output = {
         "sac": ("actor.latent_pi.", "actor.mu."),
@@ -459,4 +463,5 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, prefix: str, tensors: Mapp
         if name.startswith(prefix):
             index, slot = name.removeprefix(prefix).split(".")
             state.setdefault(int(index), {})[slot] = value.clone()
+    require_slots(optimizer, state)
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rlcli.rl.policy import Normalizer
 from rlcli.rl.trainer import Rows
+from rlcli.sim.saved import require_alike
 
 
 class TorchRolloutBuffer(RolloutBuffer):
@@ -129,12 +130,23 @@ class TorchReplayBuffer(ReplayBuffer):
         return Rows(first, stop, read)
 
     def load_rows(self, rows: Rows) -> None:
-        """Take back what `rows` gave."""
+        """Take back what `rows` gave.
+
+        Raises:
+            ValueError: if they are of another buffer.
+        """
+        count = rows.stop - rows.first
+        if not 0 <= count <= self.buffer_size:
+            raise ValueError(f"replay: {count} rows, and the buffer holds {self.buffer_size}")
+        saved = rows.read(rows.first, rows.stop)
+        if count:
+            own = {name: getattr(self, name)[:count] for name in _COLUMNS}
+            require_alike({name: saved[name] for name in own}, own, "replay")
         places = torch.arange(rows.first, rows.stop) % self.buffer_size
-        for name, values in rows.read(rows.first, rows.stop).items():
+        for name, values in saved.items():
             getattr(self, name)[places] = values
         self.added = rows.first
-        self._count(rows.stop - rows.first)
+        self._count(count)
 
     def _read(self, start: int, stop: int) -> dict[str, Tensor]:
         places = torch.arange(start, stop) % self.buffer_size

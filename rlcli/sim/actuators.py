@@ -14,6 +14,7 @@ from rlcli.config.schema import ActuatorConfig
 from rlcli.random import stream
 from rlcli.sim.entity import Entity, as_index
 from rlcli.sim.names import NameProblem, match, match_values
+from rlcli.sim.saved import require_within
 from rlcli.sim.selection import Selection
 
 POSITION, VELOCITY, EFFORT = range(3)
@@ -98,6 +99,8 @@ class ActuatorModel:
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Take back what `state_dict` gave."""
+        if self._frames is not None:
+            require_within(state["lag"], 0, self._frames.shape[1] - 1, "lag")
         for name, tensor in self._tensors().items():
             tensor.copy_(state[name])
 

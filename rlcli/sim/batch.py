@@ -378,7 +378,11 @@ class BatchEngine:
         return {"state": self._state.clone(), "warning": warning, "constants": constants, **expanded, **substep}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Take back what `state_dict` gave; derived fields are computed anew."""
+        """Take back what `state_dict` gave; derived fields are computed anew.
+
+        Raises:
+            ValueError: if a model field is not one that may differ between worlds, or of another shape.
+        """
         self._state.copy_(state["state"])
         width = self._history.width
         if not np.array_equal(

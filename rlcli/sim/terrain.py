@@ -23,6 +23,7 @@ from rlcli.config.schema import (
     TerrainHeightsConfig,
 )
 from rlcli.sim.landscapes import Block, Heights, Patch, Plot, make_patch
+from rlcli.sim.saved import require_within
 from rlcli.sim.selection import Selection
 
 BODY = "terrain"
@@ -201,6 +202,7 @@ class Terrain:
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Take back what `state_dict` gave."""
+        require_within(state["levels"], 0, self.rows - 1, "terrain.levels")
         self.levels.copy_(state["levels"])
         self._env_origins.copy_(self.origins[self.levels, self.types])
 

@@ -131,3 +131,45 @@ def test_what_cannot_be_saved_is_named(value, kind):
 def test_a_state_of_something_else_is_refused():
     with pytest.raises(ValueError, match="has no place"):
         Memory(SimpleNamespace()).load_state_dict({"helper.table": torch.zeros(2)})
+
+
+def state_with(**slots):
+    kept = {slot.replace("__DOT__", "."): json.dumps(value) for slot, value in slots.items()}
+    return {"plain": torch.frombuffer(bytearray(json.dumps(kept).encode()), dtype=torch.uint8)}
+
+
+@pytest.mark.parametrize(
+    ("slot", "value"),
+    [
+        ("change", 3),
+        ("__class__", 3),
+        ("__class__.change", 3),
+        ("change.__globals__", ["dict", []]),
+        ("__init__.__globals__", ["dict", [["torch", 1]]]),
+        ("helper", 3),
+        ("helper.__dict__", ["dict", []]),
+        ("vector.data", 3),
+        ("name.x", 3),
+        ("name", ["scalar", "O", 3]),
+        ("a b", 3),
+        ("numpy", ["dict", [["bit_generator", "MT19937"], ["state", ["dict", [["pos", 10**6]]]]]]),
+        ("numpy", ["dict", [["bit_generator", "Philox"], ["buffer_pos", -9]]]),
+    ],
+)
+def test_what_is_no_memory_of_the_object_is_not_written(slot, value):
+    owner = Owner()
+    memory, was = Memory(owner), torch.zeros
+    with pytest.raises((ValueError, TypeError)):
+        memory.load_state_dict(state_with(**{slot: value}))
+    assert torch.zeros is was
+    assert callable(owner.change)
+    assert isinstance(owner.helper, Helper)
+
+
+@pytest.mark.parametrize(
+    "path", ["change", "helper", "__class__", "helper.__class__", "tables/b", "name/x", "missing.x"]
+)
+def test_a_tensor_does_not_take_the_place_of_something_else(path):
+    owner = Owner()
+    with pytest.raises(ValueError, match=path.partition("/")[0].partition(".")[0]):
+        Memory(owner).load_state_dict({path: torch.zeros(7)})

@@ -13,38 +13,17 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
+from saved_states import SPEC, rehash, state_of
 
 from rlcli.errors import CheckpointError, MachineError
 from rlcli.rl import checkpoint, saving
 from rlcli.rl.load import policy_of
-from rlcli.rl.policy import Policy, PolicySpec
-from rlcli.rl.trainer import TrainerState
-
-SPEC = {"observation_size": 3, "action_size": 2, "hidden": [4], "activation": "elu", "action_bound": 1.0}
-
-
-def state_of(seed=0):
-    torch.manual_seed(seed)
-    policy = Policy(PolicySpec.model_validate(SPEC))
-    tensors = {"policy": policy.state_dict(), "trainer": {"critic.w": torch.randn(4)}}
-    rest = {"env": {"x": torch.randn(3)}, "rng": {"torch": torch.zeros(4)}}
-    return TrainerState({**tensors, **rest}, {"policy": policy.spec.model_dump(), "iteration": 1})
 
 
 @pytest.fixture
 def saved(tmp_path):
     (tmp_path / "checkpoints").mkdir()
     return saving.write(tmp_path / "checkpoints", 768, state_of(), {"seed": 1})
-
-
-def rehash(folder: Path, name: str) -> None:
-    """Make the manifest agree with a changed file, as an attacker would."""
-    import hashlib
-
-    manifest = json.loads((folder / "manifest.json").read_text())
-    data = (folder / name).read_bytes()
-    manifest["files"][name] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    (folder / "manifest.json").write_text(json.dumps(manifest))
 
 
 def load_all(folder):
@@ -241,7 +220,7 @@ LOOP = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from test_checkpoints import state_of
+from saved_states import state_of
 from rlcli.rl import checkpoint, saving
 folder = Path(sys.argv[1])
 step = max(checkpoint.steps(folder), default=0)
@@ -258,7 +237,7 @@ def test_kills_in_the_middle_of_saving_leave_a_good_last_checkpoint(tmp_path):
     folder.mkdir()
     for attempt in range(4):
         child = subprocess.Popen(
-            [sys.executable, "-c", LOOP, str(folder), str(Path(__file__).parent)], stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", LOOP, str(folder), str(Path(__file__).parents[1])], stdout=subprocess.PIPE, text=True
         )
         assert child.stdout.readline() == "go\n"
         time.sleep(0.05 + 0.037 * attempt)
@@ -280,7 +259,7 @@ LIMITED = """
 import resource, signal, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from test_checkpoints import state_of
+from saved_states import state_of
 from rlcli.errors import MachineError
 from rlcli.rl import checkpoint, saving
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -296,7 +275,7 @@ def test_a_file_size_limit_is_a_machine_error_and_leaves_nothing(tmp_path):
     folder = tmp_path / "checkpoints"
     folder.mkdir()
     # -B: under the limit Python would leave modules half-compiled for everybody
-    command = [sys.executable, "-B", "-c", LIMITED, str(folder), str(Path(__file__).parent)]
+    command = [sys.executable, "-B", "-c", LIMITED, str(folder), str(Path(__file__).parents[1])]
     said = subprocess.run(command, capture_output=True, text=True)
     assert "File too large" in said.stdout, said.stderr
     assert list(folder.iterdir()) == []

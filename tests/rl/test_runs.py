@@ -5,8 +5,10 @@ import subprocess
 import sys
 
 import pytest
+from saved_states import state_of
 
 from rlcli.errors import CheckpointError, MachineError, UsageError
+from rlcli.rl import saving
 from rlcli.rl.run import create_run, find_checkpoint, find_run, list_runs, open_run
 
 RECORD = {"task": {"name": "cartpole", "distribution": "rlcli"}, "seed": 1}
@@ -17,9 +19,7 @@ def make_run(runs, task="cartpole", name=None, steps=(), **entries):
     run = create_run(runs, task, name, "a: 1\n", record)
     run.unlock()
     for step in steps:
-        folder = run.checkpoints / f"{step:012d}"
-        folder.mkdir()
-        (folder / "manifest.json").touch()
+        saving.write(run.checkpoints, step, state_of(), {})
     return run
 
 

@@ -22,9 +22,9 @@ from rlcli.envs.vec_env import StepResult, VecEnv
 from rlcli.errors import ConfigError, DependencyError, DivergedError
 from rlcli.random import derive
 from rlcli.rl.policy import Policy, PolicySpec
-from rlcli.rl.rng import load_rng_state, rng_state
+from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.statistics import EpisodeStatistics
-from rlcli.rl.trainer import Report, TrainerState
+from rlcli.rl.trainer import Report, TrainerState, require_slots
 from rlcli_rl_games.config import PpoConfig, RlGamesConfig, SacConfig
 
 NEEDED = "rl-games>=1.6,<1.7"
@@ -147,8 +147,7 @@ class RlGamesTrainer(ABC):
         self.statistics = self.vec.statistics
         self.spec = self._policy_spec()
         torch.set_num_threads(torch_threads)
-        torch.manual_seed(derive(seed, "trainer"))
-        np.random.seed(derive(seed, "trainer") % 2**32)
+        seed_generators(derive(seed, "trainer"))
         with tempfile.TemporaryDirectory(prefix="rlcli-rl-games-") as folder, _quietly():
             self.agent = self._make(self._parameters(settings, device, folder))
             self.agent.writer.close()
@@ -404,9 +403,9 @@ class PpoTrainer(RlGamesTrainer):
         super().load(state)
         self.agent.last_lr = state.values["learning_rate"]
         self.agent.update_lr(self.agent.last_lr)
-        for name, value in state.values.get("central", {}).items():
-            setattr(self.agent.central_value_net, name, value)
         if self.agent.has_central_value:
+            for name in ("lr", "epoch_num", "frame"):
+                setattr(self.agent.central_value_net, name, state.values["central"][name])
             self.agent.central_value_net.update_lr(self.agent.central_value_net.lr)
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
@@ -595,6 +594,7 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tens
     for name, value in tensors.items():
         index, slot = name.split(".")
         state.setdefault(int(index), {})[slot] = value.clone()
+    require_slots(optimizer, state)
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
 
 

@@ -19,9 +19,9 @@ from rlcli.errors import ConfigError, DependencyError, DivergedError
 from rlcli.random import derive
 from rlcli.registry import load_object
 from rlcli.rl.policy import Policy, PolicySpec
-from rlcli.rl.rng import load_rng_state, rng_state
+from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.statistics import EpisodeStatistics
-from rlcli.rl.trainer import Report, TrainerState
+from rlcli.rl.trainer import Report, TrainerState, require_slots
 from rlcli_rsl_rl.config import RunnerConfig
 
 NEEDED = "rsl-rl-lib>=5.5,<6"
@@ -69,7 +69,7 @@ class RslRlTrainer:
         self.spec = _policy_spec(env, config)
         _require_batch(env, config)
         torch.set_num_threads(torch_threads)
-        torch.manual_seed(derive(seed, "trainer"))
+        seed_generators(derive(seed, "trainer"))
         with contextlib.redirect_stdout(io.StringIO()):  # RSL-RL prints its networks; standard output is for data
             settings = _settings(env, config, self._groups)
             self.alg = PPO.construct_algorithm(self._adapter.blank(), self._adapter, settings, device)
@@ -410,4 +410,5 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tens
     for name, value in tensors.items():
         index, slot = name.split(".")
         state.setdefault(int(index), {})[slot] = value.clone()
+    require_slots(optimizer, state)
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

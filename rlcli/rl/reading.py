@@ -1,0 +1,145 @@
+"""Reading files that a stranger may have written: plain files only, no larger than allowed, strict JSON."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import stat
+from pathlib import Path
+from typing import Any, NoReturn
+
+from rlcli.errors import CheckpointError
+
+JSON_LIMIT = 4 * 2**20
+"""Largest JSON file [bytes]."""
+_DEPTH = 32
+_DIGITS = 20
+_NO_LINKS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+
+def read_file(file: Path, limit: int, *, size: int | None = None) -> bytes:
+    """The content of a plain file, read once; whatever is checked afterwards is checked on these bytes.
+
+    Args:
+        file: what to read.
+        limit: largest size [bytes]; a larger file is not read at all.
+        size: the size that it must have; None: any.
+
+    Raises:
+        CheckpointError: if it is a link, no plain file, too large or of another size, or cannot be read.
+        FileNotFoundError: if it is not there.
+    """
+    if file.is_symlink():
+        raise CheckpointError(f"{file} is a link; links in runs are not followed")
+    try:
+        handle = os.open(file, os.O_RDONLY | _NO_LINKS)  # a pipe must not make this wait
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:
+        why = "it is no plain file" if _kind(error) in _ODD else getattr(error, "strerror", None) or error
+        raise CheckpointError(f"{file} cannot be read: {why}") from None
+    status = os.fstat(handle)
+    if not stat.S_ISREG(status.st_mode):
+        os.close(handle)
+        raise CheckpointError(f"{file} is no plain file")
+    with os.fdopen(handle, "rb") as opened:
+        if size is not None and status.st_size != size:
+            raise CheckpointError(
+                f"{file} is corrupt: it is not what the manifest says ({status.st_size} bytes of {size})",
+                hint="choose an older checkpoint with RUN@step:N",
+            )
+        if status.st_size > limit:
+            raise CheckpointError(f"{file} is too large: {status.st_size:,} bytes, at most {limit:,} are read")
+        try:
+            return opened.read(status.st_size)
+        except (OSError, MemoryError) as error:
+            why = getattr(error, "strerror", None) or "there is not enough memory"
+            raise CheckpointError(f"{file} cannot be read: {why}") from None
+
+
+def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:
+    """A JSON object, read strictly: no key twice, finite numbers of few digits, nested a few levels deep.
+
+    Raises:
+        CheckpointError: for anything else.
+    """
+    try:
+        text = data if isinstance(data, str) else data.decode()
+        value = json.loads(
+            text, object_pairs_hook=_unique, parse_constant=_refuse, parse_float=_finite, parse_int=_short
+        )
+        _require_flat(value)
+    except _Strict as error:
+        raise CheckpointError(f"{file} is corrupt: {error}") from None
+    except (ValueError, RecursionError):
+        raise CheckpointError(f"{file} is corrupt: not JSON") from None
+    if not isinstance(value, dict):
+        raise CheckpointError(f"{file} is corrupt: not a JSON object")
+    return value
+
+
+def refuse_links(folder: Path) -> None:
+    """A run holds no links: what is written to it must not go elsewhere.
+
+    Raises:
+        CheckpointError: naming the first.
+    """
+    try:
+        links = sorted(entry.name for entry in os.scandir(folder) if entry.is_symlink())
+    except OSError as error:
+        raise CheckpointError(f"{folder} cannot be read: {error.strerror}") from None
+    if links:
+        raise CheckpointError(f"{folder / links[0]} is a link; links in runs are not followed")
+
+
+class _Strict(ValueError):
+    """Valid JSON that is refused all the same."""
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    value = dict(pairs)
+    if len(value) != len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise _Strict(f"key '{twice[:40]}' stands there twice")
+    return value
+
+
+def _refuse(name: str) -> NoReturn:
+    raise _Strict(f"{name} is no number of JSON")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise _Strict(f"number {text[:20]} is out of range")
+    return value
+
+
+def _short(text: str) -> int:
+    if len(text) > _DIGITS:
+        raise _Strict(f"a number has {len(text)} digits")
+    return int(text)
+
+
+def _require_flat(value: Any) -> None:
+    level = [value]
+    for _ in range(_DEPTH):
+        level = [
+            inner
+            for outer in level
+            if isinstance(outer, dict | list)
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+        ]
+        if not level:
+            return
+    raise _Strict(f"it is nested more than {_DEPTH} levels deep")
+
+
+_ODD = (errno.ELOOP, errno.ENXIO, errno.EISDIR)
+
+
+def _kind(error: Exception) -> int | None:
+    return getattr(error, "errno", None)
