@@ -26,6 +26,8 @@ COMMANDS = {
     "eval": "eval",
     "export": "export",
     "replay": "replay",
+    "diff": "diff",
+    "reproduce": "reproduce",
     "check": "check",
     "lint": "lint",
     "new": "new",

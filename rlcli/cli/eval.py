@@ -133,5 +133,6 @@ def _show(summary: dict[str, Any]) -> None:
     rows += [[f"reward {name}", f"{value:.4f}", ""] for name, value in summary["reward_terms"].items()]
     rows += [[f"ended by {name}", f"{value:.2%}", ""] for name, value in summary["terminations"].items()]
     if summary["diverged"]:
-        rows.append(["diverged", str(summary["diverged"]), ""])
+        causes = ", ".join(f"{cause} {count}" for cause, count in summary["diverged_by"].items())
+        rows.append(["diverged", str(summary["diverged"]), causes])
     console.table(["", "MEAN", "95 % INTERVAL"], rows)

@@ -1,7 +1,8 @@
-"""`rlcli replay`: step a recording again, and say whether it is the same bit by bit."""
+"""`rlcli replay`: step a recording or a dump again, and say whether it is the same bit by bit."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +13,9 @@ from rlcli.cli.options import CHOOSE, Debug, Json, Quiet
 
 
 def command(
-    file: Annotated[Path, typer.Argument(help="A recording, written by eval or play with --record.")],
+    file: Annotated[
+        Path, typer.Argument(help="A recording, written by eval or play with --record, or the dump of a divergence.")
+    ],
     episode: Annotated[
         int | None, typer.Option("--episode", min=0, help="Only this episode, counted from 0; else all.")
     ] = None,
@@ -23,7 +26,7 @@ def command(
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Replay a recording."""
+    """Replay a recording or a dump."""
     from rlcli.errors import UsageError
 
     console.quiet = quiet
@@ -32,6 +35,13 @@ def command(
 
         video = Path("replay.mp4") if str(video) == CHOOSE else video
         check_video(video)
+    from rlcli.rl.dump import is_dump
+
+    if is_dump(file):
+        if episode is not None or video is not None:
+            raise UsageError("a dump holds no episodes: --episode and --video are of recordings")
+        _dump(file)
+        return
     from rlcli.rl.recording import read_recording
 
     recording = read_recording(file)
@@ -63,6 +73,64 @@ def command(
     told = {key: getattr(difference, key) for key in ("episode", "step", "field", "recorded", "replayed")}
     console.document("replay", difference=told, **said)
     raise typer.Exit(9)
+
+
+def _dump(file: Path) -> None:
+    """Step a dump again, and show where each of its environments went wrong."""
+    import torch
+
+    from rlcli.rl.dump import read_dump, replay_dump
+
+    torch.set_num_threads(1)
+    dump = read_dump(file)
+    result = replay_dump(dump)
+    document, difference = dump.document, result.difference
+    for life in document.lives:
+        where = result.where.get(life.env)
+        console.data(f"environment {life.env}: {life.cause}{f' ({life.detail})' if life.detail else ''}")
+        console.data(f"  {where or 'a single world shows nothing: the cause lies outside of what is kept'}")
+    said = {
+        "file": str(file),
+        "calls": result.calls,
+        "compared": result.compared,
+        "equal": difference is None,
+        "same_model": result.same_model,
+        "environments": [
+            {
+                "env": life.env,
+                "cause": life.cause,
+                "detail": life.detail,
+                "where": None if (where := result.where.get(life.env)) is None else _finite(where.model_dump()),
+            }
+            for life in document.lives
+        ],
+    }
+    if difference is None:
+        console.data(
+            f"{file}: {result.calls} engine calls stepped again, {result.compared} states compared: equal bit by bit"
+        )
+        console.document("replay", kind="dump", difference=None, **said)
+        return
+    console.data(
+        f"{file}: environment {difference.env} differs first after engine call {difference.call} in"
+        f" {difference.field}: dumped {_short(difference.recorded)}, now {_short(difference.replayed)}"
+    )
+    what = "MuJoCo or the machine" if result.same_model else "the task's model"
+    console.info(f"{what} is not what it was dumped with (MuJoCo {document.mujoco})")
+    told = {
+        "env": difference.env,
+        "call": difference.call,
+        "field": difference.field,
+        "recorded": [repr(value) for value in difference.recorded],
+        "replayed": [repr(value) for value in difference.replayed],
+    }
+    console.document("replay", kind="dump", difference=told, **said)
+    raise typer.Exit(9)
+
+
+def _finite(values: dict[str, Any]) -> dict[str, Any]:
+    """As JSON, which has no NaN."""
+    return {name: repr(v) if isinstance(v, float) and not math.isfinite(v) else v for name, v in values.items()}
 
 
 def _replay(recording: Any, chosen: list[int], video: Path | None) -> tuple[Any, int]:

@@ -68,7 +68,12 @@ def open_session(
         resolved = resolve(find_task(task), play=True, config_file=config, overrides=overrides, flags=values)
     check(resolved)
     tell_notes(resolved)
-    return _build(resolved, run, folder, policy, stochastic, seed)
+    session = _build(resolved, run, folder, policy, stochastic, seed)
+    from rlcli.rl.dump import Watch
+
+    home = runs_dir or default_runs_dir() if run is None else run.folder
+    Watch(session.env, home / "dumps", console.warn)
+    return session
 
 
 def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic: bool, seed: int) -> Session:
@@ -78,6 +83,7 @@ def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic
     from rlcli.random import derive
     from rlcli.rl.checkpoint import open_checkpoint
     from rlcli.rl.load import policy_of, require_fit
+    from rlcli.rl.rng import seed_generators
     from rlcli.rl.rollout import acting, random_policy, zero_policy
 
     torch.set_num_threads(1)
@@ -87,6 +93,7 @@ def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic
         checkpoint = open_checkpoint(folder)
         trained = policy_of(checkpoint)
     # evaluation sees other episodes than training did
+    seed_generators(derive(seed, "task"))  # some tasks draw from them
     env = make_env(resolved, seed=derive(seed, "evaluation"))
     if checkpoint is not None and trained is not None:
         require_fit(checkpoint, env.layout)

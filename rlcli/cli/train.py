@@ -143,6 +143,8 @@ class _Job:
     """The checkpoint folder to take weights from."""
     config: str | None = None
     """The configuration of a run that goes on, where its budget changes."""
+    stages: list[int] = field(default_factory=list)
+    """Iterations to save at, the last one to end at, instead of the agent's budget and what it keeps."""
     writes: bool = True
     """Whether this process writes the run."""
     begin: float = field(default_factory=time.monotonic)
@@ -279,9 +281,10 @@ def _created(
     init_from: str | None,
 ) -> _Job:
     """A new run, its folder written before anything heavy is imported."""
-    from rlcli.config.dump import to_data, to_yaml
+    from rlcli.config.dump import given, to_data, to_yaml
+    from rlcli.rl.environment import environment_record, file_digest
     from rlcli.rl.loggers import check_loggers
-    from rlcli.rl.run import create_run, environment_record, find_checkpoint
+    from rlcli.rl.run import create_run, find_checkpoint
 
     loggers = check_loggers(logger)
     initial = None
@@ -293,7 +296,9 @@ def _created(
         "agent": resolved.agent_name,
         "loggers": loggers,
         "init_from": str(initial) if initial else None,
-        **environment_record(*_threads(resolved)),
+        "init_from_sha256": file_digest(initial / "policy.safetensors") if initial else None,
+        "given": given(resolved),
+        **environment_record(resolved, *_threads(resolved)),
     }
     run = create_run(runs, resolved.source.name, name, to_yaml(to_data(resolved)), record)
     console.info(f"run {run.folder}")
@@ -352,6 +357,10 @@ def _train(job: _Job, device: str, stop: StopRequest) -> None:
         f"{job.resolved.source.name}: {env.num_envs} environments, {size} observations, {actions} actions,"
         f" {env.engine.threads} engine threads, agent {job.resolved.agent_name}, seed {run.record['seed']}"
     )
+    if job.writes:
+        from rlcli.rl.dump import Watch
+
+        Watch(env, run.folder / "dumps", console.warn)
     try:
         _fit(job, trainer, env, stop)
     finally:
@@ -366,11 +375,13 @@ def _build(job: _Job, device: str) -> Any:
     """The environment and the trainer, at the boundary where training begins."""
     from rlcli.envs.vec_env import make_env
     from rlcli.errors import CheckpointError
+    from rlcli.random import derive
     from rlcli.registry import load_object
     from rlcli.rl import distributed
     from rlcli.rl.checkpoint import open_checkpoint
     from rlcli.rl.files import write_atomic
     from rlcli.rl.load import require_fit, require_same_policy, require_trainer
+    from rlcli.rl.rng import seed_generators
     from rlcli.rl.saving import drop_after
 
     resolved, record = job.resolved, job.run.record
@@ -381,6 +392,7 @@ def _build(job: _Job, device: str) -> Any:
     if saved is not None:  # what a stranger's files hold shows before anything is built
         require_trainer(saved, resolved.agent.trainer)
         state = saved.state()
+    seed_generators(peers.seed(derive(record["seed"], "task"), "task"))  # some tasks draw from them as they are built
     env = make_env(resolved, seed=peers.seed(record["seed"], "environments"), device=device)
     threads = int(record.get("torch_threads") or _threads(resolved)[1])
     make = load_object(resolved.trainer.trainer)
@@ -437,7 +449,8 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
         "layout": env.layout.record(),
         "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
     }
-    keep = Keep.of(agent.keep_last, agent.keep_every, agent.save_interval)
+    keep = Keep() if job.stages else Keep.of(agent.keep_last, agent.keep_every, agent.save_interval)
+    budgets = [Budget(end, None) for end in job.stages] or [Budget(agent.max_iterations, agent.max_steps)]
     saver = Saver(run.checkpoints, keep, manifest, resumed=job.resume_from)
     sinks: list[Any] = []
 
@@ -452,29 +465,50 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
             unsaved = env.unsaved()
             if unsaved:
                 console.warn(f"a resumed run may differ: no checkpoint can hold {', '.join(unsaved)}")
-            run.update(state="running", resumes_exactly=not unsaved and env.device.type == "cpu")
+            exact = not unsaved and env.device.type == "cpu"
+            run.update(state="running", resumes_exactly=exact, **_environment(job, env, trainer))
             sinks += open_loggers(run, job.loggers, resume=resume)
         trials = _trials(job, saver, stop)
         env.before_step, stop.can_interrupt = stop.check, not env.engine.asynchronous
         with TrainingView(f"rlcli train {job.resolved.source.name}") as view:
-            fit(
-                trainer,
-                run,
-                Budget(agent.max_iterations, agent.max_steps),
-                saver,
-                loggers=sinks,
-                save_interval=agent.save_interval,
-                trials=trials,
-                show=view.show,
-                tell=console.warn,
-                divergences=lambda: env.divergences,
-                stop=stop,
-            )
+            for budget in budgets:
+                fit(
+                    trainer,
+                    run,
+                    budget,
+                    saver,
+                    loggers=sinks,
+                    save_interval=agent.save_interval,
+                    trials=trials,
+                    show=view.show,
+                    tell=console.warn,
+                    divergences=lambda: env.divergences,
+                    stop=stop,
+                )
     except BaseException as error:
         with contextlib.suppress(OSError, RlcliError):  # the first error is the one to report
             close("stopped" if isinstance(error, Stopped | KeyboardInterrupt) else "failed")
         raise
     close("finished")
+
+
+def _environment(job: _Job, env: Any, trainer: Any) -> dict[str, Any]:
+    """What run.json says of where the bits are from; of a resumed run what differs from where it began."""
+    from rlcli.rl.environment import built_record, differences, environment_record
+
+    record, device = job.run.record, str(env.device)
+    built = built_record(env.engine.model, device)
+    if job.resume_from is None:
+        return built
+    now = environment_record(job.resolved, env.engine.threads, record.get("torch_threads") or 0) | built
+    now["engine_threads"] = record.get("engine_threads")  # as many as there are; they change no bit
+    same = env.device.type == str(record.get("device", "cpu")).partition(":")[0]
+    now["device"] = record.get("device") if same else device
+    changed = {name: after for name, _, after in differences(record, now)}
+    if not changed:
+        return {}
+    console.warn(f"resumed in another environment, the bits may differ: {', '.join(changed)}")
+    return {"resumed": [*record.get("resumed", []), {"step": trainer.env_steps, "changed": changed}]}
 
 
 def _trials(job: _Job, saver: Any, stop: StopRequest) -> Any:
@@ -540,3 +574,30 @@ def _warn_physics(env: Any) -> None:
     for name, count in env.engine.warnings.items():
         if count:
             console.warn(f"{count} times: {advice[name]}")
+
+
+def train_again(
+    run: Run, resolved: Resolved, init_from: Path | None, stages: list[int], accept: Callable[[dict[str, Any]], None]
+) -> int:
+    """Train a run that was created, up to the last of some iterations, saved at each: what `reproduce` does.
+
+    `accept` hears what the environment is like once it is built, and raises if that will not do; a run that never
+    began is removed. Returns the environment steps taken.
+    """
+    from rlcli.rl.environment import built_record
+    from rlcli.rl.stop import StopRequest
+
+    job = _Job(run, resolved, [], init_from=init_from, stages=stages)
+    with StopRequest() as stop:
+        try:
+            trainer, env = _build(job, "cpu")
+            accept(built_record(env.engine.model, "cpu"))
+        except BaseException:
+            run.discard()
+            raise
+        try:
+            _fit(job, trainer, env, stop)
+        finally:
+            run.unlock()
+            env.close()
+    return int(trainer.env_steps)

@@ -81,6 +81,13 @@ def origins(resolved: Resolved) -> dict[str, str]:
     return {messages.dotted(path): _origin(resolved, path) for path in _leaves(to_data(resolved))}
 
 
+def given(resolved: Resolved) -> dict[str, str]:
+    """Dotted key of every value that stands on the command line or in a `--config` file -> where."""
+    written = resolved.layers.origins.items()
+    layers = ("config", "override", "flag")
+    return {messages.dotted(path): _place(origin) for path, origin in written if path and origin.layer in layers}
+
+
 def json_schema(vocabulary: Vocabulary, params: type[BaseModel] | None = None) -> dict[str, Any]:
     """JSON Schema of a task file, for editors: the parameters of its terms and of a direct task included."""
     schema = TaskConfig.model_json_schema()

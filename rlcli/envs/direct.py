@@ -168,6 +168,9 @@ class DirectEnv(VecEnv):
         self._observed = False
         self._settled = False  # a loaded state holds its second look already
         self._causes: dict[str, Tensor] = {}
+        self._observation_columns = [f"obs_buf[{i}]" for i in range(task.num_observations)]
+        if len(task.observation_names) == task.num_observations:
+            self._observation_columns = list(task.observation_names)
         task.post_reset()
         self._memory = Memory(task, other=("env", "cfg", "params"))
 
@@ -195,7 +198,7 @@ class DirectEnv(VecEnv):
         """The task."""
         return [self.task]
 
-    def extras(self) -> dict[str, float]:
+    def _extras(self) -> dict[str, float]:
         """The task's `extras`: numbers, and means of tensors."""
         found = {}
         for name, value in self.task.extras.items():
@@ -229,13 +232,23 @@ class DirectEnv(VecEnv):
             failed = failed | diverged
             if self.config.divergence_reward is not None:
                 reward.masked_fill_(diverged, self.config.divergence_reward)
-        self._returns += reward
+        self._pay(reward, diverged)
         self._observed = True
         return reward, failed, truncated
+
+    def _pay(self, reward: Tensor, diverged: Tensor | None) -> None:
+        """Add a step's reward to the returns; where the simulation diverged, one that is not finite is none."""
+        if diverged is not None and not self.engine.asynchronous:
+            reward.masked_fill_(diverged & ~reward.isfinite(), 0.0)
+        self._require_finite(reward, "the reward")
+        self._returns += reward
 
     def _final(self) -> dict[str, Tensor]:
         self._final_obs.copy_(self.task.obs_buf)
         self._final_states.copy_(self.task.states_buf)
+        self._require_finite(self._final_obs, "the last observation", self._observation_columns)
+        if self.task.num_states:
+            self._require_finite(self._final_states, "the last state (states_buf)")
         return self._group(self._final_obs, self._final_states)
 
     def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
@@ -270,7 +283,9 @@ class DirectEnv(VecEnv):
             task.obs_buf.copy_(torch.where(fresh, task.obs_buf, obs, out=obs))
             task.states_buf.copy_(torch.where(fresh, task.states_buf, states, out=states))
         self._observed, self._settled = False, False
-        self._require_finite(obs, "the observation")
+        self._require_finite(obs, "the observation", self._observation_columns)
+        if task.num_states:
+            self._require_finite(states, "the state (states_buf)")
         return self._group(obs, states)
 
     def _fill(self) -> None:

@@ -126,7 +126,9 @@ class ManagedEnv(VecEnv):
 
     def _judge(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         terminated, truncated = self.termination_manager.compute(diverged)
-        reward = self.reward_manager.compute()
+        reward = self.reward_manager.compute(diverged)
+        self._require_finite(reward, "the reward")
+        self.reward_manager.add_up()
         if diverged is not None:
             self.reward_manager.replace_diverged(diverged, reward)
         self.command_manager.measure()
@@ -189,7 +191,7 @@ class ManagedEnv(VecEnv):
     def _observe_again(self) -> dict[str, Tensor]:
         return self.observation_manager.again()
 
-    def extras(self) -> dict[str, float]:
+    def _extras(self) -> dict[str, float]:
         """What the curriculum's terms gave last."""
         return self.curriculum_manager.values()
 

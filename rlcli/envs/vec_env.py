@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from rlcli.managers.term import Binder
 from rlcli.sim.actuators import ActuatorModel
 from rlcli.sim.engine import open_engine
 from rlcli.sim.entity import Entity, SimData, is_finite
+from rlcli.sim.guard import LIMIT, SHOWN, Divergence, StateLayout
 from rlcli.sim.names import NameProblem
 from rlcli.sim.rotations import rotate_inverse
 from rlcli.sim.saved import require_alike
@@ -198,6 +199,11 @@ class VecEnv(ABC):
         """Called before anything is done in a step, which it may prevent by raising."""
         self.after_physics: Callable[[], None] | None = None
         """Called in every step with the state that it is judged by, before anything ends or begins."""
+        self.on_divergence: Callable[[list[Divergence], bool], None] | None = None
+        """Called where simulations have diverged, as `engine.trace` still shows them, with the first of them and
+        whether their next call of the engine is the one that goes wrong: then an event or a reset wrote the state."""
+        self._written_causes: dict[str, int] = {}
+        self._told_causes: dict[str, int] = {}
         self._playing = True
         self._counters()
         self._open(resolved)
@@ -208,6 +214,11 @@ class VecEnv(ABC):
         self._success_hold = torch.zeros(self.num_envs, device=self.device)
         self._hold_steps = math.ceil(self.config.success.hold_s / self.step_dt - 1e-6) if self.config.success else 0
         self.layout = self._layout()
+        self._action_columns = [
+            f"{term.name}[{index}]" if index >= len(term.elements) else f"{term.name}.{term.elements[index]}"
+            for term in self.layout.actions
+            for index in range(term.size)
+        ]
 
     # --- what callers use ---
 
@@ -230,6 +241,7 @@ class VecEnv(ABC):
         self._restart(self._everyone())
         self._between()
         self.sim.settle()
+        self._set_aside()
         return self._observe()
 
     def step(self, action: Tensor, begin: Tensor | None = None) -> StepResult:
@@ -256,7 +268,7 @@ class VecEnv(ABC):
         self.engine.attach()
         if begin is not None:
             action = action.masked_fill(begin[:, None], 0.0)
-        self._require_finite(action, "the policy's action")
+        self._require_finite(action, "the policy's action", self._action_columns)
 
         self._act(action)
         diverged = self._simulate()
@@ -267,7 +279,6 @@ class VecEnv(ABC):
         for sensor in self.sensors.values():
             sensor.update(self.step_dt)
         reward, terminated, truncated = self._judge(diverged)
-        self._require_finite(reward, "the reward")
         self._hold_success()
 
         if begin is not None:
@@ -287,6 +298,7 @@ class VecEnv(ABC):
             self._restart(again)  # its draws are those of the same episode: it begins alike
         self._between()
         self.sim.settle()
+        self._set_aside()
         obs = self._observe()
         self.seconds["step"] += time.perf_counter() - start
         return StepResult(obs, reward, terminated, truncated, final_obs, episodes)
@@ -301,7 +313,10 @@ class VecEnv(ABC):
         Raises:
             DivergedError: as `step`, or because the device ran out of room for contacts.
         """
-        for what in self.engine.noted():
+        noted = self.engine.noted()
+        if self.engine.asynchronous and self.on_divergence is not None and self.engine.found:
+            self.on_divergence(self.engine.found, False)
+        for what in noted:
             raise DivergedError(f"{what} is not finite, within the last steps before step {self.common_step}")
 
     @property
@@ -312,7 +327,20 @@ class VecEnv(ABC):
     @property
     def divergences(self) -> int:
         """Environments whose simulation diverged, ever."""
-        return self.engine.divergences
+        return sum(self.causes.values())
+
+    @property
+    def causes(self) -> dict[str, int]:
+        """The same by cause: MuJoCo's warning (`BADQACC`), `FIELD not finite`, `engine error`."""
+        causes = dict(self._written_causes)
+        for cause, count in self.engine.causes.items():
+            causes[cause] = causes.get(cause, 0) + count
+        return causes
+
+    @property
+    def calls_per_step(self) -> int:
+        """Calls of the engine in an environment step: one, or one a physics step where actuator models act between."""
+        return self.config.decimation if self._actuators else 1
 
     def is_playing(self) -> bool:
         """False while paused; no step runs then."""
@@ -323,8 +351,14 @@ class VecEnv(ABC):
         self._playing = not paused
 
     def extras(self) -> dict[str, float]:
-        """Further numbers to log, by the metric's name; as of the last step."""
-        return {}
+        """Further numbers to log, by the metric's name: the task's as of the last step, divergences by cause since the
+        last call.
+        """
+        causes = self.causes
+        new = {cause: count - self._told_causes.get(cause, 0) for cause, count in causes.items()}
+        self._told_causes = causes
+        diverged = {f"Sim/diverged/{cause.replace(' ', '_')}": float(count) for cause, count in new.items() if count}
+        return {**self._extras(), **diverged}
 
     def unsaved(self) -> list[str]:
         """What the task keeps from step to step that `state_dict` cannot hold; empty: it goes on exactly."""
@@ -346,6 +380,7 @@ class VecEnv(ABC):
             "common_step": self._steps.clone(),
             "seed": torch.tensor(self.seed),
             "success_hold": self._success_hold.clone(),
+            "set_aside": self._aside.clone(),
         }
         engine = {f"engine.{name}": value for name, value in self.engine.state_dict().items()}
         models = {
@@ -376,29 +411,24 @@ class VecEnv(ABC):
             ValueError: if something is of another shape or type: what was saved of other environments.
         """
         require_alike(state, {k: v for k, v in self.state_dict().items() if not k.startswith("workflow.")}, "env")
-        self._require_no_selectors(state)
         self.episode_length_buf.copy_(state["episode_length"])
         self.episode_index.copy_(state["episode_index"])
         self._steps.copy_(state["common_step"])
         self.seed = int(state["seed"])
         self._success_hold.copy_(state["success_hold"])
+        self._aside.copy_(state["set_aside"]) if "set_aside" in state else self._aside.zero_()
+        self._any_aside = bool(self._aside.any())
         self.engine.load_state_dict(_below(state, "engine."))
         for name, model in self._actuators.items():
             model.load_state_dict(_below(state, f"actuator.{name}."))
         self.sim.refresh()
+        self.sim.keep()
         if self.terrain is not None:
             self.terrain.load_state_dict(_below(state, "terrain."))
         for name, sensor in self.sensors.items():
             sensor.load_state_dict(_below(state, f"sensors.{name}."))
         self._load_workflow_state(_below(state, "workflow."))
         return self._observe_again()
-
-    def _require_no_selectors(self, state: Mapping[str, Tensor]) -> None:
-        """Integers of a model say which body hangs on which: only those that the task itself changes are taken."""
-        for name, value in state.items():
-            field = name.removeprefix("engine.model.")
-            if field != name and not value.is_floating_point() and self.engine.expanded(field) is None:
-                raise ValueError(f"env: '{name}' differs between environments, which the task does not ask for")
 
     # --- the workflow's part ---
 
@@ -449,6 +479,10 @@ class VecEnv(ABC):
         """Means over the episodes that end. (n,) each"""
         return {}
 
+    def _extras(self) -> dict[str, float]:
+        """The task's own numbers to log."""
+        return {}
+
     def _conclude(self, ended: Selection) -> None:
         """Called with the environments whose episode ends, before anything of it is forgotten."""
 
@@ -482,18 +516,75 @@ class VecEnv(ABC):
                 self.engine.step(1, derive=left == 0)
         self.seconds["physics"] += time.perf_counter() - start
         diverged = self.engine.diverged()
-        if diverged is not None and not self.engine.asynchronous:
-            self._put_back(diverged)
+        if not self.engine.asynchronous:
+            if diverged is not None and self.on_divergence is not None:
+                self.on_divergence(self.engine.found, False)
+            if self._any_aside:
+                diverged = self._aside.clone() if diverged is None else diverged | self._aside
+                self._aside.zero_()
+                self._any_aside = False
+            if diverged is not None:
+                self._put_back(diverged)
         self.sim.refresh()
+        self.sim.keep()
         return diverged
 
     def _put_back(self, diverged: Tensor) -> None:
         """Return diverged worlds to their last finite state: they are judged by that, not by MuJoCo's own reset."""
         selection = self._select(diverged)
-        if selection is not None:
-            self.engine.reset(selection)
-            self.sim.restore_rows(selection)
+        if selection is None:
+            return
+        self.engine.reset(selection)
+        self.sim.restore_rows(selection)
+        try:
             self.engine.forward(selection)
+        except DivergedError:  # the engine cannot compute where they are, either
+            self.engine.reset(selection)
+            self.engine.forward(selection)
+
+    def _set_aside(self) -> None:
+        """Take worlds back that an event or a reset has put where physics cannot go on; they end with the next step.
+
+        Until then they are where they were before the event, or in the default state where their episode has just
+        begun. A GPU, which must not be asked, finds them in the next step.
+        """
+        if self.engine.asynchronous:
+            return
+        bad = self.sim.out_of_bounds(LIMIT)
+        if bad is not None:
+            self._take_back(bad)
+        self.sim.keep()
+
+    def _take_back(self, bad: Tensor) -> None:
+        found = [self._written_badly(env) for env in bad.nonzero().flatten().tolist()]
+        for divergence in found:
+            self._written_causes[divergence.cause] = self._written_causes.get(divergence.cause, 0) + 1
+        if self.on_divergence is not None:
+            self.on_divergence(found[:SHOWN], True)
+        begun = bad & (self.episode_length_buf == 0)
+        for rows, restore in ((bad & ~begun, True), (begun, False)):
+            selection = self._select(rows)
+            if selection is None:
+                continue
+            self.engine.reset(selection)
+            if restore:
+                self.sim.restore_rows(selection)
+            self.engine.forward(selection)
+            self.sim.refresh_rows(selection)
+            for sensor in self.sensors.values():
+                sensor.moved(selection)
+        self._aside |= bad
+        self._any_aside = True
+
+    def _written_badly(self, env: int) -> Divergence:
+        columns, field = self.sim.qpos[env], "qpos"
+        if bool((columns.abs() <= LIMIT).all()):
+            columns, field = self.sim.qvel[env], "qvel"
+        index = int((~(columns.abs() <= LIMIT)).nonzero()[0, 0])
+        place = StateLayout(self.engine.model, {}).place(field, index)
+        who = "a reset" if int(self.episode_length_buf[env]) == 0 else "an event"
+        what = "out of bounds" if bool(columns.isfinite().all()) else "not finite"
+        return Divergence(env, f"{field} {what}", f"{place} = {float(columns[index]):g}, written by {who}")
 
     def _hold_success(self) -> None:
         if self._success is not None:
@@ -553,7 +644,8 @@ class VecEnv(ABC):
         """Whether a mask holds anywhere, as far as that is known without waiting for a device."""
         return self.engine.asynchronous or bool(mask.any())
 
-    def _require_finite(self, values: Tensor, what: str) -> None:
+    def _require_finite(self, values: Tensor, what: str, columns: Sequence[str] = ()) -> None:
+        """Stop with the environments, and the first of `columns` that is not finite."""
         if self.engine.asynchronous:
             self.engine.watch(values, what)
             return
@@ -563,9 +655,11 @@ class VecEnv(ABC):
         bad = ~values.isfinite()
         rows = bad.any(dim=1) if bad.dim() > 1 else bad
         first = int(rows.nonzero()[0, 0])
+        column = int(bad[first].nonzero()[0, 0]) if bad.dim() > 1 else 0
+        name = f" in column {columns[column]}" if column < len(columns) else ""
         raise DivergedError(
-            f"{what} is not finite in {int(rows.sum())} of {self.num_envs} environments, first in environment {first}"
-            f" (step {self.common_step})"
+            f"{what} is not finite in {int(rows.sum())} of {self.num_envs} environments, first in environment"
+            f" {first}{name} (step {self.common_step})"
         )
 
     # --- construction ---
@@ -640,8 +734,10 @@ class VecEnv(ABC):
         # the first reset of a new environment begins episode 0, as a reset with a seed does
         self.episode_index = torch.full((self.num_envs,), -1, dtype=torch.int64, device=self.device)
         """Episodes begun before the running one; random streams are keyed by it. (num_envs,)"""
+        self._aside = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self._any_aside = False
         self._ids = torch.arange(self.num_envs, device=self.device)
-        self._steps = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._steps: Tensor = torch.zeros((), dtype=torch.int64, device=self.device)
 
 
 def grid(num_envs: int, spacing: float) -> Tensor:

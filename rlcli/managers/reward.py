@@ -51,8 +51,10 @@ class RewardManager:
             if _moves(weight) or weight != 0.0:
                 check_shape(term, first_value(term), (num_envs,), "rewards")
 
-    def compute(self) -> Tensor:
-        """This step's reward. (num_envs,)
+    def compute(self, diverged: Tensor | None = None) -> Tensor:
+        """This step's reward; `add_up` takes it into the episode's sums. (num_envs,)
+
+        On a CPU a term that is not finite where the simulation diverged pays nothing there.
 
         On a CPU the terms are added one after the other: torch's own sum over rows rounds differently for different
         numbers of environments. On a GPU nothing is bit-identical, and one launch is cheaper than many.
@@ -61,6 +63,8 @@ class RewardManager:
             torch.mul(call(), factor, out=row)
         for row, weight in self._moved:
             row.mul_(weight * self._dt)
+        if diverged is not None and not self._fused:
+            self._values.masked_fill_(diverged & ~self._values.isfinite(), 0.0)
         self._next = (self._next + 1) % len(self._totals)
         if self._fused:
             total = torch.sum(self._values, dim=0, out=self._totals[self._next])
@@ -68,8 +72,11 @@ class RewardManager:
             total = self._totals[self._next].copy_(self._rows[0])
             for row in self._rows[1:]:
                 total += row
-        self._sums += self._values
         return total
+
+    def add_up(self) -> None:
+        """Take the step's terms into the sums of the running episodes."""
+        self._sums += self._values
 
     def values(self) -> dict[str, Tensor]:
         """Term -> what it paid in the last step, weight included; zeros where it is not called. (num_envs,) each"""

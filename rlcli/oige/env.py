@@ -136,7 +136,7 @@ class OigeEnv(DirectEnv):
         outer = self.sim.derived("cfrc_ext")[:, body, 3:]
         return outer - self.sim.derived("xfrc_applied")[:, body, :3]
 
-    def extras(self) -> dict[str, float]:
+    def _extras(self) -> dict[str, float]:
         """The task's `extras`: numbers, and means of tensors, one level deep."""
         flat: dict[str, Any] = {}
         for name, value in self.task.extras.items():
@@ -174,7 +174,7 @@ class OigeEnv(DirectEnv):
             failed = failed | diverged
             if self.config.divergence_reward is not None:
                 reward.masked_fill_(diverged, self.config.divergence_reward)
-        self._returns += reward
+        self._pay(reward, diverged)
         self._observed = True
         self._noise.after_step()
         return reward, failed, truncated
@@ -200,6 +200,9 @@ class OigeEnv(DirectEnv):
     def _final(self) -> dict[str, Tensor]:
         self._final_obs.copy_(self.task.obs_buf)
         self._final_states.copy_(self.task.states_buf)
+        self._require_finite(self._final_obs, "the last observation", self._observation_columns)
+        if self.task.num_states:
+            self._require_finite(self._final_states, "the last state (states_buf)")
         return self._group(*self._clipped(self._final_obs, self._final_states))
 
     def _restart_workflow(self, selection: Selection) -> None:

@@ -167,7 +167,8 @@ def as_run(foreign: Foreign, resolved: Resolved, record: Mapping[str, Any], runs
     """
     from rlcli.config.dump import to_data, to_yaml
     from rlcli.envs.vec_env import make_env
-    from rlcli.rl.run import create_run, environment_record
+    from rlcli.rl.environment import environment_record
+    from rlcli.rl.run import create_run
     from rlcli.rl.saving import write
     from rlcli.rl.trainer import TrainerState
 
@@ -194,7 +195,7 @@ def as_run(foreign: Foreign, resolved: Resolved, record: Mapping[str, Any], runs
         "loggers": [],
         "init_from": None,
         **record,
-        **environment_record(1, 1),
+        **environment_record(resolved, 1, 1),
     }
     run = create_run(runs_dir, resolved.source.name, name, to_yaml(to_data(resolved)), entries)
     manifest = {

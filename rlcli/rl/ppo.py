@@ -20,6 +20,7 @@ from rlcli.errors import DivergedError
 from rlcli.random import derive
 from rlcli.rl import distributed
 from rlcli.rl.capture import captured
+from rlcli.rl.finite import LEARNER_HINT, moments, require_finite
 from rlcli.rl.fusion import fused, tensor_cores
 from rlcli.rl.networks import ActorCritic, ValueNormalizer, adam, flatten, remembered
 from rlcli.rl.policy import Lstm, Normalizer, Policy
@@ -27,15 +28,15 @@ from rlcli.rl.ppo_config import PpoConfig
 from rlcli.rl.ppo_loss import KL, METRICS, Judged, Parts, log_prob
 from rlcli.rl.ppo_rollout import Rollout, Samples
 from rlcli.rl.ppo_setup import compilation, critic_groups, minibatch_sizes, policy_spec
-from rlcli.rl.rng import load_rng_state, rng_state
+from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
 from rlcli.rl.trainer import Report, TrainerState
+from rlcli.sim.entity import is_finite
 from rlcli.sim.saved import require_alike
 
 _RECORDED = 256
 """Recent observations that a checkpoint keeps, for checking what is made of the policy later."""
-_LEARNER_HINT = "lower learning_rate or max_grad_norm; the last good checkpoint is kept"
 
 
 class PpoTrainer:
@@ -64,7 +65,7 @@ class PpoTrainer:
         shared = self._groups == ("policy",)
 
         torch.set_num_threads(torch_threads)
-        torch.manual_seed(derive(seed, "trainer"))
+        seed_generators(derive(seed, "trainer"))
         self.networks = ActorCritic(obs_size, critic_size, self.spec.action_size, config).to(self.device)
         self._vector, self._shared, places = flatten(self.networks)
         self._gradient, self._shared_kl = self._shared[:-1], self._shared[-1]
@@ -73,7 +74,7 @@ class PpoTrainer:
         joint = config.clip_grad == "joint"
         self._gradient_parts = (self._gradient,) if joint else (self._gradient[:end], self._gradient[end:])
         self.learning_rate = torch.tensor(config.learning_rate, device=self.device)
-        torch.manual_seed(self.peers.seed(derive(seed, "exploration"), "exploration"))
+        seed_generators(self.peers.seed(derive(seed, "exploration"), "exploration"))
         self._ceiling = torch.tensor(config.learning_rate_range[1], device=self.device)
         self._optimizer = adam(self._vector, self.learning_rate, config.adam_eps)
         normalize = config.normalize_observations
@@ -95,6 +96,8 @@ class PpoTrainer:
         self._metrics = torch.zeros(len(METRICS) + 4, device=self.device)
         self._recorded = torch.zeros(0, obs_size, device=self.device)
         self._notes: list[str] = []
+        self._checks = self.device.type == "cpu"
+        """Whether to ask after every stage if all is finite; a GPU, which must not be asked, is once an iteration."""
         self._collect = captured(self._roll_out, self.device, env.holders(), self._notes.append)
         self._tf32, self._parts = config.tf32 and self.device.type == "cuda", Parts()
         how = compilation(config, self.device, self.steps_per_iteration)
@@ -112,7 +115,11 @@ class PpoTrainer:
         physics, step = self.env.seconds["physics"], self.env.seconds["step"]
         begin = time.perf_counter()
         torch.set_num_threads(1)
-        self._collect()
+        try:
+            self._collect()
+        except DivergedError:
+            require_finite(self._learned(), self.iteration + 1)  # where the action comes from, it may have gone wrong
+            raise
         self._record()
         collected = self._now()
         torch.set_num_threads(self.torch_threads)
@@ -218,6 +225,9 @@ class PpoTrainer:
             advantage = torch.addcmul(delta[t], fading[t], advantage, out=samples.advantage[t])
         samples.value.copy_(value)
         torch.add(samples.advantage, value, out=samples.target)
+        if self._checks and not self._rollout.is_finite():
+            require_finite(self._learned(), self.iteration)
+            require_finite(self._rollout.in_order(), self.iteration, ("step", "environment"))
         self._explain(value)
         if self.value_normalizer is not None:
             for column in (samples.value, samples.target):
@@ -303,10 +313,14 @@ class PpoTrainer:
         judged = self._differentiate(self._parts.judge, batch, number)
         self._sums += judged.metrics
         self.peers.average_(self._shared)
+        if self._checks and not is_finite(self._shared):
+            require_finite(self._stages(judged), self.iteration)
         if self.config.kl_from == "rollout":
             self._adapt(self._shared_kl, "minibatch")
         self._clip_gradient()
         self._optimizer.step()
+        if self._checks and not is_finite(self._vector):
+            require_finite([("the learning rate", self.learning_rate), *self._weights()], self.iteration)
         if self.config.kl_from == "last_pass":
             self._adapt(self._shared_kl, "minibatch")
             batch.mean.copy_(judged.mean)
@@ -323,6 +337,33 @@ class PpoTrainer:
         gradients = torch.autograd.grad(judged.loss, list(self.networks.parameters()))
         torch.cat([*(part.flatten() for part in gradients), judged.metrics[KL : KL + 1]], out=self._shared)
         return judged
+
+    def _stages(self, judged: Judged) -> list[tuple[str, Tensor]]:
+        """What a minibatch gave, in the order in which it came: losses, then gradients from the outputs backwards."""
+        losses = [(f"the loss ({name})", judged.metrics[i]) for i, name in enumerate(METRICS) if i != KL]
+        names, parameters = zip(*self.networks.named_parameters(), strict=True)
+        gradients = self._gradient.split([parameter.numel() for parameter in parameters])
+        backwards = [(f"the gradient of '{name}'", gradient) for name, gradient in zip(names, gradients, strict=True)][
+            ::-1
+        ]
+        return [*losses, ("the loss", judged.loss.detach()), *backwards, ("the divergence (KL)", self._shared_kl)]
+
+    def _weights(self) -> list[tuple[str, Tensor]]:
+        return [(f"weight '{name}'", parameter.detach()) for name, parameter in self.networks.named_parameters()]
+
+    def _learned(self) -> list[tuple[str, Tensor]]:
+        """What a rollout is made with."""
+        memories = [(f"the memory of the {name}", memory) for name, memory in self._memory_before.items()]
+        return [*self._moments(), *self._weights(), *memories]
+
+    def _moments(self) -> list[tuple[str, Tensor]]:
+        return moments(
+            [
+                ("observation", self.normalizer),
+                ("critic's observation", self.critic_normalizer),
+                ("value", self.value_normalizer),
+            ]
+        )
 
     def _inputs(self, batch: Samples, number: int) -> tuple[Tensor, Tensor]:
         """What the networks see of a minibatch: with memories, they go through its environments' steps again."""
@@ -364,7 +405,8 @@ class PpoTrainer:
     def _conclude(self) -> None:
         """Put together what `iterate` reads."""
         updates = self.config.num_epochs * len(self._rollout.minibatches)
-        last = torch.stack((self.networks.std.mean(), self.learning_rate, self._vector.isfinite().all().float()))
+        sums = torch.stack([values.sum().double() for _, values in (("", self._vector), *self._moments())])
+        last = torch.stack((self.networks.std.mean(), self.learning_rate, sums.isfinite().all().float()))
         self._metrics[: len(METRICS)].copy_(self._sums / updates)
         self._metrics[len(METRICS) : -1].copy_(last)
         self.peers.average_(self._metrics)
@@ -375,12 +417,14 @@ class PpoTrainer:
         *losses, std, learning_rate, finite, explained = self._metrics.tolist()
         metrics = {f"Loss/{name}": value for name, value in zip(METRICS, losses, strict=True)}
         metrics |= {"Policy/mean_std": std, "Loss/learning_rate": learning_rate, "Loss/explained_variance": explained}
-        for name in ("Loss/surrogate", "Loss/value", "Policy/mean_std"):
-            if not math.isfinite(metrics[name]):
-                raise DivergedError(f"{name} is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
-        if finite < 1.0:
-            name = next(n for n, p in self.networks.named_parameters() if not bool(p.isfinite().all()))
-            raise DivergedError(f"weight '{name}' is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
+        wrong = [n for n in ("Loss/surrogate", "Loss/value", "Policy/mean_std") if not math.isfinite(metrics[n])]
+        if wrong or finite < 1.0:
+            if not self._rollout.is_finite():
+                require_finite(self._rollout.in_order(), self.iteration, ("step", "environment"))
+            require_finite(self._moments(), self.iteration)
+            if wrong:
+                raise DivergedError(f"{wrong[0]} is not finite in iteration {self.iteration}", hint=LEARNER_HINT)
+            require_finite(self._weights(), self.iteration)
         if not self.config.bounds_coef:
             del metrics["Loss/bounds"]
         return {name: value for name, value in metrics.items() if math.isfinite(value)}

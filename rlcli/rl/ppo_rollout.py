@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rlcli.sim.entity import is_finite
+
 
 @dataclass(frozen=True, slots=True)
 class Samples:
@@ -78,6 +80,26 @@ class Rollout:
         parts = numbers[0].split([size // steps for size in minibatches]) if whole else ()
         self.environments = [part.clone() for part in parts]
         """The environments of each minibatch, where it holds them whole. (n,) each"""
+
+    def is_finite(self) -> bool:
+        """Whether all samples are."""
+        return is_finite(self._packed)
+
+    def in_order(self) -> list[tuple[str, Tensor]]:
+        """What was gathered, in the order in which one thing is computed from the other. (num_steps, num_envs, ...)"""
+        samples = self.samples
+        return [
+            ("the observation, as the actor sees it,", samples.obs),
+            ("the mean action", samples.mean),
+            ("the action", samples.action),
+            ("the action's log-probability", samples.log_prob),
+            ("the reward", self.reward),
+            ("the observation, as the critic sees it,", samples.critic_obs),
+            ("the last observation, as the critic sees it,", torch.where(self.cut[..., None], self.final_obs, 0.0)),
+            ("the value", samples.value),
+            ("the advantage", samples.advantage),
+            ("the value's target", samples.target),
+        ]
 
     def group(self, environments: Tensor) -> Tensor:
         """The order that deals `environments` out to the minibatches; within one, all of step 0 come first."""

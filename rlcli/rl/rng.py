@@ -1,4 +1,4 @@
-"""The global random generators of torch, numpy and Python, as tensors of a checkpoint."""
+"""The global random generators of torch, numpy and Python: seeded together, and as tensors of a checkpoint."""
 
 from __future__ import annotations
 
@@ -11,6 +11,13 @@ import torch
 from torch import Tensor
 
 from rlcli.sim.saved import require_alike, require_within
+
+
+def seed_generators(seed: int) -> None:
+    """Seed all three: tasks of others draw from whichever they know, and torch's networks from torch's."""
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)
+    random.seed(seed)
 
 
 def rng_state() -> dict[str, Tensor]:

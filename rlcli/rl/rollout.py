@@ -30,6 +30,8 @@ class Evaluation:
     reward_terms: dict[str, list[float]] = field(default_factory=dict)
     causes: dict[str, list[bool]] = field(default_factory=dict)
     diverged: int = 0
+    diverged_by: dict[str, int] = field(default_factory=dict)
+    """Cause -> how often."""
 
     def summary(self) -> dict[str, Any]:
         """Means with 95 % intervals, as plain JSON."""
@@ -40,6 +42,7 @@ class Evaluation:
             "reward_terms": {name: _mean(values)["mean"] for name, values in self.reward_terms.items()},
             "terminations": {name: sum(v) / max(1, len(self.returns)) for name, v in self.causes.items()},
             "diverged": self.diverged,
+            "diverged_by": self.diverged_by,
         }
         if self.successes:
             result["success"] = proportion(sum(self.successes), len(self.successes))
@@ -59,7 +62,7 @@ def evaluate(
     quota = torch.full((env.num_envs,), episodes // env.num_envs)
     quota[: episodes % env.num_envs] += 1
     result = Evaluation()
-    start = env.divergences
+    before = env.causes
     obs = env.reset(seed=env.seed)["policy"]
     with torch.no_grad():
         while bool((quota > 0).any()):
@@ -70,7 +73,9 @@ def evaluate(
             if step.episodes is not None:
                 _take(result, step, quota)
         env.check()
-    result.diverged = env.divergences - start
+    after = {cause: count - before.get(cause, 0) for cause, count in env.causes.items()}
+    result.diverged_by = {cause: count for cause, count in after.items() if count}
+    result.diverged = sum(after.values())
     return result
 
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import os
-import platform
 import re
 import shutil
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
-import rlcli
 from rlcli.errors import CheckpointError, MachineError, UsageError, did_you_mean, listing
 from rlcli.rl.files import disk_error, to_json, write_atomic
 from rlcli.rl.reading import JSON_LIMIT, parse_json, read_file, refuse_links
@@ -227,22 +223,6 @@ def _newest_good(run: Run, have: list[int], why: str, whole: bool, tell: Callabl
             continue
         return folder, f"{why}, its newest {'good ' if passed else ''}checkpoint"
     raise AssertionError("a run without checkpoints is refused before")
-
-
-def environment_record(engine_threads: int, torch_threads: int) -> dict[str, Any]:
-    """What results depend on besides the configuration."""
-    packages = ("mujoco", "torch", "numpy", "stable-baselines3", "safetensors")
-    return {
-        "rlcli": rlcli.__version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "machine": platform.machine(),
-        "versions": {name: metadata.version(name) for name in packages},
-        "engine_threads": engine_threads,
-        "torch_threads": torch_threads,
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "pid": os.getpid(),
-    }
 
 
 def default_runs_dir() -> Path:

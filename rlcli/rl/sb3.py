@@ -16,6 +16,7 @@ from rlcli.adapters.sb3 import Sb3VecEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DivergedError
 from rlcli.random import derive
+from rlcli.rl.finite import LEARNER_HINT, GradientWatch, moments, require_finite
 from rlcli.rl.policy import ACTIVATIONS, Normalizer, Policy, PolicySpec
 from rlcli.rl.rng import load_rng_state, rng_state
 from rlcli.rl.sb3_algorithms import FastA2C, FastDDPG, FastPPO, FastSAC, FastTD3
@@ -33,6 +34,7 @@ from rlcli.rl.sb3_config import (
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
 from rlcli.rl.trainer import Report, TrainerState, require_slots
+from rlcli.sim.entity import is_finite
 from rlcli.sim.saved import require_alike
 
 _METRICS = {
@@ -52,7 +54,6 @@ _MUST_BE_FINITE = ("Loss/surrogate", "Loss/value", "Loss/actor", "Loss/critic", 
 _LR_RANGE = (1e-5, 1e-2)
 _RECORDED = 256
 """Recent observations that a checkpoint keeps, for checking what is made of the policy later."""
-_LEARNER_HINT = "lower learning_rate or max_grad_norm; the last good checkpoint is kept"
 
 
 class Sb3Trainer:
@@ -91,6 +92,7 @@ class Sb3Trainer:
             self._horizon = config.n_steps
         self.steps_per_iteration = self._horizon * env.num_envs
         self._recorded = torch.zeros(0, self.spec.observation_size)
+        self._gradients = GradientWatch(self.model.policy, self._optimizers().values())
 
     @property
     def env_steps(self) -> int:
@@ -111,21 +113,26 @@ class Sb3Trainer:
         except ValueError as error:
             if not str(error).startswith("Expected parameter"):  # how torch refuses a distribution of NaNs
                 raise
-            self._require_finite_weights()
+            self._require_finite_learner()
             raise DivergedError(
-                f"the policy's distribution is not finite in iteration {self.iteration}", hint=_LEARNER_HINT
+                f"the policy's distribution is not finite in iteration {self.iteration}", hint=LEARNER_HINT
             ) from error
 
     def _iterate(self) -> Report:
         physics, step = self.env.seconds["physics"], self.env.seconds["step"]
         begin = time.perf_counter()
         torch.set_num_threads(1)
-        self._collect()
+        try:
+            self._collect()
+        except (DivergedError, ValueError):  # where the action comes from, it may have gone wrong
+            require_finite(self._learned(), self.iteration + 1)
+            raise
         self._record()
         collected = time.perf_counter()
         torch.set_num_threads(self.torch_threads)
         self._decay()
         self.iteration += 1
+        self._require_finite_rollout()
         self._update()
         updated = time.perf_counter()
         metrics = self._losses()
@@ -252,17 +259,55 @@ class Sb3Trainer:
         recorded = self.model.logger.name_to_value
         metrics = {name: float(recorded[key]) for key, name in _METRICS.items() if key in recorded}
         metrics["Loss/learning_rate"] = self._learning_rate
-        for name in _MUST_BE_FINITE:
-            if not math.isfinite(metrics.get(name, 0.0)):
-                raise DivergedError(f"{name} is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
-        self._require_finite_weights()
+        self._require_finite_learner()
         recorded.clear()
         return {name: value for name, value in metrics.items() if math.isfinite(value)}
 
-    def _require_finite_weights(self) -> None:
-        for name, parameter in self.model.policy.named_parameters():
-            if not bool(parameter.isfinite().all()):
-                raise DivergedError(f"weight '{name}' is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
+    def _require_finite_rollout(self) -> None:
+        """Before anything is learned from it; a replay buffer holds what the environment has checked."""
+        if isinstance(self.config, OffPolicyConfig):
+            require_finite(moments([("observation", self.normalizer)]), self.iteration)
+            return
+        buffer = self.model.rollout_buffer
+        in_order = [
+            ("the observation, as the policy sees it,", buffer.obs),
+            ("the action", buffer.action),
+            ("the action's log-probability", buffer.log_prob),
+            ("the value", buffer.value),
+            ("the reward, with the value of what time cut off,", buffer.reward),
+            ("the advantage", buffer.advantage),
+            ("the value's target", buffer.target),
+        ]
+        if not all(is_finite(values) for _, values in in_order):
+            require_finite(self._learned(), self.iteration)
+            require_finite(in_order, self.iteration, ("step", "environment"))
+        require_finite(moments([("observation", self.normalizer)]), self.iteration)
+
+    def _require_finite_learner(self) -> None:
+        """What an update gives, in the order in which it comes: losses, gradients, weights."""
+        recorded = self.model.logger.name_to_value
+        metrics = {name: float(recorded[key]) for key, name in _METRICS.items() if key in recorded}
+        for name in _MUST_BE_FINITE:
+            if not math.isfinite(metrics.get(name, 0.0)):
+                raise DivergedError(f"{name} is not finite in iteration {self.iteration}", hint=LEARNER_HINT)
+        if not math.isfinite(recorded.get("train/loss", 0.0)):
+            raise DivergedError(f"the loss is not finite in iteration {self.iteration}", hint=LEARNER_HINT)
+        if self._gradients.first is not None:
+            raise DivergedError(
+                f"the gradient of '{self._gradients.first}' is not finite, in iteration {self.iteration};"
+                " the losses are",
+                hint=LEARNER_HINT,
+            )
+        require_finite(self._weights(), self.iteration)
+
+    def _learned(self) -> list[tuple[str, Tensor]]:
+        """What a rollout is made with."""
+        return [*moments([("observation", self.normalizer)]), *self._weights()]
+
+    def _weights(self) -> list[tuple[str, Tensor]]:
+        weights = [(f"weight '{name}'", value.detach()) for name, value in self.model.policy.named_parameters()]
+        entropy = getattr(self.model, "log_ent_coef", None)
+        return weights if entropy is None else [*weights, ("the entropy coefficient", entropy.detach())]
 
     def _decay(self) -> None:
         if self.config.schedule == "linear":

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from rlcli.rl.rng import load_rng_state, rng_state
+from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.rollout import acting, evaluate
 
 if TYPE_CHECKING:
@@ -52,8 +52,9 @@ class Trials:
         torch.set_num_threads(1)
         try:
             if self._env is None:
+                seed_generators(0)  # whenever it is built, of tasks that draw as they are
                 self._env = self._make_env()
-            torch.manual_seed(self._env.seed)  # of tasks that draw from torch
+            seed_generators(self._env.seed)
             summary = evaluate(self._env, acting(self._env, policy()), self._episodes).summary()
         finally:
             load_rng_state(rng)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -14,11 +15,12 @@ from torch import Tensor
 
 from rlcli.errors import DivergedError, did_you_mean
 from rlcli.sim.engine import force_sensors, quiet_mujoco
-from rlcli.sim.saved import require_alike
+from rlcli.sim.guard import ENGINE_ERROR, FIELD_OF, SHOWN, Call, Divergence, History, StateLayout
 from rlcli.sim.selection import IdSelection, Selection
 
 _STATE = mujoco.mjtState
-_NOT_DERIVED = frozenset(mujoco.batch._STATE_FIELDS)
+_STATE_FIELDS = mujoco.batch._STATE_FIELDS
+_NOT_DERIVED = frozenset(_STATE_FIELDS)
 _ACCELERATION = frozenset(
     [
         "qacc",
@@ -37,7 +39,21 @@ _ACCELERATION = frozenset(
 """Fields of the acceleration stage: read as the last substep left them, so they ask for no stage of their own."""
 
 _W = mujoco.mjtWarning
-_DIVERGED = [int(w) for w in (_W.mjWARN_BADQPOS, _W.mjWARN_BADQVEL, _W.mjWARN_BADQACC, _W.mjWARN_BADCTRL)]
+_FLAGS = frozenset(
+    [
+        *("geom_contype", "geom_conaffinity", "geom_priority", "geom_group", "jnt_limited", "jnt_actgravcomp"),
+        *("jnt_actfrclimited", "tendon_limited", "tendon_actfrclimited", "actuator_ctrllimited", "actuator_actlimited"),
+        *("actuator_forcelimited", "eq_active0", "opt.disableactuator"),
+    ]
+)
+"""Integers of a model that are no address, number or kind of anything."""
+_DIVERGED = {
+    "BADCTRL": int(_W.mjWARN_BADCTRL),
+    "BADQPOS": int(_W.mjWARN_BADQPOS),
+    "BADQVEL": int(_W.mjWARN_BADQVEL),
+    "BADQACC": int(_W.mjWARN_BADQACC),
+}
+"""Warnings after which MuJoCo resets a world or drops its controls; of several, the first is the cause."""
 _NOTED = {
     "contact_full": int(_W.mjWARN_CONTACTFULL),
     "constraint_full": int(_W.mjWARN_CNSTRFULL),
@@ -78,12 +94,17 @@ class BatchEngine:
         self.num_envs = num_envs
         self.device = torch.device("cpu")
         self.threads = threads
-        self.divergences = 0
+        self.causes: dict[str, int] = {}
+        self.found: list[Divergence] = []
         self.warnings = dict.fromkeys(_NOTED, 0)
         self._batch = Batch(model, num_envs, threads, persistent=external_forces)
         self._state = torch.from_numpy(self._batch.state)
         self._warning_words = self._batch.warning.reshape(-1).view(np.int64)
+        self._failed = np.zeros(num_envs, dtype=bool)
+        self._error = ""
         self._default = self._default_row()
+        self.state_layout = StateLayout(model, {n: self._batch._component(kind) for n, kind in _STATE_FIELDS.items()})
+        self._history = History(self._batch.state, self.state_layout.until("ctrl"), self._default, 1)
         self._fields: dict[str, Tensor] = {}
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         self._late = late
@@ -99,6 +120,37 @@ class BatchEngine:
         self.forces_after_reset = forces_after_reset
         self._reset_stage = _ACC if forces_after_reset else _VEL
         self._force_sensors = force_sensors(model)
+
+    @property
+    def divergences(self) -> int:
+        """Worlds that diverged, ever."""
+        return sum(self.causes.values())
+
+    def remember(self, calls: int) -> None:
+        """Keep what the last calls began with, for `trace`: as many as asked for, or as fit into 64 MiB."""
+        self._history = History(self._batch.state, self._history.width, self._default, calls)
+
+    def trace(self, env: int) -> list[Call]:
+        """The last calls of a world in its running episode, the oldest first."""
+        return self._history.of(env)
+
+    @property
+    def follows_constants(self) -> bool:
+        """Whether `set_constants` has been called."""
+        return self._own_constants
+
+    def row(self, env: int) -> np.ndarray:
+        """A copy of a world's integration state. (nstate,)"""
+        return self._batch.state[env].copy()
+
+    def own_model(self, env: int) -> dict[str, np.ndarray]:
+        """Copies of the model fields of a world's own."""
+        return {name: np.array(values[env]) for name, values in self._batch._expanded.items()}
+
+    def put(self, env: int, row: np.ndarray) -> None:
+        """Give a world an integration state; derived fields stay behind."""
+        self._batch.state[env] = row
+        self._batch.warning[env] = 0
 
     def attach(self) -> None:
         """Nothing to do: calls return when their work is done."""
@@ -119,7 +171,14 @@ class BatchEngine:
             if name not in _NOT_DERIVED:
                 self._forward_all()  # a field asked for late holds zeros until then
             self._fields[name] = bound
+            if name in _NOT_DERIVED:
+                self._keep(name)
         return self._fields[name]
+
+    def _keep(self, name: str) -> None:
+        """Have the history hold a field that somebody may write to from now on."""
+        if self.state_layout.until(name) > self._history.width:
+            self._history = History(self._batch.state, self._batch.nstate, self._default, self._history.calls)
 
     def can_expand(self, name: str) -> bool:
         """Whether a model field may differ between worlds."""
@@ -149,10 +208,12 @@ class BatchEngine:
 
     def step(self, nstep: int, *, derive: bool = True) -> None:
         """Advance every world by `nstep` physics steps; without `derive` the derived fields stay behind."""
+        self._history.note(nstep)
         try:
             self._batch.step(nstep=nstep, stage=self._step_stage if derive else _NONE)
-        except SimulationError as error:
-            raise _engine_error(error) from None
+        except SimulationError:
+            self._failed |= self._batch.status != 0  # their rows are as they were; the others have been stepped
+            self._error = " ".join(self._batch.error(int(self._failed.argmax())).split()) or self._error
         if self._external is not None and derive:
             self._feel(self._external.numpy())
 
@@ -170,27 +231,68 @@ class BatchEngine:
             forces[world] = self._world.cfrc_ext
 
     def diverged(self) -> Tensor | None:
-        """Worlds whose warning counters rose in the last step.
+        """Worlds that went wrong since the last call; `found` then says what in the first of them.
 
         MuJoCo resets a diverging world by itself, to finite values, and clears its counters as it does: so they are
-        read after every step and put back to zero, and the state alone would show nothing.
+        read after every step and put back to zero, and the state alone would show nothing. What gives no warning is
+        not finite afterwards: the sum of all states then is not, either.
         """
-        bad = self._warned() if self._warning_words.any() else None
-        if self._batch._expanded:  # a time step or a mass of its own that is NaN gives no warning at first
-            silent = ~(self.field("qpos").isfinite().all(dim=1) & self.field("qvel").isfinite().all(dim=1))
-            bad = silent if bad is None else bad | silent
-        if bad is None or not bool(bad.any()):
+        self.found = []
+        warned = bool(self._warning_words.any())
+        # of whole rows: skipping the columns that nobody writes takes longer
+        finite = math.isfinite(self._state.sum().item()) or bool(self._state.isfinite().all())
+        if not warned and finite and not self._error:
             return None
-        self.divergences += int(bad.sum())
-        return bad
+        bad, causes = self._judge(finite)
+        if not bad.any():
+            return None
+        names, counts = np.unique(causes[bad], return_counts=True)
+        for name, count in zip(names.tolist(), counts.tolist(), strict=True):
+            self.causes[name] = self.causes.get(name, 0) + count
+        return torch.from_numpy(bad)
 
-    def _warned(self) -> Tensor:
+    def _judge(self, finite: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Which worlds went wrong, and the cause of each; the counters are put back to zero."""
         counts = self._batch.warning[:, :, 1]
         for name, kind in _NOTED.items():
             self.warnings[name] += int((counts[:, kind] > 0).sum())
-        bad = (counts[:, _DIVERGED] > 0).any(axis=1)
+        bad = self._failed if finite else self._failed | ~np.isfinite(self._batch.state).all(axis=1)
+        causes = np.full(self.num_envs, "", dtype=object)
+        causes[self._failed] = ENGINE_ERROR
+        for name, kind in _DIVERGED.items():
+            warned = counts[:, kind] > 0
+            causes[warned & (causes == "")] = name
+            bad = bad | warned
+        for env in (bad & (causes == "")).nonzero()[0]:
+            causes[env] = f"{self._unfit(int(env))} not finite"
+        self.found = [self._describe(int(env), causes[env]) for env in bad.nonzero()[0][:SHOWN]]
         self._batch.warning[:] = 0
-        return torch.from_numpy(bad)
+        self._failed = np.zeros(self.num_envs, dtype=bool)
+        self._error = ""
+        return bad, causes
+
+    def _unfit(self, env: int) -> str:
+        """The field that made a world's state not finite: of its own model, or the first of the state."""
+        own = self._unfit_model(env)
+        return own[0] if own else self.state_layout.unfit(self._batch.state[env])[0]
+
+    def _unfit_model(self, env: int) -> list[str]:
+        values = {name: values[env] for name, values in self._batch._expanded.items()}
+        return [n for n, value in values.items() if value.dtype.kind == "f" and not np.isfinite(value).all()]
+
+    def _describe(self, env: int, cause: str) -> Divergence:
+        """What went wrong in a world, and where it came from, as far as that can be seen afterwards."""
+        if cause == ENGINE_ERROR:
+            return Divergence(env, cause, f"{self._error}; {_MORE_MEMORY}")
+        place, index = "", -1
+        if cause in FIELD_OF:
+            index = int(self._batch.warning[env, _DIVERGED[cause], 0])
+            place = self.state_layout.place(FIELD_OF[cause], index)
+        before = self._history.last(env)
+        known = np.concatenate([before, self._default[len(before) :]]) if before is not None else self._default
+        unfit = [f"model field {name}" for name in self._unfit_model(env)] + self.state_layout.unfit(known)
+        source = f"{unfit[0]} was not finite before the step" if unfit else ""
+        return Divergence(env, cause, "; ".join(part for part in (place, source) if part), index)
 
     def forward(self, selection: Selection) -> None:
         """Compute what is bound of the derived fields of the selected worlds."""
@@ -218,7 +320,9 @@ class BatchEngine:
 
     def reset(self, selection: Selection) -> None:
         """Put the selected worlds into the default state: the whole row, controls and warm start included."""
-        self._batch.state[_ids(selection)] = self._default
+        ids = _ids(selection)
+        self._batch.state[ids] = self._default
+        self._history.forget(ids)
         if not self.forces_after_reset:
             for field, where in self._forces(selection):  # no force has acted on a start state yet
                 field[where] = 0.0
@@ -280,12 +384,17 @@ class BatchEngine:
             ValueError: if a model field is not one that may differ between worlds, or of another shape.
         """
         self._state.copy_(state["state"])
+        width = self._history.width
+        if not np.array_equal(
+            self._batch.state[:, width:],
+            np.broadcast_to(self._default[width:], (self.num_envs, self._batch.nstate - width)),
+        ):
+            self._keep("plastic")
+        self._history.forget(np.arange(self.num_envs))
         self._batch.warning[:] = state["warning"].numpy()
         for name, values in state.items():
             if name.startswith("model."):
-                field = self.expand(name.removeprefix("model."))
-                require_alike({name: values}, {name: field}, "engine")
-                field.copy_(values)
+                self.take_model(name.removeprefix("model."), values)
         if bool(state["constants"]):
             self.set_constants()
         substep = {n.removeprefix("substep."): values for n, values in state.items() if n.startswith("substep.")}
@@ -295,6 +404,19 @@ class BatchEngine:
             self._batch.forward(stage=self._forward_stage)
         for name, values in substep.items():
             self._fields[name].copy_(values)
+
+    def take_model(self, name: str, values: Tensor) -> None:
+        """Take the values of a model field from a file.
+
+        Raises:
+            ValueError: for one that does not fit, or that could send MuJoCo outside of its arrays.
+        """
+        target = self.expand(name)
+        if target.shape != values.shape or target.dtype != values.dtype:
+            raise ValueError(f"model field '{name}' is {tuple(values.shape)}, not {tuple(target.shape)}")
+        if not target.dtype.is_floating_point and name not in _FLAGS and not torch.equal(target, values):
+            raise ValueError(f"model field '{name}' is part of the model's structure, and not the model's")
+        target.copy_(values)
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """One world as MjModel and MjData, forwarded; asked again for the same world, the same two objects, updated."""
@@ -340,13 +462,13 @@ class BatchEngine:
         return row
 
 
+_MORE_MEMORY = "a larger <size memory=...> in the MJCF mends a full contact arena"
+
+
 def _ids(selection: Selection) -> np.ndarray:
     assert isinstance(selection, IdSelection)
     return selection.ids
 
 
 def _engine_error(error: SimulationError) -> DivergedError:
-    return DivergedError(
-        f"the physics engine stopped: {error}",
-        hint="a larger <size memory=...> in the MJCF mends a full contact arena",
-    )
+    return DivergedError(f"the physics engine stopped: {' '.join(str(error).split())}", hint=_MORE_MEMORY)

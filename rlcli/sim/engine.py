@@ -13,6 +13,7 @@ from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DependencyError, Problem
 from rlcli.machine import available_cores, require_device
 from rlcli.sim.capacity import capacity
+from rlcli.sim.guard import Call, Divergence
 from rlcli.sim.selection import Selection
 
 if TYPE_CHECKING:
@@ -35,6 +36,24 @@ class Engine(Protocol):
     @property
     def divergences(self) -> int:
         """Worlds that diverged, ever."""
+        ...
+
+    @property
+    def causes(self) -> dict[str, int]:
+        """The same by cause."""
+        ...
+
+    @property
+    def found(self) -> list[Divergence]:
+        """The first worlds of the last `diverged`, described; of an `asynchronous` engine the first one ever."""
+        ...
+
+    def remember(self, calls: int) -> None:
+        """Keep what the last calls of `step` began with, as many as asked for or fit."""
+        ...
+
+    def trace(self, env: int) -> list[Call]:
+        """What is kept of a world in its running episode, the oldest call first; empty where nothing is kept."""
         ...
 
     def attach(self) -> None:

@@ -40,6 +40,7 @@ class SimData:
         self._sources = [qpos, qvel] if joined is None else [joined]
         self._copies = [source.to(torch.float32).contiguous() for source in self._sources]
         self._stale = [] if self._copies[0] is self._sources[0] else list(zip(self._copies, self._sources, strict=True))
+        self._good = [copy.clone() for copy, _ in self._stale]
         self.qpos = self._copies[0][:, : qpos.shape[1]]
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
@@ -75,10 +76,22 @@ class SimData:
             selection.write(copy, selection.read(source))
         self.stamp += 1
 
+    def keep(self) -> None:
+        """Note that the state as it is here is one to go back to."""
+        for good, (copy, _) in zip(self._good, self._stale, strict=True):
+            good.copy_(copy)
+
     def restore_rows(self, selection: Selection) -> None:
-        """Write the last copied state of the selected worlds back to the engine."""
-        for copy, source in self._stale:
-            selection.write(source, selection.read(copy))
+        """Write the last state of the selected worlds that was kept back to the engine."""
+        for good, (_, source) in zip(self._good, self._stale, strict=True):
+            selection.write(source, selection.read(good))
+
+    def out_of_bounds(self, limit: float) -> Tensor | None:
+        """Worlds with a position or a velocity that is not finite or beyond `limit`; None for none. (num_envs,) bool"""
+        if all(float(copy.abs().amax()) <= limit for copy in self._copies if copy.numel()):
+            return None
+        bad = [~(copy.abs() <= limit).all(dim=1) for copy in self._copies]
+        return torch.stack(bad).any(dim=0)
 
     def derived(self, name: str) -> Tensor:
         """A derived field as float32, cast once a step. (num_envs, ...)"""

@@ -17,6 +17,8 @@ _MIX1 = wp.constant(wp.uint64(0xBF58476D1CE4E5B9))
 _MIX2 = wp.constant(wp.uint64(0x94D049BB133111EB))
 _TO_UNIT = wp.constant(wp.float32(2.0**-24))
 _TOO_LARGE = wp.constant(wp.float32(1e10))
+CAUSES = ("qpos not finite", "qpos out of bounds", "qvel not finite", "qvel out of bounds")
+"""What `guard` finds, by number."""
 
 
 @wp.func
@@ -79,26 +81,41 @@ def guard(
     last_qpos: wp.array2d(dtype=float),
     last_qvel: wp.array2d(dtype=float),
     diverged: wp.array(dtype=wp.bool),
-    count: wp.array(dtype=wp.int64),
+    counts: wp.array(dtype=wp.int64),
+    first: wp.array(dtype=wp.int32),
     overflowed: wp.array(dtype=wp.int32),
 ):
     """Find worlds whose state is not finite or beyond MuJoCo's limit, and put them back to the last good state.
 
-    What ran out of room is kept in `overflowed`, unless that was a world on its way to infinity.
+    `counts` has a number for each of `CAUSES`; `first` keeps the number of the first such world ever, counted from 1,
+    with its cause and the column. What ran out of room is kept in `overflowed`, unless that was a world on its way to
+    infinity.
     """
     world = wp.tid()
     bad = wp.int32(0)  # a plain number would be a constant
-    for i in range(qpos.shape[1]):
-        x = qpos[world, i]
-        if not wp.isfinite(x) or wp.abs(x) > _TOO_LARGE:
-            bad = wp.int32(1)
+    column = wp.int32(0)
     for i in range(qvel.shape[1]):
         x = qvel[world, i]
-        if not wp.isfinite(x) or wp.abs(x) > _TOO_LARGE:
+        if not wp.isfinite(x):
+            bad = wp.int32(3)
+            column = i
+        elif wp.abs(x) > _TOO_LARGE:
+            bad = wp.int32(4)
+            column = i
+    for i in range(qpos.shape[1]):
+        x = qpos[world, i]
+        if bad != 1 and not wp.isfinite(x):
             bad = wp.int32(1)
+            column = i
+        elif bad != 1 and wp.abs(x) > _TOO_LARGE:
+            bad = wp.int32(2)
+            column = i
     diverged[world] = bad != 0
     if bad != 0:
-        wp.atomic_add(count, 0, wp.int64(1))
+        wp.atomic_add(counts, bad - 1, wp.int64(1))
+        if wp.atomic_cas(first, 0, wp.int32(0), world + 1) == 0:
+            first[1] = bad - 1
+            first[2] = column
         overflow[world] = 0
         for i in range(qpos.shape[1]):
             qpos[world, i] = last_qpos[world, i]

@@ -25,7 +25,9 @@ from rlcli.sim import kernels
 from rlcli.sim.capacity import Capacity
 from rlcli.sim.engine import force_sensors, quiet_mujoco
 from rlcli.sim.entity import as_index
+from rlcli.sim.guard import Call, Divergence, StateLayout
 from rlcli.sim.mask import MaskSelection
+from rlcli.sim.saved import require_alike
 from rlcli.sim.selection import ALL, Selection
 
 _STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
@@ -153,14 +155,36 @@ class WarpEngine:
             self._default_qpos = torch.tensor(model.qpos0, dtype=torch.float32, device=self.device)
             self._default_qvel = torch.zeros(model.nv, device=self.device)
             self._diverged = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
-            self._count = torch.zeros(1, dtype=torch.int64, device=self.device)
+            self._counts = torch.zeros(len(kernels.CAUSES), dtype=torch.int64, device=self.device)
+            self._first = torch.zeros(3, dtype=torch.int32, device=self.device)
             self._overflowed = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
             self._flags = torch.zeros(16, dtype=torch.int32, device=self.device)
 
     @property
     def divergences(self) -> int:
         """Worlds that diverged, ever; waits for the device."""
-        return int(self._count)
+        return int(self._counts.sum())
+
+    @property
+    def causes(self) -> dict[str, int]:
+        """The same by cause; waits for the device."""
+        return {name: count for name, count in zip(kernels.CAUSES, self._counts.tolist(), strict=True) if count}
+
+    @property
+    def found(self) -> list[Divergence]:
+        """The first world that ever diverged; waits for the device."""
+        world, cause, column = self._first.tolist()
+        if not world:
+            return []
+        name = kernels.CAUSES[cause]
+        return [Divergence(world - 1, name, StateLayout(self.model, {}).place(name.split()[0], column))]
+
+    def remember(self, calls: int) -> None:
+        """Nothing is kept: no replay gives the bits of a GPU again."""
+
+    def trace(self, env: int) -> list[Call]:
+        """Nothing."""
+        return []
 
     def attach(self) -> None:
         """Let Warp launch on torch's current stream, so that the two take turns."""
@@ -362,7 +386,11 @@ class WarpEngine:
         """Take back what `state_dict` gave; derived fields are computed anew."""
         for name, values in state.items():
             if name.startswith("model."):
-                self.expand(name.removeprefix("model.")).copy_(values)
+                field = name.removeprefix("model.")
+                if not values.is_floating_point() and self.expanded(field) is None:
+                    raise ValueError(f"model field '{field}' is part of the model's structure, and not the model's")
+                require_alike({field: values}, {field: self.expand(field)}, "engine")
+                self.expand(field).copy_(values)
         for name in state:
             if name.startswith("substep."):
                 self.field(name.removeprefix("substep."))  # whoever saved had asked for it; here that may come later
@@ -429,7 +457,8 @@ class WarpEngine:
                 wp.from_torch(self._last_qpos),
                 wp.from_torch(self._last_qvel),
                 wp.from_torch(self._diverged),
-                wp.from_torch(self._count),
+                wp.from_torch(self._counts),
+                wp.from_torch(self._first),
                 wp.from_torch(self._overflowed),
             ],
             device=self._device,

@@ -30,6 +30,11 @@ def test_the_recording_page_works_as_written(tmp_path):
 
 
 @pytest.mark.slow
+def test_the_page_on_determinism_works_as_written(tmp_path):
+    assert run_commands(blocks(DOCS / "determinism.md"), tmp_path).count("no difference") == 2
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "folder"), [("write-a-task.md", "my_task"), ("write-a-direct-task.md", "my_arm")])
 def test_the_task_of_a_page_checks_trains_and_learns(page, folder, tmp_path):
     found = blocks(DOCS / page)

@@ -388,6 +388,7 @@ def test_the_update_asks_the_device_for_nothing(own, setting, monkeypatch):
     monkeypatch.setattr(
         trainer, "_value_where", lambda mask, obs: torch.where(mask, trainer._value(obs), 0.0)
     )  # as on a GPU
+    monkeypatch.setattr(trainer, "_checks", False)  # and this
     trainer._roll_out()
     with Watch() as watch:
         trainer._update()

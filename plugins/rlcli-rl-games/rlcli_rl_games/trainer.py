@@ -22,7 +22,7 @@ from rlcli.envs.vec_env import StepResult, VecEnv
 from rlcli.errors import ConfigError, DependencyError, DivergedError
 from rlcli.random import derive
 from rlcli.rl.policy import Policy, PolicySpec
-from rlcli.rl.rng import load_rng_state, rng_state
+from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.trainer import Report, TrainerState, require_slots
 from rlcli_rl_games.config import PpoConfig, RlGamesConfig, SacConfig
@@ -147,8 +147,7 @@ class RlGamesTrainer(ABC):
         self.statistics = self.vec.statistics
         self.spec = self._policy_spec()
         torch.set_num_threads(torch_threads)
-        torch.manual_seed(derive(seed, "trainer"))
-        np.random.seed(derive(seed, "trainer") % 2**32)
+        seed_generators(derive(seed, "trainer"))
         with tempfile.TemporaryDirectory(prefix="rlcli-rl-games-") as folder, _quietly():
             self.agent = self._make(self._parameters(settings, device, folder))
             self.agent.writer.close()

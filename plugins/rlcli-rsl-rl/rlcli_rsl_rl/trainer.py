@@ -19,7 +19,7 @@ from rlcli.errors import ConfigError, DependencyError, DivergedError
 from rlcli.random import derive
 from rlcli.registry import load_object
 from rlcli.rl.policy import Policy, PolicySpec
-from rlcli.rl.rng import load_rng_state, rng_state
+from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.trainer import Report, TrainerState, require_slots
 from rlcli_rsl_rl.config import RunnerConfig
@@ -69,7 +69,7 @@ class RslRlTrainer:
         self.spec = _policy_spec(env, config)
         _require_batch(env, config)
         torch.set_num_threads(torch_threads)
-        torch.manual_seed(derive(seed, "trainer"))
+        seed_generators(derive(seed, "trainer"))
         with contextlib.redirect_stdout(io.StringIO()):  # RSL-RL prints its networks; standard output is for data
             settings = _settings(env, config, self._groups)
             self.alg = PPO.construct_algorithm(self._adapter.blank(), self._adapter, settings, device)

@@ -1,0 +1,307 @@
+"""Where two runs first part: configuration, environment, metrics, weights. Their files are read, nothing else."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Any
+
+from rlcli.config import strict_yaml
+from rlcli.config.messages import dotted
+from rlcli.errors import CheckpointError
+from rlcli.rl.environment import differences
+from rlcli.rl.run import Run
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rlcli.rl.checkpoint import Checkpoint
+
+SECTIONS = ("configuration", "environment", "metrics", "weights", "policy")
+"""In the order of cause and effect: what stands first explains what follows."""
+_CLOCK = "Perf/"
+"""Metrics of the clock, which are never equal."""
+_MAX_LINE = 1024**2
+_ROWS = 4096
+"""Of a replay buffer that are compared at a time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One place where two runs differ; None stands for what one of them does not have."""
+
+    where: str
+    left: Any
+    right: Any
+    left_from: str | None = None
+    """Where the value was written."""
+    right_from: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """What comparing one part of two runs gave; `compared` says in words how much there was."""
+
+    name: str
+    compared: str
+    differences: list[Difference] = field(default_factory=list)
+
+
+def compare(left: Run, right: Run, *, sections: Iterable[str] = SECTIONS, until: int | None = None) -> list[Section]:
+    """Compare two runs. Of metrics and weights the first difference is told, of the others each.
+
+    Args:
+        left: a run.
+        right: another.
+        sections: which parts to compare.
+        until: the environment step up to which metrics and checkpoints count; None: to the end of both, and a run
+            that has more iterations differs.
+
+    Raises:
+        CheckpointError: if a file that is needed cannot be read.
+    """
+    parts: dict[str, Callable[[], Section]] = {
+        "configuration": lambda: _configurations(left, right),
+        "environment": lambda: _environments(left, right),
+        "metrics": lambda: _metrics(left, right, until),
+        "weights": lambda: _weights(left, right, until),
+        "policy": lambda: _policies(left, right, until),
+    }
+    wanted = set(sections)
+    return [parts[name]() for name in SECTIONS if name in wanted]
+
+
+def first_difference(sections: Iterable[Section]) -> tuple[str, Difference] | None:
+    """The first section with a difference, and that difference."""
+    return next(((section.name, section.differences[0]) for section in sections if section.differences), None)
+
+
+def reached(run: Run) -> int:
+    """The last iteration that a run has told of."""
+    return max((row["iteration"] for row in _rows(run, None)), default=0)
+
+
+def _configurations(left: Run, right: Run) -> Section:
+    one, other = _configuration(left), _configuration(right)
+    absent = (None, None)
+    found = []
+    for name in dict.fromkeys([*one, *other]):
+        (value, place), (twin, there) = one.get(name, absent), other.get(name, absent)
+        if (name in one) != (name in other) or _text(value) != _text(twin):
+            found.append(Difference(name, value, twin, place, there))
+    return Section("configuration", f"{len(one.keys() | other.keys())} keys", found)
+
+
+def _configuration(run: Run) -> dict[str, tuple[Any, str | None]]:
+    """Key -> (value, where it was written), the seed included."""
+    try:
+        with run.config.open("rb") as file:
+            document = strict_yaml.load(file.read(strict_yaml.MAX_BYTES + 1))
+    except OSError as error:
+        raise CheckpointError(f"{run.config} cannot be read: {error.strerror}") from None
+    except strict_yaml.YamlError as error:
+        raise CheckpointError(f"{run.config}:{error.line}:{error.column} is corrupt: {error.message}") from None
+    given = run.record.get("given")
+    given = given if isinstance(given, dict) else {}
+    values: dict[str, tuple[Any, str | None]] = {"seed": (run.record["seed"], "run.json")}
+    for path, value in _leaves(document.data, ()):
+        name = dotted(path)
+        line, column = document.marks.get(path, (0, 0))
+        values[name] = (value, str(given.get(name) or f"{run.config.name}:{line}:{column}"))
+    return values
+
+
+def _leaves(value: Any, path: strict_yaml.Path) -> Iterator[tuple[strict_yaml.Path, Any]]:
+    if isinstance(value, dict) and value:
+        for key, item in value.items():
+            yield from _leaves(item, (*path, key))
+    else:
+        yield path, value
+
+
+def _environments(left: Run, right: Run) -> Section:
+    rows = differences(left.record, right.record)
+    resumed, again = left.record.get("resumed"), right.record.get("resumed")
+    if _text(resumed) != _text(again):
+        rows.append(("resumed", resumed, again))
+    whole = all("sources" in run.record and "cpu" in run.record for run in (left, right))
+    words = "versions, sources, processor, threads" if whole else "what both have recorded"
+    return Section("environment", words, [Difference(*row) for row in rows])
+
+
+def _metrics(left: Run, right: Run, until: int | None) -> Section:
+    count = 0
+    for row, twin in zip_longest(_rows(left, until), _rows(right, until)):
+        if row is None or twin is None:
+            if until is not None:
+                break
+            ends = [None if side is None else "recorded" for side in (row, twin)]
+            longer = row if row is not None else twin
+            assert longer is not None
+            return _first("metrics", f"{count} iterations", Difference(f"iteration {longer['iteration']}", *ends))
+        for name in ("iteration", *sorted((row.keys() | twin.keys()) - {"iteration"})):
+            if not name.startswith(_CLOCK) and _text(row.get(name)) != _text(twin.get(name)):
+                where = f"iteration {row['iteration']}: {name}"
+                return _first("metrics", f"{count} iterations", Difference(where, row.get(name), twin.get(name)))
+        count += 1
+    return Section("metrics", f"{count} iterations")
+
+
+def _rows(run: Run, until: int | None) -> Iterator[dict[str, Any]]:
+    """The lines of metrics.jsonl, one by one; a last one cut short by a kill is left out."""
+    try:
+        file = run.metrics.open("rb")
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise CheckpointError(f"{run.metrics} cannot be read: {error.strerror}") from None
+    with file:
+        for number, line in enumerate(iter(lambda: file.readline(_MAX_LINE), b""), start=1):
+            if not line.endswith(b"\n") and len(line) < _MAX_LINE:
+                return
+            try:
+                row = json.loads(line)
+                if not isinstance(row["iteration"], int) or not isinstance(row["step"], int):
+                    raise TypeError
+            except (ValueError, TypeError, KeyError, RecursionError):
+                raise CheckpointError(f"{run.metrics}:{number} is corrupt: not an iteration's metrics") from None
+            if until is not None and row["step"] > until:
+                return
+            yield row
+
+
+def _weights(left: Run, right: Run, until: int | None) -> Section:
+    steps = _common_steps(left, right, until)
+    if not steps:
+        return Section("weights", "no checkpoint at a step that both have")
+    words = f"checkpoints at {len(steps)} steps, to step {steps[-1]}"
+    for step in steps:
+        one, other = (_open(run, step) for run in (left, right))
+        for part in _parts(one, other):
+            equal = _digest(one, f"{part}.safetensors") == _digest(other, f"{part}.safetensors")
+            if equal and step != steps[-1]:
+                continue  # the last pair is read whatever its manifests say: that checks the files
+            found = _tensors(one, other, part)
+            if found is not None:
+                return _first("weights", words, found)
+        found = _values(one, other) or (_logs(one, other) if step == steps[-1] else None)
+        if found is not None:
+            return _first("weights", words, found)
+    return Section("weights", words)
+
+
+def _parts(one: Checkpoint, other: Checkpoint) -> list[str]:
+    """Tensor files of either: the policy first, then what trains it."""
+    names = {name for saved in (one, other) for name in saved.manifest["files"] if name.endswith(".safetensors")}
+    order = ("policy.safetensors", "trainer.safetensors")
+    ordered = sorted(names, key=lambda name: (order.index(name) if name in order else len(order), name))
+    return [name.removesuffix(".safetensors") for name in ordered]
+
+
+def _tensors(one: Checkpoint, other: Checkpoint, part: str) -> Difference | None:
+    file = f"{part}.safetensors"
+    held = [file in saved.manifest["files"] for saved in (one, other)]
+    if not all(held):
+        return Difference(f"step {one.step}: {file}", *("there" if has else None for has in held))
+    left, right = one.tensors(part), other.tensors(part)
+    for name in sorted(left.keys() | right.keys()):
+        where = f"step {one.step}: {part} {name}"
+        if name not in left or name not in right:
+            return Difference(where, *("there" if name in side else None for side in (left, right)))
+        found = _elements(left[name], right[name], where)
+        if found is not None:
+            return found
+    return None
+
+
+def _elements(left: Tensor, right: Tensor, where: str) -> Difference | None:
+    """The first element whose bits differ."""
+    import torch
+
+    kinds = [f"{str(value.dtype).removeprefix('torch.')} {list(value.shape)}" for value in (left, right)]
+    if kinds[0] != kinds[1]:
+        return Difference(where, *kinds)
+    if not left.numel():
+        return None
+    bits = [value.contiguous().reshape(-1, 1).view(torch.uint8).reshape(left.numel(), -1) for value in (left, right)]
+    differ = (bits[0] != bits[1]).any(dim=1)
+    if not bool(differ.any()):
+        return None
+    place = int(differ.int().argmax())
+    index = [int(i) for i in torch.unravel_index(torch.tensor(place), left.shape)]
+    one, other = (value.reshape(-1)[place].item() for value in (left, right))
+    return Difference(f"{where}{index if index else ''}", one, other)
+
+
+def _logs(one: Checkpoint, other: Checkpoint) -> Difference | None:
+    """The first element of a replay buffer that differs, wherever its rows are cut into files."""
+    if not one.shards() and not other.shards():
+        return None
+    left, right = one.state().logs, other.state().logs
+    for name in sorted(left.keys() | right.keys()):
+        where = f"step {one.step}: {name}"
+        held = [None if name not in side else f"rows {side[name].first} to {side[name].stop}" for side in (left, right)]
+        if held[0] != held[1]:
+            return Difference(where, *held)
+        for start in range(left[name].first, left[name].stop, _ROWS):
+            stop = min(start + _ROWS, left[name].stop)
+            columns, twins = left[name].read(start, stop), right[name].read(start, stop)
+            for column in sorted(columns.keys() | twins.keys()):
+                found = _elements(columns[column], twins[column], f"{where} from row {start}: {column}")
+                if found is not None:
+                    return found
+    return None
+
+
+def _values(one: Checkpoint, other: Checkpoint) -> Difference | None:
+    left, right = (dict(_leaves(saved.json("state.json"), ())) for saved in (one, other))
+    for path in dict.fromkeys([*left, *right]):
+        if _text(left.get(path)) != _text(right.get(path)):
+            return Difference(f"step {one.step}: state.json {dotted(path)}", left.get(path), right.get(path))
+    return None
+
+
+def _policies(left: Run, right: Run, until: int | None) -> Section:
+    steps = _common_steps(left, right, until)
+    if not steps:
+        return Section("policy", "no checkpoint at a step that both have")
+    one, other = (_digest(_open(run, steps[-1]), "policy.safetensors") for run in (left, right))
+    words = f"sha256 of step {steps[-1]}"
+    if one != other:
+        return _first("policy", words, Difference(f"step {steps[-1]}: policy.safetensors sha256", one, other))
+    return Section("policy", f"{words}: {str(one)[:12]}...")
+
+
+def _common_steps(left: Run, right: Run, until: int | None) -> list[int]:
+    from rlcli.rl.checkpoint import steps
+
+    common = set(steps(left.checkpoints)) & set(steps(right.checkpoints))
+    return sorted(step for step in common if until is None or step <= until)
+
+
+def _open(run: Run, step: int) -> Checkpoint:
+    from rlcli.rl.checkpoint import open_checkpoint
+
+    return open_checkpoint(run.checkpoints / f"{step:012d}")
+
+
+def _digest(saved: Checkpoint, name: str) -> str | None:
+    entry = saved.manifest["files"].get(name)
+    return str(entry["sha256"]) if isinstance(entry, dict) and "sha256" in entry else None
+
+
+def _first(name: str, compared: str, difference: Difference) -> Section:
+    return Section(name, compared, [difference])
+
+
+def _text(value: Any) -> str:
+    """One text a value: equal numbers of other types differ, NaN equals itself."""
+    return json.dumps(value, sort_keys=True, default=str)
+
+
+def plain(value: Any) -> Any:
+    """A value for a JSON document, where numbers that are not finite have to be text."""
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

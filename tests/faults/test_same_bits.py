@@ -1,0 +1,140 @@
+"""Physics, episodes and draws are the same bits at any number of threads and environments, in any company."""
+
+import functools
+import json
+import os
+import subprocess
+import sys
+from itertools import combinations_with_replacement, product
+
+import numpy as np
+import pytest
+import torch
+from fault_sizes import SIZE, amount, chosen
+from same_bits import ENVS, STEPS, TASKS, Life, against_plain_steps, live, make, other_work
+
+from rlcli.sim.selection import IdSelection
+
+THREADS = (1, 2, 3, 4, 8) if SIZE != "long" else (1, 2, 3, 4, 5, 6, 8, 12, 16)
+NUM_ENVS = (1, 7, ENVS) if SIZE != "long" else (1, 2, 7, 13, ENVS)
+SEEDS = (42,) if SIZE != "long" else (42, 7)
+
+
+@pytest.fixture(autouse=True)
+def _one_torch_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("tasks")
+
+
+@pytest.fixture(scope="module")
+def reference(folder):
+    """The lives of many environments on one thread, every physics step made by `mj_step` as well."""
+
+    @functools.cache
+    def lives(task, seed=42):
+        torch.set_num_threads(1)
+        life = Life(make(task, folder, ENVS, seed=seed))
+        differing = against_plain_steps(life.env)
+        for _ in range(STEPS):
+            life.step()
+        assert differing == [], "steps that differ from mj_step"
+        assert life.ends >= ENVS, "every life crosses a reset"
+        assert len(set(life.hashes())) == ENVS, "no two lives are alike"
+        return life.hashes()
+
+    return lives
+
+
+@pytest.mark.parametrize(
+    ("task", "num_envs", "threads", "seed"), chosen(list(product(TASKS, NUM_ENVS, THREADS, SEEDS)), 7)
+)
+def test_lives_equal_plain_steps_at_any_number_of_threads_and_environments(
+    task, num_envs, threads, seed, folder, reference
+):
+    assert live(make(task, folder, num_envs, threads, seed)) == reference(task, seed)[:num_envs]
+
+
+@pytest.mark.parametrize(("task", "order"), chosen(list(product(TASKS, range(amount(6, 6, 20)))), 4))
+def test_a_partial_reset_is_the_same_in_any_order_and_in_any_parts(task, order, folder):
+    together, apart = (make(task, folder, 16, 2) for _ in range(2))
+    rng = np.random.default_rng(order)
+    ids = np.sort(rng.choice(16, size=int(rng.integers(2, 16)), replace=False))
+    parts = [np.sort(part) for part in np.array_split(rng.permutation(ids), int(rng.integers(2, len(ids) + 1)))]
+    hashes = []
+    for env, groups in ((together, [ids]), (apart, parts)):
+        life = Life(env, steps=60)
+        for _ in range(20):
+            life.step()
+        env.episode_index[ids] += 1
+        for group in groups:
+            env._restart(IdSelection(group, env.seed, env.episode_index.numpy()[group]))
+        env.sim.settle()
+        for _ in range(40):
+            life.step()
+        hashes.append(life.hashes())
+    assert hashes[0] == hashes[1]
+
+
+PROCESS = """
+import json, sys, pathlib, torch
+torch.set_num_threads(1)
+from same_bits import TASKS, live, make, other_work
+for work in other_work().values():
+    work()
+torch.set_num_threads(1)
+print(json.dumps({task: live(make(task, pathlib.Path(sys.argv[1]), 7, int(sys.argv[2]))) for task in TASKS}))
+"""
+
+
+@pytest.fixture(scope="module")
+def process(tmp_path_factory):
+    """The lives of every task in a fresh process, by its hash seed."""
+
+    @functools.cache
+    def run(hash_seed):
+        place = tmp_path_factory.mktemp("process")
+        command = [sys.executable, "-c", PROCESS, str(place), str(1 + len(str(hash_seed)) % 3)]
+        environment = {**os.environ, "PYTHONHASHSEED": str(hash_seed), "OMP_NUM_THREADS": "1"}
+        environment["PYTHONPATH"] = os.pathsep.join([*filter(None, sys.path), environment.get("PYTHONPATH", "")])
+        done = subprocess.run(command, env=environment, cwd=place, capture_output=True, text=True, check=True)
+        return json.loads(done.stdout)
+
+    return run
+
+
+HASH_SEEDS = chosen([0, 1, 12345, "random", *(range(100, 100 + amount(0, 0, 7)))], 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("hash_seed", "task"), list(product(HASH_SEEDS, TASKS)))
+def test_another_process_with_another_hash_seed_and_past_lives_the_same(hash_seed, task, process, reference):
+    assert process(hash_seed)[task] == reference(task)[:7]
+
+
+@pytest.mark.parametrize(("one", "other"), chosen(list(combinations_with_replacement(TASKS, 2)), 2))
+def test_two_environments_of_one_process_do_not_touch_each_other(one, other, folder, reference):
+    lives = [Life(make(one, folder, 7, 2)), Life(make(other, folder, 3, 1, seed=5))]
+    alone = live(make(other, folder, 3, 1, seed=5))
+    for _ in range(STEPS):
+        for life in lives:
+            life.step()
+    assert lives[0].hashes() == reference(one)[:7]
+    assert lives[1].hashes() == alone
+    assert alone != reference(other)[:3]
+
+
+@pytest.mark.parametrize(("task", "work"), chosen(list(product(TASKS, sorted(other_work()))), 3))
+def test_other_work_in_between_changes_nothing(task, work, folder, reference):
+    life = Life(make(task, folder, 7, 2))
+    for step in range(STEPS):
+        if step % 20 == 0:
+            other_work()[work]()
+        life.step()
+    assert life.hashes() == reference(task)[:7]
