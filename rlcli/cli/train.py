@@ -141,10 +141,10 @@ class _Job:
     """The checkpoint to go on from exactly."""
     init_from: Any = None
     """The checkpoint folder to take weights from."""
-    config: str | None = None
-    """The configuration of a run that goes on, where its budget changes."""
     stages: list[int] = field(default_factory=list)
     """Iterations to save at, the last one to end at, instead of the agent's budget and what it keeps."""
+    config: str | None = None
+    """The configuration of a run that goes on, where its budget changes."""
     writes: bool = True
     """Whether this process writes the run."""
     begin: float = field(default_factory=time.monotonic)
