@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import sys
@@ -13,6 +14,8 @@ from typing import Any
 SCHEMA_VERSION = 1
 _OWN = ("bug", "device", "diverged")
 """Kinds of errors that one process of several may have alone."""
+_GONE = (errno.EPIPE, errno.EIO)
+"""Nobody reads the pipe any more; the terminal was closed."""
 
 
 @dataclass(slots=True)
@@ -122,7 +125,9 @@ def _write(stream: Any, text: str) -> None:
         return
     try:
         print(text, file=stream, flush=True)
-    except BrokenPipeError:
-        discard(stream)  # whoever read it is gone; what we do may still matter
+    except OSError as error:
+        if error.errno not in _GONE and stream is not sys.stderr:
+            raise
+        discard(stream)  # whoever read it is gone, or a log is full; what we do may still matter
     except UnicodeEncodeError:
         print(text.encode(stream.encoding, "backslashreplace").decode(stream.encoding), file=stream, flush=True)
