@@ -81,6 +81,7 @@ def build() -> typer.Typer:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
+    console.owns_process = arguments is None
     arguments = sys.argv[1:] if arguments is None else arguments
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
     console.quiet = console.verbose = False  # what an earlier command of this process was told

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import re
@@ -14,6 +15,8 @@ from typing import Any
 SCHEMA_VERSION = 1
 _OWN = ("bug", "device", "diverged")
 """Kinds of errors that one process of several may have alone."""
+_GONE = (errno.EPIPE, errno.EIO)
+"""Nobody reads the pipe any more; the terminal was closed."""
 
 
 @dataclass(slots=True)
@@ -26,6 +29,9 @@ class Console:
     debug: bool = False
     follows: bool = False
     """Another process of the same run says what there is to say; only what is wrong with this one is said here."""
+
+    owns_process: bool = False
+    """Whether the process was started for the command and ends with it."""
 
     out: Any = None
     """Where the JSON document goes; None is stdout."""
@@ -133,7 +139,9 @@ def _write(stream: Any, text: str) -> None:
     text = plain(text)
     try:
         print(text, file=stream, flush=True)
-    except BrokenPipeError:
-        discard(stream)  # whoever read it is gone; what we do may still matter
+    except OSError as error:
+        if error.errno not in _GONE and stream is not sys.stderr:
+            raise
+        discard(stream)  # whoever read it is gone, or a log is full; what we do may still matter
     except UnicodeEncodeError:
         print(text.encode(stream.encoding, "backslashreplace").decode(stream.encoding), file=stream, flush=True)

@@ -75,7 +75,7 @@ def command(
 ) -> None:
     """Train a policy."""
     from rlcli.config.load import resolve
-    from rlcli.errors import UsageError
+    from rlcli.errors import Stopped, UsageError
     from rlcli.rl import distributed
     from rlcli.rl.run import default_runs_dir
     from rlcli.rl.stop import StopRequest
@@ -96,20 +96,21 @@ def command(
         "--name": name,
     }
     named = None if task is None or (resume is not None and "=" in task) else named_task(task)
-    resolved = None
+    resolved, stop = None, StopRequest(ends_process=console.owns_process)
     if resume is not None:
         _refuse_changes([task, *(overrides or [])], fixed)
     elif named is None:
         raise UsageError("which task?", hint="rlcli train TASK (rlcli list-tasks shows them), or --resume RUN")
     else:
-        resolved = resolve(
-            named,
-            agent=agent,
-            device=device,
-            config_file=config,
-            overrides=overrides or [],
-            flags={**flags(scene__num_envs=num_envs), **budget},
-        )
+        with stop, stop.before_training():
+            resolved = resolve(
+                named,
+                agent=agent,
+                device=device,
+                config_file=config,
+                overrides=overrides or [],
+                flags={**flags(scene__num_envs=num_envs), **budget},
+            )
         tell_notes(resolved)
         _require_parallel(resolved, gpus or 1)
         device = _fitting(resolved, device, wanted)
@@ -123,11 +124,13 @@ def command(
         record = {"seed": draw_seed(42 if seed is None else seed), "device": device}
         return _created(resolved, runs, name, record, logger, init_from)
 
-    with StopRequest() as stop:
+    with stop:
         try:
             job = _together(begin, resolved, named, budget, device)
             if job is not None:
                 _train(job, device, stop)
+        except KeyboardInterrupt:  # the second one, wherever it came
+            raise Stopped("stopped at once", exit_code=stop.exit_code) from None
         finally:
             distributed.leave()
 
@@ -141,6 +144,8 @@ class _Job:
     loggers: list[str]
     resume_from: Any = None
     """The checkpoint to go on from exactly."""
+    created: bool = True
+    """Whether the run's folder was made for this job; one that was killed before its first checkpoint begins again."""
     init_from: Any = None
     """The checkpoint folder to take weights from."""
     stages: list[int] = field(default_factory=list)
@@ -157,6 +162,7 @@ class _Job:
             "run": str(self.run.folder),
             "record": self.run.record,
             "resume_from": None if self.resume_from is None else str(self.resume_from.folder),
+            "created": self.created,
             "init_from": self.init_from,
         }
 
@@ -232,11 +238,11 @@ def _together(
         raise
     try:
         peers = distributed.join(device)
-        if job is not None and peers.size > 1 and job.resume_from is None:
+        if job is not None and peers.size > 1 and job.created:
             job.run.update(processes=peers.size)
         peers.share(None if job is None else job.word())
     except BaseException:
-        if job is not None and job.resume_from is None:
+        if job is not None and job.created:
             job.run.discard()
         raise
     return job
@@ -257,7 +263,10 @@ def _followed(
         return _Job(Run(folder, word["record"]), resolved, [], init_from=word["init_from"], writes=False)
     run = open_run(folder)
     resolved = resolve_run(run, play=False, flags=budget, named=named)
-    return _Job(run, resolved, [], resume_from=open_checkpoint(Path(word["resume_from"])), writes=False)
+    saved = None if word["resume_from"] is None else open_checkpoint(Path(word["resume_from"]))
+    return _Job(
+        run, resolved, [], resume_from=saved, created=word["created"], init_from=word["init_from"], writes=False
+    )
 
 
 def _budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
@@ -321,11 +330,10 @@ def _resumed(
     from rlcli.rl.checkpoint import open_checkpoint
     from rlcli.rl.load import resolve_run
     from rlcli.rl.loggers import check_loggers
-    from rlcli.rl.run import find_checkpoint, require_own
+    from rlcli.rl.run import require_own
 
-    name = None if named is None else named.name
-    run, folder, why = find_checkpoint(reference, runs, name, whole=True, tell=console.warn)
-    if run.record.get("state") == "finished" and not budget:
+    run, folder, why = _where_to_begin(reference, runs, None if named is None else named.name)
+    if run.record.get("state") == "finished" and not budget and folder is not None:
         console.info(f"{run.folder} ({why}) is finished; --max-iterations N trains on")
         console.data(str(run.folder))
         step = open_checkpoint(folder).step
@@ -340,22 +348,58 @@ def _resumed(
         from rlcli.rl.saving import clean
 
         clean(run.checkpoints)
-        saved = open_checkpoint(folder)
+        saved = None if folder is None else open_checkpoint(folder)
     except BaseException:
         run.unlock()
         raise
-    console.info(f"resuming {folder} ({why})")
-    return _Job(run, resolved, loggers, resume_from=saved, config=to_yaml(to_data(resolved)) if budget else None)
+    if folder is None:
+        console.info(f"{run.folder} ({why}) ended before its first checkpoint: it begins again")
+    else:
+        console.info(f"resuming {folder} ({why})")
+    initial = run.record.get("init_from") if folder is None else None
+    config = to_yaml(to_data(resolved)) if budget else None
+    return _Job(
+        run,
+        resolved,
+        loggers,
+        resume_from=saved,
+        created=False,
+        init_from=Path(initial) if initial else None,
+        config=config,
+    )
+
+
+def _where_to_begin(reference: str, runs: Path, task: str | None) -> tuple[Run, Path | None, str]:
+    """A run, the checkpoint to go on from, and why; no checkpoint if the run ended before it wrote one."""
+    from rlcli.errors import CheckpointError, UsageError
+    from rlcli.rl.run import find_checkpoint, find_run
+
+    try:
+        return find_checkpoint(reference, runs, task, whole=True, tell=console.warn)
+    except CheckpointError:
+        try:
+            run, why = find_run(reference, runs, task)
+        except (CheckpointError, UsageError):
+            run = None
+        if run is None or not _never_began(run):
+            raise
+        return run, None, why
+
+
+def _never_began(run: Run) -> bool:
+    """Whether a run's process was killed before the first checkpoint; one that has lost its checkpoints is damaged."""
+    from rlcli.rl.checkpoint import steps
+
+    return run.checkpoints.is_dir() and not steps(run.checkpoints) and "step" not in run.record
 
 
 def _train(job: _Job, device: str, stop: StopRequest) -> None:
-    from rlcli.errors import Stopped
+    from rlcli.rl import distributed
 
-    run, new = job.run, job.resume_from is None
+    run, new = job.run, job.created
     try:
-        trainer, env = _build(job, device)
-        if stop.signal is not None and new:
-            raise Stopped("stopped before training began; nothing was written", exit_code=stop.exit_code)
+        with stop.before_training(prompt=not distributed.launched()):
+            trainer, env = _build(job, device)
     except BaseException:
         if new and job.writes:
             run.discard()
@@ -413,6 +457,8 @@ def _build(job: _Job, device: str) -> Any:
             require_fit(initial, env.layout)
             require_same_policy(initial, trainer.policy(), resolved.agent.trainer)
             _take(initial, lambda: trainer.load_weights(initial.tensors("policy")), "its weights do not fit the agent")
+        if job.config is not None:
+            write_atomic(job.run.config, job.config)
         trainer.start()
         return trainer, env
     require_fit(saved, env.layout)
@@ -452,7 +498,7 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
 
     run, agent = job.run, job.resolved.agent
     assert agent is not None
-    resume = None if job.resume_from is None else (trainer.iteration, trainer.env_steps)
+    resume = None if job.created else (trainer.iteration, trainer.env_steps)
     manifest = {
         **{key: run.record[key] for key in ("task", "agent", "seed")},
         "trainer": agent.trainer,
@@ -465,10 +511,12 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
     sinks: list[Any] = []
 
     def close(state: str) -> None:
-        for sink in sinks:
-            sink.close()
-        if job.writes and saver.at is not None:
-            run.update(state=state, iteration=saver.at[0], step=saver.at[1])
+        with contextlib.ExitStack() as stack:
+            if job.writes and saver.written is not None:
+                iteration, step = saver.written
+                stack.callback(lambda: run.update(state=state, iteration=iteration, step=step))
+            for sink in sinks:
+                stack.callback(sink.close)
 
     try:
         if job.writes:
@@ -525,6 +573,7 @@ def _trials(job: _Job, saver: Any, stop: StopRequest) -> Any:
     """What evaluates between iterations, if the agent wants it; one process does."""
     from rlcli.envs.vec_env import make_env
     from rlcli.random import derive
+    from rlcli.rl.checkpoint import steps
     from rlcli.rl.load import resolve_run
     from rlcli.rl.loggers import read_metrics
     from rlcli.rl.trials import Trials
@@ -542,8 +591,9 @@ def _trials(job: _Job, saver: Any, stop: StopRequest) -> Any:
         return env
 
     trials = Trials(make, agent.eval_episodes, agent.eval_interval, read_metrics(run.metrics))
-    saver.best = trials.best
-    run.update(best=trials.best)
+    saver.best = trials.best if trials.best in steps(run.checkpoints) else None
+    if run.record.get("best") != saver.best:  # killed in between, or resumed from before it
+        run.update(best=saver.best)
     return trials
 
 

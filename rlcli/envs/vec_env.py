@@ -411,7 +411,6 @@ class VecEnv(ABC):
             ValueError: if something is of another shape or type: what was saved of other environments.
         """
         require_alike(state, {k: v for k, v in self.state_dict().items() if not k.startswith("workflow.")}, "env")
-        self._require_no_selectors(state)
         self.episode_length_buf.copy_(state["episode_length"])
         self.episode_index.copy_(state["episode_index"])
         self._steps.copy_(state["common_step"])
@@ -430,13 +429,6 @@ class VecEnv(ABC):
             sensor.load_state_dict(_below(state, f"sensors.{name}."))
         self._load_workflow_state(_below(state, "workflow."))
         return self._observe_again()
-
-    def _require_no_selectors(self, state: Mapping[str, Tensor]) -> None:
-        """Integers of a model say which body hangs on which: only those that the task itself changes are taken."""
-        for name, value in state.items():
-            field = name.removeprefix("engine.model.")
-            if field != name and not value.is_floating_point() and self.engine.expanded(field) is None:
-                raise ValueError(f"env: '{name}' differs between environments, which the task does not ask for")
 
     # --- the workflow's part ---
 

@@ -159,8 +159,8 @@ class Checkpoint:
     def _rows(self, name: str) -> Rows:
         log, shards = self.manifest["logs"][name], self.shards()[name]
         first, stop = log["first"], log["stop"]
-        edges = [shard.start for shard in shards[1:]] + [stop]
-        if [shard.stop for shard in shards] != edges[: len(shards)] or (shards[0].start if shards else stop) > first:
+        begins = [shard.start for shard in shards] + [stop]
+        if [shard.stop for shard in shards] != begins[1:] or begins[0] > first:
             raise CheckpointError(f"{self.folder}/manifest.json is corrupt: rows of '{name}' are missing")
         held, most = sum(shard.size for shard in shards), memory() // 3
         if held > most:

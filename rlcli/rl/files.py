@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from pathlib import Path
@@ -22,9 +23,12 @@ def write_atomic(file: Path, content: bytes | str) -> None:
         temporary.unlink(missing_ok=True)  # a link in its place would be followed
         write_synced(temporary, data)
         os.replace(temporary, file)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise disk_error(file, error) from error
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise disk_error(file, error) from error
+        raise
 
 
 def write_synced(file: Path, data: bytes) -> None:

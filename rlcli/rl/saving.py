@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import secrets
@@ -57,7 +58,9 @@ class Saver:
         self.best: int | None = None
         """Environment steps of the checkpoint with the best evaluation."""
         self.at: tuple[int, int] | None = None if resumed is None else (resumed.iteration, resumed.step)
-        """Iteration and environment steps of the newest checkpoint."""
+        """Iteration and environment steps of the newest checkpoint that was asked for."""
+        self.written = self.at
+        """The same of the newest one on the disk."""
         self._keep, self._manifest = keep, dict(manifest)
         self._shards: dict[str, list[Shard]] = {} if resumed is None else dict(resumed.shards())
         self._copied = {name: shards[-1].stop for name, shards in self._shards.items() if shards}
@@ -74,8 +77,8 @@ class Saver:
         Raises:
             MachineError: if the disk refused the checkpoint before, or the folder is gone.
         """
+        self.wait()  # it knows which rows are written
         fresh = {name: self._copy_new(name, rows) for name, rows in state.logs.items()}
-        self.wait()
         self.at = (iteration, step)
         arguments = (state, fresh, iteration, step)
         self._thread = threading.Thread(target=self._write, args=arguments, name="checkpoint", daemon=True)
@@ -122,6 +125,7 @@ class Saver:
             logs = {name: self._write_rows(name, state.logs[name], parts) for name, parts in fresh.items()}
             extra = {**self._manifest, "iteration": iteration, **({"logs": logs} if logs else {})}
             write(self.checkpoints, step, state, extra)
+            self.written = (iteration, step)
             prune(self.checkpoints, self._keep, self.best)
         except BaseException as error:
             self._failure = error
@@ -133,11 +137,14 @@ class Saver:
             data = safetensors.torch.save({column: value.contiguous() for column, value in columns.items()})
             shard = Shard(start, stop, len(data), sha256(data))
             try:
-                folder.mkdir(parents=True, exist_ok=True)
+                for own in (folder.parent, folder):  # not what they lie in: a run that has vanished is not made again
+                    own.mkdir(exist_ok=True)
             except OSError as error:
                 raise disk_error(folder, error) from error
             write_atomic(folder / shard.file, data)
             shards.append(shard)
+        if parts:
+            sync_folder(folder)
         shards[:] = [shard for shard in shards if shard.stop > rows.first]
         return {"first": rows.first, "stop": rows.stop, "shards": [shard.record() for shard in shards]}
 
@@ -206,6 +213,8 @@ def drop_after(checkpoints: Path, step: int) -> list[int]:
     later = [have for have in steps(checkpoints) if have > step]
     for have in reversed(later):
         _remove(checkpoints / f"{have:012d}")
+    if later:
+        write_atomic(checkpoints / "latest", f"{step:012d}\n")
     drop_rows(checkpoints)
     return later
 
@@ -222,14 +231,16 @@ def drop_rows(checkpoints: Path) -> None:
     except CheckpointError:
         return  # who knows what it needs
     for file in files:
-        file.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            file.unlink(missing_ok=True)
 
 
 def clean(checkpoints: Path) -> None:
     """Remove what killed writers left."""
     for leftover in checkpoints.glob(".tmp-*"):
         shutil.rmtree(leftover, ignore_errors=True)
-    for folder in (checkpoints, checkpoints.parent, *(checkpoints / LOG_FOLDER).glob("*")):
+    run = checkpoints.parent
+    for folder in (checkpoints, run, run / "tb", *(checkpoints / LOG_FOLDER).glob("*")):
         for file in folder.glob(".*.tmp-*"):
             file.unlink(missing_ok=True)
 

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
+from rlcli.errors import Stopped
+
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGUSR1", "SIGHUP")
 """Ctrl-C; what schedulers send before they kill, and as a warning; a terminal that closes."""
 
@@ -20,14 +22,18 @@ class Interrupted(KeyboardInterrupt):
 
 @dataclass(slots=True)
 class StopRequest:
-    """Notes the first signal in `signal`; a second one raises KeyboardInterrupt. Used as a context.
+    """Notes the first signal in `signal`, and raises where that loses nothing; a second one always does.
+
+    Used as a context.
 
     A signal that whoever started the process has it ignore (nohup) stays ignored.
     """
 
     signal: int | None = None
     can_interrupt: bool = False
-    """Whether somebody calls `check` before every step."""
+    """Whether an iteration may be left in the middle."""
+    ends_process: bool = False
+    """Whether nothing comes after it: once it was asked to stop, a further signal would only spoil the exit code."""
     _prompt: bool = False
     _previous: dict[int, Any] = field(default_factory=dict)
 
@@ -38,15 +44,34 @@ class StopRequest:
 
     @contextlib.contextmanager
     def prompt(self, prompt: bool = True) -> Iterator[None]:
-        """Whether `check` raises: only while there is a boundary to go back to."""
+        """Whether the first signal raises: only while there is a boundary to go back to.
+
+        It raises wherever Python is, be it in a rollout or in a long update.
+        """
         self._prompt = prompt
         try:
+            self.check()
             yield
         finally:
             self._prompt = False
 
+    @contextlib.contextmanager
+    def before_training(self, prompt: bool = True) -> Iterator[None]:
+        """Whether the first signal ends what comes before training.
+
+        Raises:
+            Stopped: if it has.
+        """
+        try:
+            with self.prompt(prompt):
+                yield
+            if self.signal is not None:
+                raise Interrupted
+        except KeyboardInterrupt:
+            raise Stopped("stopped before training began", exit_code=self.exit_code) from None
+
     def check(self) -> None:
-        """Called before every environment step.
+        """Called before every environment step, where somebody between may have caught what the signal raised.
 
         Raises:
             Interrupted: if a signal has come, and to stop here loses nothing.
@@ -62,10 +87,12 @@ class StopRequest:
         return self
 
     def __exit__(self, *_: object) -> None:
+        over = self.ends_process and self.signal is not None
         for number, handler in self._previous.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_IGN if over else handler)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
         if self.signal is not None:
             raise KeyboardInterrupt
         self.signal = number
+        self.check()

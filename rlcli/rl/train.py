@@ -99,6 +99,7 @@ def fit(
     try:
         if saver.at is None:
             boundaries.save()
+            saver.wait()
         begin, first_step = time.monotonic(), trainer.env_steps
         while not (stopped := _any_asked(stop, peers)) and not budget.spent(trainer):
             before, tried = divergences(), trials is not None and trials.due(trainer.iteration + 1)
@@ -128,6 +129,10 @@ def fit(
         raise _stopped(f"stopped in iteration {boundaries.number + 1}; resumed, it begins again", run, stop) from None
     except KeyboardInterrupt:
         raise _stopped("stopped at once; what came after the last checkpoint is lost", run, stop) from None
+    except BaseException:
+        with contextlib.suppress(Exception):  # the first error is the one to report
+            saver.wait()  # a good checkpoint may be on its way
+        raise
     if stopped and not budget.spent(trainer):
         raise _stopped(f"stopped at iteration {trainer.iteration}, checkpoint written", run, stop)
 

@@ -12,6 +12,8 @@ from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.rollout import acting, evaluate
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from rlcli.envs.vec_env import VecEnv
     from rlcli.rl.policy import Policy
 
@@ -37,6 +39,7 @@ class Trials:
     ) -> None:
         self._make_env, self._episodes, self._interval = make_env, episodes, interval
         self._env: VecEnv | None = None
+        self._fresh: Mapping[str, Tensor] = {}
         best = max(history, key=_score, default={})  # the earliest of equals
         self._best = _score(best)
         self.best: int | None = best["step"] if self._best > _NONE else None
@@ -47,13 +50,16 @@ class Trials:
         return iteration % self._interval == 0
 
     def run(self, policy: Callable[[], Policy]) -> dict[str, float]:
-        """Metrics of a trial of the policy as it is now."""
+        """Metrics of a trial of the policy that is made for it: making one draws weights."""
         rng, threads = rng_state(), torch.get_num_threads()
         torch.set_num_threads(1)
         try:
             if self._env is None:
                 seed_generators(0)  # whenever it is built, of tasks that draw as they are
                 self._env = self._make_env()
+                self._env.reset(seed=self._env.seed)
+                self._fresh = self._env.state_dict()
+            self._env.load_state_dict(self._fresh)  # a curriculum, too, is where it was
             seed_generators(self._env.seed)
             summary = evaluate(self._env, acting(self._env, policy()), self._episodes).summary()
         finally:

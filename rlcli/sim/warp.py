@@ -27,6 +27,7 @@ from rlcli.sim.engine import force_sensors, quiet_mujoco
 from rlcli.sim.entity import as_index
 from rlcli.sim.guard import Call, Divergence, StateLayout
 from rlcli.sim.mask import MaskSelection
+from rlcli.sim.saved import require_alike
 from rlcli.sim.selection import ALL, Selection
 
 _STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
@@ -385,7 +386,11 @@ class WarpEngine:
         """Take back what `state_dict` gave; derived fields are computed anew."""
         for name, values in state.items():
             if name.startswith("model."):
-                self.expand(name.removeprefix("model.")).copy_(values)
+                field = name.removeprefix("model.")
+                if not values.is_floating_point() and self.expanded(field) is None:
+                    raise ValueError(f"model field '{field}' is part of the model's structure, and not the model's")
+                require_alike({field: values}, {field: self.expand(field)}, "engine")
+                self.expand(field).copy_(values)
         for name in state:
             if name.startswith("substep."):
                 self.field(name.removeprefix("substep."))  # whoever saved had asked for it; here that may come later

@@ -26,58 +26,6 @@ def wait_for_training(process, seconds=60):
     raise AssertionError(process.communicate()[1])
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 75)])
-def test_a_signal_writes_a_checkpoint_and_says_how_to_go_on(cli, start, number, code, only_run):
-    process = start("train", "cartpole", *LONG, "--max-iterations", 100_000)
-    wait_for_training(process)
-    process.send_signal(number)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == code, err
-    assert out == ""
-    assert "Traceback" not in err
-    record = json.loads((only_run() / "run.json").read_text())
-    assert record["state"] == "stopped"
-    assert (only_run() / f"checkpoints/{record['step']:012d}/manifest.json").is_file()
-    match = re.search(r"hint: rlcli (train --resume \S+)", err)
-    assert match, err
-    more = str(record["iteration"] + 2)
-    done = cli(*match[1].split(), "--max-iterations", more, "-q", "--json")
-    assert done.code == 0, done.err
-    assert done.json["iteration"] == int(more)
-    rows = [json.loads(line)["step"] for line in (only_run() / "metrics.jsonl").read_text().splitlines()]
-    assert rows == [32 * 16 * (i + 1) for i in range(int(more))]
-
-
-def test_a_second_signal_does_not_wait(start, only_run):
-    # one iteration lasts much longer than the test
-    slow = ("scene.num_envs=2048", "agent.n_steps=2000", "agent.n_epochs=1000")
-    process = start("train", "cartpole", *LONG, *slow)
-    deadline = time.monotonic() + 60
-    while not list(Path("runs").glob("*/*/checkpoints/*/manifest.json")) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    time.sleep(1.0)
-    process.send_signal(signal.SIGTERM)
-    time.sleep(0.5)
-    assert process.poll() is None
-    process.send_signal(signal.SIGTERM)
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 75, err
-    assert "stopped at once" in err
-    assert "Traceback" not in err
-    assert sorted(p.name for p in (only_run() / "checkpoints").iterdir()) == ["000000000000", "latest"]
-
-
-def test_a_signal_before_training_begins_leaves_no_run(start):
-    process = start("train", "cartpole", *LONG, "--max-iterations", 3)
-    deadline = time.monotonic() + 30
-    while not list(Path().glob("runs/*/*/run.json")) and time.monotonic() < deadline:
-        time.sleep(0.005)
-    process.send_signal(signal.SIGTERM)  # torch is being imported
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 75, err
-    assert not list(Path().glob("runs/*/*"))
-
-
 def test_configuration_and_checkpoint_0_come_first(start):
     process = start("train", "cartpole", *LONG, "--max-iterations", 100_000)
     deadline = time.monotonic() + 60

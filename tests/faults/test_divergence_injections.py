@@ -148,6 +148,7 @@ def test_what_is_set_aside_survives_a_checkpoint(tmp_path):
     assert torch.equal(left.reward, right.reward)
 
 
+@pytest.mark.slow  # compiles kernels
 def test_the_guard_of_warp_names_environment_and_cause(tmp_path):
     pytest.importorskip("mujoco_warp")
     task = machine(tmp_path, PLAIN_TASK)

@@ -1,0 +1,199 @@
+"""SIGKILL at every moment: what was saved is whole, and the resumed run is the one that was never killed."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from children import SMALL, warm_parent
+from fault_points import KILLED_AT
+from fault_sizes import SIZE, amount, chosen
+from run_comparison import assert_loads, assert_same_run, newest
+
+from rlcli.rl.checkpoint import steps
+
+SAC = """
+agents:
+  small:
+    {trainer: sb3, algorithm: sac, train_freq: 4, gradient_steps: 2, learning_starts: 24, batch_size: 8,
+     buffer_size: 96, policy: {hidden: [8]}, normalize_observations: true}
+"""
+PPO = """
+agents:
+  small:
+    {trainer: ppo, algorithm: ppo, num_steps: 8, num_minibatches: 2, num_epochs: 2, actor: {hidden: [8]},
+     critic: {hidden: [8]}, normalize_observations: true}
+"""
+SHORT = ("episode_length_s=0.3", "agent.save_interval=1", "--max-iterations", 8)
+MINI = ("agent.num_minibatches=2", "agent.policy.hidden=[8]")
+RUNS = {
+    # a step of everything that is written: evaluations, the best, retention, TensorBoard
+    "sb3-ppo": (
+        "cartpole",
+        "agent.n_steps=8",
+        "agent.n_epochs=2",
+        "agent.eval_interval=2",
+        "agent.eval_episodes=2",
+        "agent.keep_last=2",
+        *MINI,
+    ),
+    # replay rows in files of their own, in a ring of 24 steps that wraps
+    "sac": ("cartpole", "--config", "sac.yaml", "--agent", "small", "agent.keep_last=2", "agent.keep_every=3"),
+    "ppo": ("cartpole-direct", "--config", "ppo.yaml", "--agent", "small", "agent.keep_last=1", "--logger", "none"),
+}
+RESUMING = [
+    "before the metrics are cut", "after the metrics are cut", "in the middle of the cut",
+    "in the middle of TensorBoard's cut", "after TensorBoard's cut",
+]  # fmt: skip
+ROWS = ["in the middle of replay rows", "before replay rows have their name"]
+RECORD = ["before run.json", "in the middle of run.json"]
+WRITING = [point for point in KILLED_AT if point not in (*RESUMING, *ROWS, *RECORD)]
+NAMED = [
+    *((point, nth, name) for point in WRITING for nth, name in ((1, "sb3-ppo"), (4, "sac"), (3, "ppo"))),
+    # its first time the run begins to be one
+    *((point, nth, name) for point in RECORD for nth, name in ((2, "sb3-ppo"), (4, "sb3-ppo"), (3, "sac"))),
+    *((point, nth, "sac") for point in ROWS for nth in (1, 3, 5)),
+    *((point, 1, name) for point in RESUMING for name in ("sb3-ppo", "sac")),
+]
+NAMED = [case for case in NAMED if not ("TensorBoard" in case[0] and case[2] == "ppo")]
+
+
+@pytest.fixture(scope="module")
+def child():
+    with warm_parent() as start:
+        yield start
+
+
+def train(child, folder, name, **faults):
+    return child(folder, "train", *RUNS[name], *SMALL, *SHORT, "--seed", 5, **faults)
+
+
+def prepared(folder):
+    (folder / "sac.yaml").write_text(SAC)
+    (folder / "ppo.yaml").write_text(PPO)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(child, tmp_path_factory):
+    """Runs that nobody killed, and how long they took."""
+    done = {}
+
+    def of(name):
+        if name not in done:
+            folder = prepared(tmp_path_factory.mktemp("whole"))
+            begin = time.monotonic()
+            ended = train(child, folder, name).ended()
+            assert ended.code == 0, ended.err
+            done[name] = run_in(folder), time.monotonic() - begin
+        return done[name]
+
+    return of
+
+
+def run_in(folder):
+    (run,) = [file.parent for file in folder.glob("runs/*/*/run.json")]
+    return run
+
+
+def killed_at(point, nth=1):
+    call, pattern, when = KILLED_AT[point]
+    return [{"kind": "kill", "call": call, "pattern": pattern, "when": when, "nth": nth}]
+
+
+def assert_killed(ended):
+    assert ended.code == -signal.SIGKILL, (ended.code, ended.err)
+
+
+@pytest.mark.parametrize(("point", "nth", "name"), chosen(NAMED, 4), ids=lambda value: str(value).replace(" ", "-"))
+def test_a_run_killed_at_this_moment_goes_on_as_if_it_had_not_been(child, whole, tmp_path, point, nth, name):
+    folder = prepared(tmp_path)
+    if point in RESUMING:  # twice: it had come some way before
+        assert_killed(train(child, folder, name, faults=killed_at("after the rename", 4)).ended())
+        again = child(folder, "train", "--resume", run_in(folder), "-q", faults=killed_at(point, nth))
+        assert_killed(again.ended())
+    else:
+        assert_killed(train(child, folder, name, faults=killed_at(point, nth)).ended())
+    run = run_in(folder)
+    assert_loads(run)
+    resumed = child(folder, "train", "--resume", "latest", "-q").ended()
+    assert resumed.code == 0, resumed.err
+    assert_same_run(run, whole(name)[0])
+
+
+@pytest.mark.parametrize("number", range(amount(2, 20, 240)))
+def test_a_run_killed_at_any_time_goes_on_as_if_it_had_not_been(child, whole, tmp_path, number):
+    draw, name = random.Random(number), list(RUNS)[number % len(RUNS)]
+    reference, took = whole(name)
+    folder, begun = prepared(tmp_path), None
+    for _ in range(draw.choice([1, 1, 2, 3])):
+        now = train(child, folder, name) if begun is None else child(folder, "train", "--resume", begun, "-q")
+        time.sleep(draw.uniform(0.0, took))
+        os.kill(now.pid, signal.SIGKILL)
+        assert now.ended().code in (0, -signal.SIGKILL)  # it may have been done
+        runs = list(folder.glob("runs/*/*/run.json"))  # before that there is no run
+        if runs:
+            begun = runs[0].parent
+            assert_loads(begun)
+    arguments = (*RUNS[name], *SMALL, *SHORT, "--seed", 5) if begun is None else ("--resume", begun, "-q")
+    resumed = child(folder, "train", *arguments).ended()
+    assert resumed.code == 0, resumed.err
+    assert_same_run(run_in(folder), reference)
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_again(child, whole, tmp_path):
+    folder = prepared(tmp_path)
+    assert_killed(train(child, folder, "sac", faults=killed_at("before the rename")).ended())
+    assert steps(run_in(folder) / "checkpoints") == []
+    resumed = child(folder, "train", "--resume", "latest").ended()
+    assert resumed.code == 0, resumed.err
+    assert "begins again" in resumed.err
+    assert_same_run(run_in(folder), whole("sac")[0])
+
+
+def test_a_run_that_has_lost_its_checkpoints_does_not_begin_again(child, tmp_path, whole):
+    run = tmp_path / "runs/cartpole/r"
+    shutil.copytree(whole("sac")[0], run)
+    for folder in run.glob("checkpoints/0*"):
+        shutil.rmtree(folder)
+    ended = child(tmp_path, "train", "--resume", run, "--max-iterations", 9).ended()
+    assert ended.code == 5
+    assert "no complete checkpoint" in ended.err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(SIZE == "sample", reason="minutes long: make test-faults runs it")
+@pytest.mark.timeout(1800)
+def test_a_training_of_cartpole_killed_five_times_has_the_weights_of_one_that_was_not(tmp_path):
+    def start(folder, *arguments):
+        command = [sys.executable, "-m", "rlcli", "train", *map(str, arguments), "--quiet"]
+        return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+    def weights(folder):
+        (run,) = [file.parent for file in folder.glob("runs/*/*/run.json")]
+        assert json.loads((run / "run.json").read_text())["state"] == "finished"
+        return newest(run).manifest["files"]["policy.safetensors"]["sha256"]
+
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "killed").mkdir()
+    begin = time.monotonic()
+    process = start(tmp_path / "whole", "cartpole", "--seed", 3)
+    assert process.communicate()[0], "its run"
+    took, draw, arguments = time.monotonic() - begin, random.Random(), ("cartpole", "--seed", 3)
+    for _ in range(5):
+        process = start(tmp_path / "killed", *arguments)
+        time.sleep(draw.uniform(0.1, 0.5) * took)
+        process.kill()
+        process.communicate()
+        if list(Path(tmp_path).glob("killed/runs/*/*/run.json")):
+            arguments = ("--resume", "latest")
+    process = start(tmp_path / "killed", *arguments)
+    said = process.communicate()[0]
+    assert process.returncode == 0, said
+    assert weights(tmp_path / "killed") == weights(tmp_path / "whole")

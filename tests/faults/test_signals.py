@@ -1,0 +1,183 @@
+"""Being asked to stop, at any moment: soon, with the right exit code, and the resumed run is the one never stopped."""
+
+import json
+import os
+import pty
+import re
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from children import SMALL, warm_parent
+from fault_sizes import chosen
+from run_comparison import assert_same_run, newest
+
+import rlcli_tasks.cartpole
+
+SHORT = ("episode_length_s=0.3", "agent.n_steps=64", "agent.n_epochs=10", "agent.policy.hidden=[8]", "--logger", "none")
+TRAIN = ("cartpole", *SMALL, *SHORT, "--max-iterations", 4, "--seed", 5)
+STEP, UPDATE = "rlcli.envs.vec_env:VecEnv.step", "torch.optim:Adam.step"
+LONG_FIRST = {"kind": "sleep", "call": STEP, "pattern": "", "nth": 3, "seconds": 0.2}
+"""The first iteration takes long, so that the second one can be left."""
+PHASES = {
+    # in the second of four iterations: 64 steps, 40 updates each
+    "rollout": {"kind": "slow", "call": STEP, "pattern": "", "nth": 64 + 20, "seconds": 0.3},
+    "update": {"kind": "slow", "call": UPDATE, "pattern": "", "nth": 40 + 9, "seconds": 0.3},
+    "save": {"kind": "slow", "call": "fsync", "pattern": r"checkpoints/\.tmp-", "nth": 9, "seconds": 0.2},
+}
+SIGNALS = {
+    "SIGINT": ([signal.SIGINT], 130),
+    "SIGTERM": ([signal.SIGTERM], 75),
+    "SIGUSR1": ([signal.SIGUSR1], 75),
+    "SIGHUP": ([signal.SIGHUP], 75),
+    "SIGINT twice": ([signal.SIGINT, signal.SIGINT], 130),
+    "SIGPIPE": ([signal.SIGPIPE], 0),
+}
+CASES = [(number, phase) for phase in (*PHASES, "plugin import") for number in SIGNALS]
+PLUGIN = """
+import time
+from pathlib import Path
+Path("slow").write_text(".")
+while not Path("go on").exists():
+    time.sleep(0.01)
+"""
+
+
+@pytest.fixture(scope="module")
+def child():
+    with warm_parent() as start:
+        yield start
+
+
+@pytest.fixture(scope="module")
+def whole(child, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    assert child(folder, "train", *TRAIN).ended().code == 0
+    return run_in(folder)
+
+
+def run_in(folder):
+    (run,) = [file.parent for file in folder.glob("runs/*/*/run.json")]
+    return run
+
+
+def slow_moments(folder):
+    return len((folder / "slow").read_text()) if (folder / "slow").exists() else 0
+
+
+def in_phase(child, folder, phase, *more, **settings):
+    """A training in the middle of a phase that takes seconds."""
+    process = child(folder, "train", *TRAIN, *more, faults=[PHASES[phase], LONG_FIRST], **settings)
+    process.until(lambda: slow_moments(folder))
+    return process
+
+
+@pytest.mark.parametrize(("number", "phase"), chosen(CASES, 4))
+def test_a_signal_stops_soon_and_the_resumed_run_is_the_one_that_was_not_stopped(
+    child, tmp_path, whole, number, phase
+):  # fmt: skip
+    numbers, code = SIGNALS[number]
+    if phase == "plugin import":
+        stops_in_an_import(child, tmp_path, numbers, code)
+        return
+    save = ("agent.save_interval=1",) if phase == "save" else ()
+    process = in_phase(child, tmp_path, phase, *save)
+    before = slow_moments(tmp_path)
+    os.kill(process.pid, numbers[0])
+    if len(numbers) > 1:
+        time.sleep(0.05)
+        if process.runs():
+            os.kill(process.pid, numbers[1])
+    ended = process.ended()
+    assert "Traceback" not in ended.err, ended.err
+    assert ended.code == code, ended.err
+    run = run_in(tmp_path)
+    if code:
+        record = json.loads((run / "run.json").read_text())
+        assert record["state"] == "stopped" or len(numbers) == 2
+        if len(numbers) == 1:
+            assert record["step"] == newest(run).step
+        assert ended.out == ""
+        if phase != "save":
+            assert slow_moments(tmp_path) <= before + 2, "it stopped at the next step"
+        if phase != "save" and len(numbers) == 1:
+            assert record["iteration"] == 1, "the boundary before the iteration that was left"
+        hint = re.search(r"hint: rlcli (train --resume \S+)", ended.err)
+        assert hint or len(numbers) == 2, ended.err
+        resumed = child(tmp_path, *(hint[1].split() if hint else ("train", "--resume", "latest")), "-q").ended()
+        assert resumed.code == 0, resumed.err
+    assert_same_run(run, whole)
+
+
+def stops_in_an_import(child, folder, numbers, code):
+    """While a task's module is imported: there is nothing yet that could be resumed."""
+    task, cartpole = folder / "mine", Path(rlcli_tasks.cartpole.__file__).parent
+    task.mkdir()
+    shutil.copy(cartpole / "direct.yaml", task / "task.yaml")
+    shutil.copy(cartpole / "cartpole.xml", task)
+    source = (cartpole / "task.py").read_text().replace("from __future__ import annotations", "")
+    (task / "task.py").write_text(PLUGIN + source.replace("CartpoleTask", "Task"))
+    more = ("scene.num_envs=4", "sim.engine_threads=1", "agent.torch_threads=1", "--max-iterations", 1)
+    process = child(folder, "train", "./mine", *more, "--logger", "none", "-q")
+    process.until(lambda: slow_moments(folder))
+    for number in numbers:
+        if process.runs():
+            os.kill(process.pid, number)
+    if not code:
+        (folder / "go on").touch()
+    ended = process.ended()
+    assert "Traceback" not in ended.err, ended.err
+    assert ended.code == code, ended.err
+    runs = list(folder.glob("runs/*/*"))
+    if code:
+        assert runs == []
+        assert "stopped before training began" in ended.err
+    else:
+        assert newest(runs[0]).iteration == 1
+
+
+def test_a_hangup_that_nohup_ignores_does_not_stop(child, tmp_path, whole):
+    process = in_phase(child, tmp_path, "update", ignored=("SIGHUP",))
+    os.kill(process.pid, signal.SIGHUP)
+    ended = process.ended()
+    assert ended.code == 0, ended.err
+    assert_same_run(run_in(tmp_path), whole)
+
+
+@pytest.mark.parametrize("streams", [("err",), ("out",), ("out", "err")], ids="+".join)
+def test_a_reader_that_goes_away_stops_nothing(child, tmp_path, whole, streams):
+    """As `rlcli train ... 2>&1 | head -1` does."""
+    output, readers = tmp_path / "child", []
+    for stream in streams:
+        os.mkfifo(f"{output}.{stream}")
+        readers.append(os.open(f"{output}.{stream}", os.O_RDONLY | os.O_NONBLOCK))
+    loud = [word for word in TRAIN if word != "-q"]
+    faults = [{"kind": "slow", "call": STEP, "pattern": "", "nth": 60, "seconds": 0.001}]
+    process = child(tmp_path, "train", *loud, faults=faults, output=output)
+    deadline = time.monotonic() + 60
+    while not slow_moments(tmp_path) and time.monotonic() < deadline:
+        time.sleep(0.005)
+    if "err" in streams:
+        assert os.read(readers[-1], 10)
+    for reader in readers:
+        os.close(reader)
+    status = process.ask(wait=process.pid, seconds=60)["status"]
+    assert status == 0
+    assert_same_run(run_in(tmp_path), whole)
+
+
+def test_a_terminal_that_is_gone_does_not_stop_what_ignores_its_hangup(child, tmp_path, whole):
+    terminal, name = pty.openpty()
+    output = tmp_path / "child"
+    for stream in ("out", "err"):
+        Path(f"{output}.{stream}").symlink_to(os.ttyname(name))
+    loud = [word for word in TRAIN if word != "-q"]
+    faults = [{"kind": "slow", "call": STEP, "pattern": "", "nth": 60, "seconds": 0.005}]
+    process = child(tmp_path, "train", *loud, faults=faults, output=output, ignored=("SIGHUP",))
+    assert os.read(terminal, 10)
+    os.close(name)
+    os.close(terminal)
+    assert process.ask(wait=process.pid, seconds=60)["status"] == 0
+    assert_same_run(run_in(tmp_path), whole)
