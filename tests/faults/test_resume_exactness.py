@@ -55,7 +55,7 @@ def assert_equal(run, reference):
     assert leftovers(run) == []
 
 
-@pytest.mark.parametrize(("case", "cut"), chosen(GRID, 5), ids=str)
+@pytest.mark.parametrize(("case", "cut"), chosen(GRID, 3), ids=str)
 def test_a_training_that_was_cut_goes_on_as_if_it_had_not_been(case, cut, place, whole, tmp_path, monkeypatch):
     if cut == "within":
         monkeypatch.setattr(loop, "LONG_S", -1.0)  # every iteration can be left, and its beginning is only in memory
@@ -70,6 +70,7 @@ def test_a_training_that_was_cut_goes_on_as_if_it_had_not_been(case, cut, place,
     assert_equal(run, whole(case))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("agent", "normalize"), chosen(SPECIAL, 1))
 def test_a_training_cut_again_and_again_with_other_threads_is_the_same(agent, normalize, place, whole, tmp_path):
     case = Case("everything", agent, normalize)
@@ -80,6 +81,7 @@ def test_a_training_cut_again_and_again_with_other_threads_is_the_same(agent, no
     assert_equal(run, whole(case))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("agent", "normalize"), chosen(SPECIAL, 1))
 def test_an_older_checkpoint_leads_to_the_same_end(agent, normalize, place, whole, tmp_path):
     case = Case("cartpole-direct", agent, normalize)
@@ -93,6 +95,7 @@ def test_an_older_checkpoint_leads_to_the_same_end(agent, normalize, place, whol
     assert steps(run / "checkpoints") == steps(whole(case) / "checkpoints")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("agent", "normalize"), chosen(SPECIAL, 1))
 def test_what_is_kept_changes_nothing_and_every_kept_checkpoint_goes_on(agent, normalize, place, whole, tmp_path):
     case, keep = Case("cartpole-direct", agent, normalize), Keep(2, 3)
@@ -138,6 +141,7 @@ def test_a_ring_that_is_overwritten_in_one_iteration_is_saved_whole(
     assert_equal(run, whole(case))
 
 
+@pytest.mark.slow
 def test_a_linear_schedule_goes_on_where_it_was(place, whole, tmp_path):
     for agent in ("sb3-ppo", "sac", "a2c"):
         case = replace(Case("cartpole-direct", agent, False), more="schedule: linear")

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from children import SMALL, warm_parent
+from children import SMALL
 from fault_sizes import chosen
 from run_comparison import assert_same_run, newest
 
@@ -46,12 +46,6 @@ while not Path("go on").exists():
 
 
 @pytest.fixture(scope="module")
-def child():
-    with warm_parent() as start:
-        yield start
-
-
-@pytest.fixture(scope="module")
 def whole(child, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     assert child(folder, "train", *TRAIN).ended().code == 0
@@ -74,7 +68,7 @@ def in_phase(child, folder, phase, *more, **settings):
     return process
 
 
-@pytest.mark.parametrize(("number", "phase"), chosen(CASES, 4))
+@pytest.mark.parametrize(("number", "phase"), chosen(CASES, 1))
 def test_a_signal_stops_soon_and_the_resumed_run_is_the_one_that_was_not_stopped(
     child, tmp_path, whole, number, phase
 ):  # fmt: skip
@@ -138,6 +132,7 @@ def stops_in_an_import(child, folder, numbers, code):
         assert newest(runs[0]).iteration == 1
 
 
+@pytest.mark.slow
 def test_a_hangup_that_nohup_ignores_does_not_stop(child, tmp_path, whole):
     process = in_phase(child, tmp_path, "update", ignored=("SIGHUP",))
     os.kill(process.pid, signal.SIGHUP)
@@ -146,6 +141,7 @@ def test_a_hangup_that_nohup_ignores_does_not_stop(child, tmp_path, whole):
     assert_same_run(run_in(tmp_path), whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("streams", [("err",), ("out",), ("out", "err")], ids="+".join)
 def test_a_reader_that_goes_away_stops_nothing(child, tmp_path, whole, streams):
     """As `rlcli train ... 2>&1 | head -1` does."""
@@ -168,6 +164,7 @@ def test_a_reader_that_goes_away_stops_nothing(child, tmp_path, whole, streams):
     assert_same_run(run_in(tmp_path), whole)
 
 
+@pytest.mark.slow
 def test_a_terminal_that_is_gone_does_not_stop_what_ignores_its_hangup(child, tmp_path, whole):
     terminal, name = pty.openpty()
     output = tmp_path / "child"

@@ -1,0 +1,11 @@
+"""What the suites of faults share."""
+
+import pytest
+from children import warm_parent
+
+
+@pytest.fixture(scope="session")
+def child():
+    """Starts commands as forked children of one warm parent."""
+    with warm_parent() as start:
+        yield start
