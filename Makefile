@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 RUNS ?= runs
+# Tests run beside each other: threads of theirs that wait must not keep a core busy.
+export OMP_WAIT_POLICY ?= PASSIVE
 
 .PHONY: demo test test-all test-faults test-faults-long check bench setup clean
 
