@@ -130,6 +130,9 @@ def open_run(folder: Path) -> Run:
     for inner in ("checkpoints", "checkpoints/logs"):
         if (folder / inner).is_dir():
             refuse_links(folder / inner)
+    for part in (folder / CONFIG, folder / "metrics.jsonl"):
+        if part.exists() and not part.is_file():
+            raise CheckpointError(f"{part} is no plain file")  # a pipe would be waited for
     _check(record, file)
     return Run(folder, record)
 
