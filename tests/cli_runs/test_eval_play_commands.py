@@ -289,7 +289,7 @@ def test_a_changed_observation_layout_is_shown_field_by_field(cli, trained, comm
 def test_a_damaged_policy_is_named(cli, trained):
     file = trained / "checkpoints/000000000128/policy.safetensors"
     file.write_bytes(file.read_bytes()[:-5])
-    done = cli("eval", "--checkpoint", trained)
+    done = cli("eval", "--checkpoint", f"{trained}@step:128")
     assert done.code == 5
     assert "policy.safetensors is corrupt" in done.err
     assert cli("eval", "--checkpoint", f"{trained}@step:0", "--episodes", 2, "-q").code == 0
