@@ -266,9 +266,7 @@ def python_task(reference: str, name: str | None = None) -> TaskSource:
     Raises:
         TaskError: if there is no such file.
     """
-    place, _, attribute = reference.rpartition(":")
-    path = Path(place if place and not Path(reference).exists() else reference).resolve()
-    attribute = attribute if path != Path(reference).resolve() else ""
+    path, attribute = python_place(reference)
     if path.is_dir():
         file, label = path / "__init__.py", attribute or path.name
     else:
@@ -289,6 +287,14 @@ def python_task(reference: str, name: str | None = None) -> TaskSource:
         task_file=None,
         python=f"{path}:{attribute}" if attribute else str(path),
     )
+
+
+def python_place(reference: str) -> tuple[Path, str]:
+    """The file or folder of a configuration in Python, links resolved, and the name in it ('' if it has none)."""
+    place, _, attribute = reference.rpartition(":")
+    if not place or Path(reference).exists():
+        return Path(reference).resolve(), ""
+    return Path(place).resolve(), attribute
 
 
 def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:

@@ -16,7 +16,7 @@ from typing import Any
 
 from rlcli.errors import MachineError
 from rlcli.machine import read_plain
-from rlcli.registry import TaskSource, find_task
+from rlcli.registry import TaskSource, find_task, python_place
 from rlcli.rl.files import write_atomic
 
 _LONGEST = 16 * 1024
@@ -52,11 +52,8 @@ def _key(record: Mapping[str, Any]) -> str:
     """The folder, or the file or package and the name in it, links resolved."""
     if not record.get("python"):
         return str(Path(str(record["folder"])).resolve())
-    path, colon, attribute = str(record["python"]).rpartition(":")
-    if not colon or os.sep in attribute or Path(str(record["python"])).exists():
-        path, attribute = str(record["python"]), ""
-    resolved = str(Path(path).resolve())
-    return f"{resolved}:{attribute}" if attribute else resolved
+    path, attribute = python_place(str(record["python"]))  # as it will be loaded
+    return f"{path}:{attribute}" if attribute else str(path)
 
 
 def _note(key: str) -> None:

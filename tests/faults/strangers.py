@@ -86,6 +86,19 @@ def _oige(at):
     edit(at.run, task={"folder": str(at.evil), "name": "evil"})
 
 
+def _spelled_like_a_known_one(at):
+    """A file of the run whose spelling ends, read as one path, at a folder that the user has named."""
+    from rlcli.rl.trust import named_task
+
+    known = at.cwd / "known"
+    known.mkdir()
+    shutil.copy(at.run / "config.yaml", known / "task.yaml")
+    named_task(str(known))
+    up = "../" * (len(at.run.relative_to(at.cwd).parts) + 1)
+    shutil.copy(at.evil / "task.py", at.run / "task.py")
+    edit(at.run, task={"folder": str(at.run), "python": f"{at.run}/task.py:x/{up}known"})
+
+
 CODE = {
     "a folder": _named(folder="{evil}"),
     "a folder of the run": _inside,
@@ -99,6 +112,7 @@ CODE = {
     "a Python file in the current folder": _named(folder=".", python="evil/task.py:TASK"),
     "a package": _named(folder="{evil}", python="{evil}"),
     "a package's task": _named(folder="{evil}", python="{evil}:Evil-v0"),
+    "a file spelled like a known folder": _spelled_like_a_known_one,
     "an attribute of an installed module": _named(folder="/", python=f"{os.__file__}:system"),
     "a file as distribution": _named(distribution="{evil}/task.py", name="TASK"),
     "a folder as distribution": _named(distribution="{evil}", name="Evil-v0"),
