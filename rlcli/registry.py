@@ -235,6 +235,25 @@ def package_folder(entry: Entry) -> Path | None:
     return Path(places[0]) if places else None
 
 
+def is_offered(module: str, source: TaskSource) -> bool:
+    """Whether a configuration may name a module: one of a task's own package, or of an installed plugin's.
+
+    Nothing is imported: a configuration is data, and may be a stranger's.
+    """
+    top = module.partition(".")[0]
+    if not top.isidentifier():
+        return False
+    entries = [entry for group in (TASKS, TRAINERS) for entry in catalog(group)[0]]
+    if top in {entry.value.partition(":")[0].partition(".")[0] for entry in entries}:
+        return True
+    try:
+        found = importlib.util.find_spec(top)
+    except (ImportError, ValueError):
+        return False
+    places = [Path(place).resolve() for place in (found.submodule_search_locations or ())] if found else []
+    return any(source.root.resolve().is_relative_to(place) for place in places)
+
+
 def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
     """The files of a task in an installed package."""
     root = _folder(spec.package, entry)

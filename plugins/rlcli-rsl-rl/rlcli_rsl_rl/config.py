@@ -136,8 +136,9 @@ class SymmetryConfig(StrictModel):
     """Symmetry of the task (Mittal et al. 2024)."""
 
     data_augmentation_func: str
-    """`module:function`, or `file.py:function` beside the task, called as `f(env=, obs=, actions=)`: the samples and,
-    after them, their mirror images; `obs` or `actions` may be None. `env.unwrapped` is rlcli's."""
+    """`module:function` of the task's package or a plugin's, or `file.py:function` beside the task, called as
+    `f(env=, obs=, actions=)`: the samples and, after them, their mirror images; `obs` or `actions` may be None.
+    `env.unwrapped` is rlcli's."""
     use_data_augmentation: bool = False
     """Learn from the mirror images as well."""
     use_mirror_loss: bool = False

@@ -17,7 +17,7 @@ from torch import Tensor
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DependencyError, DivergedError
 from rlcli.random import derive
-from rlcli.registry import load_object
+from rlcli.registry import is_offered, load_object
 from rlcli.rl.policy import Policy, PolicySpec
 from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.statistics import EpisodeStatistics
@@ -379,6 +379,10 @@ def _mirror(env: VecEnv, reference: str) -> Any:
             at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
             raise _problem(env, at, f"'{module}' lies outside the task's folder {root}", "put it beside the task")
         module = str(file)
+    elif not is_offered(module, env.resolved.source):
+        at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
+        message = f"'{module}' belongs neither to the task nor to an installed plugin"
+        raise _problem(env, at, message, "file.py:function beside the task, or module:function of its package")
     try:
         found = load_object(f"{module}:{name}")
     except (ImportError, AttributeError, OSError, ValueError) as error:
@@ -387,7 +391,7 @@ def _mirror(env: VecEnv, reference: str) -> Any:
         why = ", which is not a function"
     if not callable(found):
         at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
-        hint = "module:function of an installed package, or file.py:function beside the task"
+        hint = "module:function of the task's package or a plugin, or file.py:function beside the task"
         raise _problem(env, at, f"there is no function '{reference}'{why}", hint)
     return found
 

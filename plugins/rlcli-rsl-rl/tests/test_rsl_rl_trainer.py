@@ -313,7 +313,11 @@ def test_settings_that_cannot_be_are_refused_before_anything_heavy(overrides, pl
         (["agent.obs_groups={teacher: [policy]}"], "obs_groups.teacher", "sets: "),
         ([CRITIC, "agent.obs_groups={policy: [critic]}"], "obs_groups.policy", "policy alone"),
         (["agent.algorithm.num_mini_batches=90"], "algorithm.num_mini_batches", "96 samples"),
-        (["agent.algorithm.symmetry_cfg={data_augmentation_func: 'math:nothing'}"], "data_augmentation_func", "math"),
+        (
+            ["agent.algorithm.symmetry_cfg={data_augmentation_func: 'rlcli.random:nothing'}"],
+            "data_augmentation_func",
+            "rlcli.random",
+        ),
     ],
 )
 def test_settings_that_do_not_fit_the_environment_name_their_place(overrides, place, words):
@@ -321,6 +325,18 @@ def test_settings_that_do_not_fit_the_environment_name_their_place(overrides, pl
         trainer_of(*overrides)
     assert place in str(caught.value.problems)
     assert words in str(caught.value.problems)
+
+
+@pytest.mark.parametrize("reference", ["stranger:mirror", "stranger.mirror", "{folder}/stranger.py:mirror"])
+def test_symmetry_of_a_configuration_imports_nothing_but_the_tasks_and_the_plugins_modules(
+    reference, tmp_path, monkeypatch
+):
+    (tmp_path / "stranger.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\ndef mirror(**_): ...\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    named = reference.format(folder=tmp_path)
+    with pytest.raises(ConfigError, match=r"belongs neither|lies outside"):
+        trainer_of(f"agent.algorithm.symmetry_cfg={{data_augmentation_func: '{named}'}}")
+    assert not (tmp_path / "ran").exists()
 
 
 def test_a_name_alone_takes_rsl_rls_defaults():
