@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -29,6 +32,8 @@ from rlcli.sim.selection import Selection
 BODY = "terrain"
 """The body of the terrain's geoms."""
 _MOST = 1 << 24
+_HEADER = 10_000
+"""Bytes of a NumPy file's header."""
 _START, _MOVE = random.stream("terrain.start"), random.stream("terrain.move")
 _SPAWN = 0.5
 """Half the edge of the square in a patch's middle whose highest point is where its origin lies [m]."""
@@ -84,7 +89,7 @@ def misfits(config: TerrainGeneratorConfig | TerrainHeightsConfig, root: Path) -
 def make_ground(config: TerrainGeneratorConfig | TerrainHeightsConfig, root: Path) -> Ground:
     """Heights, blocks and origins; the same ones for the same configuration."""
     if isinstance(config, TerrainHeightsConfig):
-        heights = np.load(root / config.file, allow_pickle=False).astype(np.float64)
+        heights = _read_heights(root / config.file).astype(np.float64)
         nx, ny = heights.shape
         extent = ((nx - 1) * config.resolution, (ny - 1) * config.resolution)
         origin = np.array([[[0.0, 0.0, heights[nx // 2, ny // 2]]]], dtype=np.float32)
@@ -271,6 +276,22 @@ def _patch_misfits(patch: PatchConfig, edge: float, resolution: float) -> Iterat
             yield "width", f"{patch.width[0]:g} m is less than a cell of {resolution:g} m", "a finer resolution"
 
 
+def _read_heights(file: Path) -> NDArray[Any]:
+    """The array of a NumPy file, which may be a stranger's.
+
+    Raises:
+        ValueError: if it is none, or has more heights than a height field can.
+    """
+    with file.open("rb") as opened:
+        size = os.fstat(opened.fileno()).st_size
+        if size > _MOST * 8 + _HEADER:
+            raise ValueError(f"it has {size:,} bytes, more than {_MOST:,} heights need")
+        try:
+            return np.asarray(np.lib.format.read_array(opened, allow_pickle=False, max_header_size=_HEADER))
+        except (MemoryError, RecursionError, SyntaxError, TokenError) as error:  # of a header that promises too much
+            raise ValueError(f"its header is malformed ({type(error).__name__})") from None
+
+
 def _file_misfits(config: TerrainHeightsConfig, root: Path) -> Iterator[Misfit]:
     file = (root / config.file).resolve()
     if not file.is_relative_to(root.resolve()):
@@ -281,12 +302,12 @@ def _file_misfits(config: TerrainHeightsConfig, root: Path) -> Iterator[Misfit]:
         yield ("file",), f"no file '{config.file}' in {root}", f"NumPy files there: {have}"
         return
     try:
-        heights = np.load(file, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+        heights = _read_heights(file)
+    except (ValueError, OSError) as error:
         yield ("file",), f"'{config.file}' is not a NumPy file: {error}", None
         return
-    if not isinstance(heights, np.ndarray) or heights.ndim != 2 or min(heights.shape) < 2:
-        shape = getattr(heights, "shape", None)
-        yield ("file",), f"'{config.file}' must hold a table of heights, two by two at least; found shape {shape}", None
+    if heights.ndim != 2 or min(heights.shape) < 2:
+        found = f"found shape {heights.shape}"
+        yield ("file",), f"'{config.file}' must hold a table of heights, two by two at least; {found}", None
     elif heights.dtype.kind not in "fiu" or not np.isfinite(heights).all():
         yield ("file",), f"'{config.file}' must hold finite numbers; found {heights.dtype}", None

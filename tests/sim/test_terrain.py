@@ -393,6 +393,15 @@ def test_a_terrain_that_does_not_fit_is_refused_with_its_place(tmp_path, change,
     [
         (None, "hill.npy", "terrain.file: no file 'hill.npy'"),
         (b"no numbers", "hill.npy", "terrain.file: 'hill.npy' is not a NumPy file"),
+        (b"PK\3\4 and no zip", "hill.npy", "terrain.file: 'hill.npy' is not a NumPy file"),
+        (b"\x93NUMPY\1\0\x08\0{'descr\n", "hill.npy", "its header is malformed"),
+        (
+            b"\x93NUMPY\1\0\x4f\0"
+            + b"{'descr':'<f8','fortran_order':False,'shape':(1000000000000,1000)}".ljust(78)
+            + b"\n",
+            "hill.npy",
+            "its header is malformed",
+        ),
         (np.zeros(5), "hill.npy", "must hold a table of heights, two by two at least; found shape (5,)"),
         (np.full((3, 3), np.nan), "hill.npy", "must hold finite numbers"),
         (np.array([[None, 1], [2, 3]], dtype=object), "hill.npy", "is not a NumPy file"),
