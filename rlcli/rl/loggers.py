@@ -15,6 +15,8 @@ from rlcli.rl.files import disk_error, write_atomic
 from rlcli.rl.run import Run
 
 LOGGERS = ("tensorboard", "none")
+_LONGEST_LINE = 1024**2
+"""Bytes of an iteration's metrics."""
 
 
 class Logger(Protocol):
@@ -108,13 +110,17 @@ def open_loggers(run: Run, names: Sequence[str], *, resume: tuple[int, int] | No
 
 
 def read_metrics(file: Path) -> list[dict[str, Any]]:
-    """The lines of a metrics file; a last line cut short by a kill is left out."""
+    """The lines of a metrics file, up to the first that is none: a last one is cut short by a kill."""
     rows = []
-    for line in file.read_text(encoding="utf-8").splitlines():
-        try:
-            rows.append(json.loads(line))
-        except ValueError:
-            break
+    with file.open("rb") as lines:
+        for line in iter(lambda: lines.readline(_LONGEST_LINE), b""):
+            try:
+                row = json.loads(line)
+            except (ValueError, RecursionError):
+                break
+            if not isinstance(row, dict) or not all(type(row.get(key)) is int for key in ("iteration", "step")):
+                break
+            rows.append(row)
     return rows
 
 

@@ -41,6 +41,17 @@ def test_resume_drops_what_came_after_the_checkpoint_and_a_line_cut_short(tmp_pa
     assert steps_of(file) == [16, 32, 48]
 
 
+@pytest.mark.parametrize(
+    "line", [b"[1]", b'{"a": 1}', b'{"iteration": "1", "step": 1}', b"\xff", b"[" * 100_000, b"\0" * 2**21]
+)
+def test_metrics_end_where_a_line_is_no_iterations(tmp_path, line):
+    file = tmp_path / "metrics.jsonl"
+    good = b'{"iteration": %d, "step": 16}\n'
+    file.write_bytes(good % 1 + line + b"\n" + good % 2)
+    JsonLines(file, resume_after=2).close()
+    assert file.read_bytes() == good % 1
+
+
 def test_tensorboard_holds_no_step_twice_after_a_resume(tmp_path):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     board = TensorBoard(tmp_path)
