@@ -129,5 +129,5 @@ def listing(names: Iterable[str], limit: int = 20) -> str:
 
 def _by_place(problem: Problem) -> tuple[str, tuple[int, ...], str]:
     file, *numbers = problem.where.rsplit(":", 2)
-    place = tuple(int(number) for number in numbers if number.isdigit())
+    place = tuple(int(number) for number in numbers if number.isdecimal() and len(number) < 10)
     return (file if len(place) == 2 else problem.where, place, problem.path)

@@ -219,9 +219,9 @@ def find_checkpoint(
     from rlcli.rl.checkpoint import steps
 
     folder = Path(reference)
-    if (folder / "manifest.json").is_file():
+    if os.path.isfile(folder / "manifest.json"):  # of a name too long for the system: no
         return open_run(folder.resolve().parent.parent), folder, "as named"
-    name, _, which = (reference, "", "") if folder.exists() else reference.partition("@")
+    name, _, which = (reference, "", "") if os.path.exists(folder) else reference.partition("@")
     run, why = find_run(name, runs_dir, task)
     have = steps(run.checkpoints)
     if not have:
@@ -237,7 +237,7 @@ def find_checkpoint(
             )
         return run, run.checkpoints / f"{best:012d}", "its best evaluation"
     kind, _, number = which.partition(":")
-    if kind == "step" and number.isdigit():
+    if kind == "step" and re.fullmatch("[0-9]{1,30}", number):
         if int(number) not in have:
             raise CheckpointError(
                 f"{run.folder} has no checkpoint at step {number}", hint=f"steps: {listing(map(str, have))}"
@@ -284,8 +284,10 @@ def default_runs_dir() -> Path:
 _TYPES: dict[str, tuple[type, ...]] = {
     "agent": (str, type(None)),
     "best": (int, type(None)),
+    "init_from": (str, type(None)),
     "iteration": (int,),
     "loggers": (list,),
+    "resumed": (list,),
     "rlcli": (str,),
     "started": (str,),
     "state": (str,),
@@ -334,7 +336,7 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
         runs_dir / reference,
         *([runs_dir / task / reference] if task else []),
     ):
-        if (candidate / RECORD).is_file():
+        if os.path.isfile(candidate / RECORD):
             return open_run(candidate), "as named"
     matches = [run for run in list_runs(runs_dir, None) if run.folder.name == reference]
     if len(matches) == 1:

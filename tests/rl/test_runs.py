@@ -107,6 +107,11 @@ def test_a_near_miss_is_suggested(tmp_path):
     assert run.folder.name in caught.value.hint
 
 
+def test_a_name_too_long_for_the_system_is_no_run(tmp_path):
+    with pytest.raises(CheckpointError, match="no run 'aaaa"):
+        find_checkpoint("a" * 5000, tmp_path)
+
+
 def test_no_run_at_all_says_how_to_make_one(tmp_path):
     with pytest.raises(CheckpointError, match="no run of cartpole") as caught:
         find_run("latest", tmp_path / "nowhere", "cartpole")
@@ -136,6 +141,8 @@ def test_checkpoints_by_run_best_step_and_folder(tmp_path):
         ("@best", "no best checkpoint", "leave out @best"),
         ("@newest", "does not name a checkpoint", "RUN@step:N"),
         ("@step:x", "does not name a checkpoint", "RUN@step:N"),
+        ("@step:²", "does not name a checkpoint", "RUN@step:N"),
+        ("@step:" + "9" * 5000, "does not name a checkpoint", "RUN@step:N"),
     ],
 )
 def test_a_checkpoint_that_is_not_there_says_what_is(tmp_path, which, message, hint):
