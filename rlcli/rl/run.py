@@ -22,7 +22,7 @@ from rlcli.rl.reading import JSON_LIMIT, parse_json, read_file, refuse_links
 CONFIG = "config.yaml"
 RECORD = "run.json"
 MAX_SEED = 2**62
-_TASK = re.compile(r"[^/\\:]{1,255}")
+_TASK = re.compile(r"(?!\.{1,2}$)[^/\\:]{1,255}")
 _MOST = 4 * 1024 * 1024
 """Bytes of a run.json."""
 _MANY = 100_000

@@ -203,6 +203,7 @@ RECORD = {
         edit(at.run) or rewrite(at.run / "run.json", '"task": {', '"task": [{}], "x": {')
     ),
     "a name that is a path": _record(task={"distribution": "rlcli", "name": "../../evil"}),
+    "a name that is the folder above": lambda at: edit(at.run, task={"folder": str(at.evil), "name": ".."}),
     "a name that is a list": _record(task={"distribution": "rlcli", "name": ["cartpole"]}),
     "a name that commands the terminal": _record(task={"distribution": "rlcli", "name": "cart\x1b[2Jpole"}),
     "a distribution that commands the terminal": _record(task={"distribution": "rl\x1b]0;x\x07cli"}),
