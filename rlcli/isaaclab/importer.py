@@ -18,6 +18,7 @@ from rlcli.isaaclab.configclass import to_dict
 from rlcli.isaaclab.convert import agent, task
 from rlcli.isaaclab.envs import ManagerBasedRLEnvCfg
 from rlcli.isaaclab.settings import Report
+from rlcli.machine import read_plain
 from rlcli.registry import folder_task, model_file
 
 MAX_BYTES = 4 * 1024 * 1024
@@ -32,11 +33,9 @@ def read(file: Path) -> dict[str, Any]:
         ConfigError: if it is not such a file.
     """
     try:
-        text = file.read_bytes()
+        text = read_plain(file, MAX_BYTES)  # a pipe is not waited for
     except OSError as error:
         raise ConfigError([Problem(str(file), "", f"cannot be read: {error.strerror or error}")]) from None
-    if len(text) > MAX_BYTES:
-        raise ConfigError([Problem(str(file), "", f"larger than {MAX_BYTES} bytes")])
     try:
         data = yaml.load(text, Loader=_Loader)
         _count(data)
