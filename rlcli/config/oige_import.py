@@ -23,6 +23,10 @@ _WORDS = (*_DEFINED, ast.Constant)
 _MODULE = re.compile(r"^(\s*)import\s+(carb|omni|pxr)\b[\w.]*\s*$")
 
 
+_LONGEST_NAME = 100
+"""Characters of a task's name."""
+
+
 def convert(files: list[Path], output: Path | None) -> Imported:
     """Write `task.yaml` and, with their import lines changed, the Python files of the task's class.
 
@@ -43,6 +47,8 @@ def convert(files: list[Path], output: Path | None) -> Imported:
         message = "is not a task of OmniIsaacGymEnvs: it has no env: and sim:"
         raise ConfigError([Problem(str(source), "", message)])
     name = str(document.data.get("name") or source.stem)
+    if not (name.isidentifier() and name.isascii() and len(name) <= _LONGEST_NAME):  # a class's name, a folder's too
+        raise ConfigError([Problem(str(source), "name", f"'{name[:_LONGEST_NAME]}' is no name of a task's class")])
     folder = output or Path(_kebab(name))
     target = folder / "task.yaml"
     if target.exists():
@@ -96,6 +102,8 @@ def _models(models: dict[str, Any], source: Path, folder: Path) -> list[Path]:
     written = []
     for entry in models.values():
         file, target = source / entry["model"], folder / entry["model"]
+        if not target.resolve().is_relative_to(folder.resolve()):
+            raise TaskError(f"'{entry['model']}', which mjcf: names, lies outside the task's folder")
         if not file.is_file():
             raise TaskError(f"no file '{file}', which mjcf: names")
         if file.resolve() != target.resolve():

@@ -36,6 +36,28 @@ def test_an_imported_task_is_the_task_it_came_from_step_by_step(tmp_path):
     assert torch.equal(*lives)
 
 
+@pytest.mark.parametrize("name", ["../../evil", "..", "{tmp}/evil", "a\\nb", "x" * 300])
+def test_a_name_that_is_a_path_is_not_written_to(tmp_path, monkeypatch, capsys, name):
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "a" / "b")
+    file = tmp_path / "given.yaml"
+    file.write_text(f'name: "{name}"\nenv: {{numEnvs: 4}}\nsim: {{dt: 0.01}}\n'.replace("{tmp}", str(tmp_path)))
+    assert main(["import", "oige", str(file)]) == 3
+    assert "is no name of a task's class" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == [tmp_path / "a", tmp_path / "a" / "b", file]
+
+
+def test_a_model_beside_the_task_is_not_copied_beside_the_output(tmp_path, capsys):
+    source = arm_folder(tmp_path / "deep" / "arm")
+    text = (source / "Arm.yaml").read_text()
+    assert "arm.xml" in text
+    (source / "Arm.yaml").write_text(text.replace("arm.xml", "../arm.xml"))
+    (source / "arm.xml").rename(source.parent / "arm.xml")
+    assert imported(source, tmp_path / "mine") in (3, 4)
+    assert "outside" in capsys.readouterr().err
+    assert not (tmp_path / "arm.xml").exists()
+
+
 def test_of_a_package_the_class_comes_with_the_files_that_it_uses(tmp_path):
     source = arm_folder(tmp_path / "arms")
     for file, place in (("arm.py", "tasks"), ("shared.py", "views"), ("Arm.yaml", "cfg/task"), ("arm.xml", "cfg/task")):
