@@ -451,5 +451,5 @@ def _digest(tensors: Mapping[str, Tensor], document: Mapping[str, Any]) -> str:
     for name in sorted(tensors):
         value = tensors[name].contiguous()
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(memoryview(value.flatten().view(torch.uint8).numpy()) if value.numel() else b"")  # no copy of it
+        digest.update(value.flatten().view(torch.uint8).numpy().data if value.numel() else b"")  # no copy of it
     return digest.hexdigest()

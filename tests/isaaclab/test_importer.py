@@ -1,6 +1,7 @@
 """`rlcli import isaaclab`: the files of a run become a task of rlcli's own, every key accounted for."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -190,3 +191,14 @@ def test_settings_beyond_cartpoles_are_translated(imported):
     actuator = data["scene"]["entities"]["robot"]["actuators"]["cart_actuator"]
     assert (actuator["kind"], actuator["damping"], actuator["effort_limit"]) == ("pd", 10.0, 30.0)
     assert data["scene"]["ground"]["size"] == 60.0
+
+
+def test_a_pipe_and_a_file_without_end_are_not_read(tmp_path, capsys):
+    pipe, sparse = tmp_path / "pipe.yaml", tmp_path / "sparse.yaml"
+    os.mkfifo(pipe)
+    with sparse.open("wb") as file:
+        file.truncate(2**40)
+    for file, why in ((pipe, "not a plain file"), (sparse, "larger than")):
+        assert main(["import", "isaaclab", str(file), "-o", str(tmp_path / "out")]) == 3
+        assert why in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
