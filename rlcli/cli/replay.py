@@ -22,6 +22,9 @@ def command(
     video: Annotated[
         Path | None, typer.Option("--video", help="Draw one episode (--episode, else the first) to FILE.mp4 or .gif.")
     ] = None,
+    task: Annotated[
+        str | None, typer.Option("--task", help="Where the code of a task that is not installed lies now: its folder.")
+    ] = None,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -36,11 +39,13 @@ def command(
         video = Path("replay.mp4") if str(video) == CHOOSE else video
         check_video(video)
     from rlcli.rl.dump import is_dump
+    from rlcli.rl.trust import named_task
 
+    named = None if task is None else named_task(task)
     if is_dump(file):
         if episode is not None or video is not None:
             raise UsageError("a dump holds no episodes: --episode and --video are of recordings")
-        _dump(file)
+        _dump(file, named)
         return
     from rlcli.rl.recording import read_recording
 
@@ -51,7 +56,7 @@ def command(
     if not count:
         raise UsageError(f"{file} has no episodes", hint="record with --record-mode all")
     chosen = list(range(count)) if episode is None else [episode]
-    difference, frames = _replay(recording, chosen, video)
+    difference, frames = _replay(recording, named, chosen, video)
     steps = sum(recording.episodes[number].length for number in chosen)
     said = {
         "file": str(file),
@@ -75,7 +80,7 @@ def command(
     raise typer.Exit(9)
 
 
-def _dump(file: Path) -> None:
+def _dump(file: Path, named: Any) -> None:
     """Step a dump again, and show where each of its environments went wrong."""
     import torch
 
@@ -83,7 +88,7 @@ def _dump(file: Path) -> None:
 
     torch.set_num_threads(1)
     dump = read_dump(file)
-    result = replay_dump(dump)
+    result = replay_dump(dump, named)
     document, difference = dump.document, result.difference
     for life in document.lives:
         where = result.where.get(life.env)
@@ -133,14 +138,14 @@ def _finite(values: dict[str, Any]) -> dict[str, Any]:
     return {name: repr(v) if isinstance(v, float) and not math.isfinite(v) else v for name, v in values.items()}
 
 
-def _replay(recording: Any, chosen: list[int], video: Path | None) -> tuple[Any, int]:
+def _replay(recording: Any, named: Any, chosen: list[int], video: Path | None) -> tuple[Any, int]:
     import torch
 
     from rlcli.envs.vec_env import make_env
     from rlcli.rl.recording import replay
 
     torch.set_num_threads(1)
-    env = make_env(recording.resolved())
+    env = make_env(recording.resolved(named))
     if video is None:
         return replay(recording, env, chosen), 0
     from rlcli.viewer.video import Renderer

@@ -7,7 +7,6 @@ is that of the task, as installed, with the configuration that the file holds.
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
 import shlex
@@ -15,7 +14,7 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import mujoco
 import numpy as np
@@ -30,8 +29,11 @@ from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
 from rlcli.envs.vec_env import VecEnv, make_env
 from rlcli.errors import CheckpointError, MachineError
+from rlcli.registry import TaskSource
+from rlcli.rl.environment import model_digest
 from rlcli.rl.files import disk_error, write_atomic
 from rlcli.rl.load import recorded_task
+from rlcli.rl.recording import content_digest
 from rlcli.sim.batch import BatchEngine
 from rlcli.sim.engine import Engine, open_engine
 from rlcli.sim.guard import FIELD_OF, SHOWN, Call, Divergence
@@ -117,14 +119,18 @@ class Dump:
     document: Document
     tensors: dict[str, Tensor]
 
-    def resolved(self) -> Resolved:
+    def resolved(self, named: TaskSource | None = None) -> Resolved:
         """The configuration of the run, for one environment, with the task's code and models as installed.
+
+        Args:
+            named: see `Recording.resolved`.
 
         Raises:
             TaskError: if the task is not installed any more.
+            CheckpointError: if it is code that the user never named.
             ConfigError: if the installed one does not take this configuration.
         """
-        source = recorded_task(self.document.task, "the dumped task")
+        source = recorded_task(self.document.task, f"the task of {self.file}", named=named)
         with tempfile.TemporaryDirectory() as folder:
             config = Path(folder) / "task.yaml"
             config.write_text(self.document.config)
@@ -236,13 +242,13 @@ def write_dump(env: VecEnv, found: list[Divergence], pending: bool, folder: Path
         mujoco=mujoco.__version__,
         task=env.resolved.source.record(),
         config=to_yaml(to_data(env.resolved)),
-        model=_digest_of(engine.model),
+        model=model_digest(engine.model),
         constants=engine.follows_constants,
         num_envs=env.num_envs,
         step=env.common_step,
         lives=lives,
     ).model_dump(mode="json")
-    document["sha256"] = _digest(tensors, document)
+    document["sha256"] = content_digest(tensors, document)
     file = folder / f"step-{env.common_step:012d}.safetensors"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -290,7 +296,7 @@ def read_dump(file: Path) -> Dump:
         raise CheckpointError(f"{file} is corrupt, or no dump: {place}: {first['msg']}") from None
     except (SafetensorError, OSError, ValueError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{file} is corrupt, or no dump: {' '.join(str(error).split())}") from None
-    if found != _digest(tensors, data):
+    if found != content_digest(tensors, data):
         raise CheckpointError(f"{file} is corrupt: it is not what was written")
     for number, life in enumerate(document.lives):
         state, after = tensors.get(f"{number}.state"), tensors.get(f"{number}.after")
@@ -307,7 +313,7 @@ def read_dump(file: Path) -> Dump:
     return Dump(file, document, tensors)
 
 
-def replay_dump(dump: Dump) -> Replay:
+def replay_dump(dump: Dump, named: TaskSource | None = None) -> Replay:
     """Step every engine call of a dump again, and compare every state that must come out, bit by bit.
 
     Raises:
@@ -315,13 +321,13 @@ def replay_dump(dump: Dump) -> Replay:
         ConfigError: if the installed one does not take the dump's configuration.
         CheckpointError: if the states or model fields do not fit it.
     """
-    resolved = dump.resolved()
+    resolved = dump.resolved(named)
     env = make_env(resolved)
     model = env.engine.model
     env.close()
     calls = compared = 0
     where: dict[int, Where | None] = {}
-    same = _digest_of(model) == dump.document.model
+    same = model_digest(model) == dump.document.model
     for number, life in enumerate(dump.document.lives):
         prefix = f"{number}.model."
         own = {n.removeprefix(prefix): v for n, v in dump.tensors.items() if n.startswith(prefix)}
@@ -433,23 +439,3 @@ def _what(world: BatchEngine, found: Divergence, before: np.ndarray) -> tuple[st
         values = before[layout.columns(field)]
     value = f"{field} {float(values[found.index])!r}" if 0 <= found.index < len(values) else ""
     return found.detail, value
-
-
-def _digest_of(model: mujoco.MjModel) -> str:
-    """Of every array of a compiled model and its options."""
-    digest = hashlib.sha256()
-    for owner in (model, model.opt):
-        for name in sorted(dir(owner)):
-            value = None if name.startswith("_") else getattr(owner, name)
-            if isinstance(value, np.ndarray | int | float) and name != "signature":
-                digest.update(name.encode() + np.asarray(value).tobytes())
-    return digest.hexdigest()
-
-
-def _digest(tensors: Mapping[str, Tensor], document: Mapping[str, Any]) -> str:
-    digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode())
-    for name in sorted(tensors):
-        value = tensors[name].contiguous()
-        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(value.flatten().view(torch.uint8).numpy().data if value.numel() else b"")  # no copy of it
-    return digest.hexdigest()

@@ -75,7 +75,7 @@ def recorded_task(
 def _unknown(record: Mapping[str, Any], what: str, run: str | None) -> CheckpointError:
     place = trust.place(record)
     name = shlex.quote(place if os.sep in place or "/" in place else f"./{place}")
-    allow = f"rlcli check {name}" if run is None else f"rlcli play {name} --checkpoint {shlex.quote(run)}"
+    allow = f"--task {name}" if run is None else f"rlcli play {name} --checkpoint {shlex.quote(run)}"
     return CheckpointError(
         f"{what} is not loaded: it names code that you have not used on this machine, {place}",
         hint=f"if you trust that code, or have it elsewhere, name it once: {allow}",

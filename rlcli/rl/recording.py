@@ -172,7 +172,7 @@ class Recorder:
             "episodes": [asdict(e) for e in episodes],
         }
         tensors = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
-        document["sha256"] = _digest(tensors, document)
+        document["sha256"] = content_digest(tensors, document)
         write_atomic(file, safetensors.torch.save(tensors, metadata={"rlcli": json.dumps(document)}))
         return file
 
@@ -249,7 +249,7 @@ def read_recording(file: Path) -> Recording:
         raise CheckpointError(f"{file} is no recording: it has no header of rlcli")
     if document.get("format") != FORMAT:
         raise CheckpointError(f"{file} has recording format {document.get('format')}; this rlcli reads {FORMAT}")
-    if document.pop("sha256", None) != _digest(tensors, document):
+    if document.pop("sha256", None) != content_digest(tensors, document):
         raise CheckpointError(f"{file} is corrupt: it is not what was written")
     _check(file, document, tensors)
     return Recording(file, document, tensors, [Episode(**entry) for entry in document["episodes"]])
@@ -360,7 +360,8 @@ def _state(env: VecEnv) -> dict[str, Tensor]:
     return {name: env.engine.field(name).detach().cpu().clone() for name in _STATES}
 
 
-def _digest(tensors: Mapping[str, Tensor], document: Mapping[str, Any]) -> str:
+def content_digest(tensors: Mapping[str, Tensor], document: Mapping[str, Any]) -> str:
+    """sha256 of what a file of tensors and a document holds."""
     digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode())
     for name in sorted(tensors):
         value = tensors[name].contiguous()

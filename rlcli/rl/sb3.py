@@ -284,7 +284,8 @@ class Sb3Trainer:
         require_finite(moments([("observation", self.normalizer)]), self.iteration)
 
     def _require_finite_learner(self) -> None:
-        """What an update gives, in the order in which it comes: losses, gradients, weights."""
+        """What an update gives. Gradients that are not finite reach no weight: weights that are not were so before."""
+        require_finite(self._weights(), self.iteration)
         recorded = self.model.logger.name_to_value
         metrics = {name: float(recorded[key]) for key, name in _METRICS.items() if key in recorded}
         for name in _MUST_BE_FINITE:
@@ -298,7 +299,6 @@ class Sb3Trainer:
                 " the losses are",
                 hint=LEARNER_HINT,
             )
-        require_finite(self._weights(), self.iteration)
 
     def _learned(self) -> list[tuple[str, Tensor]]:
         """What a rollout is made with."""

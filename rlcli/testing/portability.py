@@ -107,9 +107,12 @@ def checkpoint(subject: Subject) -> Iterator[Finding]:
     difference = first_difference(env, *lives)
     if difference is not None:
         where, message = difference
-        hint = "give a term with a memory state_dict() and load_state_dict(state)"
+        kept = "keep what is carried on in tensors, numbers, containers or random generators, as attributes"
+        hint = f"{kept}; a term may have state_dict() and load_state_dict(state) of its own"
         if not isinstance(env, ManagedEnv):
-            hint = "keep what a task carries on in tensors with a row for each environment, as its own attributes"
+            hint = f"{kept} of the task"
+        if unsaved := env.unsaved():
+            hint = f"no checkpoint can hold {', '.join(unsaved)}; {hint}"
         message = f"goes on differently after saving and restoring: {message}"
         yield Finding("checkpoint", "error", where, message, f"{hint}; else a resumed run is another run")
 

@@ -345,7 +345,7 @@ def test_a_run_that_was_stopped_and_resumed_is_reproduced(cli, trained, coin):
 
 
 def test_a_killed_run_is_reproduced_as_far_as_it_told(cli, run):
-    edit(run / "run.json", lambda record: record.update(state="running", iteration=None))
+    edit(run / "run.json", lambda record: (record.update(state="running"), record.pop("iteration")))
     shutil.rmtree(last(run))
     lines = (run / "metrics.jsonl").read_text().splitlines()
     (run / "metrics.jsonl").write_text("\n".join(lines[:2]) + "\n" + lines[2][:20])

@@ -9,7 +9,8 @@ import torch
 from safetensors import safe_open
 
 from rlcli.errors import CheckpointError
-from rlcli.rl.dump import _digest, read_dump, replay_dump
+from rlcli.rl.dump import read_dump, replay_dump
+from rlcli.rl.recording import content_digest
 
 BREAKS = '''
 import torch
@@ -65,7 +66,7 @@ def rewritten(file, **changes):
     tensors.update(changes.pop("tensors", {}))
     document["lives"][0].update(changes.pop("life", {}))
     document.update(changes)
-    document["sha256"] = _digest(tensors, document)
+    document["sha256"] = content_digest(tensors, document)
     safetensors.torch.save_file(tensors, file, metadata={"rlcli": json.dumps(document)})
 
 

@@ -320,6 +320,6 @@ def test_checkpoint_keeps_recent_observations_as_the_environment_gave_them(newes
 def test_checkpoint_without_recorded_observations_is_checked_on_random_ones(newest, tmp_path, monkeypatch):
     checkpoint = open_checkpoint(newest("cartpole"))
     tensors = type(checkpoint).tensors
-    older = lambda self, part: {k: v for k, v in tensors(self, part).items() if k != "observations"}  # noqa: E731
+    older = lambda self, *args: {k: v for k, v in tensors(self, *args).items() if k != "observations"}  # noqa: E731
     monkeypatch.setattr(type(checkpoint), "tensors", older)
     assert export(checkpoint, tmp_path / "policy.onnx").observations == 512

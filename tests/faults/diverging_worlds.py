@@ -10,6 +10,8 @@ from pathlib import Path
 import torch
 from worlds import actions, build, clone, dump, life, same, write
 
+from rlcli.rl.trust import named_task
+
 N = 5
 WHO = (0, 2, N - 1)
 MACHINE = """
@@ -289,6 +291,7 @@ FAULTS = {
 def pair(folder: Path, fault: Fault, *overrides: str):
     """Two equal environments, one step apart from nothing: what is struck, and what it is compared with."""
     task = machine(folder, fault.task)
+    named_task(str(task))  # its user has: a dump of it is loaded
     envs = [build(task, N, *overrides) for _ in range(2)]
     for env in envs:
         for field in fault.expands:

@@ -216,7 +216,8 @@ def test_a_run_with_links_is_refused_and_what_they_lead_to_is_untouched(name, re
     before = look(precious) if precious.is_dir() else precious.read_bytes()
     assert main(command(reader, run)) == 5
     err = capfd.readouterr().err
-    assert f"{name} is a link" in err
+    assert name in err
+    assert "a link" in err
     assert (look(precious) if precious.is_dir() else precious.read_bytes()) == before
 
 

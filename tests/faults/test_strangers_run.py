@@ -192,7 +192,7 @@ def forge(file, changes, at):
     from safetensors import safe_open
     from safetensors.torch import save
 
-    from rlcli.rl.recording import _digest
+    from rlcli.rl.recording import content_digest
 
     with safe_open(file, "pt") as opened:
         document = json.loads(opened.metadata()["rlcli"])
@@ -207,7 +207,7 @@ def forge(file, changes, at):
         else:
             document[key] = value.format(**vars(at)) if isinstance(value, str) else value
     del document["sha256"]
-    document["sha256"] = _digest(tensors, document)
+    document["sha256"] = content_digest(tensors, document)
     forged = at.cwd / "forged.safetensors"
     forged.write_bytes(save(tensors, metadata={"rlcli": json.dumps(document)}))
     return forged

@@ -139,23 +139,25 @@ def test_memory_that_a_checkpoint_does_not_hold_is_found(managed):
 class Travelled:
     def __init__(self, env, *, entity: Entity = "robot") -> None:
         self._entity = entity
-        self.sum = torch.zeros(env.num_envs)
+        self.sums = self._summed(torch.zeros(env.num_envs))
+
+    def _summed(self, sum):
+        while True:
+            sum = sum + self._entity.data.joint_vel[:, 0].abs()
+            yield sum
 
     def __call__(self) -> Tensor:
-        self.sum += self._entity.data.joint_vel[:, 0].abs()
-        return self.sum.clone()
-
-    def reset(self, selection) -> None:
-        selection.write(self.sum, 0.0)
+        return next(self.sums)
 """
     managed.config["rewards"]["travelled"] = {"func": "travelled", "weight": -0.01}
     ((finding,), _) = only(managed, "checkpoint")
     assert finding.where == "reward"
-    assert "state_dict()" in finding.hint
+    assert "no checkpoint can hold Travelled.sums (generator)" in finding.hint
     managed.path = managed.path.with_name("mended")
-    managed.terms += (
-        "\n    def state_dict(self):\n        return {'sum': self.sum.clone()}\n"
-        "\n    def load_state_dict(self, state) -> None:\n        self.sum.copy_(state['sum'])\n"
+    managed.terms = managed.terms.replace(
+        "return next(self.sums)",
+        "self.sum = getattr(self, 'sum', 0.0) + self._entity.data.joint_vel[:, 0].abs()\n"
+        "        return self.sum.clone()",
     )
     assert only(managed, "checkpoint") == ([], {})
 
@@ -175,6 +177,12 @@ class Turn:
 
     def reset(self, selection) -> None:
         selection.write(self.command, 0.0)
+
+    def state_dict(self):
+        return {"command": self.command.clone()}
+
+    def load_state_dict(self, state) -> None:
+        self.command.copy_(state["command"])
 """
     managed.config["commands"] = {"turn": {"func": "turn", "resampling_time_s": [9.0, 9.0]}}
     managed.config["observations"]["policy"]["asked"] = {"func": "generated_commands", "command": "turn"}
@@ -182,13 +190,19 @@ class Turn:
     assert "asked" in finding.where
 
 
-def test_direct_task_that_counts_in_a_number_is_found(direct):
+def test_direct_task_that_counts_in_an_iterator_is_found_and_in_a_number_not(direct):
     direct.replace(
         "        self.rew_buf[:] = ",
-        "        self.count = getattr(self, 'count', 0) + 1\n        self.rew_buf[:] = 0.01 * self.count + ",
+        "        self.count = getattr(self, 'count', None) or iter(range(999))\n"
+        "        self.rew_buf[:] = 0.01 * next(self.count) + ",
     )
     ((finding,), _) = only(direct, "checkpoint")
-    assert "own attributes" in finding.hint
+    assert "(range_iterator)" in finding.hint
+    assert "of the task" in finding.hint
+    direct.replace("getattr(self, 'count', None) or iter(range(999))", "getattr(self, 'count', 0) + 1")
+    direct.replace("next(self.count)", "self.count")
+    direct.path = direct.path.with_name("mended")
+    assert only(direct, "checkpoint") == ([], {})
 
 
 # --- versions ---
