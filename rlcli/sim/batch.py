@@ -14,8 +14,9 @@ from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
 from torch import Tensor
 
 from rlcli.errors import DivergedError, did_you_mean
-from rlcli.sim.engine import force_sensors, quiet_mujoco
+from rlcli.sim.engine import force_sensors
 from rlcli.sim.guard import ENGINE_ERROR, FIELD_OF, SHOWN, Call, Divergence, History, StateLayout
+from rlcli.sim.mjcf import quiet_mujoco
 from rlcli.sim.selection import IdSelection, Selection
 
 _STATE = mujoco.mjtState

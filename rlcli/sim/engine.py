@@ -234,14 +234,3 @@ def force_sensors(model: mujoco.MjModel) -> list[int]:
     acceleration = int(mujoco.mjtStage.mjSTAGE_ACC)
     sensors = [s for s in range(model.nsensor) if int(model.sensor_needstage[s]) == acceleration]
     return [int(model.sensor_adr[s]) + i for s in sensors for i in range(int(model.sensor_dim[s]))]
-
-
-def quiet_mujoco() -> None:
-    """Keep MuJoCo from writing MUJOCO_LOG.TXT into the user's folder and warnings onto the terminal.
-
-    The guard reads the engine's warning counters instead.
-    """
-    config = mujoco.MjLogConfig()
-    config.logto_file = False
-    config.logto_console = False
-    config.set()

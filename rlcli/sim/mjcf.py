@@ -60,6 +60,7 @@ def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False) -> 
     if not installed and scan.cost > MUCH:
         _try_apart(file)
     try:
+        quiet_mujoco()
         spec = mujoco.MjSpec.from_file(str(file))
     except ValueError as error:
         raise BadModel(_one_line(error)) from None
@@ -221,6 +222,17 @@ class _Scan:
             self._most, self.dearest = cost, f"'{path}'"
 
 
+def quiet_mujoco() -> None:
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT into the user's folder and warnings onto the terminal.
+
+    The guard reads the engine's warning counters instead.
+    """
+    config = mujoco.MjLogConfig()
+    config.logto_file = False
+    config.logto_console = False
+    config.set()
+
+
 def _weight(name: str, attributes: dict[str, str]) -> float:
     """How many ordinary elements an element costs."""
     counts = [max(1.0, _number(word)) for word in attributes.get("count", "").split()]
@@ -292,6 +304,9 @@ _APART = """
 import sys
 file, memory, time = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 import mujoco
+log = mujoco.MjLogConfig()
+log.logto_file = log.logto_console = False
+log.set()
 try:
     import resource
     for what, most in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, time), (resource.RLIMIT_CORE, 0)):

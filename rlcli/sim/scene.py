@@ -21,8 +21,7 @@ from rlcli.config.schema import (
 )
 from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
 from rlcli.registry import model_file
-from rlcli.sim.engine import quiet_mujoco
-from rlcli.sim.mjcf import BadModel, model_roots, read_mjcf
+from rlcli.sim.mjcf import BadModel, model_roots, quiet_mujoco, read_mjcf
 from rlcli.sim.names import NameProblem, match
 from rlcli.sim.terrain import BODY as TERRAIN
 from rlcli.sim.terrain import Ground, add_ground, make_ground, misfits
