@@ -234,7 +234,7 @@ def test_mutants_are_taken_or_refused_in_words_and_none_crashes_or_hangs(first, 
 
 def test_a_costly_model_leaves_no_log_in_the_folder_it_is_read_from(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    geoms = "".join(f'<geom name="NaN{number}" size="1"/>' for number in range(6000))  # MuJoCo warns of the letters
-    (tmp_path / "model.xml").write_text(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>")
+    geoms, odd = '<geom size="1"/>' * 6000, '<custom><numeric name="odd" data="NaN"/></custom>'  # which MuJoCo warns of
+    (tmp_path / "model.xml").write_text(f"<mujoco>{odd}<worldbody>{geoms}</worldbody></mujoco>")
     read_mjcf(tmp_path / "model.xml", [tmp_path])
     assert [file.name for file in tmp_path.iterdir()] == ["model.xml"]
