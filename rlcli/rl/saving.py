@@ -213,8 +213,9 @@ def drop_after(checkpoints: Path, step: int) -> list[int]:
     later = [have for have in steps(checkpoints) if have > step]
     for have in reversed(later):
         _remove(checkpoints / f"{have:012d}")
-    if later:
-        write_atomic(checkpoints / "latest", f"{step:012d}\n")
+    latest = checkpoints / "latest"
+    if later or not latest.is_file() or latest.read_bytes() != f"{step:012d}\n".encode():  # or killed before it said so
+        write_atomic(latest, f"{step:012d}\n")
     drop_rows(checkpoints)
     return later
 

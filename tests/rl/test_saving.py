@@ -207,3 +207,11 @@ def test_a_boundary_reads_its_rows_while_the_next_ones_are_stored():
         fresh = TorchReplayBuffer(8 * 2, space, space, n_envs=2)
         fresh.load_rows(rows)
         assert (fresh.pos, fresh.full, fresh.added) == (filled % 8, filled >= 8, filled)
+
+
+@pytest.mark.parametrize("said", [None, "000000000100\n", ""])
+def test_the_newest_checkpoint_is_said_to_be_it_also_after_a_kill_before_that(folder, said):
+    save_all(folder, Keep(), range(3))
+    (folder / "latest").unlink() if said is None else (folder / "latest").write_text(said)
+    assert saving.drop_after(folder, 200) == []
+    assert (folder / "latest").read_text() == "000000000200\n"
