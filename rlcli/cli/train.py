@@ -51,7 +51,9 @@ def command(
     gpus: Annotated[
         int | None, typer.Option("--gpus", min=1, help="Processes on this machine, a GPU each; num_envs is of each.")
     ] = None,
-    logger: Annotated[list[str] | None, typer.Option("--logger", help="tensorboard or none; repeatable.")] = None,
+    logger: Annotated[
+        list[str] | None, typer.Option("--logger", help="tensorboard, wandb, mlflow, trackio or none; repeatable.")
+    ] = None,
     config: ConfigFile = None,
     resume: Annotated[
         str | None, typer.Option("--resume", help="Go on with a run: RUN, RUN@step:N or latest. Needs no TASK.")

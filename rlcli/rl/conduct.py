@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from rlcli.config.dump import to_data
 from rlcli.envs.vec_env import make_env
 from rlcli.errors import RlcliError, Stopped
 from rlcli.random import derive
@@ -70,7 +71,7 @@ def conduct(job: Job, trainer: Trainer, env: Any, stop: StopRequest, view: View,
                 iteration, step = saver.written
                 stack.callback(lambda: run.update(state=state, iteration=iteration, step=step))
             for sink in sinks:
-                stack.callback(sink.close)
+                stack.callback(sink.close, state)
 
     try:
         if job.writes:
@@ -79,7 +80,7 @@ def conduct(job: Job, trainer: Trainer, env: Any, stop: StopRequest, view: View,
                 tell(f"a resumed run may differ: no checkpoint can hold {', '.join(unsaved)}")
             exact = not unsaved and env.device.type == "cpu"
             run.update(state="running", resumes_exactly=exact, **_environment(job, env, trainer, tell))
-            sinks += open_loggers(run, job.loggers, resume=resume)
+            sinks += open_loggers(run, job.loggers, resume=resume, config=to_data(job.resolved), tell=tell)
         trials = _trials(job, saver, stop)
         env.before_step, stop.can_interrupt = stop.check, not env.engine.asynchronous
         with view:

@@ -293,6 +293,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "state": (str,),
     "step": (int,),
     "torch_threads": (int,),
+    "trackers": (dict,),
     "versions": (dict,),
 }
 
