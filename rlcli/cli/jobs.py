@@ -23,6 +23,7 @@ def created(
     record: dict[str, Any],
     logger: list[str] | None,
     init_from: str | None,
+    video_every: int | None,
 ) -> Job:
     """A new run, its folder written before anything heavy is imported."""
     from rlcli.config.dump import given, to_data, to_yaml
@@ -32,6 +33,7 @@ def created(
     from rlcli.rl.run import create_run, find_checkpoint
 
     loggers = check_loggers(logger)
+    _require_drawing(video_every)
     initial = None
     if init_from is not None:
         _, initial, why = find_checkpoint(init_from, runs, tell=console.warn)
@@ -40,6 +42,7 @@ def created(
         "task": resolved.source.record() | {"file": resolved.source.config.name},
         "agent": resolved.agent_name,
         "loggers": loggers,
+        "video_every": video_every or 0,
         "init_from": str(initial) if initial else None,
         "init_from_sha256": file_digest(initial / "policy.safetensors") if initial else None,
         "given": given(resolved),
@@ -47,11 +50,16 @@ def created(
     }
     run = create_run(runs, resolved.source.name, name, to_yaml(to_data(resolved)), record)
     console.info(f"run {run.folder}")
-    return Job(run, resolved, loggers, init_from=initial)
+    return Job(run, resolved, loggers, init_from=initial, video_every=video_every or 0)
 
 
 def resumed(
-    reference: str, runs: Path, named: TaskSource | None, budget: dict[str, Any], logger: list[str] | None
+    reference: str,
+    runs: Path,
+    named: TaskSource | None,
+    budget: dict[str, Any],
+    logger: list[str] | None,
+    video_every: int | None,
 ) -> Job | None:
     """A run to go on with; None if there is nothing left to do."""
     from rlcli.config.dump import to_data, to_yaml
@@ -71,6 +79,8 @@ def resumed(
     resolved = resolve_run(run, play=False, flags=budget, named=named)
     require_parallel(resolved)
     loggers = check_loggers(logger or run.record.get("loggers") or ["none"])
+    every = run.record.get("video_every", 0) if video_every is None else video_every
+    _require_drawing(every)
     require_own(run, ".")
     run.lock()
     try:
@@ -95,7 +105,25 @@ def resumed(
         created=False,
         init_from=Path(initial) if initial else None,
         config=config,
+        video_every=every,
     )
+
+
+def _require_drawing(video_every: int | None) -> None:
+    """What the first clip would fail for is said before training.
+
+    Raises:
+        DependencyError: if imageio is not installed.
+        MachineError: if nothing on this machine can draw.
+    """
+    if not video_every:
+        return
+    from rlcli.viewer.gl import open_context
+    from rlcli.viewer.writer import check_video
+
+    check_video(Path("clip.mp4"))
+    context, _ = open_context(64, 64)
+    context.free()
 
 
 def _where_to_begin(reference: str, runs: Path, task: str | None) -> tuple[Run, Path | None, str]:

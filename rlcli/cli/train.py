@@ -54,6 +54,14 @@ def command(
     logger: Annotated[
         list[str] | None, typer.Option("--logger", help="tensorboard, wandb, mlflow, trackio or none; repeatable.")
     ] = None,
+    video_every: Annotated[
+        int | None,
+        typer.Option(
+            "--video-every",
+            min=0,
+            help="Film an episode every N iterations, in an environment of its own, into RUN/videos; 0: never.",
+        ),
+    ] = None,
     config: ConfigFile = None,
     resume: Annotated[
         str | None, typer.Option("--resume", help="Go on with a run: RUN, RUN@step:N or latest. Needs no TASK.")
@@ -117,9 +125,9 @@ def command(
     def begin() -> Job | None:
         if resolved is None:
             assert resume is not None
-            return resumed(resume, runs, named, budget, logger)
+            return resumed(resume, runs, named, budget, logger, video_every)
         record = {"seed": draw_seed(42 if seed is None else seed), "device": device}
-        return created(resolved, runs, name, record, logger, init_from)
+        return created(resolved, runs, name, record, logger, init_from, video_every)
 
     with stop:
         try:

@@ -26,6 +26,7 @@ from rlcli.rl.trials import Trials
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
     from rlcli.rl.trainer import Trainer
+    from rlcli.viewer.clips import Clips
 
 
 class View(Protocol):
@@ -82,6 +83,7 @@ def conduct(job: Job, trainer: Trainer, env: Any, stop: StopRequest, view: View,
             run.update(state="running", resumes_exactly=exact, **_environment(job, env, trainer, tell))
             sinks += open_loggers(run, job.loggers, resume=resume, config=to_data(job.resolved), tell=tell)
         trials = _trials(job, saver, stop)
+        clips = _clips(job, stop, tell)
         env.before_step, stop.can_interrupt = stop.check, not env.engine.asynchronous
         with view:
             for budget in budgets:
@@ -93,6 +95,7 @@ def conduct(job: Job, trainer: Trainer, env: Any, stop: StopRequest, view: View,
                     loggers=sinks,
                     save_interval=agent.save_interval,
                     trials=trials,
+                    clips=clips,
                     show=view.show,
                     tell=tell,
                     divergences=lambda: env.divergences,
@@ -141,6 +144,21 @@ def _trials(job: Job, saver: Saver, stop: StopRequest) -> Trials | None:
     if run.record.get("best") != saver.best:  # killed in between, or resumed from before it
         run.update(best=saver.best)
     return trials
+
+
+def _clips(job: Job, stop: StopRequest, tell: Callable[[str], None]) -> Clips | None:
+    """What films between iterations, if the user wants it; one process does."""
+    run, interval = job.run, job.video_every
+    if not interval or not job.writes:
+        return None
+    from rlcli.viewer.clips import Clips  # nothing of drawing is read otherwise
+
+    def make() -> Any:
+        alone = {"scene.num_envs": 1, "sim.engine_threads": 1}
+        resolved = resolve_run(run, play=True, flags=alone, named=job.resolved.source)
+        return make_env(resolved, seed=derive(run.record["seed"], "video"))
+
+    return Clips(make, run.folder / "videos", interval, tell, lambda: stop.signal is not None)
 
 
 def train_again(

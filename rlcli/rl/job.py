@@ -30,6 +30,8 @@ class Job:
     """Iterations to save at, the last one to end at, instead of the agent's budget and what it keeps."""
     config: str | None = None
     """The configuration of a run that goes on, where its budget changes."""
+    video_every: int = 0
+    """Iterations between clips; 0: none."""
     writes: bool = True
     """Whether this process writes the run."""
     begin: float = field(default_factory=time.monotonic)

@@ -295,6 +295,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "torch_threads": (int,),
     "trackers": (dict,),
     "versions": (dict,),
+    "video_every": (int,),
 }
 
 

@@ -20,7 +20,7 @@ from typing import Any, Protocol
 from urllib.parse import urlsplit
 
 from rlcli.errors import MachineError
-from rlcli.rl.rng import load_rng_state, rng_state
+from rlcli.rl.rng import undisturbed
 from rlcli.rl.run import Run
 
 _MOST_ROWS = 100_000
@@ -147,16 +147,13 @@ def open_tracker(
     known, after = _mark(run, name) if resume is not None else (None, 0)
     if known is not None and resume is not None:
         after = max(after, resume[1])
-    rng = rng_state()  # whatever a library draws for its names
     try:
-        with _unheard():
+        with undisturbed(), _unheard():  # whatever a library draws for its names
             tracker = contextvars.copy_context().run(kind, run, config, known, tell)  # trackio leaves its run behind
     except Exception as error:
         raise MachineError(
             f"the logger {name} cannot be opened: {_short(error)}", hint="--logger none trains without it"
         ) from error
-    finally:
-        load_rng_state(rng)
     marks = run.record.get("trackers") or {}
     run.update(trackers={**marks, name: {"id": tracker.id, "step": after if tracker.id == known else 0}})
     return Guarded(name, Behind(tracker), after if tracker.id == known else 0, tell)

@@ -7,6 +7,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rlcli.errors import DivergedError, Stopped
 from rlcli.rl import checkpoint, distributed
@@ -16,6 +17,9 @@ from rlcli.rl.saving import Saver
 from rlcli.rl.stop import Interrupted, StopRequest
 from rlcli.rl.trainer import Report, Trainer
 from rlcli.rl.trials import Trials
+
+if TYPE_CHECKING:
+    from rlcli.viewer.clips import Clips
 
 SAVE_EVERY_S = 60.0
 LONG_S = 0.1
@@ -80,6 +84,7 @@ def fit(
     loggers: Sequence[Logger] = (),
     save_interval: int | None = None,
     trials: Trials | None = None,
+    clips: Clips | None = None,
     show: Callable[[Progress], None] = lambda _: None,
     tell: Callable[[str], None] = lambda _: None,
     divergences: Callable[[], int] = lambda: 0,
@@ -123,6 +128,8 @@ def fit(
                 saver.best = trainer.env_steps
                 run.update(best=saver.best)
             saver.check()
+            if clips is not None and clips.due(trainer.iteration):
+                clips.record(trainer.policy, trainer.env_steps)
         boundaries.save()
         saver.wait()
     except Interrupted:
