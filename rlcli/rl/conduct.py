@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rlcli.config.dump import to_data
 from rlcli.envs.vec_env import make_env
-from rlcli.errors import RlcliError, Stopped
+from rlcli.errors import DivergedError, RlcliError, Stopped
 from rlcli.random import derive
 from rlcli.rl.build import build
 from rlcli.rl.checkpoint import steps
@@ -17,10 +19,11 @@ from rlcli.rl.environment import built_record, differences, environment_record
 from rlcli.rl.job import Job
 from rlcli.rl.load import resolve_run
 from rlcli.rl.loggers import open_loggers, read_metrics
+from rlcli.rl.progress import Progress
 from rlcli.rl.run import Run
 from rlcli.rl.saving import Keep, Saver
 from rlcli.rl.stop import StopRequest
-from rlcli.rl.train import Budget, Progress, fit
+from rlcli.rl.train import Budget, fit
 from rlcli.rl.trials import Trials
 
 if TYPE_CHECKING:
@@ -65,12 +68,14 @@ def conduct(job: Job, trainer: Trainer, env: Any, stop: StopRequest, view: View,
     budgets = [Budget(end, None) for end in job.stages] or [Budget(agent.max_iterations, agent.max_steps)]
     saver = Saver(run.checkpoints, keep, manifest, resumed=job.resume_from)
     sinks: list[Any] = []
+    trained = run.record.get("trained_s", 0.0)
 
-    def close(state: str) -> None:
+    def close(state: str, reason: str | None = None) -> None:
         with contextlib.ExitStack() as stack:
             if job.writes and saver.written is not None:
                 iteration, step = saver.written
-                stack.callback(lambda: run.update(state=state, iteration=iteration, step=step))
+                ended = {"state": state, "reason": reason, "trained_s": trained + time.monotonic() - job.begin}
+                stack.callback(lambda: run.update(**ended, iteration=iteration, step=step))
             for sink in sinks:
                 stack.callback(sink.close, state)
 
@@ -80,7 +85,8 @@ def conduct(job: Job, trainer: Trainer, env: Any, stop: StopRequest, view: View,
             if unsaved:
                 tell(f"a resumed run may differ: no checkpoint can hold {', '.join(unsaved)}")
             exact = not unsaved and env.device.type == "cpu"
-            run.update(state="running", resumes_exactly=exact, **_environment(job, env, trainer, tell))
+            run.update(state="running", since=datetime.now(UTC).isoformat(), iterations=budgets[-1].iterations(trainer))
+            run.update(resumes_exactly=exact, **_environment(job, env, trainer, tell))
             sinks += open_loggers(run, job.loggers, resume=resume, config=to_data(job.resolved), tell=tell)
         trials = _trials(job, saver, stop)
         clips = _clips(job, stop, tell)
@@ -103,9 +109,17 @@ def conduct(job: Job, trainer: Trainer, env: Any, stop: StopRequest, view: View,
                 )
     except BaseException as error:
         with contextlib.suppress(OSError, RlcliError):  # the first error is the one to report
-            close("stopped" if isinstance(error, Stopped | KeyboardInterrupt) else "failed")
+            close(*_ending(error))
         raise
     close("finished")
+
+
+def _ending(error: BaseException) -> tuple[str, str | None]:
+    """The state that an error leaves a run in, and the reason."""
+    if isinstance(error, Stopped | KeyboardInterrupt):
+        return "stopped", None
+    said = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"
+    return "diverged" if isinstance(error, DivergedError) else "failed", " ".join(said.split())[:500]
 
 
 def _environment(job: Job, env: Any, trainer: Trainer, tell: Callable[[str], None]) -> dict[str, Any]:

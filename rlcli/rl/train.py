@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from rlcli.errors import DivergedError, Stopped
 from rlcli.rl import checkpoint, distributed
 from rlcli.rl.loggers import Logger
+from rlcli.rl.progress import Progress
 from rlcli.rl.run import Run
 from rlcli.rl.saving import Saver
 from rlcli.rl.stop import Interrupted, StopRequest
@@ -59,20 +60,6 @@ class Budget:
             left = max(0, self.max_steps - trainer.env_steps)
             limits.append(trainer.iteration + -(-left // trainer.steps_per_iteration))
         return min(limits)
-
-
-@dataclass(slots=True)
-class Progress:
-    """Where training stands, for whoever shows it."""
-
-    iteration: int
-    iterations: int
-    env_steps: int
-    elapsed_s: float
-    remaining_s: float
-    steps_per_s: float
-    seconds: dict[str, float]
-    metrics: dict[str, float]
 
 
 def fit(
