@@ -26,6 +26,8 @@ COMMANDS = {
     "eval": "eval",
     "export": "export",
     "replay": "replay",
+    "runs": "runs",
+    "watch": "watch",
     "diff": "diff",
     "reproduce": "reproduce",
     "check": "check",
