@@ -98,6 +98,7 @@ class Panel(plugin.ViewerPlugin):
         imgui.SameLine()
         if imgui.Button("Camera"):
             self._aim()
+        imgui.PushItemWidth(imgui.GetContentRegionAvail().x * 0.5)
         changed, place = imgui.Combo("Speed", SPEEDS.index(view.speed), _SPEEDS)
         if changed:
             player.ask(partial(player.set_speed, SPEEDS[place]))
@@ -107,6 +108,7 @@ class Panel(plugin.ViewerPlugin):
                 player.ask(partial(player.show, shown))
         self._checkpoints(view)
         self._commands(view)
+        imgui.PopItemWidth()
         imgui.Separator()
         imgui.TextUnformatted(f"episode {view.episodes}, {view.episode_s:.2f} s, reward {view.reward:.4g}")
         if view.message:

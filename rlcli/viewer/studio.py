@@ -244,9 +244,12 @@ def _quiet() -> Iterator[None]:
     for handler, _ in streams:
         handler.setStream(sys.stderr)
     loop.addFilter(_is_wrong)
+    viewer = logging.getLogger("mujoco.studio.viewer_protocol")
+    was, viewer.disabled = viewer.disabled, True  # what ends the viewer is raised, and said once
     try:
         yield
     finally:
+        viewer.disabled = was
         loop.removeFilter(_is_wrong)
         log.setLevel(level)
         for handler, stream in streams:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import getpass
 import os
 import shlex
 import threading
@@ -61,7 +62,10 @@ def tunnel_here(url: str) -> str | None:
     if len(said) != 4:
         return None
     port = url.rstrip("/").rpartition(":")[2]
-    user = os.environ.get("USER") or os.environ.get("LOGNAME") or "USER"
+    try:
+        user = getpass.getuser()
+    except (OSError, KeyError, ImportError):  # a number without a name
+        user = "USER"
     return f"ssh -N -L {port}:127.0.0.1:{port} {shlex.quote(f'{user}@{said[2]}')}"
 
 
