@@ -34,26 +34,21 @@ class Crowd:
         return [(shown + place) % self.env.num_envs for place in range(1, self.count)]
 
     def offsets(self) -> NDArray[np.float64]:
-        """Where each stands, seen from the first: on terrain, which all share, at its own place. (count, 3) [m]"""
+        """How far each is moved from where it is in its world: on terrain, which all share, by 0. (count, 3) [m]"""
         if self.env.terrain is not None:
             return np.zeros((self.count, 3))
         places = grid(self.count, self.env.config.scene.env_spacing).double().numpy()
         return np.subtract(places, places[0])
 
-    def middle(self) -> NDArray[np.float64]:
-        """The middle of all, seen from the first. (3,) [m]"""
-        offsets = self.offsets()
-        return (offsets.min(axis=0) + offsets.max(axis=0)) / 2.0
-
-    def extent(self) -> float:
-        """How wide the grid is [m]."""
-        offsets = self.offsets()
-        return float((offsets.max(axis=0) - offsets.min(axis=0)).max())
-
-    def stand_back(self, camera: mujoco.MjvCamera) -> mujoco.MjvCamera:
-        """A camera that looks at the first of them, moved so that it has all in the picture."""
-        camera.lookat[:] += self.middle()
-        camera.distance += 1.2 * self.extent()
+    def stand_back(self, camera: mujoco.MjvCamera, shown: int = 0) -> mujoco.MjvCamera:
+        """A camera that looks at the one shown, moved so that it has all in the picture."""
+        places = self.offsets()
+        if self.env.terrain is not None:
+            starts = self.env.origins.double().cpu().numpy()
+            places = starts[[shown, *self.others(shown)]] - starts[shown]
+        low, high = places.min(axis=0), places.max(axis=0)
+        camera.lookat[:] += (low + high) / 2.0
+        camera.distance += 1.2 * float((high - low).max())
         return camera
 
     def add(self, scene: mujoco.MjvScene, shown: int, option: mujoco.MjvOption) -> None:

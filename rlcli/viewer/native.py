@@ -57,7 +57,7 @@ def run(player: Player, together: int, ready: Callable[[], None]) -> None:
     drawing = set(threading.enumerate()) - before
     try:
         with handle as window:
-            camera = crowd.stand_back(free_camera(env.config.viewer, env.origins[shown].tolist()))
+            camera = crowd.stand_back(free_camera(env.config.viewer, env.origins[shown].tolist()), shown)
             window.cam.lookat[:], window.cam.distance = camera.lookat, camera.distance
             window.cam.azimuth, window.cam.elevation = camera.azimuth, camera.elevation
             ready()
