@@ -22,6 +22,8 @@ class Session:
     run: Any
     checkpoint: Path | None
     resolved: Any
+    policy: str
+    """trained, zero or random."""
 
 
 def open_session(
@@ -104,7 +106,7 @@ def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic
         act = zero_policy(env)
     else:
         act = random_policy(env, resolved.agent.action_bound if resolved.agent else 1.0, derive(seed, "play"))
-    return Session(env, act, run, folder, resolved)
+    return Session(env, act, run, folder, resolved, policy)
 
 
 def check_record(record: Path | None, mode: str) -> None:
