@@ -35,7 +35,7 @@ def command(
     ] = None,
     overrides: Overrides = None,
     checkpoint: CheckpointRef = None,
-    policy: Annotated[str, typer.Option("--policy", help="trained, zero or random.")] = "trained",
+    policy: Annotated[str, typer.Option("--policy", help="trained, zero, random or lqr.")] = "trained",
     episodes: Annotated[
         int, typer.Option("--episodes", min=1, help="Episodes to run, each environment's first ones.")
     ] = 200,

@@ -34,7 +34,7 @@ def command(
     ] = None,
     overrides: Overrides = None,
     checkpoint: CheckpointRef = None,
-    policy: Annotated[str, typer.Option("--policy", help="trained, zero or random.")] = "trained",
+    policy: Annotated[str, typer.Option("--policy", help="trained, zero, random or lqr.")] = "trained",
     video: Annotated[
         Path | None,
         typer.Option(

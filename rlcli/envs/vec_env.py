@@ -306,6 +306,10 @@ class VecEnv(ABC):
         self.seconds["step"] += time.perf_counter() - start
         return StepResult(obs, reward, terminated, truncated, final_obs, episodes)
 
+    def succeeding(self) -> Tensor | None:
+        """Where the success condition holds as things are; None for a task without one. (num_envs,) bool"""
+        return None if self._success is None else self._success()
+
     def holders(self) -> list[Any]:
         """Objects that carry something of their own from step to step: terms with memory, a direct task."""
         return []

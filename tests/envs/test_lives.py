@@ -20,7 +20,8 @@ observations:
 events:
   mass: {func: randomize_body_mass, mode: startup, bodies: [block], range: [0.5, 2.0]}
   start: {func: reset_joints_by_offset, mode: reset, position: [-1.0, 1.0], velocity: [-1.0, 1.0]}
-  damp: {func: randomize_joint_damping, mode: interval, interval_range_s: [0.03, 0.08], operation: set, range: [0.0, 5.0]}
+  damp: {func: randomize_joint_damping, mode: interval, interval_range_s: [0.03, 0.08], operation: set,
+         range: [0.0, 5.0]}
 rewards: {alive: {func: is_alive, weight: 1.0}}
 terminations: {time_out: {func: time_out, time_out: true}}
 """
