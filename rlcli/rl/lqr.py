@@ -30,6 +30,8 @@ _STILL = 1e-5
 _SINGULAR = 1e-4
 """Directions of the observations that are this much weaker than the strongest are rounding."""
 _ROUNDS = 100_000
+_MOST_COST = 1e12
+"""Of a state of 1, beyond which nothing holds it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +111,7 @@ def riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix) -> Matrix | None:
         gain = np.linalg.solve(r + b.T @ cost @ b, b.T @ cost @ a)
         longer = q + a.T @ cost @ (a - b @ gain)
         longer = (longer + longer.T) / 2
-        if not np.isfinite(longer).all():
+        if np.abs(longer).max() > _MOST_COST:
             return None
         if np.abs(longer - cost).max() <= 1e-12 * np.abs(longer).max():
             return gain
