@@ -171,6 +171,25 @@ def test_without_matplotlib_the_pip_line_is_said(cli, monkeypatch):
     assert 'pip install "rlcli[plot]"' in done.err
 
 
+@pytest.mark.parametrize("name", ["map.png", "map.svg"])
+def test_the_map_is_drawn(cli, name):
+    words = ("stress", *LQR[:-1], "--sweep", "body_mass.pole=1:2:2", "--sweep", "push.slider_to_cart=0:1:3")
+    for _ in range(2):
+        done = cli(*words, "--against", "zero", "--episodes", 2, "-o", name)
+        assert done.code == 0, done.err
+        assert f"drawn to {name}" in done.err
+    content = Path(name).read_bytes()
+    if name.endswith("svg"):
+        text = content.decode()
+        for word in ("success, lqr", "success, zero", "body_mass.pole", "push.slider_to_cart"):
+            assert f"<!-- {word} -->" in text
+        assert text.count("<!-- 0 -->") >= 6  # zero succeeds in none of the variants
+        cli(*words, "--against", "zero", "--episodes", 2, "-o", "again.svg")
+        assert Path("again.svg").read_bytes() == content
+    else:
+        assert content[:4] == b"\x89PNG"
+
+
 # --- maps ---
 
 

@@ -9,6 +9,7 @@ from rlcli.errors import UsageError
 from rlcli.registry import find_task
 from rlcli.rl.lqr import regulator, riccati
 from rlcli.rl.stress import run_points
+from rlcli.rl.sweeps import read_sweeps
 
 MODEL = """
 <mujoco><worldbody><body name="block">
@@ -105,3 +106,18 @@ def test_where_there_is_none_the_reason_is_said(task, overrides, more, said):
         regulator(task(*overrides, more=more), 1.0)
     assert said in caught.value.message
     assert "there is no LQR of" in caught.value.message
+
+
+def test_on_the_other_engine_it_is_the_same_regulator_and_variants_have_the_same_numbers():
+    found = {}
+    for engine in ("batch", "warp"):
+        settings = ["scene.num_envs=3", f"sim.engine={engine}", "sim.engine_threads=1", "episode_length_s=0.7"]
+        resolved = resolve(find_task("cartpole"), play=True, overrides=settings)
+        sweeps = read_sweeps(["body_mass.pole=1,4", "push.slider_to_cart=0,2", "action_noise=0,0.1"], 5)
+        points = [None, (1.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 2.0, 0.0), (1.0, 0.0, 0.1)]
+        law = regulator(resolved, 1.0)
+        results = run_points(resolved, law.acting, sweeps, points, 3, 42)
+        assert results[0].returns == results[1].returns
+        found[engine] = [*law.gain[0].tolist(), *(value for result in results for value in result.returns)]
+    assert found["warp"] == pytest.approx(found["batch"], rel=1e-4)
+    assert len(set(found["batch"])) == 4 + 4 * 3
