@@ -178,7 +178,7 @@ def verdict(summary: dict[str, Any], limits: dict[str, float]) -> list[str]:
     """
     failures = []
     for key, limit in limits.items():
-        value = _value(summary, key)
+        value = value_of(summary, key)
         if value is None:
             failures.append(f"{key} is not known from one episode, and {limit:g} is asked for")
         elif value < limit:
@@ -186,7 +186,12 @@ def verdict(summary: dict[str, Any], limits: dict[str, float]) -> list[str]:
     return failures
 
 
-def _value(summary: dict[str, Any], key: str) -> float | None:
+def value_of(summary: dict[str, Any], key: str) -> float | None:
+    """The number that a key of --fail-under stands for; None where it is not known.
+
+    Raises:
+        UsageError: for a term that there is not.
+    """
     from rlcli.errors import UsageError, did_you_mean, listing
 
     head, _, rest = key.partition(".")

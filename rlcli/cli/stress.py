@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -60,7 +61,9 @@ def command(
     stochastic: Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")] = False,
     fail_under: Annotated[
         list[str] | None,
-        typer.Option("--fail-under", help="success=0.9 and the like, as in eval: exit 9 if the worst is below."),
+        typer.Option(
+            "--fail-under", help="success=0.9 and the like, as in eval: exit 9 if it is below in any variant."
+        ),
     ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Draw the map to FILE.png or FILE.svg.")] = None,
     num_envs: NumEnvs = None,
@@ -72,7 +75,7 @@ def command(
     debug: Debug = False,
 ) -> None:
     """Evaluate a policy in variants of its task."""
-    from rlcli.cli.eval import read_limits, require_success, verdict
+    from rlcli.cli.eval import read_limits, require_success, value_of, verdict
     from rlcli.cli.session import actor, baseline, find_subject, names_run
     from rlcli.errors import UsageError
     from rlcli.rl.heat_map import check_picture, draw, heat_map
@@ -127,7 +130,11 @@ def command(
         searched = {at: r.summary() for at, r in zip(more, run(judged, more), strict=True)} if more else {}
     everything = {**summaries, **searched}
     where = min(everything, key=lambda at: score(everything[at]))
-    failures = [f"at {_at(sweeps, where)}: {said}" for said in verdict(everything[where], limits)]
+    failures = []
+    for key, limit in limits.items():  # what is worst in success need not be so in return
+        known = {at: value_of(summary, key) for at, summary in everything.items()}
+        at = min(known, key=lambda at: -math.inf if (value := known[at]) is None else value)
+        failures += [f"at {_at(sweeps, at)}: {said}" for said in verdict(everything[at], {key: limit})]
 
     metric = "success" if "success" in nominal else "return"
     _table(sweeps, [None, *variants], [nominal, *found], rival, against, metric)

@@ -34,6 +34,15 @@ def test_as_it_is_and_at_factor_1_it_is_exactly_what_eval_says(cli):
     assert len({json.dumps(value) for value in others}) == 4  # and every other variant is another one
 
 
+def test_chance_in_the_actions_is_the_same_in_every_variant(cli, only_run):
+    cli("train", "cartpole", *SMALL, "--max-iterations", 1)
+    for words in (("cartpole", "--policy", "random"), ("--checkpoint", only_run(), "--stochastic")):
+        done = cli("stress", *words, "--sweep", "body_mass.pole=1,8", "--episodes", 6, "--json").json
+        said = cli("eval", *words, "--episodes", 6, "--num-envs", 6, "--json").json["return"]
+        assert done["nominal"]["return"] == of(done, body_mass__pole=1.0)["return"] == said
+        assert of(done, body_mass__pole=8.0)["return"] != said
+
+
 def test_fewer_environments_than_episodes_are_eval_with_as_many(cli):
     done = cli("stress", *LQR, "--sweep", "gravity=1,2", "--episodes", 7, "--num-envs", 3).json
     said = cli("eval", *LQR, "--episodes", 7, "--num-envs", 3).json
