@@ -24,6 +24,7 @@ COMMANDS = {
     "train": "train",
     "play": "play",
     "eval": "eval",
+    "stress": "stress",
     "export": "export",
     "replay": "replay",
     "runs": "runs",
