@@ -26,6 +26,7 @@ COMMANDS = {
     "eval": "eval",
     "export": "export",
     "replay": "replay",
+    "plot": "plot",
     "diff": "diff",
     "reproduce": "reproduce",
     "check": "check",
