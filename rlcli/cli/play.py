@@ -142,10 +142,10 @@ def _video(session: Any, file: Path) -> None:
 
 
 def _statistics(session: Any, record: Path | None, record_mode: str) -> None:
-    from rlcli.cli.eval import _show
+    from rlcli.cli.eval import show_summary
     from rlcli.cli.session import run_episodes
 
     console.info("no window asked for, or no display: one episode an environment, as numbers (--video FILE.mp4 draws)")
     summary, recorded = run_episodes(session, session.env.num_envs, record, record_mode)
-    _show(summary)
+    show_summary(summary)
     console.document("play", video=None, recorded=recorded, **summary)

@@ -22,6 +22,9 @@ class Session:
     run: Any
     checkpoint: Path | None
     resolved: Any
+    seed: int
+    as_trained: bool
+    """Whether it is a checkpoint in its own run, in the task as the run has it."""
 
 
 def open_session(
@@ -70,6 +73,9 @@ def open_session(
     check(resolved)
     tell_notes(resolved)
     session = _build(resolved, run, folder, policy, stochastic, seed)
+    changed = bool(overrides) or config is not None
+    if policy == "trained" and run is not None and folder is not None and not changed:
+        session.as_trained = folder.resolve().parent == run.checkpoints.resolve()
     from rlcli.rl.dump import Watch
 
     home = runs_dir or default_runs_dir() if run is None else run.folder
@@ -104,7 +110,7 @@ def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic
         act = zero_policy(env)
     else:
         act = random_policy(env, resolved.agent.action_bound if resolved.agent else 1.0, derive(seed, "play"))
-    return Session(env, act, run, folder, resolved)
+    return Session(env, act, run, folder, resolved, seed, False)
 
 
 def check_record(record: Path | None, mode: str) -> None:
