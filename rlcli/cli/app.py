@@ -27,6 +27,7 @@ COMMANDS = {
     "export": "export",
     "replay": "replay",
     "plot": "plot",
+    "report": "report",
     "diff": "diff",
     "reproduce": "reproduce",
     "check": "check",
