@@ -28,6 +28,8 @@ INK, FAINT, PAPER = "#1b1f24", "#d0d7de", "#fefefe"
 """Of text, rules and what lies behind a legend; a page has its own."""
 _WIDTH, _HEIGHT = 5.2, 3.2
 """Of a panel [inches]."""
+_ON_A_PAGE = (4.1, 2.7)
+"""The same of one on a page, where it is as wide as its place: smaller, so that its text is larger."""
 _LONGEST = 64
 """Characters of a label."""
 _ODD = re.compile("[\x00-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]")
@@ -111,7 +113,7 @@ def panel_svg(panel: Panel, x_label: str, name: str) -> str:
         name: what its ids begin with, its own in the page.
     """
     with _drawing({"svg.fonttype": "none"}):
-        figure = _figure((_WIDTH, _HEIGHT))
+        figure = _figure(_ON_A_PAGE)
         _draw(figure.add_subplot(), panel, x_label, legend=len(panel.items) > 1, title=False)
         svg = _bytes(figure, ".svg", transparent=True).decode()
     return _for_page(svg, name, f"{panel.title}, {panel.unit}")
@@ -224,7 +226,8 @@ def _for_page(svg: str, name: str, label: str) -> str:
     assert box is not None
     rest = re.sub(r"<metadata>.*?</metadata>|<defs>\s*<style.*?</style>\s*</defs>", "", rest, flags=re.DOTALL)
     rest = re.sub(r'(?<= id=")|(?<=url\(#)|(?<=xlink:href="#)', f"{name}-", rest)
-    for color, variable in ((INK, "currentColor"), (FAINT, "var(--rule)"), (PAPER, "var(--paper)")):
+    variables = {INK: "currentColor", FAINT: "var(--rule)", PAPER: "var(--paper)"}
+    for color, variable in {**variables, **{color: f"var(--c{i})" for i, color in enumerate(COLORS)}}.items():
         rest = rest.replace(color, variable)
     rest = rest.replace("'DejaVu Sans'", "inherit")
     return f'<svg {box[0]} role="img" aria-label="{escape(label)}">{rest}'.strip()

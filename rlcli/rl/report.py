@@ -197,7 +197,9 @@ def _installed(run: Run) -> tuple[dict[str, Any], dict[str, str]]:
         resolved = resolve(source, agent=run.record.get("agent"), device=device)
     except RlcliError:
         return {}, {}
-    return {dotted(path): value for path, value in _leaves(to_data(resolved), ())}, origins(resolved)
+    values = {dotted(path): value for path, value in _leaves(to_data(resolved), ())}
+    # of a file of the task its name is enough; the page may be read on another machine
+    return values, {key: place.replace(source.label, source.config.name) for key, place in origins(resolved).items()}
 
 
 def _sections(settings: list[Setting]) -> list[tuple[str, list[Setting]]]:
