@@ -58,6 +58,7 @@ def command(
     names = None if metrics is None else [name.strip() for name in metrics.split(",") if name.strip()]
     if names == []:
         raise UsageError("--metrics names none", hint="--metrics return,success")
+    require_folder(output)
     check_drawing()
     found = find_runs(runs, runs_dir or default_runs_dir())
 
@@ -84,6 +85,21 @@ def command(
         curves=[_document(curve, x) for curve in curves],
         notes=notes,
     )
+
+
+def require_folder(output: Path | None) -> None:
+    """Refuse a file that cannot be written before anything is done for it.
+
+    Raises:
+        UsageError: for a folder.
+        MachineError: if its folder is not there.
+    """
+    from rlcli.errors import MachineError, UsageError
+
+    if output is not None and output.is_dir():
+        raise UsageError(f"-o {output} is a folder", hint="give a file")
+    if output is not None and not output.absolute().parent.is_dir():
+        raise MachineError(f"cannot write {output}: there is no folder {output.absolute().parent}")
 
 
 def find_runs(references: list[str], runs_dir: Path) -> list[Run]:

@@ -9,6 +9,7 @@ import typer
 
 from rlcli.cli.console import console
 from rlcli.cli.options import Debug, Json, Quiet, RunsDir
+from rlcli.cli.plot import require_folder
 
 if TYPE_CHECKING:
     from rlcli.cli.session import Session
@@ -43,6 +44,7 @@ def command(
     console.quiet = quiet
     if output is not None and output.suffix not in (".html", ".htm"):
         raise UsageError(f"'{output}' is not a page", hint="name it *.html")
+    require_folder(output)
     found, checkpoint = _find(run, runs_dir or default_runs_dir())
     if output is None:
         require_own(found, _FILE)

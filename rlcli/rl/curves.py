@@ -276,7 +276,7 @@ def _settings(run: Run) -> dict[str, Any]:
         "init_from": record.get("init_from_sha256") or record.get("init_from"),
         **{f"source of {name}": str(digest)[:8] for name, digest in sources.items() if name != "rlcli"},
     }
-    return {**apart, **{dotted(path): value for path, value in _leaves(data, ())}}
+    return {**{dotted(path): value for path, value in _leaves(data, ())}, **apart}
 
 
 def _leaves(value: Any, path: strict_yaml.Path) -> Iterator[tuple[strict_yaml.Path, Any]]:
