@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from rlcli.rl.run import Run
 
 _MANY = Path("curves.png")
+_MOST_PANELS = 60
+"""Of one picture."""
 
 
 def command(
@@ -73,6 +75,9 @@ def command(
     panels = choose(curves, names, x)
     if not panels:
         raise UsageError("there is nothing to draw: no episode has ended yet", hint="--metrics Loss draws the losses")
+    if len(panels) > _MOST_PANELS:
+        console.warn(f"the first {_MOST_PANELS} of {len(panels)} panels are drawn; --metrics chooses")
+    panels = panels[:_MOST_PANELS]
     file = output or _default_file(found)
     write_atomic(file, picture(panels, AXES[x], file.suffix, title=_title(curves), note=_note(curves)))
     _tell(curves)

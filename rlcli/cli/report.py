@@ -73,7 +73,7 @@ def command(
         file=str(file),
         run=str(found.folder),
         checkpoint=str(checkpoint) if checkpoint else None,
-        charts=[title for title, _, _ in page.charts],
+        charts=[chart.title for chart in page.charts],
         evaluation=made.get("evaluation") or None,
         video=made.get("video") or None,
         missing=page.missing,

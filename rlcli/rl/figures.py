@@ -30,6 +30,8 @@ _WIDTH, _HEIGHT = 5.2, 3.2
 """Of a panel [inches]."""
 _ON_A_PAGE = (4.1, 2.7)
 """The same of one on a page, where it is as wide as its place: smaller, so that its text is larger."""
+_FEW = 8
+"""Lines whose legend has one column."""
 _LONGEST = 64
 """Characters of a label."""
 _ODD = re.compile("[\x00-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]")
@@ -105,7 +107,7 @@ def picture(panels: Sequence[Panel], x_label: str, kind: str, *, title: str = ""
 
 
 def panel_svg(panel: Panel, x_label: str, name: str) -> str:
-    """One panel as an SVG element for a page, whose text and rules take the page's colours.
+    """One panel as an SVG element for a page, whose text and rules take the page's colours; without a legend.
 
     Args:
         panel: what to draw.
@@ -114,9 +116,16 @@ def panel_svg(panel: Panel, x_label: str, name: str) -> str:
     """
     with _drawing({"svg.fonttype": "none"}):
         figure = _figure(_ON_A_PAGE)
-        _draw(figure.add_subplot(), panel, x_label, legend=len(panel.items) > 1, title=False)
+        _draw(figure.add_subplot(), panel, x_label, legend=False, title=False)
         svg = _bytes(figure, ".svg", transparent=True).decode()
     return _for_page(svg, name, f"{panel.title}, {panel.unit}")
+
+
+def legend_of(panel: Panel) -> list[tuple[str, int, int]]:
+    """What a page puts beside a panel: (label, number of the colour, number of the line's style) each."""
+    if panel.by_curve and len(panel.items) == 1:
+        return []
+    return [(item.label, item.index % len(COLORS), item.index // len(COLORS) % len(_STYLES)) for item in panel.items]
 
 
 @contextmanager
@@ -152,7 +161,9 @@ def _draw(axes: Any, panel: Panel, x_label: str, *, legend: bool, title: bool = 
     if title:
         axes.set_title("\n".join(_text(line, 54) for line in (panel.title, panel.subtitle) if line))
     if legend and panel.items and not (panel.by_curve and len(panel.items) == 1):
-        _legend(axes, panel.items, bands=panel.stacked, loc="upper left" if panel.stacked else "best", fontsize=8)
+        many = len(panel.items) > _FEW
+        settings = {"loc": "upper left" if panel.stacked else "best", "fontsize": 6 if many else 8, "ncols": 1 + many}
+        _legend(axes, panel.items, bands=panel.stacked, **settings)
 
 
 def _lines(axes: Any, items: Sequence[Item]) -> None:

@@ -39,7 +39,7 @@ def render(page: Page) -> str:
             page=page,
             policy=POLICY,
             # made by us from numbers and escaped names, and by us alone
-            charts=[(title, unit, Markup(svg)) for title, unit, svg in page.charts],
+            charts=[(chart.title, Markup(chart.svg), chart.legend) for chart in page.charts],
             video=video,
             shares=_shares(page.evaluation),
             means=_means(page.evaluation),

@@ -41,6 +41,15 @@ class Setting:
     origin: str
 
 
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """A panel of learning curves: an SVG element, and beside it (label, colour, style of the line) of what is in it."""
+
+    title: str
+    svg: str
+    legend: list[tuple[str, int, int]]
+
+
 @dataclass(slots=True)
 class Page:
     """What the page shows. A part that is missing has its reason in `missing`."""
@@ -50,8 +59,7 @@ class Page:
     summary: str
     facts: list[tuple[str, str]]
     card: Card | None = None
-    charts: list[tuple[str, str, str]] = field(default_factory=list)
-    """(title, unit, SVG element) each."""
+    charts: list[Chart] = field(default_factory=list)
     evaluation: dict[str, Any] | None = None
     checkpoint: str | None = None
     video: bytes | None = None
@@ -128,7 +136,7 @@ def _curve(run: Run, page: Page) -> Curve | None:
 
 
 def _charts(curve: Curve | None, page: Page) -> None:
-    from rlcli.rl.figures import panel_svg
+    from rlcli.rl.figures import legend_of, panel_svg
 
     if curve is None:
         return
@@ -137,7 +145,7 @@ def _charts(curve: Curve | None, page: Page) -> None:
         page.missing["charts"] = "There are no learning curves yet: no episode has ended."
     try:
         page.charts = [
-            (panel.title, panel.unit, panel_svg(panel, AXES["steps"], f"chart{position}"))
+            Chart(panel.title, panel_svg(panel, AXES["steps"], f"chart{position}"), legend_of(panel))
             for position, panel in enumerate(panels)
         ]
     except RlcliError as error:
