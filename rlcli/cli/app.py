@@ -29,6 +29,8 @@ COMMANDS = {
     "replay": "replay",
     "runs": "runs",
     "watch": "watch",
+    "plot": "plot",
+    "report": "report",
     "diff": "diff",
     "reproduce": "reproduce",
     "check": "check",
