@@ -34,8 +34,16 @@ def command(
         str | None, typer.Argument(help="A task: its newest run is evaluated. Not needed with --checkpoint.")
     ] = None,
     overrides: Overrides = None,
+    compare: Annotated[
+        bool,
+        typer.Option(
+            "--compare",
+            help="RUN1 RUN2 [...] in the same episodes: eval --compare A B; beside a run also lqr, zero or random."
+            " --fail-under is of the first.",
+        ),
+    ] = False,
     checkpoint: CheckpointRef = None,
-    policy: Annotated[str, typer.Option("--policy", help="trained, zero or random.")] = "trained",
+    policy: Annotated[str, typer.Option("--policy", help="trained, zero, random or lqr.")] = "trained",
     episodes: Annotated[
         int, typer.Option("--episodes", min=1, help="Episodes to run, each environment's first ones.")
     ] = 200,
@@ -64,6 +72,24 @@ def command(
 
     console.quiet = quiet
     limits = read_limits(fail_under or [])
+    if compare:
+        from rlcli.cli.compare import compare as compared
+        from rlcli.errors import UsageError
+
+        if checkpoint is not None or policy != "trained" or record is not None:
+            raise UsageError("--compare takes its policies as words: eval --compare RUN1 RUN2")
+        failures = compared(
+            [*([] if task is None else [task]), *(overrides or [])],
+            limits=limits,
+            episodes=episodes,
+            stochastic=stochastic,
+            num_envs=num_envs,
+            seed=draw_seed(seed),
+            config=config,
+            runs_dir=runs_dir,
+        )
+        _conclude(failures)
+        return
 
     def check(resolved: Any) -> None:
         require_success(resolved, limits)
@@ -97,9 +123,13 @@ def command(
     if not stochastic and session.as_trained:
         keep(session, said)
     console.document("eval", **said, passed=not failures, failures=failures, recorded=recorded)
+    _conclude(failures)
+
+
+def _conclude(failures: list[str]) -> None:
+    for failure in failures:
+        console.info(f"failed: {failure}")
     if failures:
-        for failure in failures:
-            console.info(f"failed: {failure}")
         raise typer.Exit(9)
 
 
@@ -148,7 +178,7 @@ def verdict(summary: dict[str, Any], limits: dict[str, float]) -> list[str]:
     """
     failures = []
     for key, limit in limits.items():
-        value = _value(summary, key)
+        value = value_of(summary, key)
         if value is None:
             failures.append(f"{key} is not known from one episode, and {limit:g} is asked for")
         elif value < limit:
@@ -156,7 +186,12 @@ def verdict(summary: dict[str, Any], limits: dict[str, float]) -> list[str]:
     return failures
 
 
-def _value(summary: dict[str, Any], key: str) -> float | None:
+def value_of(summary: dict[str, Any], key: str) -> float | None:
+    """The number that a key of --fail-under stands for; None where it is not known.
+
+    Raises:
+        UsageError: for a term that there is not.
+    """
     from rlcli.errors import UsageError, did_you_mean, listing
 
     head, _, rest = key.partition(".")

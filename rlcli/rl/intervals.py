@@ -32,10 +32,10 @@ def proportion(hits: int, count: int) -> dict[str, float]:
 def mean(values: Sequence[float]) -> dict[str, float | None]:
     """A mean with Student's t interval; of a single value nothing is known about how far others lie."""
     count = len(values)
-    middle = sum(values) / max(1, count)
+    middle = math.fsum(values) / max(1, count)  # exact, so that no order of the episodes shows
     if count < 2:
         return {"mean": middle, "std": 0.0, "low": None, "high": None}
-    std = math.sqrt(sum((v - middle) ** 2 for v in values) / (count - 1))
+    std = math.sqrt(math.fsum((v - middle) ** 2 for v in values) / (count - 1))
     half = student(count - 1) * std / math.sqrt(count)
     return {"mean": middle, "std": std, "low": middle - half, "high": middle + half}
 

@@ -117,15 +117,29 @@ def evaluate(
 
 
 def acting(env: VecEnv, policy: Policy, *, stochastic: bool = False, generator: torch.Generator | None = None) -> Act:
-    """A policy in an environment; what it remembers begins anew with each episode."""
+    """A policy in an environment; what it remembers begins anew with each episode, and equal lives meet equal noise."""
     memory: Tensor | None = None
+    groups = env.num_envs // (env.engine.lives or env.num_envs) if stochastic and generator is not None else 1
 
     def act(obs: Tensor) -> Tensor:
         nonlocal memory
         if memory is not None:
             memory = memory * (env.episode_length_buf > 0)[:, None]
-        action, memory = policy.step(obs, memory, stochastic=stochastic, generator=generator)
-        return action
+        if groups == 1:
+            action, memory = policy.step(obs, memory, stochastic=stochastic, generator=generator)
+            return action
+        assert generator is not None
+        state = generator.get_state()
+        actions: list[Tensor] = []
+        memories: list[Tensor] = []
+        for number, seen in enumerate(obs.chunk(groups)):
+            generator.set_state(state)
+            before = None if memory is None else memory.chunk(groups)[number]
+            action, after = policy.step(seen, before, stochastic=True, generator=generator)
+            actions.append(action)
+            memories += [] if after is None else [after]
+        memory = torch.cat(memories) if memories else None
+        return torch.cat(actions)
 
     return act
 
@@ -137,12 +151,13 @@ def zero_policy(env: VecEnv) -> Act:
 
 
 def random_policy(env: VecEnv, bound: float | None, seed: int) -> Act:
-    """Uniform actions within the bound, or standard Gaussian ones where there is none."""
+    """Uniform actions within the bound, or standard Gaussian ones where there is none; the same in equal lives."""
     generator = torch.Generator().manual_seed(seed)
-    shape = (env.num_envs, env.layout.action_size)
+    lives = env.engine.lives or env.num_envs
+    shape, groups = (lives, env.layout.action_size), env.num_envs // lives
     if bound is None:
-        return lambda obs: torch.randn(shape, generator=generator)
-    return lambda obs: (torch.rand(shape, generator=generator) * 2.0 - 1.0) * bound
+        return lambda obs: torch.randn(shape, generator=generator).repeat(groups, 1)
+    return lambda obs: ((torch.rand(shape, generator=generator) * 2.0 - 1.0) * bound).repeat(groups, 1)
 
 
 def _require_end(env: VecEnv) -> None:
