@@ -198,8 +198,8 @@ def _filmed(run: Run, file: Path, stage: _Stage) -> bytes | None:
 
     try:
         frames, fps, backend = film(session.env, session.act, file, longest_s=_LONGEST_S)
-    except OSError as error:
-        raise MachineError(f"cannot write {file}: {error.strerror or error}") from None
+    except (OSError, RuntimeError) as error:  # imageio's own, where there is no ffmpeg
+        raise MachineError(f"cannot write {file}: {getattr(error, 'strerror', None) or error}") from None
     console.info(f"{file}: {frames} frames, {fps:g} a second, drawn with {backend}")
     return _read(run, file)
 

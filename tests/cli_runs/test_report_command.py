@@ -242,6 +242,19 @@ def test_an_evaluation_is_made_once_and_kept_with_its_intervals(cli, trained):
     assert "is no evaluation" in broken.json["missing"]["evaluation"]
 
 
+def test_a_report_of_a_checkpoint_is_of_that_one_and_one_episode_has_no_interval(cli, trained):
+    assert cli("eval", "--checkpoint", f"{trained}@step:0", "--episodes", 1, "-q").code == 0
+    said = cli("report", f"{trained}@step:0", "--no-video", "-o", "page.html", "--json")
+    assert (said.code, said.json["evaluation"]) == (0, "stored")
+    page = read("page.html")
+    assert "Checkpoint step 0" in page.text
+    assert "1 episode of the deterministic policy" in page.text
+    assert "unknown" in page.text
+    newest = cli("report", trained, "--no-video", "--no-eval", "--json")
+    assert newest.json["evaluation"] is None
+    assert newest.json["checkpoint"] != said.json["checkpoint"]
+
+
 def test_nothing_is_evaluated_or_drawn_where_that_is_asked(cli, trained):
     said = cli("report", trained, "--no-eval", "--no-video", "-o", "page.html", "--json")
     assert (said.code, said.json["evaluation"], said.json["video"]) == (0, None, None)
