@@ -103,11 +103,15 @@ class Perturbations:
 
     def _hold(self) -> None:
         """Change the model where that has not been done, or an event of the task has written since."""
-        env, derived = self._env, None
+        env, changed, derived = self._env, False, None
         for physical in self._physical:
-            changed = physical.hold()
-            if changed is not None and physical.derives:
-                derived = changed if derived is None else derived | changed
+            rows = physical.hold()
+            changed = changed or rows is not None
+            if rows is not None and physical.derives:
+                derived = rows if derived is None else derived | rows
+        if changed:
+            for physical in self._physical:  # what one has written is no event to another
+                physical.note()
         if derived is not None:
             env.engine.set_constants(env.engine.select(derived, env.seed, env.episode_index))
 
@@ -142,18 +146,21 @@ class _Physical:
             if bare := [name for name, has in zip(names, limited, strict=True) if not has]:
                 raise NameProblem(f"{listing(bare)} has no effort limit", "give its joint an effort_limit")
         self._touched = ~values.isnan() & ((values != 1.0) | sweep.absolute)
-        self._held: Tensor | None = None
 
     def hold(self) -> Tensor | None:
-        """Change what has been written since; where something was. (num_envs,) bool"""
-        now = self._parts[0].now()
-        written = self._touched if self._held is None else self._touched & (now != self._held).any(dim=1)
-        if not bool(written.any()):
+        """Change what has been written since `note`; where something was. (num_envs,) bool"""
+        written = [part.written() & self._touched[:, None] for part in self._parts]
+        rows = torch.stack([mask.any(dim=1) for mask in written]).any(dim=0)
+        if not bool(rows.any()):
             return None
-        for part, values in zip(self._parts, self._targets(now), strict=True):
-            part.write(written, values)
-        self._held = self._parts[0].now()
-        return written
+        for part, mask, values in zip(self._parts, written, self._targets(self._parts[0].now()), strict=True):
+            part.write(mask, values)
+        return rows
+
+    def note(self) -> None:
+        """What stands there now is as it should be."""
+        for part in self._parts:
+            part.held = part.now()
 
     def _targets(self, now: Tensor) -> list[Tensor]:
         """What each part is to be. (num_envs, values) each"""
@@ -164,7 +171,7 @@ class _Physical:
             ends = torch.tensor([-1.0, 1.0], dtype=now.dtype, device=now.device)
             return [value * ends.repeat(now.shape[1] // 2)]
         if self._sweep.parameter == "gravity":
-            return [now * (value / now.square().sum(dim=1, keepdim=True).sqrt())]  # it keeps its direction
+            return [now * (value / now.square().sum(dim=1, keepdim=True).sqrt())]  # its direction stays
         if self._sweep.parameter == "body_mass":
             return [part.now() * (value / now).repeat_interleave(part.width, dim=1) for part in self._parts]
         return [value.expand_as(now)]
@@ -180,15 +187,22 @@ class _Part:
         width = self._live.shape[1] // total
         axes = list(range(width)) if axes is None else axes
         self.width = len(axes)
+        self.held: Tensor | None = None
+        """The values when they were last changed; None before. (num_envs, elements x axes)"""
         self._columns = torch.tensor([row * width + axis for row in rows for axis in axes], device=env.device)
 
     def now(self) -> Tensor:
         """A copy of the values. (num_envs, elements x axes)"""
         return self._live[:, self._columns]
 
-    def write(self, rows: Tensor, values: Tensor) -> None:
-        """Set the values of the environments where `rows` holds."""
-        self._live[:, self._columns] = torch.where(rows[:, None], values.to(self._live.dtype), self.now())
+    def written(self) -> Tensor:
+        """Which values somebody else has written. (num_envs, elements x axes) bool"""
+        now = self.now()
+        return torch.ones_like(now, dtype=torch.bool) if self.held is None else now != self.held
+
+    def write(self, where: Tensor, values: Tensor) -> None:
+        """Set the values where that holds. (num_envs, elements x axes) each"""
+        self._live[:, self._columns] = torch.where(where, values.to(self._live.dtype), self.now())
 
 
 class _Signal:
