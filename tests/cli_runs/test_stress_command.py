@@ -48,6 +48,8 @@ def test_fewer_environments_than_episodes_are_eval_with_as_many(cli):
     done = cli("stress", *LQR, *SHORT, "--sweep", "gravity=1,2", "--episodes", 7, "--num-envs", 3).json
     said = cli("eval", *LQR, *SHORT, "--episodes", 7, "--num-envs", 3).json
     assert done["num_envs"] == 3
+    words = ("scene.num_envs=3", "--sweep", "gravity=1,2", "--episodes", 7)
+    assert cli("stress", *LQR, *SHORT, *words).json["points"] == done["points"]
     assert done["nominal"]["return"] == said["return"]
     assert of(done, gravity=1.0)["return"] == said["return"]
 
