@@ -121,7 +121,7 @@ def command(
         **summary,
     }
     if not stochastic and session.as_trained:
-        _keep(session, said)
+        keep(session, said)
     console.document("eval", **said, passed=not failures, failures=failures, recorded=recorded)
     _conclude(failures)
 
@@ -226,7 +226,7 @@ def interval(value: dict[str, Any]) -> str:
     return f"{value['low']:.4f} .. {value['high']:.4f}"
 
 
-def _keep(session: Any, document: dict[str, Any]) -> None:
+def keep(session: Any, document: dict[str, Any]) -> None:
     """Leave the document in the run, for whoever reports on it; a run that cannot be written to stays as it is."""
     from rlcli.errors import CheckpointError, MachineError
     from rlcli.rl.evaluations import keep_evaluation

@@ -36,6 +36,8 @@ class Session:
     run: Any
     checkpoint: Path | None
     resolved: Any
+    policy: str
+    """One of POLICIES."""
     seed: int
     as_trained: bool
 
@@ -208,7 +210,16 @@ def _build(subject: Subject) -> Session:
     # evaluation sees other episodes than training did
     seed_generators(derive(subject.seed, "task"))  # some tasks draw from them
     env = make_env(subject.resolved, seed=derive(subject.seed, "evaluation"))
-    return Session(env, put(env), subject.run, subject.checkpoint, subject.resolved, subject.seed, subject.as_trained)
+    return Session(
+        env=env,
+        act=put(env),
+        run=subject.run,
+        checkpoint=subject.checkpoint,
+        resolved=subject.resolved,
+        policy=subject.policy,
+        seed=subject.seed,
+        as_trained=subject.as_trained,
+    )
 
 
 def check_record(record: Path | None, mode: str) -> None:

@@ -10,6 +10,7 @@ import torch
 import yaml
 from fenced import REPOSITORY, Block, blocks, run_commands, success_rate, write_files
 from worlds import CRITTER, CRITTER_TASK, build, edited, write
+from written_runs import learning, write_run
 
 import rlcli.errors
 from rlcli.rl.sweeps import PHYSICAL, SIGNALS
@@ -50,6 +51,24 @@ def test_the_page_on_evaluation_names_every_parameter():
 @pytest.mark.slow
 def test_the_page_on_determinism_works_as_written(tmp_path):
     assert run_commands(blocks(DOCS / "determinism.md"), tmp_path).count("no difference") == 2
+
+
+@pytest.mark.slow
+def test_the_page_on_plots_and_reports_works_as_written(tmp_path):
+    for seed in (1, 2):
+        write_run(tmp_path / "runs", seed=seed, rows=learning())
+    page = DOCS / "plots-and-reports.md"
+    output = run_commands(blocks(page, "## Learning curves", "## A run as a page"), tmp_path)
+    output += run_commands(blocks(page, "## A run as a page", "## The card"), tmp_path)
+    for file in ("curves.svg", "curves.png", "losses.pdf", "cartpole.html"):
+        assert file in output
+        assert (tmp_path / file).stat().st_size > 5_000
+
+
+def test_the_card_of_the_page_is_printed(capsys):
+    (block,) = blocks(DOCS / "plots-and-reports.md", "## The card of a task")
+    exec(compile(block.text, "plots-and-reports.md", "exec"), {})
+    assert "| `pole_pos` | -1 | Squared joint deviation" in capsys.readouterr().out
 
 
 @pytest.mark.slow
