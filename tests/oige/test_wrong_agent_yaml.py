@@ -127,11 +127,20 @@ def test_a_recurrent_network_has_the_size_that_is_written(tmp_path):
         ("clip_value: False", "value_bootstrap: False", "params.config.value_bootstrap", "approximated"),
         ("clip_value: False", "central_value_config: {}", "params.config.central_value_config", "approximated"),
         ("lr_schedule: adaptive", "lr_schedule: linear", "params.config.kl_threshold", "ignored"),
-        ("    separate: False\n", "    rnn: {name: lstm, before_mlp: True}\n", "params.network.rnn.before_mlp", "mapped"),
-        ("    separate: False\n", "    rnn: {name: lstm, concat_input: True}\n", "params.network.rnn.concat_input",
-         "approximated"),
+        (
+            "    separate: False\n",
+            "    rnn: {name: lstm, before_mlp: True}\n",
+            "params.network.rnn.before_mlp",
+            "mapped",
+        ),
+        (
+            "    separate: False\n",
+            "    rnn: {name: lstm, concat_input: True}\n",
+            "params.network.rnn.concat_input",
+            "approximated",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_is_only_near_is_noted_as_such(tmp_path, old, new, key, status):
     notes = {note.key: note.status for note in resolved(tmp_path, edited(old, new)).notes}
     assert notes[key] == status

@@ -122,7 +122,12 @@ NOISE = f"{BLOCK}.randomization_params.observations.on_reset"
         (noise(schedule="cubic"), f"{NOISE}.schedule", "no schedule 'cubic'", "constant"),
         (noise(operation="direct"), f"{NOISE}.operation", "noise is additive or scaling", None),
         (noise(distribution_parameters=[1.0]), f"{NOISE}.distribution_parameters", "expected [a, b] or", None),
-        (noise(distribution_parameters=[[1.0], [1.0, 2.0]]), f"{NOISE}.distribution_parameters", "expected [a, b]", None),
+        (
+            noise(distribution_parameters=[[1.0], [1.0, 2.0]]),
+            f"{NOISE}.distribution_parameters",
+            "expected [a, b]",
+            None,
+        ),
         (noise(distribution_parameters=[["a"], ["b"]]), f"{NOISE}.distribution_parameters", "expected numbers", None),
         (noise(distribution_parameters=[2.0, 1.0]), f"{NOISE}.distribution_parameters", "lower end is above", None),
         (
@@ -141,7 +146,7 @@ NOISE = f"{BLOCK}.randomization_params.observations.on_reset"
         (noise(frequency_interval=0), f"{NOISE}.frequency_interval", "expected a whole number", None),
         (noise(schedule="linear", schedule_steps=[1]), f"{NOISE}.schedule_steps", "expected a whole number", None),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_randomisation_is_refused_at_its_key(tmp_path, block, key, message, hint):
     found = problem_of(tmp_path, YAML + yaml_module.safe_dump({BLOCK: block}), message)
     assert found.path == key
