@@ -31,9 +31,9 @@ def read_file(file: Path, limit: int, *, size: int | None = None) -> bytes:
         CheckpointError: if it is a link, no plain file, too large or of another size, or cannot be read.
         FileNotFoundError: if it is not there.
     """
-    if file.is_symlink():
-        raise CheckpointError(f"{file} is a link; links in runs are not followed")
     try:
+        if file.is_symlink():
+            raise CheckpointError(f"{file} is a link; links in runs are not followed")
         handle = os.open(file, os.O_RDONLY | _NO_LINKS)  # a pipe must not make this wait
     except FileNotFoundError:
         raise
