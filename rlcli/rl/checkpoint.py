@@ -203,7 +203,7 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     file = folder / "manifest.json"
     try:
         manifest = parse_json(read_file(file, JSON_LIMIT), file)
-    except (FileNotFoundError, NotADirectoryError):
+    except FileNotFoundError:
         raise CheckpointError(f"{folder} is not a checkpoint: it has no manifest.json") from None
     if type(manifest.get("format")) is not int or manifest["format"] != FORMAT:
         raise CheckpointError(
