@@ -60,6 +60,13 @@ def test_when_it_fails_the_old_content_stays_and_nothing_is_left(tmp_path, monke
         assert caught.value.__cause__ is error
 
 
+def test_what_cannot_even_be_cleaned_away_is_the_disks_error_too(tmp_path):
+    (tmp_path / f".file.tmp-{os.getpid()}").mkdir()
+    with pytest.raises(MachineError, match=r"cannot write .*file: "):
+        files.write_atomic(tmp_path / "file", "new")
+    assert not (tmp_path / "file").exists()
+
+
 @pytest.mark.parametrize(
     ("code", "hint"),
     [

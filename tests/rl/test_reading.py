@@ -8,6 +8,7 @@ import pytest
 
 from rlcli.errors import CheckpointError
 from rlcli.rl import reading
+from rlcli.rl.checkpoint import open_checkpoint
 from rlcli.rl.reading import parse_json, read_file, refuse_links
 
 
@@ -32,8 +33,10 @@ def test_a_file_of_another_size_is_corrupt(file, size):
 
 
 def test_what_is_not_there_is_the_callers_to_name(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        read_file(tmp_path / "nothing", 10)
+    (tmp_path / "file").touch()
+    for missing in (tmp_path / "nothing", tmp_path / "file" / "below"):
+        with pytest.raises(FileNotFoundError):
+            read_file(missing, 10)
 
 
 def test_a_link_is_refused_also_to_a_file_that_is_good_or_missing(file):
@@ -80,8 +83,20 @@ def test_no_handle_is_left_open(file, tmp_path):
 
 
 def test_a_name_that_no_file_can_have_is_refused(tmp_path):
-    with pytest.raises(CheckpointError, match="cannot be read"):
-        read_file(tmp_path / ("x" * 300), 10)
+    for name, said in (("x" * 300, "File name too long"), ("a\0b", "embedded null byte")):
+        with pytest.raises(CheckpointError) as caught:
+            read_file(tmp_path / name, 10)
+        assert caught.value.message.endswith(f"{name} cannot be read: {said}")
+
+
+def test_a_json_file_has_at_most_4_mib(tmp_path):
+    manifest = tmp_path / "manifest.json"
+    manifest.write_bytes(b" " * (4 * 1024 * 1024 + 1))
+    with pytest.raises(CheckpointError, match=r"is too large: 4,194,305 bytes, at most 4,194,304 are read"):
+        open_checkpoint(tmp_path)
+    manifest.write_bytes(b" " * 4 * 1024 * 1024)
+    with pytest.raises(CheckpointError, match="not JSON"):
+        open_checkpoint(tmp_path)
 
 
 @pytest.mark.parametrize("error", [OSError(5, "Input/output error"), MemoryError()])
