@@ -9,7 +9,7 @@ import pytest
 from rlcli.errors import CheckpointError
 from rlcli.rl import reading
 from rlcli.rl.checkpoint import open_checkpoint
-from rlcli.rl.reading import parse_json, read_file, refuse_links
+from rlcli.rl.reading import parse_json, read_file, read_tail, refuse_links
 
 
 @pytest.fixture
@@ -120,6 +120,19 @@ def test_a_file_that_breaks_off_is_an_error_of_the_file(file, monkeypatch, error
     said = "Input/output error" if isinstance(error, OSError) else "there is not enough memory"
     with pytest.raises(CheckpointError, match=rf"data\.json cannot be read: {said}"):
         read_file(file, 100)
+
+
+def test_of_a_file_that_grows_its_end_is_read_and_whether_that_is_all(file):
+    assert read_tail(file, 100) == (b'{"a": 1}', True)
+    assert read_tail(file, 8) == (b'{"a": 1}', True)
+    assert read_tail(file, 7) == (b'"a": 1}', False)
+    assert read_tail(file, 0) == (b"", False)
+    link = file.with_name("link")
+    link.symlink_to(file)
+    with pytest.raises(CheckpointError, match="is a link"):
+        read_tail(link, 100)
+    with pytest.raises(FileNotFoundError):
+        read_tail(file.with_name("nothing"), 100)
 
 
 # --- JSON ---
