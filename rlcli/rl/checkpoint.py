@@ -324,7 +324,7 @@ def _is_shard(entry: Any) -> bool:
 def _require_header(data: bytes, file: Path) -> None:
     """What the file says of its tensors must be of a size that torch takes; whether it is true, safetensors checks."""
     length = int.from_bytes(data[:8], "little")
-    if len(data) < 8 or length > min(_HEADER_LIMIT, len(data) - 8):
+    if length > min(_HEADER_LIMIT, len(data) - 8):
         raise CheckpointError(f"{file} is corrupt: it is no safetensors file, or its header is too long")
     header = parse_json(data[8 : 8 + length], file)
     if len(header) > _MOST_TENSORS:

@@ -170,6 +170,12 @@ def test_a_manager_based_task_needs_actions_rewards_and_observations(problems_of
         ("success={func: is_alive}", "success.func: no success term 'is_alive'", "'is_alive' is a term of rewards"),
         ("rewards.alive.func=time_oot", "no reward term 'time_oot'", "terms: "),
         ("rewards.alive.func=is_aliv", "no reward term 'is_aliv'", "did you mean 'is_alive'?"),
+        (
+            "rewards.alive.func=joint_pos_limit",
+            "no reward term 'joint_pos_limit'",
+            "did you mean 'joint_pos_limits' or",
+        ),
+        ("rewards.alive.func=bad_orientation", "no reward term", "'bad_orientation' is a term of terminations"),
         ("terminations.time_out.func=is_terminated", "no termination term 'is_terminated'", "is a term of rewards"),
     ],
 )
@@ -281,6 +287,17 @@ def test_the_agents_patch_is_applied_before_plays_and_after_the_task(task):
     assert place.layer == "play"
     assert resolve(task(text), overrides=["agent.task.decimation=5"]).task.decimation == 5
     assert resolve(task(text), play=True, overrides=["play.decimation=6"]).task.decimation == 6
+
+
+def test_a_known_trainer_that_is_there_but_cannot_be_found_is_not_called_missing(task, monkeypatch):
+    from rlcli.config import load
+
+    def two(*_, **__):
+        raise TaskError("two plugins have a trainer 'ppo'", hint="name one")
+
+    monkeypatch.setattr(load, "find_entry", two)
+    with pytest.raises(ConfigError, match=r"agents\.one\.trainer: two plugins have a trainer 'ppo'; name one"):
+        resolve(task(TASK.replace("one: {trainer: sb3", "one: {trainer: ppo")))
 
 
 def test_a_trainer_of_a_newer_api_is_refused(task, monkeypatch):

@@ -68,6 +68,12 @@ def test_a_part_is_read_up_to_the_size_that_is_allowed(folder):
         opened.tensors("own")
 
 
+def test_what_this_machine_has_no_memory_for_is_not_read(folder, monkeypatch):
+    monkeypatch.setattr(checkpoint, "memory", lambda: 90)
+    with pytest.raises(CheckpointError, match=r"env\.safetensors is too large: .* at most 30 are read"):
+        checkpoint.open_checkpoint(folder).tensors("env")
+
+
 def edit_manifest(change):
     def damage(folder):
         document = json.loads((folder / "manifest.json").read_text())
@@ -122,6 +128,14 @@ def header(text):
 
 def listed(name):
     return edit_manifest(lambda m: m["files"].update({name: {"size": 1, "sha256": DIGEST}}))
+
+
+def extra_files(total):
+    def change(document):
+        for number in range(total - len(document["files"])):
+            document["files"][f"more{number}.json"] = {"size": 1, "sha256": DIGEST}
+
+    return edit_manifest(change)
 
 
 def statistics(**changes):
@@ -196,6 +210,8 @@ SHAPE = "env.safetensors is corrupt: the shape of 'x' makes no sense"
         (statistics(total=-1), STATISTICS),
         (statistics(more=1), STATISTICS),
         (values(**{"statistics.x": []}), "statistics.x makes no sense"),
+        (values(**{"statistics.x": 3}), "statistics.x makes no sense"),
+        (extra_files(4097), "manifest.json is corrupt: it lists 4097 files"),
         (tensor("trainer", "observations", torch.zeros(2, 4)), "trainer.safetensors: 'observations' is (2, 4)"),
         (tensor("trainer", "observations", torch.zeros(6)), "trainer.safetensors: 'observations' is (6,)"),
         (tensor("trainer", "critic.w", torch.tensor([1.0, float("nan")])), "'critic.w' holds values that are not"),
@@ -236,6 +252,7 @@ def test_what_is_wrong_is_said(folder, damage, said):
         tensor("trainer", "bias", torch.tensor([-1.0])),
         tensor("env", "x", torch.tensor([float("nan")])),
         entry(note="whatever"),
+        extra_files(4096),
     ],
 )
 def test_what_is_only_unusual_is_read(folder, damage):
