@@ -87,7 +87,7 @@ class History:
 
     def last(self, env: int) -> np.ndarray | None:
         """What the newest call began with, of one environment."""
-        if self._count == 0 or self._begin[env] == self._count:
+        if self._begin[env] == self._count:
             return None
         return self._ring[(self._count - 1) % self.calls, env]
 
