@@ -491,6 +491,7 @@ def _take(saved: Any, load: Any, failure: str) -> None:
 
 def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
     from rlcli.cli.live import TrainingView
+    from rlcli.envs.deployment import describe
     from rlcli.errors import RlcliError, Stopped
     from rlcli.rl.loggers import open_loggers
     from rlcli.rl.saving import Keep, Saver
@@ -503,6 +504,7 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
         **{key: run.record[key] for key in ("task", "agent", "seed")},
         "trainer": agent.trainer,
         "layout": env.layout.record(),
+        "deployment": describe(env),
         "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
     }
     keep = Keep() if job.stages else Keep.of(agent.keep_last, agent.keep_every, agent.save_interval)
