@@ -72,6 +72,12 @@ def close(referee: Referee, checkpoint: Any, file: Path, format_: str, episodes:
         f"{verdict.episodes} episodes, mean return {verdict.driven:.6g} in plain MuJoCo, {verdict.evaluated:.6g} in"
         " the run's evaluation"
     )
+    if verdict.beside is not None:
+        console.info(
+            f"every number agrees, and yet the returns part by {verdict.unaided:.2%}: the motion magnifies rounding;"
+            f" lived side by side, with rounding set aside in each step, the mean return is {verdict.beside:.6g}, and"
+            f" {verdict.parted} steps did not agree"
+        )
     return {
         "passed": verdict.holds,
         "episodes": verdict.episodes,
@@ -80,6 +86,7 @@ def close(referee: Referee, checkpoint: Any, file: Path, format_: str, episodes:
         "program": str(file.parent / PROGRAM),
         "return": verdict.driven,
         "evaluation_return": verdict.evaluated,
+        "side_by_side": None if verdict.beside is None else {"return": verdict.beside, "parted": verdict.parted},
         "checks": [
             {"check": what, "found": found, "allowed": allowed, "passed": held}
             for what, found, allowed, held in verdict.rows()

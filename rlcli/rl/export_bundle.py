@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
@@ -36,7 +39,7 @@ _IMPORTS = {
 }
 _NEEDS = {"onnx": "numpy, mujoco, onnxruntime", "numpy": "numpy and mujoco", "torch": "numpy, mujoco and torch"}
 _ALIKE = {"rtol": 1e-4, "atol": 1e-5}
-"""How far a model may be from one that was read from its text, which has six digits."""
+"""How far a model may be from one that was read from its text, which may have six digits."""
 
 
 def program(policy: Path, model: Path, format_: str) -> str:
@@ -93,13 +96,32 @@ def open_model(file: Path) -> mujoco.MjModel:
 
 def _as_text(spec: mujoco.MjSpec, model: mujoco.MjModel) -> str | None:
     assets = [*spec.meshes, *spec.hfields, *spec.textures, *spec.skins]
-    if any(getattr(asset, "file", "") or list(getattr(asset, "cubefiles", [])) for asset in assets):
+    if any(getattr(asset, "file", "") or any(getattr(asset, "cubefiles", [])) for asset in assets):
         return None
     try:
-        text = str(spec.to_xml())
+        with _all_digits():
+            text = str(spec.to_xml())
         return text if _alike(mujoco.MjModel.from_xml_string(text), model) else None
     except (ValueError, RuntimeError):  # something that has no text
         return None
+
+
+@contextlib.contextmanager
+def _all_digits() -> Iterator[None]:
+    """MuJoCo writes six digits of a number unless told otherwise, by a function that has no name in Python."""
+    try:
+        found = next(Path(mujoco.__file__).parent.glob("*mujoco*.[sd][oly]*"))
+        library = ctypes.CDLL(str(found))
+        get, put = library._mjPRIVATE__get_xml_precision, library._mjPRIVATE__set_xml_precision
+    except (StopIteration, OSError, AttributeError):  # six have to do
+        yield
+        return
+    before = get()
+    put(17)
+    try:
+        yield
+    finally:
+        put(before)
 
 
 def _alike(read: mujoco.MjModel, model: mujoco.MjModel) -> bool:
