@@ -211,7 +211,7 @@ def _joints(env: VecEnv) -> list[dict[str, Any]]:
             for column, actuator in entity.actuators_of(kind):
                 held = kind == "position", kind != "motor"
                 parts = (model.actuator_gainprm[actuator, 0], -model.actuator_biasprm[actuator, 2])
-                gains[column] = tuple(float(v) if is_ else 0.0 for v, is_ in zip(parts, held, strict=True))  # type: ignore[assignment]
+                gains[column] = tuple(float(v) + 0.0 if is_ else 0.0 for v, is_ in zip(parts, held, strict=True))  # type: ignore[assignment]
         for drive in entity.actuators:
             for i, column in enumerate(drive.joints):
                 gains[column] = float(drive.stiffness[0, i]), float(drive.damping[0, i])

@@ -157,6 +157,7 @@ class _Driver:
         self._closed = np.zeros(model.nu, dtype=bool)
         self._closed[closed] = True
         self._open_terms = [term for term in self._plan["observations"] if not term["closed"]]
+        self._ends = _ends(controller, model)
         self._decimation = controller.about["decimation"]
         self._steps = 0
         self._worst = {"action": 0.0, "observation": 0.0, "control": 0.0}
@@ -182,9 +183,7 @@ class _Driver:
     def physics(self) -> None:
         """`decimation` times `mj_step`, in the place of the engine."""
         asked = self._engine.field("ctrl").numpy()
-        low, high = self._models[0].actuator_ctrlrange.T
-        limited = self._models[0].actuator_ctrllimited.astype(bool)
-        allowed = np.where(limited, np.clip(asked, low, high), asked)
+        allowed = np.clip(asked, *self._ends)  # what MuJoCo would cut off, the file has cut off already
         self._note("control", *(torch.from_numpy(values[:, self._closed]) for values in (self._ctrl, allowed)))
         calls = self._env.calls_per_step
         for _ in range(calls):
@@ -288,3 +287,29 @@ class _Driver:
 def _apart(found: Tensor, expected: Tensor) -> Tensor:
     """Differences relative to max(1, |value|)."""
     return (found - expected).abs() / expected.abs().clamp(min=1.0)
+
+
+def _ends(controller: Any, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Between which controls make a difference: the range of controls, and what `command` is kept within. (nu,) each"""
+    limited = model.actuator_ctrllimited.astype(bool)
+    low, high = (np.where(limited, end, far) for end, far in zip(model.actuator_ctrlrange.T, _FREE, strict=True))
+    columns = [pair for term in controller.about["actions"] for pair in term["limits"] or [_FREE] * term["size"]]
+    kept = np.array([[far if end is None else end for end, far in zip(pair, _FREE, strict=True)] for pair in columns])
+    for control in controller.plan["controls"]:
+        if control["closed"] and _reads_command(control["value"]):
+            ends = [controller.value(control["value"], None, {"command": end}) for end in kept.astype(np.float32).T]
+            low[control["ctrl"]] = np.maximum(low[control["ctrl"]], np.minimum(*ends))
+            high[control["ctrl"]] = np.minimum(high[control["ctrl"]], np.maximum(*ends))
+    return low, high
+
+
+_FREE = (-np.inf, np.inf)
+
+
+def _reads_command(formula: Any) -> bool:
+    """Whether it is made of the command alone."""
+    if isinstance(formula, list):
+        return True
+    if "op" in formula:
+        return all(map(_reads_command, formula["of"]))
+    return formula.get("given") == "command"
