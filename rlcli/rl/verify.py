@@ -231,7 +231,9 @@ class _Driver:
         return Verdict(
             len(driven.returns),
             self._steps,
-            **self._worst,
+            action=self._worst["action"],
+            observation=self._worst["observation"],
+            control=self._worst["control"],
             evaluated=float(np.mean(returns)),
             driven=float(np.mean(driven.returns)),
             scale=float(np.mean(np.abs(returns))),
@@ -241,8 +243,8 @@ class _Driver:
 
     def _follow(self, i: int, begun: bool) -> None:
         """Where a reset or an event has put the simulation, the plain one is put as well."""
-        row, data = self._engine.row(i), self._datas[i]
-        if not begun and self._rows[i] is not None and np.array_equal(row, self._rows[i]):
+        row, last, data = self._engine.row(i), self._rows[i], self._datas[i]
+        if not begun and last is not None and np.array_equal(row, last):
             return
         for name, values in self._engine.own_model(i).items():
             owner, _, attribute = name.rpartition(".")

@@ -13,14 +13,14 @@ import mujoco
 import numpy as np
 import onnxruntime
 
-OPS = {
+OPS: dict = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "clip": np.clip, "cross": np.cross,
     "rotate": lambda q, v: v + 2 * (q[0] * np.cross(q[1:], v) + np.cross(q[1:], np.cross(q[1:], v))),
     "unrotate": lambda q, v: v - 2 * (q[0] * np.cross(q[1:], v) - np.cross(q[1:], np.cross(q[1:], v))),
     "product": lambda p, q: np.r_[p[0] * q[0] - p[1:] @ q[1:], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])],
-    "inverse": lambda q: q * np.float32([1, -1, -1, -1]), "unique": lambda q: -q if q[0] < 0 else q, "asin": np.arcsin,
+    "inverse": lambda q: q * np.array([1, -1, -1, -1], np.float32), "unique": lambda q: -q if q[0] < 0 else q,
     "dot": lambda x, y: (x * y).sum()[None], "sqrt": np.sqrt, "cat": lambda *x: np.concatenate(x),
-    "take": lambda x, at: x[at.astype(int)], "angle": lambda x: np.arctan2(x[1:2], x[:1]),
+    "take": lambda x, at: x[at.astype(int)], "angle": lambda x: np.arctan2(x[1:2], x[:1]), "asin": np.arcsin,
     "wrap": lambda x: x - np.round(x / np.float32(2 * np.pi)) * np.float32(2 * np.pi),
     "below": lambda x, limit, yes, no: np.where(x < limit, yes, no),
 }  # fmt: skip
@@ -73,7 +73,7 @@ if __name__ == "__main__":
     data, plan = mujoco.MjData(model), controller.plan
     data.qpos[:], data.qvel[:] = plan["start"]["qpos"], plan["start"]["qvel"]
     mujoco.mj_forward(model, data)
-    for _ in range(steps := int((*sys.argv, 300)[1])):
+    for _ in range(steps := int((*sys.argv, "300")[1])):
         data.ctrl[:] = controller.act(data, {f"command/{c['name']}": np.zeros(c["size"]) for c in plan["commands"]})
         mujoco.mj_step(model, data, controller.about["decimation"])
         mujoco.mj_step1(model, data)  # positions, velocities and their sensors of the state as it is now
