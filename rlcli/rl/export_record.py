@@ -223,12 +223,16 @@ def deployment_of(checkpoint: Checkpoint, policy: Policy, found: Any = None) -> 
     terms = record.observations.get(policy.spec.group, [])
     columns = [0]
     for term in terms:
-        if term.columns[0] != columns[-1] or term.columns[1] <= term.columns[0]:
+        if term.columns[0] != columns[-1] or term.columns[1] <= columns[-1] or _width(term) % term.history:
             break
         columns.append(term.columns[1])
     if len(columns) != len(terms) + 1 or columns[-1] != policy.spec.observation_size:
         raise CheckpointError(f"{checkpoint.folder}/manifest.json: deployment: its columns are not the policy's")
     return record
+
+
+def _width(term: ObservationFormula) -> int:
+    return term.columns[1] - term.columns[0]
 
 
 def _read(kind: type[Any], value: Any, name: str, checkpoint: Checkpoint) -> Any:

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import CheckpointError
+from rlcli.errors import CheckpointError, UsageError
 from rlcli.rl.export import TOLERANCE
 from rlcli.rl.export_bundle import open_model
 from rlcli.rl.policy import Policy
@@ -122,9 +122,6 @@ def verify(env: VecEnv, policy: Policy, code: str, file: Path, model: Path, epis
         env.instead_of_physics = driver.physics
         try:
             return driver, evaluate(env, driver.act, episodes)
-        except (KeyError, IndexError, TypeError, ValueError) as error:
-            said = f"{type(error).__name__}: {error}"
-            raise CheckpointError(f"{file}: its metadata does not fit the model: {said}") from error
         finally:
             env.instead_of_physics = None
 
@@ -140,7 +137,8 @@ class _Driver:
     """One plain simulation and one controller for each environment."""
 
     def __init__(self, env: VecEnv, policy: Policy, controller: Any, model: mujoco.MjModel, beside: bool) -> None:
-        assert isinstance(env.engine, BatchEngine)
+        if not isinstance(env.engine, BatchEngine):
+            raise UsageError("--verify compares with the CPU engine, and the task asks for another: sim.engine")
         self._env, self._engine, self._beside = env, env.engine, beside
         self.parted = 0
         """Steps in which a plain simulation and the engine did not arrive at one state."""
@@ -169,7 +167,12 @@ class _Driver:
             self._follow(i, begun[i])
             if begun[i]:
                 controller.reset()
-            self._ctrl[i] = controller.act(self._datas[i], self._inputs(i, obs))
+            inputs = self._inputs(i, obs)
+            try:
+                self._ctrl[i] = controller.act(self._datas[i], inputs)
+            except (KeyError, IndexError, TypeError, ValueError) as error:
+                said = f"{type(error).__name__}: {error}"
+                raise CheckpointError(f"the file's metadata does not fit the model: {said}") from error
         actions = torch.from_numpy(np.stack([controller.action for controller in self._controllers]))
         seen = torch.from_numpy(np.stack([controller.obs for controller in self._controllers])).float()
         self._note("observation", seen, obs)
