@@ -118,7 +118,7 @@ def _card(run: Run, document: strict_yaml.Document | None, checkpoint: Path | No
 
 
 def _layout(checkpoint: Path | None) -> dict[str, Any] | None:
-    from rlcli.rl.export import LayoutRecord
+    from rlcli.rl.export_record import LayoutRecord
 
     if checkpoint is None:
         return None
