@@ -34,7 +34,7 @@ def command(
     ] = None,
     overrides: Overrides = None,
     checkpoint: CheckpointRef = None,
-    policy: Annotated[str, typer.Option("--policy", help="trained, zero or random.")] = "trained",
+    policy: Annotated[str, typer.Option("--policy", help="trained, zero, random or lqr.")] = "trained",
     video: Annotated[
         Path | None,
         typer.Option(
@@ -161,10 +161,10 @@ def _video(session: Any, file: Path, together: int) -> None:
 
 
 def _statistics(session: Any, record: Path | None, record_mode: str) -> None:
-    from rlcli.cli.eval import _show
+    from rlcli.cli.eval import show_summary
     from rlcli.cli.session import run_episodes
 
     console.info("one episode an environment, as numbers (--video FILE.mp4 draws)")
     summary, recorded = run_episodes(session, session.env.num_envs, record, record_mode)
-    _show(summary)
+    show_summary(summary)
     console.document("play", video=None, recorded=recorded, **summary)

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from rlcli.errors import CheckpointError
 from rlcli.machine import memory
+from rlcli.rl.optimizers import below
 from rlcli.rl.policy import blank_policy, filled
 from rlcli.rl.reading import read_file
 
@@ -126,13 +127,13 @@ def read_rsl_rl(file: Path, *, activation: str | None = None, action_bound: floa
     actor = saved.get("actor_state_dict")
     if actor is not None:  # version 5
         weights, critic = _named_tensors(actor, where), _named_tensors(saved.get("critic_state_dict", {}), where)
-        hidden, memory_of, stats = "mlp.", "rnn.rnn.", _below(weights, "obs_normalizer.")
+        hidden, memory_of, stats = "mlp.", "rnn.rnn.", below(weights, "obs_normalizer.")
         std = {"std": "distribution.std_param", "log_std": "distribution.log_std_param"}
     else:  # versions 2 to 4
         weights = _named_tensors(saved.get("model_state_dict"), where)
         critic = {name: value for name, value in weights.items() if name.startswith(("critic", "memory_c"))}
         hidden, memory_of = "actor.", "memory_a.rnn."
-        stats = _below(weights, "actor_obs_normalizer.")
+        stats = below(weights, "actor_obs_normalizer.")
         if not stats and "obs_norm_state_dict" in saved:
             stats = _named_tensors(saved["obs_norm_state_dict"], where)
         std = {"std": "std", "log_std": "log_std"}
@@ -461,10 +462,6 @@ def _whole(
     except CheckpointError as error:
         raise CheckpointError(f"{file} holds no policy that can be taken over: {error.message}") from None
     return Foreign(policy.spec.model_dump(), weights, critic, algorithm)
-
-
-def _below(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in weights.items() if name.startswith(prefix)}
 
 
 def _some(weights: Mapping[str, Tensor]) -> str:
