@@ -26,6 +26,7 @@ COMMANDS = {
     "eval": "eval",
     "export": "export",
     "replay": "replay",
+    "autopsy": "autopsy",
     "diff": "diff",
     "reproduce": "reproduce",
     "check": "check",

@@ -507,7 +507,13 @@ def _fit(job: _Job, trainer: Any, env: Any, stop: StopRequest) -> None:
     }
     keep = Keep() if job.stages else Keep.of(agent.keep_last, agent.keep_every, agent.save_interval)
     budgets = [Budget(end, None) for end in job.stages] or [Budget(agent.max_iterations, agent.max_steps)]
-    saver = Saver(run.checkpoints, keep, manifest, resumed=job.resume_from)
+    cases = None
+    if job.writes and not job.stages:
+        from rlcli.rl.autopsy import open_keeper
+
+        step = None if job.resume_from is None else job.resume_from.step
+        cases = open_keeper(env, agent.autopsy, run.folder, step, console.warn)
+    saver = Saver(run.checkpoints, keep, manifest, resumed=job.resume_from, cases=cases)
     sinks: list[Any] = []
 
     def close(state: str) -> None:

@@ -145,6 +145,14 @@ class ManagedEnv(VecEnv):
         returns, terms = self.reward_manager.episode(ended)
         return returns, terms, self.termination_manager.causes(ended)
 
+    @property
+    def reward_names(self) -> list[str]:
+        """The terms of the reward."""
+        return [term.name for term in self.reward_manager.terms]
+
+    def _paid(self) -> Tensor:
+        return self.reward_manager.paid
+
     def _start_over(self) -> None:
         self.curriculum_manager.advance(self._steps)  # the clock may have been set back
         self.event_manager.start_over(self._everyone())
