@@ -43,6 +43,13 @@ def command(
     ] = None,
     viewer: Annotated[str, typer.Option("--viewer", help="auto, native or none.")] = "auto",
     stochastic: Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")] = False,
+    env: Annotated[
+        int | None,
+        typer.Option("--env", min=0, help="With --episode: one episode of this environment, as eval lives it."),
+    ] = None,
+    episode: Annotated[
+        int | None, typer.Option("--episode", min=0, help="Which of its episodes, counted from 0.")
+    ] = None,
     record: Record = None,
     record_mode: RecordMode = "all",
     num_envs: NumEnvs = None,
@@ -70,6 +77,11 @@ def command(
     if record is not None and video is not None:
         raise UsageError("--record writes episodes, not pictures", hint="rlcli replay FILE --video draws what it holds")
     check_record(record, record_mode)
+    if env is not None or episode is not None:
+        from rlcli.cli.one_episode import check_choice
+
+        check_choice(env, episode, num_envs, record_mode)
+    seed = draw_seed(seed)
     session = open_session(
         task,
         overrides or [],
@@ -77,10 +89,18 @@ def command(
         policy=policy,
         stochastic=stochastic,
         num_envs=num_envs,
-        seed=draw_seed(seed),
+        seed=seed,
         config=config,
         runs_dir=runs_dir,
+        at_least=1 if env is None else env + 1,
     )
+    if env is not None and episode is not None:
+        from rlcli.cli.one_episode import play_episode
+
+        video = _default_video(session) if video is not None and str(video) == CHOOSE else video
+        drawn = stochastic or policy == "random"
+        play_episode(session, env, episode, seed, drawn_actions=drawn, video=video, record=record, window=window)
+        return
     if video is not None:
         _video(session, _default_video(session) if str(video) == CHOOSE else video)
     elif window:

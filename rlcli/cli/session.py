@@ -36,10 +36,11 @@ def open_session(
     config: Path | None,
     runs_dir: Path | None,
     check: Callable[[Any], None] = lambda resolved: None,
+    at_least: int = 1,
 ) -> Session:
     """Find, check and build; heavy imports begin only when files and configuration are in order.
 
-    `check` gets the configuration and may raise.
+    `check` gets the configuration and may raise; of environments there are `at_least` so many.
     """
     from rlcli.config.load import resolve
     from rlcli.errors import UsageError, did_you_mean
@@ -63,10 +64,20 @@ def open_session(
         runs = runs_dir or default_runs_dir()
         run, folder, why = find_checkpoint(checkpoint or "latest", runs, name, tell=console.warn)
         console.info(f"checkpoint {folder} ({why})")
-        resolved = resolve_run(run, play=True, config_file=config, overrides=overrides, flags=values, named=named)
+        the_run = run
+
+        def configure(values: Any) -> Any:
+            return resolve_run(the_run, play=True, config_file=config, overrides=overrides, flags=values, named=named)
     else:
         assert task is not None
-        resolved = resolve(named_task(task), play=True, config_file=config, overrides=overrides, flags=values)
+        source = named_task(task)
+
+        def configure(values: Any) -> Any:
+            return resolve(source, play=True, config_file=config, overrides=overrides, flags=values)
+
+    resolved = configure(values)
+    if resolved.task.scene.num_envs < at_least:
+        resolved = configure({**values, "scene.num_envs": at_least})
     check(resolved)
     tell_notes(resolved)
     session = _build(resolved, run, folder, policy, stochastic, seed)

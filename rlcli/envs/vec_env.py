@@ -241,15 +241,20 @@ class VecEnv(ABC):
 
     # --- what callers use ---
 
-    def reset(self, seed: int | None = None) -> dict[str, Tensor]:
+    def reset(self, seed: int | None = None, *, episode: int = 0) -> dict[str, Tensor]:
         """Start a new episode everywhere. With a seed, the random streams start over as in a new environment.
+
+        Args:
+            seed: of every draw from now on; None: draws go on.
+            episode: with a seed, the number of the episode that begins; what `carried` names is not as it would be
+                after those before it.
 
         Returns:
             Group -> observations. (num_envs, d) float32
         """
         if seed is not None:
             self.seed = seed
-            self.episode_index.zero_()
+            self.episode_index.fill_(episode)
             self._steps.zero_()
             if self.terrain is not None:
                 self.terrain.start(seed)
@@ -364,6 +369,10 @@ class VecEnv(ABC):
     def calls_per_step(self) -> int:
         """Calls of the engine in an environment step: one, or one a physics step where actuator models act between."""
         return self.config.decimation if self._actuators else 1
+
+    def carried(self) -> list[str]:
+        """What makes an episode depend on those before it, by its place in the configuration; empty: nothing known."""
+        return ["scene.terrain"] if self.terrain is not None else []
 
     @property
     def reward_names(self) -> list[str]:

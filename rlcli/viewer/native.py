@@ -13,8 +13,14 @@ from rlcli.rl.rollout import Act
 from rlcli.viewer.video import free_camera
 
 
-def run(env: VecEnv, act: Act, shown: int = 0) -> None:
+def run(env: VecEnv, act: Act, shown: int = 0, obs: torch.Tensor | None = None) -> None:
     """Step the environment in real time until the window is closed. Space pauses.
+
+    Args:
+        env: the environment.
+        act: what acts in it.
+        shown: which of its environments to show.
+        obs: what the policy sees, of an environment that goes on from where it is; None: it begins anew.
 
     Raises:
         MachineError: if no window opens, as on macOS outside mjpython.
@@ -36,7 +42,7 @@ def run(env: VecEnv, act: Act, shown: int = 0) -> None:
         camera = free_camera(env.config.viewer, env.origins[shown].tolist())
         window.cam.lookat[:], window.cam.distance = camera.lookat, camera.distance
         window.cam.azimuth, window.cam.elevation = camera.azimuth, camera.elevation
-        obs = env.reset(seed=env.seed)["policy"]
+        obs = env.reset(seed=env.seed)["policy"] if obs is None else obs
         while window.is_running():
             begin = time.perf_counter()
             if env.is_playing():
