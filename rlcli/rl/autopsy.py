@@ -158,14 +158,15 @@ class Keeper:
         self._written: set[str] = set()
         self._failed = ""
         self._take_over(step)
-        env.engine.remember(slots * env.calls_per_step, config.memory_mib << 20)
+        steps = sum(ring.nbytes for ring in self._rings.values())
+        env.engine.remember(slots * env.calls_per_step, max(0, (config.memory_mib << 20) - steps))
         env.on_divergence.append(self._on_divergence)
         env.on_lived = self._on_lived
 
     @property
     def seconds(self) -> float:
         """How much of an episode's end is kept [s]."""
-        return self._most * self._env.step_dt
+        return min(self._most, self._engine.history.calls // self._env.calls_per_step) * self._env.step_dt
 
     def close(self) -> None:
         """Watch no more."""
@@ -262,8 +263,12 @@ class Keeper:
             if self._diverging:
                 self._keep_diverged(self._ended[-1])
         self._diverging.clear()
-        if self._ended and self._step - self._ended[0].step >= self._slack:
+        if self._ended and self._step - self._ended[0].step >= self._patience():
             self._harvest()
+
+    def _patience(self) -> int:
+        """Steps that ended episodes may wait: states that were wider than was known leave fewer."""
+        return min(self._slack, max(1, self._engine.history.calls // self._env.calls_per_step // 4))
 
     def _note(self, episodes: Episodes) -> _Ended:
         ids = episodes.ids.numpy().copy()
