@@ -365,6 +365,8 @@ def read_dump(file: Path) -> Dump:
         CheckpointError: if it is missing, corrupt or of another format.
     """
     try:
+        if file.exists() and not file.is_file():
+            raise CheckpointError(f"{file} is no plain file")  # a pipe would be waited for
         if file.stat().st_size > _LARGEST:
             raise CheckpointError(f"{file} is too large for a dump: more than {_LARGEST >> 20} MiB")
         with safe_open(file, "pt") as opened:

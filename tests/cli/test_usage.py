@@ -18,7 +18,9 @@ def document(text):
 
 
 @pytest.mark.parametrize("flag", ["-h", "--help"])
-@pytest.mark.parametrize("command", [[], ["list-tasks"], ["show"], ["validate"], ["train"], ["play"], ["eval"]])
+@pytest.mark.parametrize(
+    "command", [[], ["list-tasks"], ["show"], ["validate"], ["train"], ["play"], ["eval"], ["autopsy"]]
+)
 def test_help_is_data_and_exits_with_0(in_process, command, flag):
     code, out, err = in_process(*command, flag)
     assert (code, err) == (0, "")

@@ -12,6 +12,7 @@ from safetensors import safe_open
 
 from rlcli.cli.autopsy import sparkline
 from rlcli.rl.recording import content_digest
+from rlcli.rl.trust import named_task
 
 TRAIN = ("--max-iterations", "3", "--logger", "none", "--quiet", "agent.autopsy.keep=6")
 
@@ -31,11 +32,11 @@ def trained(coin, cli, trained_once, only_run):
         shutil.copytree(trained_once / "runs", "runs")
         record = only_run() / "run.json"
         data = json.loads(record.read_text())
-        moved = str(Path("coin").resolve())
-        old, data["task"]["folder"] = data["task"]["folder"], moved
+        moved = str(named_task(coin).root)
+        data["task"]["folder"] = moved
         record.write_text(json.dumps(data))
-        for file in (only_run() / "autopsy").glob("*.safetensors"):
-            rewritten(file, document=lambda d, old=old: d["task"].update(folder=moved))
+        for file in files(only_run()):
+            rewritten(file, document=lambda d: d["task"].update(folder=moved))
     return only_run()
 
 

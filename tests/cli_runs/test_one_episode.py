@@ -185,3 +185,17 @@ def test_what_names_no_episode_is_refused(coin, cli, arguments, said):
     done = cli("play", coin, "--policy", "zero", *arguments)
     assert done.code == 2
     assert said in done.err
+
+
+@pytest.mark.slow
+def test_the_episode_is_drawn_and_its_frames_are_its_own(cli):
+    imageio = pytest.importorskip("imageio.v2")
+    arguments = ("--policy", "zero", "--env", "2", "--episode", "3")
+    shown = cli("play", "cartpole", *arguments, "--video", "one.gif", "--json")
+    assert shown.code == 0, shown.err
+    assert shown.json["length"] == cli("play", "cartpole", *arguments, "--json").json["length"]
+    frames = imageio.mimread("one.gif")
+    assert len(frames) == shown.json["frames"]
+    assert shown.json["frames"] > 1
+    assert frames[0].std() > 0
+    assert (frames[0] != frames[-1]).any()
