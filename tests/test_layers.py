@@ -37,6 +37,8 @@ LIGHT = [
     "rl/sb3_config.py",
     "rl/ppo_config.py",
     "rl/distributed.py",
+    "rl/sweeps.py",
+    "rl/heat_map.py",
 ]
 """What is imported before a configuration is known to be good."""
 

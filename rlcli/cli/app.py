@@ -24,9 +24,14 @@ COMMANDS = {
     "train": "train",
     "play": "play",
     "eval": "eval",
+    "stress": "stress",
     "export": "export",
     "replay": "replay",
     "autopsy": "autopsy",
+    "runs": "runs",
+    "watch": "watch",
+    "plot": "plot",
+    "report": "report",
     "diff": "diff",
     "reproduce": "reproduce",
     "check": "check",
@@ -38,6 +43,8 @@ COMMANDS = {
 
 GROUPS = {"import": "import_"}
 """Command that has commands of its own -> module of `rlcli.cli` with their `app`."""
+
+_INTERRUPTED = 130
 
 _SETTINGS = {
     "help_option_names": ["-h", "--help"],
@@ -110,6 +117,8 @@ def _with_values(arguments: list[str]) -> list[str]:
 def _run(arguments: list[str]) -> int:
     try:
         result = build()(arguments, prog_name="rlcli", standalone_mode=False)
+        if result == _INTERRUPTED:  # how typer hands on Ctrl-C
+            raise KeyboardInterrupt
         return result if isinstance(result, int) else 0
     except RlcliError as error:
         return _report(error)
@@ -119,8 +128,8 @@ def _run(arguments: list[str]) -> int:
         console.error("usage", error.exit_code, error.format_message(), None, [])
         return error.exit_code
     except (KeyboardInterrupt, typer.Abort):
-        console.error("stopped", 130, "interrupted", None, [])
-        return 130
+        console.error("stopped", _INTERRUPTED, "interrupted", None, [])
+        return _INTERRUPTED
     except OSError as error:
         return _machine(error)
     except Exception as error:

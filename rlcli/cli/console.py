@@ -110,6 +110,35 @@ class Console:
             cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
             _write(sys.stdout, "  ".join(cells).rstrip())
 
+    def heat_map(self, title: str, corner: str, drawn: Any) -> None:
+        """A map of numbers on stdout, in colours where stdout is a terminal: red is low, green high.
+
+        `drawn` has `rows`, `columns`, `cells` and `share(number)`, the place of a number on the scale from 0 to 1.
+        """
+        columns = [corner, *drawn.columns]
+        rows = [[name, *(f"{x:.2f}" for x in cells)] for name, cells in zip(drawn.rows, drawn.cells, strict=True)]
+        if self.json or sys.stdout is None or not sys.stdout.isatty():
+            self.data(title)
+            self.table(columns, rows)
+            return
+        from rich.console import Console as Rich
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(title=Text(plain(title)), title_justify="left")
+        for name in columns:
+            table.add_column(Text(plain(name)))
+        for row, cells in zip(rows, drawn.cells, strict=True):
+            styles = ["", *(_shade(drawn.share(x)) for x in cells)]
+            table.add_row(*(Text(f" {plain(text)} ", style) for text, style in zip(row, styles, strict=True)))
+        Rich().print(table)
+
+
+def _shade(share: float) -> str:
+    """Black on red at 0, yellow at a half, green at 1."""
+    red, green = min(1.0, 2.0 - 2.0 * share), min(1.0, 2.0 * share)
+    return f"#000000 on #{round(225 * red):02x}{round(200 * green):02x}40"
+
 
 console = Console()
 

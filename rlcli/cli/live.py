@@ -8,11 +8,12 @@ import time
 from types import TracebackType
 from typing import Any
 
-from rlcli.cli.console import console
-from rlcli.rl.train import Progress
+from rlcli.cli.console import console, plain
+from rlcli.rl.progress import PARTS, Progress
 
 LINE_EVERY_S = 5.0
-_PARTS = ("physics", "task", "policy", "update")
+_MOST_ROWS = 100
+"""Of a table: metrics may be a stranger's."""
 
 
 class TrainingView:
@@ -60,11 +61,11 @@ class TrainingView:
 
         m = progress.metrics
         total = max(sum(progress.seconds.values()), 1e-9)
-        split = "  ".join(f"{part} {progress.seconds.get(part, 0.0) / total:4.0%}" for part in _PARTS)
+        split = "  ".join(f"{part} {progress.seconds.get(part, 0.0) / total:4.0%}" for part in PARTS)
         head = Text.assemble(
             (self._title, "bold"),
-            f"   iteration {progress.iteration}/{progress.iterations}   {progress.env_steps:,} steps"
-            f"   {progress.steps_per_s:,.0f} steps/s   {_clock(progress.remaining_s)} left\n",
+            f"   {_iteration(progress)}   {progress.env_steps:,} steps"
+            f"   {progress.steps_per_s:,.0f} steps/s   {_left(progress)}\n",
             (split, "dim"),
         )
         tables = []
@@ -78,13 +79,13 @@ class TrainingView:
             if not rows:
                 continue
             table = Table(heading, "", box=None, pad_edge=False, header_style="bold cyan")
-            for name, value in rows:
+            for name, value in rows[:_MOST_ROWS]:
                 text = (
                     f"{value:.1%}"
                     if prefix == "Episode_Termination/" or (name.endswith("_rate") and prefix == "Train/")
                     else f"{value:.4g}"
                 )
-                table.add_row(name.partition("/")[2], text)
+                table.add_row(Text(plain(name.partition("/")[2])), text)
             tables.append(table)
         return Group(head, Columns(tables, padding=(0, 4)))
 
@@ -92,20 +93,30 @@ class TrainingView:
 def _line(progress: Progress) -> str:
     m = progress.metrics
     parts = [
-        f"iteration {progress.iteration}/{progress.iterations}",
+        _iteration(progress),
         f"{progress.env_steps} steps",
         f"{progress.steps_per_s:.0f} steps/s",
     ]
     if "Train/mean_reward" in m:
         parts.append(f"return {m['Train/mean_reward']:.3f}")
+    if "Train/mean_episode_length" in m:
         parts.append(f"length {m['Train/mean_episode_length']:.0f}")
     if "Train/success_rate" in m:
         parts.append(f"success {m['Train/success_rate']:.1%}")
-    parts.append(f"{_clock(progress.remaining_s)} left")
+    parts.append(_left(progress))
     return "  ".join(parts)
 
 
-def _clock(seconds: float) -> str:
+def _iteration(progress: Progress) -> str:
+    return f"iteration {progress.iteration}/{'?' if progress.iterations is None else progress.iterations}"
+
+
+def _left(progress: Progress) -> str:
+    return f"{'?' if progress.remaining_s is None else clock(progress.remaining_s)} left"
+
+
+def clock(seconds: float) -> str:
+    """Hours, minutes and seconds."""
     whole = int(seconds)
     return (
         f"{whole // 3600}:{whole % 3600 // 60:02}:{whole % 60:02}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,9 @@ if TYPE_CHECKING:
     from rlcli.rl.regenerate import Begun
 
 
-def check_choice(env: int | None, episode: int | None, num_envs: int | None, record_mode: str) -> None:
+def check_choice(
+    env: int | None, episode: int | None, num_envs: int | None, record_mode: str, commands: Mapping[str, float]
+) -> None:
     """Refuse, before anything is built, what does not name one episode.
 
     Raises:
@@ -27,31 +30,32 @@ def check_choice(env: int | None, episode: int | None, num_envs: int | None, rec
         raise UsageError(f"there is no environment {env} of {num_envs}", hint=f"--num-envs {env + 1}, or leave it out")
     if record_mode != "all":
         raise UsageError("--record-mode chooses among episodes, and this is one")
+    if commands:
+        raise UsageError("--command makes another episode of it", hint="leave out --env and --episode, or --command")
 
 
 def play_episode(
     session: Any,
     who: int,
     episode: int,
-    seed: int,
     *,
-    drawn_actions: bool,
+    stochastic: bool,
     video: Path | None,
     record: Path | None,
-    window: bool,
+    watch: Callable[[], bool],
 ) -> None:
-    """Bring it about, and show it."""
+    """Bring it about, and show it: `watch` opens a viewer where the session stands, and says whether there was one."""
     from rlcli.rl.recording import Recorder
     from rlcli.rl.regenerate import begin_episode, live_episode
 
     env = session.env
-    begun = begin_episode(env, session.act, who, episode, drawn_actions=drawn_actions)
-    _tell_origin(session, begun, who, episode, seed)
-    if window:
-        from rlcli.viewer.native import run
-
-        run(env, session.act, who, begun.obs)
-        return
+    drawn = stochastic or session.policy == "random"
+    begun = begin_episode(env, session.act, who, episode, drawn_actions=drawn)
+    _tell_origin(session, begun, who, episode)
+    if video is None and record is None:
+        session.begun = (who, begun.obs)
+        if watch():
+            return
     frames, recorded = 0, []
     if video is not None:
         last, frames = _filmed(session, begun, who, video)
@@ -77,7 +81,7 @@ def play_episode(
         checkpoint=str(session.checkpoint) if session.checkpoint else None,
         env=who,
         episode=episode,
-        seed=seed,
+        seed=session.seed,
         num_envs=env.num_envs,
         lived_before=begun.lived,
         because_of=begun.carried,
@@ -89,11 +93,10 @@ def play_episode(
     )
 
 
-def _tell_origin(session: Any, begun: Begun, who: int, episode: int, seed: int) -> None:
+def _tell_origin(session: Any, begun: Begun, who: int, episode: int) -> None:
     of = f" --checkpoint {shlex.quote(str(session.checkpoint))}" if session.checkpoint else ""
-    console.info(
-        f"episode {episode} of environment {who} of rlcli eval{of} --num-envs {session.env.num_envs} --seed {seed}"
-    )
+    evaluation = f"rlcli eval{of} --num-envs {session.env.num_envs} --seed {session.seed}"
+    console.info(f"episode {episode} of environment {who} of {evaluation}")
     if begun.lived:
         console.info(f"lived after the {begun.lived} before it, which reach into it by {_listed(begun.carried)}")
 

@@ -1,4 +1,4 @@
-"""`rlcli play`: watch a policy, in a window, as a video, or as numbers."""
+"""`rlcli play`: watch a policy, in a window, in the browser, as a video, or as numbers."""
 
 from __future__ import annotations
 
@@ -34,14 +34,32 @@ def command(
     ] = None,
     overrides: Overrides = None,
     checkpoint: CheckpointRef = None,
-    policy: Annotated[str, typer.Option("--policy", help="trained, zero or random.")] = "trained",
+    policy: Annotated[str, typer.Option("--policy", help="trained, zero, random or lqr.")] = "trained",
     video: Annotated[
         Path | None,
         typer.Option(
             "--video", help="Write one episode to FILE.mp4 or FILE.gif, offscreen; without FILE into the run."
         ),
     ] = None,
-    viewer: Annotated[str, typer.Option("--viewer", help="auto, native or none.")] = "auto",
+    viewer: Annotated[
+        str,
+        typer.Option(
+            "--viewer",
+            help="auto, native (a window), web (the browser) or none (numbers). auto: a window if there is a display,"
+            " else the browser if a terminal asks, else numbers.",
+        ),
+    ] = "auto",
+    port: Annotated[
+        int | None,
+        typer.Option("--port", min=0, max=65535, help="Of --viewer web, on this machine alone; 0: any. Else 8080."),
+    ] = None,
+    together: Annotated[
+        int, typer.Option("--show", min=1, help="How many environments to draw, side by side on the grid.")
+    ] = 1,
+    asked: Annotated[
+        list[str] | None,
+        typer.Option("--command", help="Hold commands of the task: vx=0.5,wz=0. A wrong name lists the right ones."),
+    ] = None,
     stochastic: Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")] = False,
     env: Annotated[
         int | None,
@@ -63,25 +81,26 @@ def command(
 ) -> None:
     """Play a policy."""
     from rlcli.cli.session import check_record, open_session
-    from rlcli.errors import UsageError, did_you_mean
+    from rlcli.cli.viewing import choose_viewers, read_commands, require_viewer, show
+    from rlcli.errors import UsageError
 
     console.quiet = quiet
-    if viewer not in ("auto", "native", "none"):
-        near = did_you_mean(viewer, ("auto", "native", "none"))
-        raise UsageError(f"no viewer '{viewer}'", hint=near or "viewers: auto, native, none")
+    require_viewer(viewer, port, drawn=video is not None or record is not None)
+    commands = read_commands(asked or [])
     if video is not None:
         from rlcli.viewer.writer import check_video
 
         check_video(_FALLBACK_VIDEO if str(video) == CHOOSE else video)
-    window = video is None and record is None and _window(viewer, headless)
+    viewers = choose_viewers(viewer, port, headless=headless or video is not None or record is not None)
     if record is not None and video is not None:
         raise UsageError("--record writes episodes, not pictures", hint="rlcli replay FILE --video draws what it holds")
+    if record is not None and commands:
+        raise UsageError("--record with --command would write episodes that the task alone does not give again")
     check_record(record, record_mode)
     if env is not None or episode is not None:
         from rlcli.cli.one_episode import check_choice
 
-        check_choice(env, episode, num_envs, record_mode)
-    seed = draw_seed(seed)
+        check_choice(env, episode, num_envs, record_mode, commands)
     session = open_session(
         task,
         overrides or [],
@@ -89,7 +108,7 @@ def command(
         policy=policy,
         stochastic=stochastic,
         num_envs=num_envs,
-        seed=seed,
+        seed=draw_seed(seed),
         config=config,
         runs_dir=runs_dir,
         at_least=1 if env is None else env + 1,
@@ -98,16 +117,24 @@ def command(
         from rlcli.cli.one_episode import play_episode
 
         video = _default_video(session) if video is not None and str(video) == CHOOSE else video
-        drawn = stochastic or policy == "random"
-        play_episode(session, env, episode, seed, drawn_actions=drawn, video=video, record=record, window=window)
-        return
-    if video is not None:
-        _video(session, _default_video(session) if str(video) == CHOOSE else video)
-    elif window:
-        from rlcli.viewer.native import run
 
-        run(session.env, session.act)
-    else:
+        def watch() -> bool:
+            return show(session, viewers, port=port, together=together, stochastic=stochastic)
+
+        play_episode(session, env, episode, stochastic=stochastic, video=video, record=record, watch=watch)
+        return
+    if together > session.env.num_envs:
+        raise UsageError(
+            f"--show {together}, and there are {session.env.num_envs} environments", hint=f"--num-envs {together}"
+        )
+    if commands:
+        from rlcli.viewer.player import hold_command
+
+        for name, value in commands.items():
+            hold_command(session.env, name, value)
+    if video is not None:
+        _video(session, _default_video(session) if str(video) == CHOOSE else video, together)
+    elif record is not None or not show(session, viewers, port=port, together=together, stochastic=stochastic):
         _statistics(session, record, record_mode)
 
 
@@ -121,27 +148,20 @@ def _default_video(session: Any) -> Path:
     return session.run.folder / "videos" / f"{session.checkpoint.name}.mp4"
 
 
-def _window(viewer: str, headless: bool) -> bool:
-    from rlcli.errors import MachineError
-    from rlcli.viewer.gl import has_display
-
-    if viewer == "native" and not has_display():
-        raise MachineError(
-            "there is no display for a window",
-            hint="--video FILE.mp4 draws offscreen, --viewer none prints statistics",
-        )
-    return viewer == "native" or (viewer == "auto" and has_display() and not headless)
-
-
-def _video(session: Any, file: Path) -> None:
+def _video(session: Any, file: Path, together: int) -> None:
     from rlcli.rl.rollout import evaluate
+    from rlcli.viewer.crowd import Crowd
     from rlcli.viewer.video import Renderer
     from rlcli.viewer.writer import VideoWriter
 
     env = session.env
     stride = max(1, env.config.sim.render_interval // env.config.decimation)
     ended = False
-    with Renderer(env.engine.model, env.config.viewer) as renderer, VideoWriter(file, stride * env.step_dt) as writer:
+    crowd = Crowd(env, together)
+    with (
+        Renderer(env.engine.model, env.config.viewer, crowd) as renderer,
+        VideoWriter(file, stride * env.step_dt) as writer,
+    ):
 
         def act(obs: Any) -> Any:
             # a picture of the states that the policy acts in, the first one too
@@ -156,16 +176,17 @@ def _video(session: Any, file: Path) -> None:
 
         summary = evaluate(env, act, env.num_envs, note_end).summary()
     frames, fps, backend = writer.frames, writer.fps, renderer.backend
-    console.info(f"{frames} frames of environment 0 at {fps:g} a second, drawn with {backend}")
+    shown = "environment 0" if together == 1 else f"environments 0 to {together - 1}"
+    console.info(f"{frames} frames of {shown} at {fps:g} a second, drawn with {backend}")
     console.data(str(file))
     console.document("play", video=str(file), frames=frames, fps=fps, gl=backend, **summary)
 
 
 def _statistics(session: Any, record: Path | None, record_mode: str) -> None:
-    from rlcli.cli.eval import _show
+    from rlcli.cli.eval import show_summary
     from rlcli.cli.session import run_episodes
 
-    console.info("no window asked for, or no display: one episode an environment, as numbers (--video FILE.mp4 draws)")
+    console.info("one episode an environment, as numbers (--video FILE.mp4 draws)")
     summary, recorded = run_episodes(session, session.env.num_envs, record, record_mode)
-    _show(summary)
+    show_summary(summary)
     console.document("play", video=None, recorded=recorded, **summary)

@@ -28,7 +28,7 @@ def command(
 ) -> None:
     """Train a run again, and compare."""
     from rlcli.cli.diff import report
-    from rlcli.cli.train import train_again
+    from rlcli.cli.live import TrainingView
     from rlcli.machine import available_cores
     from rlcli.rl.environment import environment_record
     from rlcli.rl.load import resolve_run
@@ -41,6 +41,7 @@ def command(
     console.info(f"reproducing {original.folder} ({why})")
 
     from rlcli.rl.compare import compare, reached
+    from rlcli.rl.conduct import train_again
     from rlcli.rl.reproduction import changed, create_again, milestones, require_reproducible
 
     require_reproducible(original)
@@ -61,7 +62,8 @@ def command(
         console.warn("the run was resumed in another environment than it began in; its later bits may not come again")
 
     run, initial = create_again(original, runs, name, now)
-    step = train_again(run, resolved, initial, milestones(original, until), accept)
+    view = TrainingView(f"rlcli train {resolved.source.name}")
+    step = train_again(run, resolved, initial, milestones(original, until), accept, view, console.warn)
     console.info(f"trained {until} of {last} iterations again in {run.folder}")
     sections = compare(original, run, sections=("metrics", "weights", "policy"), until=step)
     more = {"iterations": until, "environment": [_entry(row) for row in rows]}

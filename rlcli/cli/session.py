@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rlcli.cli.console import console
 from rlcli.cli.options import flags, tell_notes
 
-POLICIES = ("trained", "zero", "random")
+POLICIES = ("trained", "zero", "random", "lqr")
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """A policy in a task, found and checked, and not yet built."""
+
+    resolved: Any
+    run: Any
+    checkpoint: Path | None
+    policy: str
+    stochastic: bool
+    seed: int
+    as_trained: bool
+    """Whether it is a checkpoint in its own run, in the task as the run has it."""
 
 
 @dataclass(slots=True)
@@ -22,6 +37,64 @@ class Session:
     run: Any
     checkpoint: Path | None
     resolved: Any
+    policy: str
+    """One of POLICIES."""
+    seed: int
+    as_trained: bool
+    begun: tuple[int, Any] | None = None
+    """An environment to watch, and the observations of all where they stand; None: from the beginning."""
+
+
+def find_subject(
+    task: str | None,
+    overrides: list[str],
+    *,
+    checkpoint: str | None,
+    policy: str,
+    stochastic: bool = False,
+    num_envs: int | None,
+    seed: int,
+    config: Path | None,
+    runs_dir: Path | None,
+    check: Callable[[Any], None] = lambda resolved: None,
+    at_least: int = 1,
+) -> Subject:
+    """Find and check; nothing heavy is imported.
+
+    `check` gets the configuration and may raise; environments there are `at_least` so many.
+    """
+    from rlcli.config.load import resolve
+    from rlcli.errors import UsageError
+    from rlcli.rl.load import resolve_run
+    from rlcli.rl.run import default_runs_dir, find_checkpoint
+    from rlcli.rl.trust import named_task
+
+    require_policy(policy)
+    if task is not None and "=" in task:
+        overrides, task = [task, *overrides], None
+    if task is None and checkpoint is None:
+        raise UsageError("play what?", hint="a TASK, or --checkpoint RUN|latest")
+    values = flags(scene__num_envs=num_envs)
+    run = folder = None
+    as_trained = False
+    if policy == "trained" or checkpoint is not None:
+        named = None if task is None else named_task(task)
+        name = None if named is None else named.name
+        runs = runs_dir or default_runs_dir()
+        run, folder, why = find_checkpoint(checkpoint or "latest", runs, name, tell=console.warn)
+        console.info(f"checkpoint {folder} ({why})")
+        configure = partial(resolve_run, run, play=True, config_file=config, overrides=overrides, named=named)
+        own = folder.resolve().parent == run.checkpoints.resolve()
+        as_trained = own and policy == "trained" and not overrides and config is None
+    else:
+        assert task is not None
+        configure = partial(resolve, named_task(task), play=True, config_file=config, overrides=overrides)
+    resolved = configure(flags=values)
+    if resolved.task.scene.num_envs < at_least:
+        resolved = configure(flags={**values, "scene.num_envs": at_least})
+    check(resolved)
+    tell_notes(resolved)
+    return Subject(resolved, run, folder, policy, stochastic, seed, as_trained)
 
 
 def open_session(
@@ -40,82 +113,122 @@ def open_session(
 ) -> Session:
     """Find, check and build; heavy imports begin only when files and configuration are in order.
 
-    `check` gets the configuration and may raise; of environments there are `at_least` so many.
+    `check` gets the configuration and may raise; environments there are `at_least` so many.
     """
-    from rlcli.config.load import resolve
+    subject = find_subject(
+        task,
+        overrides,
+        checkpoint=checkpoint,
+        policy=policy,
+        stochastic=stochastic,
+        num_envs=num_envs,
+        seed=seed,
+        config=config,
+        runs_dir=runs_dir,
+        check=check,
+        at_least=at_least,
+    )
+    session = _build(subject)
+    from rlcli.rl.dump import Watch
+    from rlcli.rl.run import default_runs_dir
+
+    home = runs_dir or default_runs_dir() if subject.run is None else subject.run.folder
+    Watch(session.env, home / "dumps", console.warn)
+    return session
+
+
+def require_policy(policy: str) -> None:
+    """There must be such a policy.
+
+    Raises:
+        UsageError: naming those that there are.
+    """
     from rlcli.errors import UsageError, did_you_mean
-    from rlcli.rl.load import resolve_run
-    from rlcli.rl.run import default_runs_dir, find_checkpoint
-    from rlcli.rl.trust import named_task
 
     if policy not in POLICIES:
         raise UsageError(
             f"no policy '{policy}'", hint=did_you_mean(policy, POLICIES) or f"policies: {', '.join(POLICIES)}"
         )
-    if task is not None and "=" in task:
-        overrides, task = [task, *overrides], None
-    if task is None and checkpoint is None:
-        raise UsageError("play what?", hint="a TASK, or --checkpoint RUN|latest")
-    values = flags(scene__num_envs=num_envs)
-    run = folder = None
-    if policy == "trained" or checkpoint is not None:
-        named = None if task is None else named_task(task)
-        name = None if named is None else named.name
-        runs = runs_dir or default_runs_dir()
-        run, folder, why = find_checkpoint(checkpoint or "latest", runs, name, tell=console.warn)
-        console.info(f"checkpoint {folder} ({why})")
-        the_run = run
-
-        def configure(values: Any) -> Any:
-            return resolve_run(the_run, play=True, config_file=config, overrides=overrides, flags=values, named=named)
-    else:
-        assert task is not None
-        source = named_task(task)
-
-        def configure(values: Any) -> Any:
-            return resolve(source, play=True, config_file=config, overrides=overrides, flags=values)
-
-    resolved = configure(values)
-    if resolved.task.scene.num_envs < at_least:
-        resolved = configure({**values, "scene.num_envs": at_least})
-    check(resolved)
-    tell_notes(resolved)
-    session = _build(resolved, run, folder, policy, stochastic, seed)
-    from rlcli.rl.dump import Watch
-
-    home = runs_dir or default_runs_dir() if run is None else run.folder
-    Watch(session.env, home / "dumps", console.warn)
-    return session
 
 
-def _build(resolved: Any, run: Any, folder: Path | None, policy: str, stochastic: bool, seed: int) -> Session:
+def baseline(subject: Subject, policy: str) -> Subject:
+    """Another policy in the same task, one that needs no checkpoint.
+
+    Raises:
+        UsageError: if there is no such policy.
+    """
+    from rlcli.errors import UsageError
+
+    require_policy(policy)
+    if policy == "trained":
+        raise UsageError("--against trained: it is compared with what needs no training", hint="lqr, zero or random")
+    return replace(subject, policy=policy, stochastic=False, as_trained=False)
+
+
+def names_run(word: str, runs_dir: Path | None) -> bool:
+    """Whether a word stands for a run or a checkpoint, and not for a task."""
+    from rlcli.rl.run import RECORD, default_runs_dir, list_runs
+
+    runs = runs_dir or default_runs_dir()
+    name = word if Path(word).exists() else word.partition("@")[0]
+    if name == "latest" or (Path(word) / "manifest.json").is_file():
+        return True
+    if any((folder / RECORD).is_file() for folder in (Path(name), runs / name)):
+        return True
+    return any(run.folder.name == name for run in list_runs(runs, None))
+
+
+def actor(subject: Subject) -> Callable[[Any], Any]:
+    """What puts the policy into an environment; its files are read once, whatever the number of environments."""
     import torch
 
-    from rlcli.envs.vec_env import make_env
     from rlcli.random import derive
     from rlcli.rl.checkpoint import open_checkpoint
     from rlcli.rl.load import policy_of, require_fit
-    from rlcli.rl.rng import seed_generators
     from rlcli.rl.rollout import acting, random_policy, zero_policy
 
     torch.set_num_threads(1)
-    trained, checkpoint = None, None
-    if policy == "trained":
-        assert folder is not None
-        checkpoint = open_checkpoint(folder)
-        trained = policy_of(checkpoint)
-    # evaluation sees other episodes than training did
-    seed_generators(derive(seed, "task"))  # some tasks draw from them
-    env = make_env(resolved, seed=derive(seed, "evaluation"))
-    if checkpoint is not None and trained is not None:
+    agent, seed = subject.resolved.agent, derive(subject.seed, "play")
+    bound = agent.action_bound if agent else 1.0
+    if subject.policy == "zero":
+        return zero_policy
+    if subject.policy == "random":
+        return lambda env: random_policy(env, bound, seed)
+    if subject.policy == "lqr":
+        from rlcli.rl.lqr import regulator
+
+        return regulator(subject.resolved, bound).acting
+    assert subject.checkpoint is not None
+    checkpoint = open_checkpoint(subject.checkpoint)
+    trained = policy_of(checkpoint)
+
+    def act(env: Any) -> Any:
         require_fit(checkpoint, env.layout)
-        generator = torch.Generator().manual_seed(derive(seed, "play"))
-        act = acting(env, trained, stochastic=stochastic, generator=generator)
-    elif policy == "zero":
-        act = zero_policy(env)
-    else:
-        act = random_policy(env, resolved.agent.action_bound if resolved.agent else 1.0, derive(seed, "play"))
-    return Session(env, act, run, folder, resolved)
+        generator = torch.Generator().manual_seed(seed)
+        return acting(env, trained, stochastic=subject.stochastic, generator=generator)
+
+    return act
+
+
+def _build(subject: Subject) -> Session:
+    from rlcli.envs.vec_env import make_env
+    from rlcli.random import derive
+    from rlcli.rl.rng import seed_generators
+
+    put = actor(subject)
+    # evaluation sees other episodes than training did
+    seed_generators(derive(subject.seed, "task"))  # some tasks draw from them
+    env = make_env(subject.resolved, seed=derive(subject.seed, "evaluation"))
+    return Session(
+        env=env,
+        act=put(env),
+        run=subject.run,
+        checkpoint=subject.checkpoint,
+        resolved=subject.resolved,
+        policy=subject.policy,
+        seed=subject.seed,
+        as_trained=subject.as_trained,
+    )
 
 
 def check_record(record: Path | None, mode: str) -> None:

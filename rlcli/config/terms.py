@@ -95,6 +95,8 @@ class Signature:
     error: str | None = None
     target: Any = None
     """What to call, where a configuration in Python holds it; None: `attribute` of the file."""
+    description: str = ""
+    """The first paragraph of its docstring, on one line."""
 
 
 @dataclass(slots=True)
@@ -286,10 +288,23 @@ def _signature(node: ast.FunctionDef | ast.ClassDef, call: ast.FunctionDef, name
             error = error or f"parameter '{argument.arg}': {problem}"
     if error is None:
         error = _selector_error(parameters)
-    summary = (ast.get_docstring(node) or ast.get_docstring(call) or "").split("\n")[0]
+    docstring = ast.get_docstring(node) or ast.get_docstring(call) or ""
     return Signature(
-        name, node.name, isinstance(node, ast.ClassDef), file, call.lineno, summary, tuple(parameters), error
+        name,
+        node.name,
+        isinstance(node, ast.ClassDef),
+        file,
+        call.lineno,
+        docstring.split("\n")[0],
+        tuple(parameters),
+        error,
+        description=first_paragraph(docstring),
     )
+
+
+def first_paragraph(docstring: str) -> str:
+    """What a docstring begins with, on one line."""
+    return " ".join(re.split(r"\n\s*\n", docstring.strip())[0].split())
 
 
 def _positional_error(call: ast.FunctionDef, is_class: bool) -> str | None:

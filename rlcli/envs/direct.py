@@ -116,7 +116,8 @@ class DirectTask:
         """
         ids, episodes = env_ids.cpu().numpy(), self.env.episode_index.cpu().numpy()
         device = None if self.device.type == "cpu" else self.device
-        return IdSelection(ids, self.env.seed, episodes[ids], stream(f"direct.{name}"), device)
+        lives = self.env.engine.lives
+        return IdSelection(ids, self.env.seed, episodes[ids], stream(f"direct.{name}"), device, lives)
 
 
 class DirectEnv(VecEnv):

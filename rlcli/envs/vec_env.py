@@ -193,14 +193,17 @@ class VecEnv(ABC):
         resolved: a validated configuration.
         seed: of every random draw of the environment.
         device: where the engine and all tensors live.
+        lives: environment i lives the life of i % lives, under equal actions: what differs between the two is what
+            somebody makes differ; 0: each lives its own.
 
     Raises:
         ConfigError: with everything that does not fit the compiled model.
         DeviceError: for a device that is not there.
     """
 
-    def __init__(self, resolved: Resolved, *, seed: int = 42, device: str = "cpu") -> None:
+    def __init__(self, resolved: Resolved, *, seed: int = 42, device: str = "cpu", lives: int = 0) -> None:
         require_device(device)
+        self._lives = lives
         self.config = resolved.task
         self.resolved = resolved
         self.seed = seed
@@ -330,6 +333,10 @@ class VecEnv(ABC):
         obs = self._seen = self._observe()
         self.seconds["step"] += time.perf_counter() - start
         return StepResult(obs, reward, terminated, truncated, final_obs, episodes)
+
+    def succeeding(self) -> Tensor | None:
+        """Where the success condition holds as things are; None for a task without one. (num_envs,) bool"""
+        return None if self._success is None else self._success()
 
     def holders(self) -> list[Any]:
         """Objects that carry something of their own from step to step: terms with memory, a direct task."""
@@ -724,6 +731,7 @@ class VecEnv(ABC):
         self.spec = scene.spec
         model = scene.compile()
         self.engine = open_engine(model, self.num_envs, config.sim, device=str(self.device))
+        self.engine.lives = self._lives
         self.sim = SimData(self.engine)
         self.entities: dict[str, Entity] = {}
         for name, entity in scene.config.entities.items():  # a direct task may have added some
@@ -747,8 +755,9 @@ class VecEnv(ABC):
         terrain = config.scene.terrain
         self.terrain: Terrain | None = None
         if terrain is not None and scene.ground is not None:
-            self.terrain = Terrain(scene.ground, terrain, self.origins, self.seed)
-        self.env_origins = grid(self.num_envs, config.scene.env_spacing).to(self.device)
+            self.terrain = Terrain(scene.ground, terrain, self.origins, self.seed, self._lives)
+        own = self._lives or self.num_envs
+        self.env_origins: Tensor = grid(own, config.scene.env_spacing).to(self.device)[self._ids % own]
 
     def _add_actuators(self, entity: Entity) -> None:
         for name, config in entity.config.actuators.items():
@@ -800,7 +809,9 @@ def _finite_pairs(pairs: tuple[tuple[float, float], ...] | None) -> list[list[fl
     return [[x if math.isfinite(x) else None for x in pair] for pair in pairs or ()] or None
 
 
-def make_env(task: Resolved | TaskConfig, *, seed: int = 42, device: str = "cpu", root: Path | None = None) -> VecEnv:
+def make_env(
+    task: Resolved | TaskConfig, *, seed: int = 42, device: str = "cpu", root: Path | None = None, lives: int = 0
+) -> VecEnv:
     """The environment of a task, in the task's own workflow.
 
     `task` is a resolved one, or a `TaskConfig` built in Python, whose models lie in `root` (by default here).
@@ -809,14 +820,14 @@ def make_env(task: Resolved | TaskConfig, *, seed: int = 42, device: str = "cpu"
     if resolved.source.task is None:
         from rlcli.envs.managed import ManagedEnv
 
-        return ManagedEnv(resolved, seed=seed, device=device)
+        return ManagedEnv(resolved, seed=seed, device=device, lives=lives)
     if resolved.task.oige:
         from rlcli.oige.env import OigeEnv
 
-        return OigeEnv(resolved, seed=seed, device=device)
+        return OigeEnv(resolved, seed=seed, device=device, lives=lives)
     from rlcli.envs.direct import DirectEnv
 
-    return DirectEnv(resolved, seed=seed, device=device)
+    return DirectEnv(resolved, seed=seed, device=device, lives=lives)
 
 
 def _below(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

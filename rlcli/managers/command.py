@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from rlcli.errors import UsageError, did_you_mean, listing
 from rlcli.managers.live import LiveValues
 from rlcli.managers.term import BoundTerm
 from rlcli.sim.selection import Selection
@@ -20,7 +24,9 @@ class CommandTerm(Protocol):
     """A command term is a class `Name(env, *, ...)`.
 
     It may have a method `metrics() -> dict[str, Tensor]` (num_envs,) of how well the command is followed; their means
-    over an episode are logged. And `reset(selection)`, `state_dict`, `load_state_dict` for what else it carries.
+    over an episode are logged. And `reset(selection)`, `state_dict`, `load_state_dict` for what else it carries;
+    `elements`, names of the columns of `command` that a person may set ("" for the others), and `limits`, the [low,
+    high] that they usually have.
     """
 
     command: Tensor
@@ -33,6 +39,18 @@ class CommandTerm(Protocol):
     def update(self) -> None:
         """Called once a step, after resampling: let the command follow the state (a heading, a frame)."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class Knob:
+    """A column of a command that a person may set."""
+
+    name: str
+    """`ELEMENT`, or `TERM.ELEMENT` where several terms have such an element."""
+    term: str
+    column: int
+    low: float
+    high: float
 
 
 class CommandManager:
@@ -58,6 +76,45 @@ class CommandManager:
         ]
         self._sums = torch.zeros(num_envs, len(self._measured), device=device)
         self._steps = torch.zeros(num_envs, device=device)
+        self.held: dict[str, float] = {}
+        """What a person asks in every environment instead of the terms, by the knob's name."""
+        self._holds: dict[str, Knob] = {}
+
+    def knobs(self) -> list[Knob]:
+        """What a person may set."""
+        found = []
+        for term in self.terms:
+            width = term.instance.command.shape[1]
+            names = getattr(term.instance, "elements", None) or [f"{term.name}[{column}]" for column in range(width)]
+            limits = list(getattr(term.instance, "limits", ()))
+            for column, name in enumerate(names[:width]):
+                low, high = limits[column] if column < len(limits) else (-1.0, 1.0)
+                low, high = (float(low), float(high)) if float(high) > float(low) else (-1.0, 1.0)
+                if name:
+                    found.append(Knob(name, term.name, column, low, high))
+        many = Counter(knob.name for knob in found)
+        return [replace(knob, name=f"{knob.term}.{knob.name}") if many[knob.name] > 1 else knob for knob in found]
+
+    def hold(self, name: str, value: float | None) -> None:
+        """Ask a value of the policy from the next step on, whatever the term draws; None: what the term draws.
+
+        Raises:
+            UsageError: for a name that there is not, or a value that is not finite.
+        """
+        knobs = {name: knob for knob in self.knobs() for name in (f"{knob.term}.{knob.name}", knob.name)}
+        if name not in knobs:
+            names = [knob.name for knob in self.knobs()]
+            known = f"commands: {listing(names)}" if names else "the task has no commands"
+            near = did_you_mean(name, names)
+            raise UsageError(f"no command '{name}'", hint=f"{near} {known}" if near else known)
+        if value is not None and not math.isfinite(value):
+            raise UsageError(f"command '{name}' cannot be {value}", hint="give a finite number")
+        knob = knobs[name]
+        if value is None:
+            self.held.pop(knob.name, None)
+            self._holds.pop(knob.name, None)
+        else:
+            self.held[knob.name], self._holds[knob.name] = value, knob
 
     def get_command(self, name: str) -> Tensor:
         """The command of a term. (num_envs, k)"""
@@ -102,6 +159,8 @@ class CommandManager:
             if due is not None:
                 self._resample(number, due, _NEXT)
             term.instance.update()
+        for name, knob in self._holds.items():
+            self._by_name[knob.term].instance.command[:, knob.column] = self.held[name]
 
     def state_dict(self) -> dict[str, Tensor]:
         """Timers, sums, and the commands."""

@@ -31,6 +31,8 @@ class NullCommand:
 class _VelocityCommand:
     """`drawn` (num_envs, 3) is what was asked; `command` is that after heading control and standing."""
 
+    elements = ("vx", "vy", "wz")
+
     def __init__(
         self, env: ManagedEnv, entity: Entity, toward: Range | None, rel_standing: float, rel_heading: float, kp: float
     ) -> None:
@@ -117,6 +119,11 @@ class UniformVelocity(_VelocityCommand):
         low, high = self._ranges[2]
         return low, high
 
+    @property
+    def limits(self) -> list[Range]:
+        """What is drawn. [m/s, m/s, rad/s]"""
+        return [(low, high) for low, high in self._ranges]
+
 
 class NormalVelocity(_VelocityCommand):
     """The same drawn from normal distributions, each velocity zero with a chance of its own. (num_envs, 3)
@@ -144,12 +151,19 @@ class NormalVelocity(_VelocityCommand):
             selection.write(self._drawn[:, column], value * (selection.uniform(0.0, 1.0) >= zero))
         self._draw_modes(selection)
 
+    @property
+    def limits(self) -> list[Range]:
+        """Nearly all of what is drawn: two deviations about the means. [m/s, m/s, rad/s]"""
+        return [(mean - 2.0 * std, mean + 2.0 * std) for mean, std in zip(self._mean, self._std, strict=True)]
+
 
 class UniformPose:
     """Pose of a body in the root's frame: position [m] and quaternion (w, x, y, z), drawn uniformly. (num_envs, 7)
 
     Angles are roll, pitch, yaw [rad]. Isaac Lab: UniformPoseCommand.
     """
+
+    elements = ("x", "y", "z", "", "", "", "")
 
     def __init__(
         self,
@@ -179,6 +193,11 @@ class UniformPose:
 
     def update(self) -> None:
         """It stays where it is in the root's frame."""
+
+    @property
+    def limits(self) -> list[Range]:
+        """Of the position [m]."""
+        return [(low, high) for low, high in self._ranges[:3]]
 
     @property
     def pose_w(self) -> tuple[Tensor, Tensor]:
@@ -211,6 +230,8 @@ class UniformPose2d:
     `command` is that seen from the root: x, y, z in its yaw frame [m], and the turn to the heading [rad]. With
     `simple_heading` the heading is the direction in which the place lies. Isaac Lab: UniformPose2dCommand.
     """
+
+    elements = ("ahead", "left", "", "turn")
 
     def __init__(
         self,

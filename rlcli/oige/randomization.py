@@ -210,7 +210,7 @@ class Randomizer:
         numbers = ids.cpu().numpy()
         counters = env.episode_index.cpu().numpy()[numbers] if step is None else np.full(len(numbers), step)
         device = None if env.device.type == "cpu" else env.device
-        rows = IdSelection(numbers, env.seed, counters, stream(f"oige.{gate.name}"), device)
+        rows = IdSelection(numbers, env.seed, counters, stream(f"oige.{gate.name}"), device, env.engine.lives)
         low, high = self._bounds(gate, size)
         if gate.distribution == "gaussian":
             drawn = rows.normal(0.0, 1.0, (size,)) * high + low

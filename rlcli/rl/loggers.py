@@ -1,4 +1,4 @@
-"""Where metrics go: always `metrics.jsonl`, and TensorBoard where it is installed."""
+"""Where metrics go: always `metrics.jsonl`, TensorBoard where it is installed, and the trackers that are asked for."""
 
 from __future__ import annotations
 
@@ -6,15 +6,35 @@ import importlib.util
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 from rlcli.errors import DependencyError, MachineError, UsageError, did_you_mean
+from rlcli.registry import load_object
 from rlcli.rl.files import disk_error, write_atomic
 from rlcli.rl.run import Run
 
-LOGGERS = ("tensorboard", "none")
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A logger that can be asked for."""
+
+    needs: str
+    """The module that must be installed; its extra has the logger's name."""
+    opens: str
+    """`module:name` of what opens it."""
+    title: str
+
+
+LOGGERS = {
+    "tensorboard": Kind("tensorboard", "rlcli.rl.loggers:TensorBoard", "TensorBoard"),
+    "wandb": Kind("wandb", "rlcli.rl.trackers:Wandb", "Weights & Biases"),
+    "mlflow": Kind("mlflow", "rlcli.rl.trackers:MLflow", "MLflow"),
+    "trackio": Kind("trackio", "rlcli.rl.trackers:Trackio", "trackio"),
+}
+"""By the name that `--logger` takes; `none` is for none of them."""
 _LONGEST_LINE = 1024**2
 """Bytes of an iteration's metrics."""
 
@@ -26,8 +46,8 @@ class Logger(Protocol):
         """Record one iteration."""
         ...
 
-    def close(self) -> None:
-        """Flush and let go."""
+    def close(self, state: str = "finished") -> None:
+        """Flush and let go of a run that is finished, stopped or failed."""
         ...
 
 
@@ -51,7 +71,7 @@ class JsonLines:
         except OSError as error:
             raise disk_error(self._path, error) from error
 
-    def close(self) -> None:
+    def close(self, state: str = "finished") -> None:
         """Close the file."""
         self._file.close()
 
@@ -75,7 +95,7 @@ class TensorBoard:
         for name, value in metrics.items():
             self._writer.add_scalar(name, value, step)
 
-    def close(self) -> None:
+    def close(self, state: str = "finished") -> None:
         """Flush and close."""
         self._writer.close()
 
@@ -87,25 +107,56 @@ def check_loggers(names: Sequence[str] | None) -> list[str]:
         UsageError: for a name that is no logger.
         DependencyError: for one that is not installed.
     """
-    installed = importlib.util.find_spec("tensorboard") is not None
     if not names:
-        return ["tensorboard"] if installed else []
-    for name in names:
+        return ["tensorboard"] if _installed("tensorboard") else []
+    known = [*LOGGERS, "none"]
+    wanted = [name for name in dict.fromkeys(names) if name != "none"]
+    for name in wanted:
         if name not in LOGGERS:
-            raise UsageError(
-                f"no logger '{name}'", hint=did_you_mean(name, LOGGERS) or f"loggers: {', '.join(LOGGERS)}"
-            )
-    if "tensorboard" in names and not installed:
-        raise DependencyError("TensorBoard is not installed", hint='pip install "rlcli[tensorboard]"')
-    return [name for name in names if name != "none"]
+            raise UsageError(f"no logger '{name}'", hint=did_you_mean(name, known) or f"loggers: {', '.join(known)}")
+    for name in wanted:
+        if not _installed(name):
+            raise DependencyError(f"{LOGGERS[name].title} is not installed", hint=f'pip install "rlcli[{name}]"')
+    return wanted
 
 
-def open_loggers(run: Run, names: Sequence[str], *, resume: tuple[int, int] | None = None) -> list[Logger]:
-    """The loggers of a run; `resume` is the (iteration, step) it goes on after."""
+def open_loggers(
+    run: Run,
+    names: Sequence[str],
+    *,
+    resume: tuple[int, int] | None = None,
+    config: Mapping[str, Any] | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> list[Logger]:
+    """The loggers of a run.
+
+    Args:
+        run: whose metrics.
+        names: those besides `metrics.jsonl`.
+        resume: the (iteration, step) it goes on after.
+        config: its resolved configuration, for those that keep it.
+        tell: hears what the user should know, a logger that fails among it.
+
+    Raises:
+        MachineError: if one cannot be opened.
+    """
+    from rlcli.rl.trackers import Guarded, open_tracker  # heavy, and names are checked before
+
     iteration, step = resume if resume is not None else (None, None)
+    reached = None if resume is None else max(resume, _end(run.metrics))
     loggers: list[Logger] = [JsonLines(run.metrics, resume_after=iteration)]
-    if "tensorboard" in names:
-        loggers.append(TensorBoard(run.folder / "tb", resume_after_step=step))
+    try:
+        for name in names:
+            make = load_object(LOGGERS[name].opens)
+            if name == "tensorboard":
+                board = make(run.folder / "tb", resume_after_step=step)
+                loggers.append(Guarded(name, board, 0, tell))
+            else:
+                loggers.append(open_tracker(name, make, run, config or {}, reached, tell))
+    except BaseException:
+        for logger in loggers:
+            logger.close("failed")
+        raise
     return loggers
 
 
@@ -122,6 +173,19 @@ def read_metrics(file: Path) -> list[dict[str, Any]]:
                 break
             rows.append(row)
     return rows
+
+
+def _installed(name: str) -> bool:
+    return importlib.util.find_spec(LOGGERS[name].needs) is not None
+
+
+def _end(file: Path) -> tuple[int, int]:
+    """How far the iterations of a file go."""
+    try:
+        last = read_metrics(file)[-1]
+    except (OSError, IndexError):
+        return 0, 0
+    return last["iteration"], last["step"]
 
 
 def _cut(file: Path, iteration: int) -> None:

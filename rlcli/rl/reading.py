@@ -31,19 +31,7 @@ def read_file(file: Path, limit: int, *, size: int | None = None) -> bytes:
         CheckpointError: if it is a link, no plain file, too large or of another size, or cannot be read.
         FileNotFoundError: if it is not there.
     """
-    if file.is_symlink():
-        raise CheckpointError(f"{file} is a link; links in runs are not followed")
-    try:
-        handle = os.open(file, os.O_RDONLY | _NO_LINKS)  # a pipe must not make this wait
-    except FileNotFoundError:
-        raise
-    except (OSError, ValueError) as error:
-        why = "it is no plain file" if _kind(error) in _ODD else getattr(error, "strerror", None) or error
-        raise CheckpointError(f"{file} cannot be read: {why}") from None
-    status = os.fstat(handle)
-    if not stat.S_ISREG(status.st_mode):
-        os.close(handle)
-        raise CheckpointError(f"{file} is no plain file")
+    handle, status = _open(file)
     with os.fdopen(handle, "rb") as opened:
         if size is not None and status.st_size != size:
             raise CheckpointError(
@@ -57,6 +45,42 @@ def read_file(file: Path, limit: int, *, size: int | None = None) -> bytes:
         except (OSError, MemoryError) as error:
             why = getattr(error, "strerror", None) or "there is not enough memory"
             raise CheckpointError(f"{file} cannot be read: {why}") from None
+
+
+def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
+    """The last bytes of a plain file that may be growing, and whether they are all of it.
+
+    Raises:
+        CheckpointError: if it is a link or no plain file, or cannot be read.
+        FileNotFoundError: if it is not there.
+    """
+    handle, status = _open(file)
+    begin = max(0, status.st_size - limit)
+    with os.fdopen(handle, "rb") as opened:
+        try:
+            opened.seek(begin)
+            return opened.read(status.st_size - begin), begin == 0
+        except (OSError, MemoryError) as error:
+            why = getattr(error, "strerror", None) or "there is not enough memory"
+            raise CheckpointError(f"{file} cannot be read: {why}") from None
+
+
+def _open(file: Path) -> tuple[int, os.stat_result]:
+    """A plain file, opened."""
+    if file.is_symlink():
+        raise CheckpointError(f"{file} is a link; links in runs are not followed")
+    try:
+        handle = os.open(file, os.O_RDONLY | _NO_LINKS)  # a pipe must not make this wait
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:
+        why = "it is no plain file" if _kind(error) in _ODD else getattr(error, "strerror", None) or error
+        raise CheckpointError(f"{file} cannot be read: {why}") from None
+    status = os.fstat(handle)
+    if not stat.S_ISREG(status.st_mode):
+        os.close(handle)
+        raise CheckpointError(f"{file} is no plain file")
+    return handle, status
 
 
 def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import random
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import torch
@@ -33,6 +34,21 @@ def rng_state() -> dict[str, Tensor]:
         "python.words": torch.tensor([version, *words], dtype=torch.int64),
         "python.gauss": torch.tensor([math.nan if next_gauss is None else next_gauss], dtype=torch.float64),
     }
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """What is done in here draws from the generators and sets torch's threads without anybody noticing afterwards.
+
+    Torch computes on one thread.
+    """
+    rng, threads = rng_state(), torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        load_rng_state(rng)
+        torch.set_num_threads(threads)
 
 
 def load_rng_state(state: Mapping[str, Tensor]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +11,8 @@ from torch import Tensor
 
 from rlcli.envs.vec_env import StepResult, VecEnv
 from rlcli.errors import ConfigError
+from rlcli.managers.termination import DIVERGED
+from rlcli.rl.intervals import mean, proportion
 from rlcli.rl.policy import Policy
 
 Act = Callable[[Tensor], Tensor]
@@ -21,8 +22,9 @@ PATIENCE = 10
 
 @dataclass(slots=True)
 class Evaluation:
-    """Finished episodes, one entry each."""
+    """Finished episodes, one entry each, in the order in which they ended."""
 
+    envs: list[int] = field(default_factory=list)
     returns: list[float] = field(default_factory=list)
     lengths: list[int] = field(default_factory=list)
     successes: list[bool] = field(default_factory=list)
@@ -34,13 +36,13 @@ class Evaluation:
     """Cause -> how often."""
 
     def summary(self) -> dict[str, Any]:
-        """Means with 95 % intervals, as plain JSON."""
+        """Means and shares with 95 % intervals, as plain JSON: Student's t of means, Wilson's of shares."""
         result: dict[str, Any] = {
             "episodes": len(self.returns),
-            "return": _mean(self.returns),
-            "length": _mean([float(n) for n in self.lengths]),
-            "reward_terms": {name: _mean(values)["mean"] for name, values in self.reward_terms.items()},
-            "terminations": {name: sum(v) / max(1, len(self.returns)) for name, v in self.causes.items()},
+            "return": mean(self.returns),
+            "length": mean([float(n) for n in self.lengths]),
+            "reward_terms": {name: mean(values) for name, values in self.reward_terms.items()},
+            "terminations": {name: proportion(sum(v), max(1, len(v))) for name, v in self.causes.items()},
             "diverged": self.diverged,
             "diverged_by": self.diverged_by,
         }
@@ -48,19 +50,54 @@ class Evaluation:
             result["success"] = proportion(sum(self.successes), len(self.successes))
         return result
 
+    def part(self, first: int, stop: int) -> Evaluation:
+        """The episodes of some environments, numbered from `first` on."""
+        rows = [row for row, env in enumerate(self.envs) if first <= env < stop]
+        return self._rows(rows, first)
+
+    def by_life(self) -> Evaluation:
+        """The same in the order of environments, and of an environment's episodes: equal lives, equal places."""
+        return self._rows(sorted(range(len(self.envs)), key=lambda row: self.envs[row]), 0)  # the sort keeps the order
+
+    def _rows(self, rows: list[int], first: int) -> Evaluation:
+        causes = {name: [fired[row] for row in rows] for name, fired in self.causes.items()}
+        return Evaluation(
+            [self.envs[row] - first for row in rows],
+            [self.returns[row] for row in rows],
+            [self.lengths[row] for row in rows],
+            [self.successes[row] for row in rows] if self.successes else [],
+            [self.truncated[row] for row in rows],
+            {name: [values[row] for row in rows] for name, values in self.reward_terms.items()},
+            causes,
+            sum(causes.get(DIVERGED, [])),
+        )
+
 
 def evaluate(
-    env: VecEnv, act: Act, episodes: int, on_step: Callable[[StepResult], None] = lambda _: None
+    env: VecEnv,
+    act: Act,
+    episodes: int,
+    on_step: Callable[[StepResult], None] = lambda _: None,
+    groups: int = 1,
 ) -> Evaluation:
     """Run exactly `episodes` episodes: how many each environment contributes is fixed beforehand.
 
     Counting the first episodes to finish anywhere would favour short ones.
 
+    Args:
+        env: the environments.
+        act: what acts in them.
+        episodes: of each group.
+        on_step: sees every step.
+        groups: as many equal parts of the environments, one after the other, run so many episodes each.
+
     Raises:
         ConfigError: if episodes go on and on because the task has no time-out.
     """
-    quota = torch.full((env.num_envs,), episodes // env.num_envs)
-    quota[: episodes % env.num_envs] += 1
+    size = env.num_envs // groups
+    quota = torch.full((size,), episodes // size)
+    quota[: episodes % size] += 1
+    quota = quota.repeat(groups)
     result = Evaluation()
     before = env.causes
     obs = env.reset(seed=env.seed)["policy"]
@@ -80,15 +117,29 @@ def evaluate(
 
 
 def acting(env: VecEnv, policy: Policy, *, stochastic: bool = False, generator: torch.Generator | None = None) -> Act:
-    """A policy in an environment; what it remembers begins anew with each episode."""
+    """A policy in an environment; what it remembers begins anew with each episode, and equal lives meet equal noise."""
     memory: Tensor | None = None
+    groups = env.num_envs // (env.engine.lives or env.num_envs) if stochastic and generator is not None else 1
 
     def act(obs: Tensor) -> Tensor:
         nonlocal memory
         if memory is not None:
             memory = memory * (env.episode_length_buf > 0)[:, None]
-        action, memory = policy.step(obs, memory, stochastic=stochastic, generator=generator)
-        return action
+        if groups == 1:
+            action, memory = policy.step(obs, memory, stochastic=stochastic, generator=generator)
+            return action
+        assert generator is not None
+        state = generator.get_state()
+        actions: list[Tensor] = []
+        memories: list[Tensor] = []
+        for number, seen in enumerate(obs.chunk(groups)):
+            generator.set_state(state)
+            before = None if memory is None else memory.chunk(groups)[number]
+            action, after = policy.step(seen, before, stochastic=True, generator=generator)
+            actions.append(action)
+            memories += [] if after is None else [after]
+        memory = torch.cat(memories) if memories else None
+        return torch.cat(actions)
 
     return act
 
@@ -100,22 +151,13 @@ def zero_policy(env: VecEnv) -> Act:
 
 
 def random_policy(env: VecEnv, bound: float | None, seed: int) -> Act:
-    """Uniform actions within the bound, or standard Gaussian ones where there is none."""
+    """Uniform actions within the bound, or standard Gaussian ones where there is none; the same in equal lives."""
     generator = torch.Generator().manual_seed(seed)
-    shape = (env.num_envs, env.layout.action_size)
+    lives = env.engine.lives or env.num_envs
+    shape, groups = (lives, env.layout.action_size), env.num_envs // lives
     if bound is None:
-        return lambda obs: torch.randn(shape, generator=generator)
-    return lambda obs: (torch.rand(shape, generator=generator) * 2.0 - 1.0) * bound
-
-
-def proportion(hits: int, count: int) -> dict[str, float]:
-    """A share with its 95 % interval (Wilson's score interval, Wilson 1927)."""
-    z = 1.959963984540054
-    share = hits / count
-    middle = (share + z * z / (2 * count)) / (1 + z * z / count)
-    half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-    # at the ends the formula gives 0 and 1 but for rounding
-    return {"rate": share, "low": middle - half if hits else 0.0, "high": middle + half if hits < count else 1.0}
+        return lambda obs: torch.randn(shape, generator=generator).repeat(groups, 1)
+    return lambda obs: ((torch.rand(shape, generator=generator) * 2.0 - 1.0) * bound).repeat(groups, 1)
 
 
 def _require_end(env: VecEnv) -> None:
@@ -133,6 +175,7 @@ def _take(result: Evaluation, step: StepResult, quota: Tensor) -> None:
         if quota[env] <= 0:
             continue
         quota[env] -= 1
+        result.envs.append(env)
         result.returns.append(float(ended.returns[row]))
         result.lengths.append(int(ended.lengths[row]))
         result.truncated.append(bool(ended.truncated[row]))
@@ -140,13 +183,7 @@ def _take(result: Evaluation, step: StepResult, quota: Tensor) -> None:
             result.successes.append(bool(ended.success[row]))
         for name, values in ended.reward_terms.items():
             result.reward_terms.setdefault(name, []).append(float(values[row]))
-        for name, fired in ended.causes.items():
-            result.causes.setdefault(name, []).append(bool(fired[row]))
-
-
-def _mean(values: list[float]) -> dict[str, float]:
-    count = max(1, len(values))
-    mean = sum(values) / count
-    variance = sum((v - mean) ** 2 for v in values) / max(1, count - 1)
-    half = 1.96 * math.sqrt(variance / count)
-    return {"mean": mean, "std": math.sqrt(variance), "low": mean - half, "high": mean + half}
+        for name in ended.causes:  # `diverged` becomes one once something has
+            result.causes.setdefault(name, [False] * (len(result.returns) - 1))
+        for name, fired in result.causes.items():
+            fired.append(name in ended.causes and bool(ended.causes[name][row]))

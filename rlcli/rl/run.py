@@ -21,12 +21,15 @@ from rlcli.rl.reading import JSON_LIMIT, parse_json, read_file, refuse_links
 
 CONFIG = "config.yaml"
 RECORD = "run.json"
+LOCK = ".lock"
 MAX_SEED = 2**62
 _TASK = re.compile(r"(?!\.{1,2}$)[^/\\:]{1,255}")
 _MOST = 4 * 1024 * 1024
 """Bytes of a run.json."""
 _MANY = 100_000
 _MOST_THREADS = 4096
+_PEEK_S = 0.3
+"""For longer than somebody looks whether a run is locked."""
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
 
 
@@ -64,7 +67,7 @@ class Run:
         Raises:
             MachineError: if another process is writing to this run.
         """
-        self._lock = FileLock(self.folder / ".lock", timeout=0)
+        self._lock = FileLock(self.folder / LOCK, timeout=_PEEK_S)
         try:
             self._lock.acquire()
         except Timeout:
@@ -135,6 +138,40 @@ def open_run(folder: Path) -> Run:
             raise CheckpointError(f"{part} is no plain file")  # a pipe would be waited for
     _check(record, file)
     return Run(folder, record)
+
+
+def is_locked(folder: Path) -> bool:
+    """Whether a process is writing to the run: asked of the system, without a trace in the folder."""
+    try:
+        handle = os.open(folder / LOCK, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+    except OSError:
+        return False
+    try:
+        return stat.S_ISREG(os.fstat(handle).st_mode) and not _shared(handle)
+    finally:
+        os.close(handle)
+
+
+def _shared(handle: int) -> bool:
+    """Whether a lock file can be locked together with others; the lock is let go with the handle."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        import msvcrt
+
+        try:
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+            msvcrt.locking(handle, msvcrt.LK_UNLCK, 1)  # type: ignore[attr-defined]
+        except OSError:
+            return False
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True
 
 
 def require_own(run: Run, *parts: str) -> None:
@@ -293,7 +330,10 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "state": (str,),
     "step": (int,),
     "torch_threads": (int,),
+    "trained_s": (float, int),
+    "trackers": (dict,),
     "versions": (dict,),
+    "video_every": (int,),
 }
 
 

@@ -7,15 +7,20 @@ import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rlcli.errors import DivergedError, Stopped
 from rlcli.rl import checkpoint, distributed
 from rlcli.rl.loggers import Logger
+from rlcli.rl.progress import Progress
 from rlcli.rl.run import Run
 from rlcli.rl.saving import Saver
 from rlcli.rl.stop import Interrupted, StopRequest
 from rlcli.rl.trainer import Report, Trainer
 from rlcli.rl.trials import Trials
+
+if TYPE_CHECKING:
+    from rlcli.viewer.clips import Clips
 
 SAVE_EVERY_S = 60.0
 LONG_S = 0.1
@@ -57,20 +62,6 @@ class Budget:
         return min(limits)
 
 
-@dataclass(slots=True)
-class Progress:
-    """Where training stands, for whoever shows it."""
-
-    iteration: int
-    iterations: int
-    env_steps: int
-    elapsed_s: float
-    remaining_s: float
-    steps_per_s: float
-    seconds: dict[str, float]
-    metrics: dict[str, float]
-
-
 def fit(
     trainer: Trainer,
     run: Run,
@@ -80,6 +71,7 @@ def fit(
     loggers: Sequence[Logger] = (),
     save_interval: int | None = None,
     trials: Trials | None = None,
+    clips: Clips | None = None,
     show: Callable[[Progress], None] = lambda _: None,
     tell: Callable[[str], None] = lambda _: None,
     divergences: Callable[[], int] = lambda: 0,
@@ -125,6 +117,8 @@ def fit(
                 saver.best = trainer.env_steps
                 run.update(best=saver.best)
             saver.check()
+            if clips is not None and clips.due(trainer.iteration):
+                clips.record(trainer.policy, trainer.env_steps)
         boundaries.save()
         saver.wait()
     except Interrupted:

@@ -6,9 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import torch
-
-from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
+from rlcli.rl.rng import seed_generators, undisturbed
 from rlcli.rl.rollout import acting, evaluate
 
 if TYPE_CHECKING:
@@ -51,9 +49,7 @@ class Trials:
 
     def run(self, policy: Callable[[], Policy]) -> dict[str, float]:
         """Metrics of a trial of the policy that is made for it: making one draws weights."""
-        rng, threads = rng_state(), torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+        with undisturbed():
             if self._env is None:
                 seed_generators(0)  # whenever it is built, of tasks that draw as they are
                 self._env = self._make_env()
@@ -62,9 +58,6 @@ class Trials:
             self._env.load_state_dict(self._fresh)  # a curriculum, too, is where it was
             seed_generators(self._env.seed)
             summary = evaluate(self._env, acting(self._env, policy()), self._episodes).summary()
-        finally:
-            load_rng_state(rng)
-            torch.set_num_threads(threads)
         metrics = {_RETURN: summary["return"]["mean"], _LENGTH: summary["length"]["mean"]}
         return {**metrics, _SUCCESS: summary["success"]["rate"]} if "success" in summary else metrics
 

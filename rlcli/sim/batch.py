@@ -93,6 +93,7 @@ class BatchEngine:
         quiet_mujoco()
         self.model = model
         self.num_envs = num_envs
+        self.lives = 0
         self.device = torch.device("cpu")
         self.threads = threads
         self.causes: dict[str, int] = {}
@@ -351,7 +352,7 @@ class BatchEngine:
     def select(self, mask: Tensor, seed: int, counters: Tensor) -> IdSelection | None:
         """The worlds where `mask` holds, as ids; None for none."""
         ids = mask.numpy().nonzero()[0]
-        return IdSelection(ids, seed, counters.numpy()[ids]) if len(ids) else None
+        return IdSelection(ids, seed, counters.numpy()[ids], lives=self.lives) if len(ids) else None
 
     def rays(
         self,

@@ -28,6 +28,8 @@ class Engine(Protocol):
     model: mujoco.MjModel
     threads: int
     warnings: dict[str, int]
+    lives: int
+    """World i draws as world i % lives does; 0: each lives a life of its own."""
     asynchronous: bool
     """Whether reading a value waits for a device: then nothing on the path of a step may."""
     forces_after_reset: bool

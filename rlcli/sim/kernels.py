@@ -45,13 +45,14 @@ def draw_uniform(
     counters: wp.array(dtype=wp.int64),
     stream: wp.uint64,
     index: int,
+    lives: int,
     low: float,
     span: float,
     out: wp.array2d(dtype=float),
 ):
     """Uniform in [low, low + span). out (num_envs, count)"""
     env, column = wp.tid()
-    out[env, column] = unit(start, counters[env], stream, env, index + column) * span + low
+    out[env, column] = unit(start, counters[env], stream, env % lives, index + column) * span + low
 
 
 @wp.kernel
@@ -60,13 +61,14 @@ def draw_normal(
     counters: wp.array(dtype=wp.int64),
     stream: wp.uint64,
     index: int,
+    lives: int,
     out: wp.array2d(dtype=float),
 ):
     """Standard normal, by Box and Muller. out (num_envs, count)"""
     env, column = wp.tid()
     count = out.shape[1]
-    u = unit(start, counters[env], stream, env, index + column)
-    v = unit(start, counters[env], stream, env, index + count + column)
+    u = unit(start, counters[env], stream, env % lives, index + column)
+    v = unit(start, counters[env], stream, env % lives, index + count + column)
     out[env, column] = wp.sqrt(-2.0 * wp.log(1.0 - u)) * wp.cos(2.0 * wp.pi * v)
 
 

@@ -17,8 +17,11 @@ from rlcli.sim.selection import ALL, Columns
 class MaskSelection:
     """Every row takes part in the arithmetic; only masked ones are written. Draws are those of `IdSelection`."""
 
-    def __init__(self, mask: Tensor, seed: int, counters: Tensor, stream: np.uint64 | None = None) -> None:
+    def __init__(
+        self, mask: Tensor, seed: int, counters: Tensor, stream: np.uint64 | None = None, lives: int = 0
+    ) -> None:
         self.mask = mask
+        self._lives = lives
         self._seed = seed
         self._counters = counters
         self._stream = np.uint64(0) if stream is None else stream
@@ -40,7 +43,7 @@ class MaskSelection:
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Gaussian. (num_envs, *shape)"""
         out, index = self._room(shape, 2)
-        inputs = [self._start(), self._counter_array(), int(self._stream), index]
+        inputs = [self._start(), self._counter_array(), int(self._stream), index, self._names()]
         self._launch(kernels.draw_normal, inputs, out)
         return out.view(len(self.mask), *shape).mul_(std).add_(mean)
 
@@ -81,7 +84,7 @@ class MaskSelection:
 
     def where(self, mask: Tensor) -> MaskSelection:
         """Those of the rows where `mask` (num_envs,) holds."""
-        return MaskSelection(self.mask & mask, self._seed, self._counters, self._stream)
+        return MaskSelection(self.mask & mask, self._seed, self._counters, self._stream, self._lives)
 
     def env_ids(self) -> Tensor:
         """The masked rows' numbers; waits for the device. (rows,) int64"""
@@ -89,15 +92,15 @@ class MaskSelection:
 
     def joined(self, other: MaskSelection) -> MaskSelection:
         """The rows that are in either."""
-        return MaskSelection(self.mask | other.mask, self._seed, self._counters)
+        return MaskSelection(self.mask | other.mask, self._seed, self._counters, lives=self._lives)
 
     def stream(self, stream: np.uint64) -> MaskSelection:
         """The same rows drawing from another stream."""
-        return MaskSelection(self.mask, self._seed, self._counters, stream)
+        return MaskSelection(self.mask, self._seed, self._counters, stream, self._lives)
 
     def _uniform(self, low: float, high: float, shape: tuple[int, ...]) -> Tensor:
         out, index = self._room(shape, 1)
-        inputs = [self._start(), self._counter_array(), int(self._stream), index, low, high - low]
+        inputs = [self._start(), self._counter_array(), int(self._stream), index, self._names(), low, high - low]
         self._launch(kernels.draw_uniform, inputs, out)
         return out.view(len(self.mask), *shape)
 
@@ -106,6 +109,10 @@ class MaskSelection:
         count = math.prod(shape)
         index, self._drawn = self._drawn, self._drawn + words * count
         return torch.empty(len(self.mask), count, device=self.mask.device), index
+
+    def _names(self) -> int:
+        """How many environments draw each for itself."""
+        return self._lives or len(self.mask)
 
     def _start(self) -> int:
         return int(random.start(self._seed)[0])

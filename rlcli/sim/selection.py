@@ -90,7 +90,10 @@ class Selection(Protocol):
 
 
 class IdSelection:
-    """A selection as a sorted list of ids, on the CPU. Its draws may be sent to a device."""
+    """A selection as a sorted list of ids, on the CPU. Its draws may be sent to a device.
+
+    With `lives`, environment i draws as i % lives does.
+    """
 
     def __init__(
         self,
@@ -99,8 +102,10 @@ class IdSelection:
         counters: NDArray[np.int64],
         stream: np.uint64 | None = None,
         device: torch.device | None = None,
+        lives: int = 0,
     ) -> None:
         self.ids = ids
+        self._lives = lives
         self._device = device
         self._seed = seed
         self._counters = counters
@@ -159,13 +164,15 @@ class IdSelection:
             return self
         if not chosen.any():
             return None
-        return IdSelection(self.ids[chosen], self._seed, self._counters[chosen], self._stream, self._device)
+        return IdSelection(
+            self.ids[chosen], self._seed, self._counters[chosen], self._stream, self._device, self._lives
+        )
 
     def joined(self, other: IdSelection) -> IdSelection:
         """The rows that are in either; one that is in both draws as it does here."""
         ids, first = np.unique(np.concatenate([self.ids, other.ids]), return_index=True)
         counters = np.concatenate([self._counters, other._counters])[first]
-        return IdSelection(ids, self._seed, counters, self._stream, self._device)
+        return IdSelection(ids, self._seed, counters, self._stream, self._device, self._lives)
 
     def env_ids(self) -> Tensor:
         """The rows' numbers. (rows,) int64"""
@@ -173,7 +180,7 @@ class IdSelection:
 
     def stream(self, stream: np.uint64) -> IdSelection:
         """The same rows drawing from another stream."""
-        other = IdSelection(self.ids, self._seed, self._counters, stream, self._device)
+        other = IdSelection(self.ids, self._seed, self._counters, stream, self._device, self._lives)
         other._keys = self._row_keys()
         return other
 
@@ -183,7 +190,8 @@ class IdSelection:
 
     def _row_keys(self) -> random.Keys:
         if self._keys is None:
-            self._keys = random.row_keys(self._seed, self.ids, self._counters)
+            names = self.ids % self._lives if self._lives else self.ids
+            self._keys = random.row_keys(self._seed, names, self._counters)
         return self._keys
 
     def _next(self, shape: tuple[int, ...]) -> tuple[random.Keys, np.uint64, int, int]:

@@ -157,6 +157,7 @@ class Terrain:
         config: its configuration.
         origins: the environments' start places, kept up to date. (num_envs, 3) [m]
         seed: of the start levels.
+        lives: environment i stands where i % lives does; 0: each for itself.
     """
 
     def __init__(
@@ -165,11 +166,13 @@ class Terrain:
         config: TerrainGeneratorConfig | TerrainHeightsConfig,
         origins: Tensor,
         seed: int,
+        lives: int = 0,
     ) -> None:
         device, count = origins.device, len(origins)
         self.origins = torch.from_numpy(ground.origins).to(device)
         """Start place on each patch. (rows, columns, 3) [m]"""
-        self.types = torch.arange(count, device=device) % self.origins.shape[1]
+        self._names = np.arange(count) % (lives or max(1, count))
+        self.types = torch.from_numpy(self._names).to(device) % self.origins.shape[1]
         """Column of each environment. (num_envs,) int64"""
         self.levels = torch.zeros(count, dtype=torch.int64, device=device)
         """Row of each environment. (num_envs,) int64"""
@@ -188,8 +191,7 @@ class Terrain:
 
     def start(self, seed: int) -> None:
         """Put every environment on its start level, which depends on the seed and its number alone."""
-        ids = np.arange(len(self.levels))
-        keys = random.row_keys(seed, ids, np.zeros_like(ids))
+        keys = random.row_keys(seed, self._names, np.zeros_like(self._names))
         self.levels.copy_(torch.from_numpy(random.integers(keys, _START, 0, 1, self._start_levels)[:, 0]))
         self._env_origins.copy_(self.origins[self.levels, self.types])
 

@@ -118,6 +118,7 @@ class WarpEngine:
         quiet_mujoco()
         self.model = model
         self.num_envs = num_envs
+        self.lives = 0
         self.device = torch.device(device)
         self.capacity = capacity
         self.warnings: dict[str, int] = {}
@@ -320,7 +321,7 @@ class WarpEngine:
 
     def select(self, mask: Tensor, seed: int, counters: Tensor) -> MaskSelection:
         """The worlds where `mask` holds; whether there are any is known to the device alone."""
-        return MaskSelection(mask, seed, counters)
+        return MaskSelection(mask, seed, counters, lives=self.lives)
 
     def rays(
         self,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlcli.config.schema import ViewerConfig
+from rlcli.viewer.crowd import Crowd
 from rlcli.viewer.gl import open_context
 
 
@@ -26,23 +27,28 @@ def free_camera(viewer: ViewerConfig, origin: Sequence[float] = (0.0, 0.0, 0.0))
 
 
 class Renderer:
-    """Draws one environment offscreen.
+    """Draws an environment offscreen.
 
     Args:
         model: its model.
         viewer: size and camera.
+        crowd: further environments in the picture; None: there are none.
 
     Raises:
         MachineError: if nothing on this machine can draw.
     """
 
-    def __init__(self, model: mujoco.MjModel, viewer: ViewerConfig) -> None:
-        self._viewer = viewer
+    def __init__(self, model: mujoco.MjModel, viewer: ViewerConfig, crowd: Crowd | None = None) -> None:
+        self._crowd = crowd if crowd is not None and crowd.count > 1 else None
         self._width, self._height = viewer.width, viewer.height
         self._context, self.backend = open_context(viewer.width, viewer.height)
-        self._scene = mujoco.MjvScene(model, maxgeom=10_000)
+        count = 1 if self._crowd is None else self._crowd.count
+        self._scene = mujoco.MjvScene(model, maxgeom=10_000 + (count - 1) * (model.ngeom + model.nsite))
         self._option = mujoco.MjvOption()
         self._camera = free_camera(viewer)
+        if self._crowd is not None:
+            self._crowd.stand_back(self._camera)
+        self._lookat = self._camera.lookat.copy()
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
         self._rect = mujoco.MjrRect(0, 0, viewer.width, viewer.height)
@@ -50,10 +56,15 @@ class Renderer:
     def draw(
         self, model: mujoco.MjModel, data: mujoco.MjData, origin: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> NDArray[np.uint8]:
-        """A picture of a forwarded state, of an environment whose origin is there. (height, width, 3)"""
-        self._camera.lookat[:] = np.add(self._viewer.lookat, origin)
+        """A picture of a forwarded state, of an environment whose origin is there. (height, width, 3)
+
+        With a crowd it is environment 0.
+        """
+        self._camera.lookat[:] = np.add(self._lookat, origin)
         everything = int(mujoco.mjtCatBit.mjCAT_ALL)
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self._scene)
+        if self._crowd is not None:
+            self._crowd.add(self._scene, 0, self._option)
         mujoco.mjr_render(self._rect, self._scene, self._mjr)
         pixels = np.empty((self._height, self._width, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, self._rect, self._mjr)

@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from rlcli.cli.app import COMMANDS
+
 HEAVY = ["torch", "mujoco", "numpy", "stable_baselines3"]
 
 
@@ -18,9 +20,7 @@ def document(text):
 
 
 @pytest.mark.parametrize("flag", ["-h", "--help"])
-@pytest.mark.parametrize(
-    "command", [[], ["list-tasks"], ["show"], ["validate"], ["train"], ["play"], ["eval"], ["autopsy"]]
-)
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
 def test_help_is_data_and_exits_with_0(in_process, command, flag):
     code, out, err = in_process(*command, flag)
     assert (code, err) == (0, "")

@@ -39,7 +39,8 @@ def test_the_mix_of_short_and_long_episodes_is_the_true_one(cli, coin):
     assert result["success"]["low"] < 0.5 < result["success"]["high"]
     assert result["length"]["mean"] == pytest.approx(1 + 99 * rate)
     assert result["return"]["mean"] == result["length"]["mean"]
-    assert result["terminations"] == {"time_out": rate, "task": 1 - rate}
+    shares = {name: share["rate"] for name, share in result["terminations"].items()}
+    assert shares == {"time_out": rate, "task": 1 - rate}
 
 
 @pytest.mark.parametrize(("chance", "rate"), [("0.0", 1.0), ("1.0", 0.0)])
@@ -69,6 +70,9 @@ def test_evaluation_repeats_with_its_seed(cli):
         (("success=0.99",), ["success"]),
         (("return=1", "length=1000"), ["length"]),
         (("success=0.99", "return=1000", "length=1000"), ["success", "return", "length"]),
+        (("success.low=0.2", "terminations.time_out=0.3", "terminations.time_out.low=0.2"), []),
+        (("success.low=0.5", "return.low=60"), ["success.low", "return.low"]),
+        (("terminations.task=0.9", "terminations.task.low=0.5"), ["terminations.task", "terminations.task.low"]),
     ],
 )
 def test_falling_under_a_limit_is_a_negative_verdict(cli, coin, limits, failed):
@@ -81,12 +85,80 @@ def test_falling_under_a_limit_is_a_negative_verdict(cli, coin, limits, failed):
 
 
 @pytest.mark.parametrize(
-    "text", ["success", "success=", "succes=0.5", "success=high", "return=nan", "length=inf", "=1"]
+    "text",
+    [
+        "success",
+        "success=",
+        "succes=0.5",
+        "success=high",
+        "return=nan",
+        "length=inf",
+        "=1",
+        "success.high=1",
+        "reward=1",
+    ],
 )
 def test_a_malformed_limit_is_a_usage_error(cli, coin, text):
     done = cli("eval", coin, "--policy", "zero", "--fail-under", text)
     assert done.code == 2
     assert text in done.err
+
+
+def test_a_limit_of_a_term_that_there_is_not_names_those_that_there_are(cli, coin):
+    done = cli("eval", coin, "--policy", "zero", "--episodes", 2, "--fail-under", "terminations.time_ot=0.5")
+    assert done.code == 2
+    assert "no terminations.time_ot" in done.err
+    assert "did you mean 'time_out'" in done.err
+
+
+def test_every_number_has_an_interval_that_holds_it(cli, coin):
+    done = cli("eval", "cartpole", "--policy", "random", "--episodes", 12, "--num-envs", 4, "--json").json
+    for group in ("reward_terms", "terminations"):
+        for value in done[group].values():
+            assert value["low"] <= value.get("mean", value.get("rate")) <= value["high"]
+    assert done["terminations"]["time_out"]["low"] < done["terminations"]["time_out"]["high"]
+    assert done["reward_terms"]["pole_pos"]["low"] < done["reward_terms"]["pole_pos"]["high"]
+
+
+def test_one_episode_has_no_interval(cli, coin):
+    arguments = ("eval", coin, "--policy", "zero", "--episodes", 1)
+    assert cli(*arguments, "--json").json["return"]["low"] is None
+    done = cli(*arguments, "--fail-under", "return.low=0")
+    assert "unknown" in done.out
+    assert done.code == 9
+    assert "return.low is not known from one episode" in done.err
+
+
+def test_the_evaluation_of_a_checkpoint_stays_in_its_run(cli, trained):
+    from rlcli.rl.evaluations import read_evaluation
+    from rlcli.rl.run import open_run
+
+    said = cli("eval", "--checkpoint", trained, "--episodes", 4, "--json").json
+    kept = read_evaluation(open_run(trained), "000000000128")
+    assert kept == {key: value for key, value in said.items() if key in kept}
+    assert kept["command"] == "eval"
+    assert kept["return"] == said["return"]
+    assert read_evaluation(open_run(trained), "000000000000") is None
+    cli("eval", "--checkpoint", trained, "--episodes", 5)
+    assert read_evaluation(open_run(trained), "000000000128")["episodes"] == 5  # the newest counts
+
+
+@pytest.mark.parametrize(
+    "changed", [("episode_length_s=0.5",), ("--policy", "zero"), ("--stochastic",), ("--config", "more.yaml")]
+)
+def test_an_evaluation_of_something_else_than_was_trained_is_not_kept(cli, trained, changed):
+    Path("more.yaml").write_text("episode_length_s: 0.5\n")
+    assert cli("eval", "--checkpoint", trained, "--episodes", 2, *changed).code == 0
+    assert not (trained / "evaluations").exists()
+
+
+def test_an_evaluation_is_not_kept_where_a_run_leads_elsewhere(cli, trained, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (trained / "evaluations").symlink_to(tmp_path / "elsewhere")
+    done = cli("eval", "--checkpoint", trained, "--episodes", 2)
+    assert not list((tmp_path / "elsewhere").iterdir())
+    assert done.code in (0, 5)
+    assert "link" in done.err
 
 
 def test_a_task_without_success_has_none_and_cannot_be_judged_by_it(cli, coin):
@@ -109,7 +181,7 @@ def test_a_policy_that_is_not_trained_needs_no_checkpoint(cli, policy):
     assert done.code == 0
     assert done.json["checkpoint"] is None
     assert set(done.json["reward_terms"]) == {"alive", "terminating", "pole_pos", "cart_vel", "pole_vel"}
-    total = sum(done.json["reward_terms"].values())
+    total = sum(term["mean"] for term in done.json["reward_terms"].values())
     assert total == pytest.approx(done.json["return"]["mean"], rel=1e-4)
 
 

@@ -232,7 +232,7 @@ def test_a_learner_that_diverges_keeps_the_last_good_checkpoint(cli, only_run):
     done = cli("train", "cartpole", *SMALL, "agent.learning_rate=1e30")
     assert done.code == 6, done.err
     assert "not finite" in done.err
-    assert json.loads((only_run() / "run.json").read_text())["state"] == "failed"
+    assert json.loads((only_run() / "run.json").read_text())["state"] == "diverged"
     assert cli("eval", "--checkpoint", "latest", "--episodes", 4, "-q").code == 0
 
 

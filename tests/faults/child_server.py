@@ -13,6 +13,7 @@ from pathlib import Path
 
 WARM = (
     "rlcli.cli.train", "rlcli.cli.live", "rlcli.envs.managed", "rlcli.envs.direct", "rlcli.rl.sb3", "rlcli.rl.ppo",
+    "rlcli.rl.build", "rlcli.rl.conduct",
     "rlcli.rl.loggers", "rlcli.rl.saving", "rlcli.rl.train", "rlcli.rl.trials", "rlcli.rl.load",
     "torch.utils.tensorboard", "torch._dynamo", "rlcli.mdp", "rlcli_tasks.cartpole",
     "tensorboard.backend.event_processing.event_file_loader", "tensorboard.summary.writer.record_writer", "rich.live",

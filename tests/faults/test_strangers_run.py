@@ -86,7 +86,7 @@ def reading(run, good_run):
         "runs": ["runs"],
         "watch": ["watch", run],
         "plot": ["plot", run],
-        "report": ["report", run],
+        "report": ["report", run, "--no-eval", "--no-video"],
         "import sb3": ["import", "sb3", run],
         "import rsl-rl": ["import", "rsl-rl", run],
         "as a task": ["play", f"{run}/", "--policy", "zero"],

@@ -3,18 +3,22 @@
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
 import yaml
-from fenced import REPOSITORY, blocks, run_commands, success_rate, write_files
+from fenced import REPOSITORY, Block, blocks, run_commands, success_rate, write_files
 from worlds import CRITTER, CRITTER_TASK, build, edited, write
+from written_runs import learning, write_run
 
 import rlcli.errors
+from rlcli.rl.sweeps import PHYSICAL, SIGNALS
 from rlcli.testing import CHECKS, RULES
 
 DOCS = REPOSITORY / "docs"
 README = REPOSITORY / "README.md"
+EVALUATION = DOCS / "evaluation.md"
 
 
 @pytest.mark.slow
@@ -30,8 +34,41 @@ def test_the_recording_page_works_as_written(tmp_path):
 
 
 @pytest.mark.slow
+def test_the_page_on_evaluation_works_as_written(tmp_path):
+    train = Block("sh", None, "rlcli train cartpole --max-iterations 2 --logger none\n")
+    found = [replace(b, text=re.sub("(episodes) [0-9]+ --fail-under .*", r"\1 4", b.text)) for b in blocks(EVALUATION)]
+    output = run_commands([train, *found], tmp_path)
+    assert "P(IMPROVEMENT)" in output
+    assert "LQR SUCCESS" in output
+    assert (tmp_path / "map.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_page_on_evaluation_names_every_parameter():
+    text = EVALUATION.read_text(encoding="utf-8")
+    assert all(f"`{name}`" in text for name in (*PHYSICAL, *SIGNALS))
+
+
+@pytest.mark.slow
 def test_the_page_on_determinism_works_as_written(tmp_path):
     assert run_commands(blocks(DOCS / "determinism.md"), tmp_path).count("no difference") == 2
+
+
+@pytest.mark.slow
+def test_the_page_on_plots_and_reports_works_as_written(tmp_path):
+    for seed in (1, 2):
+        write_run(tmp_path / "runs", seed=seed, rows=learning())
+    page = DOCS / "plots-and-reports.md"
+    output = run_commands(blocks(page, "## Learning curves", "## A run as a page"), tmp_path)
+    output += run_commands(blocks(page, "## A run as a page", "## The card"), tmp_path)
+    for file in ("curves.svg", "curves.png", "losses.pdf", "cartpole.html"):
+        assert file in output
+        assert (tmp_path / file).stat().st_size > 5_000
+
+
+def test_the_card_of_the_page_is_printed(capsys):
+    (block,) = blocks(DOCS / "plots-and-reports.md", "## The card of a task")
+    exec(compile(block.text, "plots-and-reports.md", "exec"), {})
+    assert "| `pole_pos` | -1 | Squared joint deviation" in capsys.readouterr().out
 
 
 @pytest.mark.slow

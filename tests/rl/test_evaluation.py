@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from rlcli.errors import ConfigError
-from rlcli.rl.rollout import evaluate, proportion, random_policy, zero_policy
+from rlcli.rl.rollout import evaluate, random_policy, zero_policy
 from rlcli.rl.statistics import EpisodeStatistics
 
 
@@ -26,32 +26,19 @@ def test_exactly_as_many_episodes_as_asked_the_first_of_each_environment(make, s
 def test_causes_are_shares_of_the_episodes(make, scheduled):
     env, _ = make(scheduled)
     summary = evaluate(env, zero_policy(env), 8).summary()
-    assert summary["terminations"] == {"time_out": 0.5, "task": 0.75}
+    shares = {name: share["rate"] for name, share in summary["terminations"].items()}
+    assert shares == {"time_out": 0.5, "task": 0.75}
     assert summary["length"]["mean"] == pytest.approx(9 / 4)
     assert "success" not in summary
 
 
-@pytest.mark.parametrize(
-    ("hits", "count", "low", "high"),
-    [
-        # Newcombe 1998, "Two-sided confidence intervals for the single proportion", table I, method 3
-        (81, 263, 0.2553, 0.3662),
-        (15, 148, 0.0624, 0.1605),
-        (0, 20, 0.0, 0.1611),
-        (1, 29, 0.0061, 0.1718),
-    ],
-)
-def test_the_interval_of_a_share_is_wilsons(hits, count, low, high):
-    interval = proportion(hits, count)
-    assert interval["rate"] == hits / count
-    assert interval["low"] == pytest.approx(low, abs=5e-5)
-    assert interval["high"] == pytest.approx(high, abs=5e-5)
-
-
-def test_the_interval_of_certainty_ends_at_one():
-    assert proportion(20, 20)["high"] == 1.0
-    assert proportion(0, 20)["low"] == 0.0
-    assert proportion(20, 20)["low"] == pytest.approx(1 - 0.1611, abs=5e-5)
+def test_groups_of_environments_run_as_many_episodes_each_and_are_told_apart(make, scheduled):
+    env, _ = make(scheduled, "scene.num_envs=8")
+    result = evaluate(env, zero_policy(env), 6, groups=2)
+    alone = evaluate(make(scheduled)[0], zero_policy(make(scheduled)[0]), 6)
+    assert result.part(0, 4).by_life().lengths == alone.by_life().lengths == [2, 2, 3, 3, 3, 1]
+    assert result.part(4, 8).envs == result.part(0, 4).envs
+    assert result.part(4, 8).summary()["episodes"] == 6
 
 
 def test_episodes_that_never_end_are_a_configuration_error(make):

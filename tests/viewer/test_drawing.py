@@ -66,7 +66,9 @@ def test_drawing_switched_off_is_a_machine_error(monkeypatch):
 
 def test_no_gl_at_all_says_what_was_tried_and_what_to_install():
     code = (
-        "import sys; sys.modules['mujoco.egl'] = None; sys.modules['mujoco.osmesa'] = None\n"
+        "import sys\nclass Hidden:\n    def find_spec(name, *_):\n"
+        "        if name in ('mujoco.egl', 'mujoco.osmesa'): raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Hidden)\n"
         "from rlcli.errors import MachineError\nfrom rlcli.viewer.gl import open_context\n"
         "try: open_context(64, 48)\nexcept MachineError as e: print(e.message, '|', e.hint)"
     )

@@ -1,0 +1,105 @@
+"""Videos of a training: now and then one episode of the policy as it is, in an environment of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rlcli.rl.rng import seed_generators, undisturbed
+from rlcli.rl.rollout import acting, evaluate
+from rlcli.viewer.video import Renderer
+from rlcli.viewer.writer import VideoWriter
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rlcli.envs.vec_env import StepResult, VecEnv
+    from rlcli.rl.policy import Policy
+
+
+class Abandoned(Exception):
+    """Somebody asks training to stop, and the clip is not waited for."""
+
+
+class Clips:
+    """Films the deterministic policy every so many iterations, always in the same episode; training does not notice.
+
+    Between clips there is nothing but the idle environment: the OpenGL context is freed.
+
+    Args:
+        make_env: builds an environment of one world, at the first clip.
+        folder: where `STEP.mp4` goes.
+        interval: iterations between clips.
+        tell: hears of a clip that failed; training goes on.
+        stopping: whether somebody asks training to stop.
+    """
+
+    def __init__(
+        self,
+        make_env: Callable[[], VecEnv],
+        folder: Path,
+        interval: int,
+        tell: Callable[[str], None],
+        stopping: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._make_env, self._folder, self._interval = make_env, folder, interval
+        self._tell, self._stopping = tell, stopping
+        self._env: VecEnv | None = None
+        self._said: set[str] = set()
+
+    def due(self, iteration: int) -> bool:
+        """Whether there is a clip of the policy after this iteration."""
+        return iteration % self._interval == 0
+
+    def record(self, policy: Callable[[], Policy], step: int) -> Path | None:
+        """Write a clip of the policy that is made for it; None if that failed."""
+        file = self._folder / f"{step:012d}.mp4"
+        try:
+            with undisturbed():
+                if self._env is None:
+                    seed_generators(0)  # whenever it is built, of tasks that draw as they are
+                    self._env = self._make_env()
+                    self._env.before_step = self._go_on
+                seed_generators(self._env.seed)
+                film(self._env, policy(), file)
+        except Abandoned:
+            return None
+        except Exception as error:  # a full disk, a driver, an encoder, a task's own code
+            said = f"no clip {file.name}: {' '.join(str(error).split()) or type(error).__name__}; training goes on"
+            if type(error).__name__ not in self._said:
+                self._tell(said)
+            self._said.add(type(error).__name__)
+            return None
+        return file
+
+    def close(self) -> None:
+        """Let go of the environment."""
+        if self._env is not None:
+            self._env.close()
+
+    def _go_on(self) -> None:
+        if self._stopping():
+            raise Abandoned
+
+
+def film(env: VecEnv, policy: Policy, file: Path) -> int:
+    """One episode of an environment's first world as a video: a picture of each state that the policy acts in.
+
+    Returns the number of pictures.
+    """
+    stride = max(1, env.config.sim.render_interval // env.config.decimation)
+    act, ended = acting(env, policy), False
+    with Renderer(env.engine.model, env.config.viewer) as renderer, VideoWriter(file, stride * env.step_dt) as writer:
+
+        def draw(obs: Tensor) -> Tensor:
+            if not ended and int(env.episode_length_buf[0]) % stride == 0:
+                writer.add(renderer.draw(*env.world(0), env.origins[0].tolist()))
+            return act(obs)
+
+        def note_end(step: StepResult) -> None:
+            nonlocal ended
+            ended = ended or bool(step.terminated[0] | step.truncated[0])
+
+        evaluate(env, draw, env.num_envs, note_end)
+    return writer.frames

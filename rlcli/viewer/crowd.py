@@ -1,0 +1,87 @@
+"""Several environments in one picture: the others stand beside the one shown, on the grid of `env_spacing`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rlcli.envs.vec_env import VecEnv, grid
+
+_GROUND = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+_MOVING = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
+_FIXED = int(mujoco.mjtCatBit.mjCAT_STATIC)
+_FIELDS = [name for name in dir(mujoco.MjvGeom) if not name.startswith("_")]
+
+
+@dataclass(frozen=True, slots=True)
+class Crowd:
+    """Which environments are drawn, and where.
+
+    Args:
+        env: the environments.
+        count: how many are in the picture; the one shown is the first of them.
+    """
+
+    env: VecEnv
+    count: int
+
+    def others(self, shown: int) -> list[int]:
+        """The environments beside the one shown."""
+        return [(shown + place) % self.env.num_envs for place in range(1, self.count)]
+
+    def offsets(self) -> NDArray[np.float64]:
+        """How far each is moved from where it is in its world: on terrain, which all share, by 0. (count, 3) [m]"""
+        if self.env.terrain is not None:
+            return np.zeros((self.count, 3))
+        places = grid(self.count, self.env.config.scene.env_spacing).double().numpy()
+        return np.subtract(places, places[0])
+
+    def stand_back(self, camera: mujoco.MjvCamera, shown: int = 0) -> mujoco.MjvCamera:
+        """A camera that looks at the one shown, moved so that it has all in the picture."""
+        places = self.offsets()
+        if self.env.terrain is not None:
+            starts = self.env.origins.double().cpu().numpy()
+            places = starts[[shown, *self.others(shown)]] - starts[shown]
+        low, high = places.min(axis=0), places.max(axis=0)
+        camera.lookat[:] += (low + high) / 2.0
+        camera.distance += 1.2 * float((high - low).max())
+        return camera
+
+    def add(self, scene: mujoco.MjvScene, shown: int, option: mujoco.MjvOption) -> None:
+        """Append the others to a scene that holds the one shown; the ground is there already."""
+        category = _MOVING if self.env.terrain is not None else _MOVING | _FIXED
+        for number, offset in zip(self.others(shown), self.offsets()[1:], strict=True):
+            model, data = self.env.world(number)
+            begin = scene.ngeom
+            mujoco.mjv_addGeoms(model, data, option, mujoco.MjvPerturb(), category, scene)
+            for place in range(scene.ngeom - 1, begin - 1, -1):
+                geom = scene.geoms[place]
+                if geom.type in _GROUND:
+                    scene.ngeom -= 1
+                    _copy(scene.geoms[scene.ngeom], geom)
+                else:
+                    geom.pos[:] += offset
+
+    def geoms(self, shown: int, option: mujoco.MjvOption, most: int) -> Iterator[mujoco.MjvGeom]:
+        """The geoms of the others, each a copy of its own, as many as allowed."""
+        if self.count == 1:
+            return
+        scene = mujoco.MjvScene(self.env.engine.model, maxgeom=most)
+        self.add(scene, shown, option)
+        for source in scene.geoms[: scene.ngeom]:
+            geom = mujoco.MjvGeom()
+            _copy(source, geom)
+            yield geom
+
+
+def _copy(source: mujoco.MjvGeom, target: mujoco.MjvGeom) -> None:
+    for name in _FIELDS:
+        value = getattr(source, name)
+        if isinstance(value, np.ndarray):
+            getattr(target, name)[:] = value
+        else:
+            setattr(target, name, value)

@@ -1,0 +1,18 @@
+"""A trained cartpole, for those tests that need one."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def cartpole_run(tmp_path_factory):
+    """The folder of a run that balances, with its earlier checkpoints."""
+    runs = tmp_path_factory.mktemp("runs")
+    words = ["train", "cartpole", "--runs-dir", str(runs), "--logger", "none", "-q", "agent.save_interval=10"]
+    variables = {**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+    subprocess.run([sys.executable, "-m", "rlcli", *words], check=True, env=variables, stdout=subprocess.DEVNULL)
+    (folder,) = runs.glob("*/*")
+    return folder

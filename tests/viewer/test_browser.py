@@ -1,0 +1,108 @@
+"""`play --viewer web` in a real browser: a trained cartpole is seen to move, is paused, and changes its policy."""
+
+import io
+import re
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from chromium import CHROMIUM, FLAGS
+from viewer_process import Playing
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(900),
+    pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine"),
+]
+SCENE = {"x": 215, "y": 30, "width": 425, "height": 330}
+"""The part of the page that shows the simulation alone. [pixels]"""
+PATIENCE = 240.0
+"""How long a page that is drawn without a GPU may take to show something new [s]."""
+
+
+@contextmanager
+def page_of(url):
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        try:
+            page = browser.new_page(viewport={"width": 640, "height": 400})
+            page.requested = []
+            page.on("request", lambda request: page.requested.append(request.url))
+            page.goto(url)
+            yield page
+        finally:
+            browser.close()
+
+
+def picture(page):
+    from PIL import Image
+
+    shot = page.screenshot(clip=SCENE, timeout=120_000)
+    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
+
+
+def until(what, condition):
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, f"not seen: {what}"
+
+
+def press(page, key):
+    """A key that stays down for some frames."""
+    page.keyboard.down(key)
+    time.sleep(1.5)
+    page.keyboard.up(key)
+
+
+def differ(one, other):
+    """More than what the renderer's dithering does."""
+    return np.abs(one - other).max() > 20
+
+
+def moves(page):
+    first = picture(page)
+    time.sleep(1.0)
+    return differ(first, picture(page))
+
+
+def stands_still(page):
+    """For longer than an episode, at whose end a cart stands elsewhere."""
+    pictures = [picture(page)]
+    for _ in range(4):
+        time.sleep(2.0)
+        pictures.append(picture(page))
+    return not any(differ(pictures[0], other) for other in pictures[1:])
+
+
+def pole(page):
+    """Pixels of the pole, which is orange."""
+    seen = picture(page)
+    return (seen[..., 0] > 90) & (seen[..., 0] - seen[..., 2] > 60)
+
+
+def test_a_trained_cartpole_moves_is_paused_and_changes_its_policy(cartpole_run):
+    with Playing("--checkpoint", cartpole_run, "--viewer", "web", "--port", 0) as playing:
+        with page_of(playing.url) as page:
+            until("the pole", lambda: pole(page).sum() > 20)
+            assert picture(page).std() > 5
+            until("a movement", lambda: moves(page))
+
+            press(page, "Space")
+            until("a pause", lambda: stands_still(page))
+
+            press(page, "PageDown")
+            steps = sorted(int(folder.name) for folder in (cartpole_run / "checkpoints").glob("0*"))
+            until("another policy", lambda: f"now playing step {steps[-2]}" in playing.err)
+            assert stands_still(page)
+            press(page, "Space")
+            until("a movement again", lambda: moves(page))
+
+            hosts = {re.match(r"\w+://([^/]+)/", url)[1] for url in page.requested if not url.startswith("blob:")}
+            assert hosts == {playing.host}
+        assert playing.interrupt() == 130
+    assert playing.out == ""
+    assert "Traceback" not in playing.err
+    assert not playing.answers()
