@@ -47,7 +47,7 @@ class Logger(Protocol):
         ...
 
     def close(self, state: str = "finished") -> None:
-        """Flush and let go of a run that is finished, stopped or failed."""
+        """Flush and let go of a run that is finished, stopped, diverged or failed."""
         ...
 
 

@@ -42,7 +42,7 @@ class Tracker(Protocol):
         ...
 
     def close(self, state: str) -> None:
-        """Let go of a run that is finished, stopped or failed."""
+        """Let go of a run that is finished, stopped, diverged or failed."""
         ...
 
 

@@ -167,7 +167,7 @@ def test_the_state_of_a_stopped_training_reaches_the_tracker(capfd):
     run = train(
         "a", "--agent", "sb3-ppo", "agent.learning_rate=1e30", "--max-iterations", "3", "--logger", "notebook", code=6
     )
-    assert notes(run)[-1] == {"closed": "failed"}
+    assert notes(run)[-1] == {"closed": "diverged"}
 
 
 def test_training_does_not_wait_for_a_slow_tracker_but_its_end_does():
