@@ -218,6 +218,8 @@ class VecEnv(ABC):
         """Called before anything is done in a step, which it may prevent by raising."""
         self.after_physics: Callable[[], None] | None = None
         """Called in every step with the state that it is judged by, before anything ends or begins."""
+        self.instead_of_physics: Callable[[], None] | None = None
+        """Called to step the simulations in the engine's place; it leaves their states and derived fields there."""
         self.on_divergence: list[Callable[[list[Divergence], bool], None]] = []
         """Called where simulations have diverged, as `engine.trace` still shows them, with the first of them and
         whether their next call of the engine is the one that goes wrong: then an event or a reset wrote the state."""
@@ -376,6 +378,11 @@ class VecEnv(ABC):
     def calls_per_step(self) -> int:
         """Calls of the engine in an environment step: one, or one a physics step where actuator models act between."""
         return self.config.decimation if self._actuators else 1
+
+    def compute_efforts(self) -> None:
+        """Let the actuator models write the controls of the coming physics step."""
+        for actuator in self._actuators.values():
+            actuator.compute()
 
     def carried(self) -> list[str]:
         """What makes an episode depend on those before it, by its place in the configuration; empty: nothing known."""
@@ -556,12 +563,13 @@ class VecEnv(ABC):
 
     def _simulate(self) -> Tensor | None:
         start = time.perf_counter()
-        if not self._actuators:
+        if self.instead_of_physics is not None:
+            self.instead_of_physics()
+        elif not self._actuators:
             self.engine.step(self.config.decimation)
         else:
             for left in reversed(range(self.config.decimation)):
-                for actuator in self._actuators.values():
-                    actuator.compute()
+                self.compute_efforts()
                 self.engine.step(1, derive=left == 0)
         self.seconds["physics"] += time.perf_counter() - start
         diverged = self.engine.diverged()
@@ -780,6 +788,8 @@ class VecEnv(ABC):
                 root = entity.data.default_root_state[:1].double().cpu()
                 local = rotate_inverse(root[:, 3:7], root[:, 10:])  # a free joint's is in the body's frame
                 qvel[dof : dof + 6] = torch.cat([root[:, 7:10], local], dim=1)[0]
+        self.default_state = {"qpos": qpos, "qvel": qvel}
+        """What episodes start from, but for what resets draw. (nq,), (nv,)"""
         self.engine.set_default(qpos, qvel)
         self.engine.reset(self._everyone())
         self.sim.refresh()

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rlcli.config.dump import to_data
+from rlcli.envs.deployment import describe
 from rlcli.envs.vec_env import make_env
 from rlcli.errors import DivergedError, RlcliError, Stopped
 from rlcli.random import derive
@@ -63,6 +64,7 @@ def conduct(job: Job, trainer: Trainer, env: Any, stop: StopRequest, view: View,
         **{key: run.record[key] for key in ("task", "agent", "seed")},
         "trainer": agent.trainer,
         "layout": env.layout.record(),
+        "deployment": describe(env),
         "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
     }
     keep = Keep() if job.stages else Keep.of(agent.keep_last, agent.keep_every, agent.save_interval)

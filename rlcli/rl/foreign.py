@@ -21,6 +21,7 @@ from torch import Tensor
 
 from rlcli.errors import CheckpointError
 from rlcli.machine import memory
+from rlcli.rl.optimizers import below
 from rlcli.rl.policy import blank_policy, filled
 from rlcli.rl.reading import read_file
 
@@ -126,13 +127,13 @@ def read_rsl_rl(file: Path, *, activation: str | None = None, action_bound: floa
     actor = saved.get("actor_state_dict")
     if actor is not None:  # version 5
         weights, critic = _named_tensors(actor, where), _named_tensors(saved.get("critic_state_dict", {}), where)
-        hidden, memory_of, stats = "mlp.", "rnn.rnn.", _below(weights, "obs_normalizer.")
+        hidden, memory_of, stats = "mlp.", "rnn.rnn.", below(weights, "obs_normalizer.")
         std = {"std": "distribution.std_param", "log_std": "distribution.log_std_param"}
     else:  # versions 2 to 4
         weights = _named_tensors(saved.get("model_state_dict"), where)
         critic = {name: value for name, value in weights.items() if name.startswith(("critic", "memory_c"))}
         hidden, memory_of = "actor.", "memory_a.rnn."
-        stats = _below(weights, "actor_obs_normalizer.")
+        stats = below(weights, "actor_obs_normalizer.")
         if not stats and "obs_norm_state_dict" in saved:
             stats = _named_tensors(saved["obs_norm_state_dict"], where)
         std = {"std": "std", "log_std": "log_std"}
@@ -166,6 +167,7 @@ def as_run(foreign: Foreign, resolved: Resolved, record: Mapping[str, Any], runs
         MachineError: if the disk refuses.
     """
     from rlcli.config.dump import to_data, to_yaml
+    from rlcli.envs.deployment import describe
     from rlcli.envs.vec_env import make_env
     from rlcli.rl.environment import environment_record
     from rlcli.rl.run import create_run
@@ -175,7 +177,7 @@ def as_run(foreign: Foreign, resolved: Resolved, record: Mapping[str, Any], runs
     task = resolved.task
     one = task.model_copy(update={"scene": task.scene.model_copy(update={"num_envs": 1})})
     env = make_env(replace(resolved, task=one), seed=0)
-    layout = env.layout
+    layout, deployment = env.layout, describe(env)
     env.close()
     sizes = {"observation_size": layout.size("policy"), "action_size": layout.action_size}
     differing = [(key, str(foreign.spec[key]), str(size)) for key, size in sizes.items() if foreign.spec[key] != size]
@@ -203,6 +205,7 @@ def as_run(foreign: Foreign, resolved: Resolved, record: Mapping[str, Any], runs
         "iteration": 0,
         "trainer": record["imported"]["form"],
         "layout": layout.record(),
+        "deployment": deployment,
         "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
     }
     values = {"policy": foreign.spec, "iteration": 0, "env_steps": 0}
@@ -461,10 +464,6 @@ def _whole(
     except CheckpointError as error:
         raise CheckpointError(f"{file} holds no policy that can be taken over: {error.message}") from None
     return Foreign(policy.spec.model_dump(), weights, critic, algorithm)
-
-
-def _below(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in weights.items() if name.startswith(prefix)}
 
 
 def _some(weights: Mapping[str, Tensor]) -> str:

@@ -23,6 +23,7 @@ from rlcli.rl.capture import captured
 from rlcli.rl.finite import LEARNER_HINT, moments, require_finite
 from rlcli.rl.fusion import fused, tensor_cores
 from rlcli.rl.networks import ActorCritic, ValueNormalizer, adam, flatten, remembered
+from rlcli.rl.optimizers import below
 from rlcli.rl.policy import Lstm, Normalizer, Policy
 from rlcli.rl.ppo_config import PpoConfig
 from rlcli.rl.ppo_loss import KL, METRICS, Judged, Parts, log_prob
@@ -555,9 +556,7 @@ class PpoTrainer:
         """Take a policy's weights, with its normaliser; the critic stays as it is."""
         self.networks.load_policy_tensors(policy)
         if self.normalizer is not None:
-            prefix = "normalizer."
-            saved = {name.removeprefix(prefix): value for name, value in policy.items() if name.startswith(prefix)}
-            self.normalizer.load_state_dict(saved)
+            self.normalizer.load_state_dict(below(policy, "normalizer."))
 
     def _policy_tensors(self) -> dict[str, Tensor]:
         tensors = {name: _copy(value) for name, value in self.networks.policy_tensors().items()}

@@ -17,6 +17,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DivergedError
 from rlcli.random import derive
 from rlcli.rl.finite import LEARNER_HINT, GradientWatch, moments, require_finite
+from rlcli.rl.optimizers import below, load_optimizer, optimizer_tensors
 from rlcli.rl.policy import ACTIVATIONS, Normalizer, Policy, PolicySpec
 from rlcli.rl.rng import load_rng_state, rng_state
 from rlcli.rl.sb3_algorithms import FastA2C, FastDDPG, FastPPO, FastSAC, FastTD3
@@ -33,7 +34,7 @@ from rlcli.rl.sb3_config import (
 )
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
-from rlcli.rl.trainer import Report, TrainerState, require_slots
+from rlcli.rl.trainer import Report, TrainerState
 from rlcli.sim.entity import is_finite
 from rlcli.sim.saved import require_alike
 
@@ -159,8 +160,7 @@ class Sb3Trainer:
         rest = {f"weights.{name}": value.clone() for name, value in weights.items() if name not in self._actor_names}
         rest["observations"] = self._recorded.clone()
         for name, optimizer in self._optimizers().items():
-            for index, slots in optimizer.state_dict()["state"].items():
-                rest.update({f"optimizer.{name}.{index}.{slot}": value.clone() for slot, value in slots.items()})
+            rest |= optimizer_tensors(optimizer, f"optimizer.{name}.")
         if getattr(self.model, "log_ent_coef", None) is not None:
             rest["log_ent_coef"] = self.model.log_ent_coef.detach().clone()
         tensors = {
@@ -190,7 +190,7 @@ class Sb3Trainer:
         require_alike(state.tensors["env"], {"episode_starts": torch.ones(self.env.num_envs, dtype=torch.bool)}, "env")
         self._load_weights(state.tensors["policy"], rest)
         for name, optimizer in self._optimizers().items():
-            _load_optimizer(optimizer, f"optimizer.{name}.", rest)
+            load_optimizer(optimizer, rest, f"optimizer.{name}.")
         if "log_ent_coef" in rest:
             self.model.log_ent_coef.data.copy_(rest["log_ent_coef"])
         self._recorded = rest.get("observations", self._recorded)
@@ -242,10 +242,7 @@ class Sb3Trainer:
         if not rest and hasattr(self.model, "actor_target"):
             self.model.actor_target.load_state_dict(self.model.actor.state_dict())
         if self.normalizer is not None:
-            prefix = "normalizer."
-            self.normalizer.load_state_dict(
-                {k.removeprefix(prefix): v for k, v in policy.items() if k.startswith(prefix)}
-            )
+            self.normalizer.load_state_dict(below(policy, "normalizer."))
 
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
         if isinstance(self.config, OnPolicyConfig):
@@ -455,13 +452,3 @@ def actor_names(algorithm: str, weights: Mapping[str, Tensor]) -> dict[str, str]
         elif name.startswith("actor.log_std."):
             names[name] = f"log_std_head.{name.removeprefix('actor.log_std.')}"
     return names
-
-
-def _load_optimizer(optimizer: torch.optim.Optimizer, prefix: str, tensors: Mapping[str, Tensor]) -> None:
-    state: dict[int, dict[str, Tensor]] = {}
-    for name, value in tensors.items():
-        if name.startswith(prefix):
-            index, slot = name.removeprefix(prefix).split(".")
-            state.setdefault(int(index), {})[slot] = value.clone()
-    require_slots(optimizer, state)
-    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

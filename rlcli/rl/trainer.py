@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
-    import torch
     from torch import Tensor
 
     from rlcli.rl.policy import Policy
@@ -42,41 +41,6 @@ class Report:
     seconds: dict[str, float]
     notes: list[str] = field(default_factory=list)
     """What the user should know, said once."""
-
-
-_SLOTS = {
-    "Adam": {"step", "exp_avg", "exp_avg_sq"},
-    "AdamW": {"step", "exp_avg", "exp_avg_sq"},
-    "RMSprop": {"step", "square_avg"},
-    "SGD": {"momentum_buffer"},
-}
-
-
-def require_slots(optimizer: torch.optim.Optimizer, state: Mapping[int, Mapping[str, Tensor]]) -> None:
-    """What an optimiser is given back must be what it steps with: it looks only when it steps.
-
-    Args:
-        optimizer: whose it is.
-        state: its state by the number of the parameter.
-
-    Raises:
-        ValueError: naming the first slot that is missing or of another shape.
-    """
-    owned = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    for number, slots in state.items():
-        if not 0 <= number < len(owned):
-            raise ValueError(f"trainer: the optimiser has no parameter {number}")
-        parameter = owned[number]
-        missing = _SLOTS.get(type(optimizer).__name__, set()) - set(slots)
-        if missing:
-            raise ValueError(f"trainer: the optimiser's state of parameter {number} has no {sorted(missing)[0]}")
-        for name, value in slots.items():
-            expected = () if name == "step" else tuple(parameter.shape)
-            if tuple(value.shape) != expected or not value.is_floating_point():
-                raise ValueError(
-                    f"trainer: the optimiser's {name} of parameter {number} is {value.dtype} {tuple(value.shape)},"
-                    f" expected {expected}"
-                )
 
 
 class Trainer(Protocol):

@@ -167,6 +167,13 @@ class BatchEngine:
         self._batch.state[env] = row
         self._batch.warning[env] = 0
 
+    def take(self, env: int, data: mujoco.MjData) -> None:
+        """Give a world the state of an MjData, and its derived fields."""
+        mujoco.mj_getState(self.model, data, self._batch.state[env], int(_STATE.mjSTATE_INTEGRATION))
+        for name, field in self._fields.items():
+            if name not in _NOT_DERIVED and hasattr(data, name):
+                field[env] = torch.from_numpy(np.array(getattr(data, name))).reshape(field[env].shape)
+
     def attach(self) -> None:
         """Nothing to do: calls return when their work is done."""
 

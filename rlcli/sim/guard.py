@@ -106,7 +106,7 @@ class History:
 
     def last(self, env: int) -> np.ndarray | None:
         """What the newest call began with, of one environment."""
-        if self.count == 0 or self._begin[env] == self.count:
+        if self._begin[env] == self.count:
             return None
         return self._ring[(self.count - 1) % self.calls, env]
 

@@ -21,10 +21,11 @@ from torch import Tensor
 from rlcli.envs.vec_env import StepResult, VecEnv
 from rlcli.errors import ConfigError, DependencyError, DivergedError
 from rlcli.random import derive
+from rlcli.rl.optimizers import below, load_optimizer, optimizer_tensors
 from rlcli.rl.policy import Policy, PolicySpec
 from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.statistics import EpisodeStatistics
-from rlcli.rl.trainer import Report, TrainerState, require_slots
+from rlcli.rl.trainer import Report, TrainerState
 from rlcli_rl_games.config import PpoConfig, RlGamesConfig, SacConfig
 
 NEEDED = "rl-games>=1.6,<1.7"
@@ -225,7 +226,7 @@ class RlGamesTrainer(ABC):
         for part, module in self._modules().items():
             rest |= {f"{part}.{name}": value.detach().clone() for name, value in module.state_dict().items()}
         for name, optimizer in self._optimizers().items():
-            rest |= _optimizer_tensors(optimizer, f"optimizer.{name}.")
+            rest |= optimizer_tensors(optimizer, f"optimizer.{name}.")
         values = {
             "policy": self.spec.model_dump(mode="json"),
             "iteration": self.iteration,
@@ -240,9 +241,9 @@ class RlGamesTrainer(ABC):
         """Go back to a boundary: the next iteration gives the same bits as it did then."""
         values, rest = state.values, state.tensors["trainer"]
         for part, module in self._modules().items():
-            module.load_state_dict(_below(rest, f"{part}."))
+            module.load_state_dict(below(rest, f"{part}."))
         for name, optimizer in self._optimizers().items():
-            _load_optimizer(optimizer, _below(rest, f"optimizer.{name}."))
+            load_optimizer(optimizer, rest, f"optimizer.{name}.")
         self.agent.dones = rest["dones"].clone()
         self.agent.epoch_num = values["epoch"]
         self.iteration, self.env_steps = values["iteration"], values["env_steps"]
@@ -575,27 +576,6 @@ def _nones(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: "None" if item is None and "activation" in key else _nones(item) for key, item in value.items()}
     return copy.deepcopy(value)
-
-
-def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-
-
-def _optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
-    return {
-        f"{prefix}{index}.{slot}": torch.as_tensor(value).clone()
-        for index, slots in optimizer.state_dict()["state"].items()
-        for slot, value in slots.items()
-    }
-
-
-def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    state: dict[int, dict[str, Tensor]] = {}
-    for name, value in tensors.items():
-        index, slot = name.split(".")
-        state.setdefault(int(index), {})[slot] = value.clone()
-    require_slots(optimizer, state)
-    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
 
 
 @contextlib.contextmanager

@@ -18,10 +18,11 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DependencyError, DivergedError
 from rlcli.random import derive
 from rlcli.registry import is_offered, load_object
+from rlcli.rl.optimizers import below, load_optimizer, optimizer_tensors
 from rlcli.rl.policy import Policy, PolicySpec
 from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.statistics import EpisodeStatistics
-from rlcli.rl.trainer import Report, TrainerState, require_slots
+from rlcli.rl.trainer import Report, TrainerState
 from rlcli_rsl_rl.config import RunnerConfig
 
 NEEDED = "rsl-rl-lib>=5.5,<6"
@@ -118,7 +119,7 @@ class RslRlTrainer:
         for part, module in self._modules().items():
             rest |= {f"{part}.{name}": value.detach().clone() for name, value in module.state_dict().items()}
         for name, optimizer in self._optimizers().items():
-            rest |= _optimizer_tensors(optimizer, f"optimizer.{name}.")
+            rest |= optimizer_tensors(optimizer, f"optimizer.{name}.")
         for part, network in (("actor", self.alg.actor), ("critic", self.alg.critic)):
             for index, memory in enumerate(network.get_hidden_state() or ()):
                 rest[f"memory.{part}.{index}"] = memory.detach().clone()
@@ -141,14 +142,14 @@ class RslRlTrainer:
         """Go back to a boundary: the next iteration gives the same bits as it did then."""
         values, rest = state.values, state.tensors["trainer"]
         for part, module in self._modules().items():
-            module.load_state_dict(_below(rest, f"{part}."))
+            module.load_state_dict(below(rest, f"{part}."))
         for name, optimizer in self._optimizers().items():
-            _load_optimizer(optimizer, _below(rest, f"optimizer.{name}."))
+            load_optimizer(optimizer, rest, f"optimizer.{name}.")
         self.alg.learning_rate = values["learning_rate"]
         for group in self.alg.optimizer.param_groups:
             group["lr"] = values["learning_rate"]
         for part, network in (("actor", self.alg.actor), ("critic", self.alg.critic)):
-            memory = _below(rest, f"memory.{part}.")
+            memory = below(rest, f"memory.{part}.")
             if memory:
                 network.reset(hidden_state=tuple(memory[str(index)].clone() for index in range(len(memory))))
         if self.alg.rnd:
@@ -398,26 +399,3 @@ def _mirror(env: VecEnv, reference: str) -> Any:
 
 def _problem(env: VecEnv, at: tuple[str, ...], message: str, hint: str) -> ConfigError:
     return ConfigError([env.resolved.problem(("agents", env.resolved.agent_name or "", *at), message, hint)])
-
-
-def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-
-
-def _optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
-    state = optimizer.state_dict()["state"]
-    return {
-        f"{prefix}{index}.{slot}": torch.as_tensor(value).clone()
-        for index, slots in state.items()
-        for slot, value in slots.items()
-        if value is not None
-    }
-
-
-def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    state: dict[int, dict[str, Tensor]] = {}
-    for name, value in tensors.items():
-        index, slot = name.split(".")
-        state.setdefault(int(index), {})[slot] = value.clone()
-    require_slots(optimizer, state)
-    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
