@@ -218,6 +218,10 @@ class DirectEnv(VecEnv):
                 found[f"Task/{name}"] = float(value)
         return found
 
+    def carried(self) -> list[str]:
+        """The task: its class may remember anything, and draw from anywhere."""
+        return [*super().carried(), f"the class {type(self.task).__name__}"]
+
     def _start_over(self) -> None:
         self._observed = False
 

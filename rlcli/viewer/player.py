@@ -7,6 +7,7 @@ was asked between two steps (`advance`), so that nothing is ever changed within 
 from __future__ import annotations
 
 import queue
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -23,7 +24,7 @@ from rlcli.rl.rollout import Act
 SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Multiples of real time."""
 _LAG = 0.25
-"""How far the simulation may fall behind before it stops to catch up [s of wall clock]."""
+"""How far the simulation may fall behind before it stops to catch up [s]."""
 
 
 class Shelf(Protocol):
@@ -70,7 +71,7 @@ class Player:
     """See the module.
 
     Args:
-        env: the environment; its episodes begin when the player is made.
+        env: the environment; its episodes begin when the player is made, unless they have `begun`.
         act: the policy.
         shelf: other policies, if there are.
         checkpoint: the step of the first policy.
@@ -86,6 +87,10 @@ class Player:
     speed: float = 1.0
     follow: bool = False
     """Play each new checkpoint as it appears."""
+    patience: float = 0.1
+    """How long steps may go on before a viewer is asked again what it wants [s]."""
+    begun: Tensor | None = None
+    """Observations of an environment that goes on from where it stands; None: its episodes begin now."""
     steps: int = 0
     message: str = ""
     _asked: queue.SimpleQueue[Callable[[], None]] = field(default_factory=queue.SimpleQueue)
@@ -102,7 +107,7 @@ class Player:
 
     def __post_init__(self) -> None:
         self._commands = _commands(self.env)
-        self._obs = self.env.reset(seed=self.env.seed)["policy"]
+        self._obs = self.env.reset(seed=self.env.seed)["policy"] if self.begun is None else self.begun
         self._reward = torch.zeros(self.env.num_envs)
         self.ended = torch.zeros(self.env.num_envs, dtype=torch.int64)
         self.reread()
@@ -137,10 +142,13 @@ class Player:
             self._due += min(elapsed, _LAG) * self.speed / self.env.step_dt
             count = int(self._due)
             self._due -= count
-        for _ in range(count):
+        end = time.perf_counter() + self.patience
+        done = 0
+        while done < count and (done == 0 or time.perf_counter() < end):
             self._step()
+            done += 1
         self._publish()
-        return count
+        return done
 
     def pause(self, paused: bool = True) -> None:
         """Pause: no step runs, and the environment says so. Or go on."""

@@ -25,8 +25,11 @@ PORT = 8080
 _FRAME = 1.0 / 60.0
 _REREAD = 1.0
 """How often the list of checkpoints is read again [s]."""
-_LOOKS = ("geom_", "body_pos", "body_quat", "body_ipos", "body_iquat", "site_", "mat_", "light_", "cam_", "mesh_")
-"""How the names of model fields begin that are seen."""
+_LOOKS = (
+    *("geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_type", "geom_dataid", "geom_matid", "mat_", "light_"),
+    *("site_size", "site_pos", "site_quat", "site_rgba", "body_pos", "body_quat", "jnt_pos", "jnt_axis", "qpos0"),
+)
+"""How the names of those model fields begin that a picture shows."""
 
 
 def run(player: Player, *, port: int, title: str, together: int = 1, ready: Callable[[str], None]) -> None:

@@ -28,7 +28,7 @@ def cartpole(num_envs=3):
 @pytest.fixture
 def player():
     env = cartpole()
-    return Player(env, zero_policy(env))
+    return Player(env, zero_policy(env), patience=60.0)
 
 
 @pytest.fixture
@@ -68,6 +68,14 @@ def test_faster_and_slower_stop_at_the_ends(player):
     for _ in range(20):
         player.faster(-1)
     assert player.speed == 1 / 8
+
+
+def test_a_slow_machine_answers_between_steps(counted):
+    player, steps = counted
+    player.patience = 0.0
+    player.set_speed(8.0)
+    assert player.advance(0.2) == 1
+    assert len(steps) == 1
 
 
 def test_a_long_gap_is_not_caught_up_with(counted):
