@@ -27,6 +27,7 @@ COMMANDS = {
     "stress": "stress",
     "export": "export",
     "replay": "replay",
+    "autopsy": "autopsy",
     "runs": "runs",
     "watch": "watch",
     "plot": "plot",

@@ -49,14 +49,14 @@ def compare(
 
     names = [word for word in words if "=" not in word]
     overrides = [word for word in words if "=" in word]
-    subjects = _find(names, overrides, stochastic, seed, config, runs_dir)
+    subjects = _find(names, overrides, stochastic, num_envs, seed, config, runs_dir)
     for name, subject in zip(names[1:], subjects[1:], strict=True):
         _require_same(names[0], subjects[0], name, subject)
     resolved = subjects[0].resolved
     require_success(resolved, limits)
-    from rlcli.rl.stress import run_points, with_envs
+    from rlcli.rl.stress import one_each, run_points
 
-    task = with_envs(resolved, num_envs or episodes)
+    task = one_each(resolved, episodes)
     found = [run_points(task, actor(subject), [], [None], episodes, seed)[0] for subject in subjects]
     summaries = [evaluation.summary() for evaluation in found]
     rows = [_compared(found[0], other) for other in found[1:]]
@@ -96,6 +96,7 @@ def _find(
     names: list[str],
     overrides: list[str],
     stochastic: bool,
+    num_envs: int | None,
     seed: int,
     config: Path | None,
     runs_dir: Path | None,
@@ -117,7 +118,7 @@ def _find(
             checkpoint=name,
             policy="trained",
             stochastic=stochastic,
-            num_envs=None,
+            num_envs=num_envs,
             seed=seed,
             config=config,
             runs_dir=runs_dir,

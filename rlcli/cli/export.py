@@ -1,9 +1,9 @@
-"""`rlcli export`: a trained policy as one file for a robot, checked against the policy it was made of."""
+"""`rlcli export`: a trained policy as one file for a robot, checked against the policy and, if asked, in MuJoCo."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -16,10 +16,15 @@ def command(
         str | None, typer.Argument(help="A task: its newest run is exported. Not needed with --checkpoint.")
     ] = None,
     checkpoint: CheckpointRef = None,
-    format_: Annotated[str, typer.Option("--format", help="onnx or torch (a torch.export program).")] = "onnx",
+    format_: Annotated[str, typer.Option("--format", help="onnx, torch (a torch.export program) or numpy.")] = "onnx",
     output: Annotated[
-        Path | None, typer.Option("--output", help="File to write; else RUN/exports/policy.onnx or .pt2.")
+        Path | None, typer.Option("--output", help="File to write; else RUN/exports/policy.onnx, .pt2 or .py.")
     ] = None,
+    verify: Annotated[
+        bool,
+        typer.Option("--verify", help="Let the file drive plain MuJoCo; writes the model and run_policy.py beside it."),
+    ] = False,
+    episodes: Annotated[int, typer.Option("--episodes", min=1, help="With --verify: how many to live through.")] = 64,
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
@@ -42,10 +47,22 @@ def command(
         require_own(Run(run), "exports")
         output = run / "exports" / f"policy{FORMATS[format_]}"
     console.info(f"checkpoint {folder} ({why})")
-    done = export(open_checkpoint(folder), output, format_)
+    saved, session = open_checkpoint(folder), None
+    if verify:
+        if run is None:
+            raise UsageError(f"{folder} lies outside a run", hint="--verify needs the run's configuration")
+        from rlcli.cli.closing import open_referee
+
+        session = open_referee(Run(run), saved, task)
+    done = export(saved, output, format_, None if session is None else session.deployment)
     console.info(
         f"equal to the policy on {done.observations} observations: difference {done.max_difference:.1e} at most"
     )
+    closed: dict[str, Any] = {}
+    if session is not None:
+        from rlcli.cli.closing import close
+
+        closed = close(session, saved, done.file, format_, episodes)
     console.data(str(done.file))
     console.document(
         "export",
@@ -56,7 +73,10 @@ def command(
         observations=done.observations,
         max_difference=done.max_difference,
         metadata=done.metadata,
+        verified=closed or None,
     )
+    if closed and not closed["passed"]:
+        raise typer.Exit(9)
 
 
 def _find(reference: str, runs_dir: Path, task: str | None) -> tuple[Path, Path | None, str]:

@@ -61,6 +61,13 @@ def command(
         typer.Option("--command", help="Hold commands of the task: vx=0.5,wz=0. A wrong name lists the right ones."),
     ] = None,
     stochastic: Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")] = False,
+    env: Annotated[
+        int | None,
+        typer.Option("--env", min=0, help="With --episode: one episode of this environment, as eval lives it."),
+    ] = None,
+    episode: Annotated[
+        int | None, typer.Option("--episode", min=0, help="Which of its episodes, counted from 0.")
+    ] = None,
     record: Record = None,
     record_mode: RecordMode = "all",
     num_envs: NumEnvs = None,
@@ -90,6 +97,10 @@ def command(
     if record is not None and commands:
         raise UsageError("--record with --command would write episodes that the task alone does not give again")
     check_record(record, record_mode)
+    if env is not None or episode is not None:
+        from rlcli.cli.one_episode import check_choice
+
+        check_choice(env, episode, num_envs, record_mode, commands)
     session = open_session(
         task,
         overrides or [],
@@ -100,7 +111,18 @@ def command(
         seed=draw_seed(seed),
         config=config,
         runs_dir=runs_dir,
+        at_least=1 if env is None else env + 1,
     )
+    if env is not None and episode is not None:
+        from rlcli.cli.one_episode import play_episode
+
+        video = _default_video(session) if video is not None and str(video) == CHOOSE else video
+
+        def watch() -> bool:
+            return show(session, viewers, port=port, together=together, stochastic=stochastic)
+
+        play_episode(session, env, episode, stochastic=stochastic, video=video, record=record, watch=watch)
+        return
     if together > session.env.num_envs:
         raise UsageError(
             f"--show {together}, and there are {session.env.num_envs} environments", hint=f"--num-envs {together}"

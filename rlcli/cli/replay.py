@@ -14,7 +14,10 @@ from rlcli.cli.options import CHOOSE, Debug, Json, Quiet
 
 def command(
     file: Annotated[
-        Path, typer.Argument(help="A recording, written by eval or play with --record, or the dump of a divergence.")
+        Path,
+        typer.Argument(
+            help="A recording, written by eval or play with --record, the dump of a divergence, or a case of autopsy."
+        ),
     ],
     episode: Annotated[
         int | None, typer.Option("--episode", min=0, help="Only this episode, counted from 0; else all.")
@@ -44,7 +47,10 @@ def command(
     named = None if task is None else named_task(task)
     if is_dump(file):
         if episode is not None or video is not None:
-            raise UsageError("a dump holds no episodes: --episode and --video are of recordings")
+            raise UsageError(
+                "a dump holds no whole episodes: --episode and --video are of recordings",
+                hint="rlcli autopsy RUN N --video FILE.mp4 draws a case of a run",
+            )
         _dump(file, named)
         return
     from rlcli.rl.recording import read_recording
@@ -90,9 +96,13 @@ def _dump(file: Path, named: Any) -> None:
     dump = read_dump(file)
     result = replay_dump(dump, named)
     document, difference = dump.document, result.difference
+    ending = document.ending
     for life in document.lives:
         where = result.where.get(life.env)
         console.data(f"environment {life.env}: {life.cause}{f' ({life.detail})' if life.detail else ''}")
+        if ending is not None and ending.kind != "diverged":
+            console.data(f"  the end of its episode {ending.episode}, by {', '.join(ending.causes) or 'nothing named'}")
+            continue
         console.data(f"  {where or 'a single world shows nothing: the cause lies outside of what is kept'}")
     said = {
         "file": str(file),
@@ -100,6 +110,7 @@ def _dump(file: Path, named: Any) -> None:
         "compared": result.compared,
         "equal": difference is None,
         "same_model": result.same_model,
+        "episode": None if ending is None else ending.episode,
         "environments": [
             {
                 "env": life.env,

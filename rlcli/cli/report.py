@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _FILE = "report.html"
 _EPISODES = 200
 _SEED = 42
+_LONGEST_S = 20.0
+"""Of an episode that is filmed for the page."""
 _LARGEST = 24 * 2**20
 """Of a video in the page [bytes]."""
 
@@ -195,9 +197,9 @@ def _filmed(run: Run, file: Path, stage: _Stage) -> bytes | None:
     from rlcli.viewer.clip import film
 
     try:
-        frames, fps, backend = film(session.env, session.act, file)
-    except OSError as error:
-        raise MachineError(f"cannot write {file}: {error.strerror or error}") from None
+        frames, fps, backend = film(session.env, session.act, file, longest_s=_LONGEST_S)
+    except (OSError, RuntimeError) as error:  # imageio's own, where there is no ffmpeg
+        raise MachineError(f"cannot write {file}: {getattr(error, 'strerror', None) or error}") from None
     console.info(f"{file}: {frames} frames, {fps:g} a second, drawn with {backend}")
     return _read(run, file)
 

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from rlcli.rl.overview import Overview
 
 _COLUMNS = [
-    "RUN", "STATE", "PROGRESS", "RETURN", "SUCCESS", "BEST", "AGE", "TRAINED", "SIZE", "AGENT", "SEED", "REMARK",
+    "RUN", "STATE", "PROGRESS", "RETURN", "SUCCESS", "BEST", "EVAL", "AGE", "TRAINED", "SIZE", "AGENT", "SEED",
+    "REMARK",
 ]  # fmt: skip
 _LONGEST = 60
 
@@ -55,7 +56,7 @@ def _row(run: Overview, place: Path) -> list[str]:
     folder = run.folder.relative_to(place) if run.folder.is_relative_to(place) else run.folder
     resumable = run.resumable and run.state in ("interrupted", "stopped", "diverged", "failed")
     if run.state == "broken":
-        return [str(folder), run.state, *["-"] * 6, size(run.size_bytes), "-", "-", _cut(run.reason or "")]
+        return [str(folder), run.state, *["-"] * 7, size(run.size_bytes), "-", "-", _cut(run.reason or "")]
     of = "?" if run.iterations is None else run.iterations
     return [
         str(folder),
@@ -64,6 +65,7 @@ def _row(run: Overview, place: Path) -> list[str]:
         _number(run.last.get("return")),
         _share(run.last.get("success")),
         _best(run.best),
+        _best(run.evaluation),
         "-" if run.age_s is None else age(run.age_s),
         "-" if run.duration_s is None else clock(run.duration_s),
         size(run.size_bytes),

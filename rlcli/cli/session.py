@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,8 @@ class Session:
     """One of POLICIES."""
     seed: int
     as_trained: bool
+    begun: tuple[int, Any] | None = None
+    """An environment to watch, and the observations of all where they stand; None: from the beginning."""
 
 
 def find_subject(
@@ -54,10 +57,11 @@ def find_subject(
     config: Path | None,
     runs_dir: Path | None,
     check: Callable[[Any], None] = lambda resolved: None,
+    at_least: int = 1,
 ) -> Subject:
     """Find and check; nothing heavy is imported.
 
-    `check` gets the configuration and may raise.
+    `check` gets the configuration and may raise; environments there are `at_least` so many.
     """
     from rlcli.config.load import resolve
     from rlcli.errors import UsageError
@@ -79,12 +83,15 @@ def find_subject(
         runs = runs_dir or default_runs_dir()
         run, folder, why = find_checkpoint(checkpoint or "latest", runs, name, tell=console.warn)
         console.info(f"checkpoint {folder} ({why})")
-        resolved = resolve_run(run, play=True, config_file=config, overrides=overrides, flags=values, named=named)
+        configure = partial(resolve_run, run, play=True, config_file=config, overrides=overrides, named=named)
         own = folder.resolve().parent == run.checkpoints.resolve()
         as_trained = own and policy == "trained" and not overrides and config is None
     else:
         assert task is not None
-        resolved = resolve(named_task(task), play=True, config_file=config, overrides=overrides, flags=values)
+        configure = partial(resolve, named_task(task), play=True, config_file=config, overrides=overrides)
+    resolved = configure(flags=values)
+    if resolved.task.scene.num_envs < at_least:
+        resolved = configure(flags={**values, "scene.num_envs": at_least})
     check(resolved)
     tell_notes(resolved)
     return Subject(resolved, run, folder, policy, stochastic, seed, as_trained)
@@ -102,10 +109,11 @@ def open_session(
     config: Path | None,
     runs_dir: Path | None,
     check: Callable[[Any], None] = lambda resolved: None,
+    at_least: int = 1,
 ) -> Session:
     """Find, check and build; heavy imports begin only when files and configuration are in order.
 
-    `check` gets the configuration and may raise.
+    `check` gets the configuration and may raise; environments there are `at_least` so many.
     """
     subject = find_subject(
         task,
@@ -118,6 +126,7 @@ def open_session(
         config=config,
         runs_dir=runs_dir,
         check=check,
+        at_least=at_least,
     )
     session = _build(subject)
     from rlcli.rl.dump import Watch

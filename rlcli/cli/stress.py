@@ -112,9 +112,9 @@ def command(
         check=lambda resolved: require_success(resolved, limits),
     )
     other = None if against is None else baseline(judged, against)
-    from rlcli.rl.stress import run_points, score, search, with_envs
+    from rlcli.rl.stress import one_each, run_points, score, search
 
-    task = judged.resolved if num_envs is not None else with_envs(judged.resolved, episodes)
+    task = one_each(judged.resolved, episodes)
 
     def run(who: Subject, at: list[Any]) -> list[Evaluation]:
         return run_points(task, actor(who), sweeps, at, episodes, judged.seed)

@@ -112,7 +112,8 @@ def _open(session: Any, name: str, reason: str, port: int | None, together: int,
     trained = run is not None and session.policy == "trained"
     shelf = RunShelf(run, env, stochastic, env.seed) if trained else None
     step = open_checkpoint(session.checkpoint).step if trained else None
-    player = Player(env, session.act, shelf, step, console.info)
+    shown, begun = session.begun or (0, None)
+    player = Player(env, session.act, shelf, step, console.info, shown=shown, begun=begun)
     task = session.resolved.source.name
     url = None
     if name == "native":

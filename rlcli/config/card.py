@@ -85,6 +85,7 @@ def card(
     tables = [
         *_observations(task, vocabulary, layout),
         _actions(task, vocabulary, layout),
+        _actuators(task),
         *_direct(task, source),
         _rewards(task, vocabulary),
         _terminations(task, vocabulary),
@@ -311,6 +312,22 @@ def _sensors(task: TaskConfig) -> Table:
         for name, sensor in task.scene.sensors.items()
     ]
     return Table("Sensors", "", (Column("Name", CODE), Column("Kind"), Column("Settings")), tuple(rows))
+
+
+def _actuators(task: TaskConfig) -> Table:
+    """The models of what drives joints; of MuJoCo's own actuators the MJCF tells."""
+    rows = [
+        (
+            name,
+            actuator.kind,
+            text_of(actuator.joints),
+            text_of(actuator.model_dump(exclude={"kind", "joints"}, exclude_none=True)),
+        )
+        for entity in task.scene.entities.values()
+        for name, actuator in entity.actuators.items()
+    ]
+    columns = (Column("Name", CODE), Column("Kind"), Column("Joints"), Column("Settings"))
+    return Table("Actuators", "", columns, tuple(rows))
 
 
 # --- direct tasks ---

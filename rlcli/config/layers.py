@@ -149,7 +149,7 @@ def marked(document: Document, name: str, layer: str, at: Path = ()) -> Callable
             full = full[:-1]
         if not document.marks:  # built in Python
             return Origin(layer, name)
-        line, column = document.marks.get(full, (1, 1))
+        line, column = document.marks[full]
         return Origin(layer, f"{name}:{line}:{column}")
 
     return origin

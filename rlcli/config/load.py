@@ -445,9 +445,8 @@ class _Check:
 
     def _unknown_term(self, section: str, path: Path, name: str) -> None:
         known = self.vocabulary.names(section)
-        hint = did_you_mean(name, known)
-        if hint is None and (other := self.vocabulary.other_section(section, name)):
-            hint = f"'{name}' is a term of {other}"
+        other = self.vocabulary.other_section(section, name)
+        hint = f"'{name}' is a term of {other}" if other else did_you_mean(name, known)
         what = section if section == "success" else section.removesuffix("s")
         self.problem(path, f"no {what} term '{name}'", hint or f"terms: {listing(known, 60)}")
 

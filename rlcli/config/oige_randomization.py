@@ -202,6 +202,10 @@ def _check_gate(
         if key in entry and entry[key] not in known:
             near = did_you_mean(str(entry[key]), known) or f"known: {listing(known)}"
             problem((*at, key), f"no {key} '{entry[key]}'", near)
+    for key, least in (("frequency_interval", 1), ("schedule_steps", 0)):
+        count = entry.get(key, least)
+        if isinstance(count, bool) or not isinstance(count, int | float) or count != int(count) or count < least:
+            problem((*at, key), f"expected a whole number >= {least}, found {count!r}", None)
     if entry["operation"] == "direct" and target[0] in ("observations", "actions"):
         problem((*at, "operation"), "noise is additive or scaling", None)
     _check_numbers((*at, "distribution_parameters"), entry, problem)

@@ -55,6 +55,7 @@ _HANDLED = (
     "minibatch_size",
 )  # fmt: skip
 _ACTIVATIONS = ("elu", "relu", "tanh", "silu")
+_MOST_LOG_STD = 20
 
 
 @dataclass(slots=True)
@@ -196,6 +197,9 @@ class _Translator:
             inner = (*at, "continuous", key)
             if key == "sigma_init":
                 log_std = value.get("val", 0) if isinstance(value, dict) else 0
+                if not isinstance(log_std, int | float) or abs(log_std) > _MOST_LOG_STD:
+                    self._problem(inner, f"val: expected a number between -{_MOST_LOG_STD} and {_MOST_LOG_STD}")
+                    continue
                 self._put(("init_std",), math.exp(log_std), inner)
                 self._note(inner, "mapped", "init_std")
             elif key == "fixed_sigma" and value is not True:
@@ -261,7 +265,7 @@ class _Translator:
         schedule = config.get("lr_schedule") or "constant"
         if str(schedule) == "None":
             schedule = "constant"
-        if schedule not in _SCHEDULES:
+        if not isinstance(schedule, str) or schedule not in _SCHEDULES:
             self._problem((*at, "lr_schedule"), f"no schedule '{schedule}'", f"known: {listing(_SCHEDULES)}")
             return
         self._put(("schedule",), _SCHEDULES[schedule], (*at, "lr_schedule"))

@@ -880,6 +880,17 @@ class TaskConfig(StrictModel):
         return math.ceil(self.episode_length_s / self.step_dt - 1e-6)
 
 
+class AutopsyConfig(StrictModel):
+    """What is kept, while training, of episodes that ended badly or unlike the others; `rlcli autopsy RUN` shows it."""
+
+    seconds: Annotated[float, Field(gt=0, le=60), _Fraction()] = 2.0
+    """How much of an episode's end [s]."""
+    keep: Annotated[int, Field(ge=1, le=1000)] = 32
+    """Episodes that stay: the newest, of every kind of end some."""
+    memory_mib: Annotated[int, Field(ge=1, le=1_000_000)] = 256
+    """What the last seconds of all environments may take [MiB]; where they do not fit, fewer seconds are kept."""
+
+
 class AgentConfig(StrictModel):
     """What every trainer's settings have in common; a trainer's own model extends it."""
 
@@ -904,6 +915,8 @@ class AgentConfig(StrictModel):
     null: none."""
     eval_episodes: Count = 100
     """Episodes of such an evaluation."""
+    autopsy: AutopsyConfig | None = AutopsyConfig()
+    """Ends of episodes that are kept while training on a CPU; null: none."""
     torch_threads: _Threads | None = None
     """Threads of the update; null: min(4, cores). Results are equal only for an equal number."""
     action_bound: Positive | None = 1.0

@@ -106,8 +106,6 @@ def _parse(text: str) -> tuple[Any, dict[Path, Mark]]:
     except yaml.reader.ReaderError as error:
         found = f"the character {chr(error.character)!r} is not allowed"
         raise YamlError(found, place=_after(text[: error.position])) from None
-    except RecursionError:
-        raise YamlError("nested too deeply") from None
 
 
 class _Reader:
@@ -178,8 +176,6 @@ class _Reader:
         path = (*frame.path, key)
         if key in frame.container:
             raise YamlError(f"duplicate key '{key}' (first on line {self.marks[path][0]})", mark)
-        assert isinstance(frame.container, dict)
-        frame.container[key] = None
         frame.key = key
         self.marks[path] = (mark.line + 1, mark.column + 1)
         return path
@@ -206,6 +202,6 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
         return number
     if _NOT_FINITE.match(text):
         raise YamlError(f"{text} is not allowed; write a number, or null for none", event.start_mark)
-    if text.lower() in _WORDS and not (key and text == "y"):  # x, y and z are names of parameters
+    if text.lower() in _WORDS:  # not y and n: x, y and z are names of parameters
         raise YamlError(f"{text} is ambiguous; write true or false, or quote it", event.start_mark)
     return text

@@ -109,6 +109,15 @@ class DirectTask:
         """Raise reset_buf where the task ended an episode; the framework adds the time-out."""
         raise NotImplementedError
 
+    def in_terms(self) -> dict[str, list[dict[str, Any]]] | None:
+        """The observation and the action in the vocabulary of `rlcli.mdp`, for exports that do without this code.
+
+        `observations` and `actions` are lists of terms as a YAML has them (`func`, its parameters, `scale`, `clip`),
+        side by side in the order of the columns, before `clip_observations` and after `clip_actions`. None: only this
+        class knows. `rlcli export --verify` finds out if they are not what the hooks compute.
+        """
+        return None
+
     def draws(self, env_ids: Tensor, name: str = "reset") -> IdSelection:
         """Random numbers for these environments' running episodes: `draws(ids).uniform(-1, 1, (k,))` is (n, k).
 
@@ -208,6 +217,10 @@ class DirectEnv(VecEnv):
             elif isinstance(value, int | float):
                 found[f"Task/{name}"] = float(value)
         return found
+
+    def carried(self) -> list[str]:
+        """The task: its class may remember anything, and draw from anywhere."""
+        return [*super().carried(), f"the class {type(self.task).__name__}"]
 
     def _start_over(self) -> None:
         self._observed = False

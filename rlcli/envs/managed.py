@@ -28,6 +28,8 @@ from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import ActuatorNeed, Scene
 from rlcli.sim.selection import Selection
 
+_STATELESS = ("functools", "rlcli.mdp.")
+"""Modules of terms that begin alike in every episode."""
 _UNIT = re.compile(r"\[([^\]]+)\]")
 """The unit in the first line of a term's docstring."""
 
@@ -91,6 +93,26 @@ class ManagedEnv(VecEnv):
         terms = [*bound, *(term for group in self._observations.values() for term in group)]
         return [term.instance for term in terms if not isinstance(term.instance, functools.partial)]
 
+    def carried(self) -> list[str]:
+        """Whatever draws by the clock of all episodes, remembers beyond a reset, or may: objects of a task's own."""
+        found = [*super().carried(), *(f"actuators.{name}" for name in self._actuators)]
+        found += [".".join(map(str, term.path)) for term in (*self._commands, *self._curriculum)]
+        for term in self._events:
+            config = term.config
+            throttled = config.mode == "reset" and config.min_steps_between  # type: ignore[attr-defined]
+            if config.mode == "interval" or throttled or hasattr(term.instance, "update"):  # type: ignore[attr-defined]
+                found.append(f"events.{term.name}")
+        for group, terms in self._observations.items():
+            for term in terms:
+                config = term.config
+                assert isinstance(config, ObservationConfig)
+                drawn = config.noise is not None or config.bias is not None or config.delay is not None
+                if (drawn and self.config.observations[group].enable_corruption) or config.modifiers:
+                    found.append(f"observations.{group}.{term.name}")
+        own = [term for term in self._parts().values() if isinstance(term, BoundTerm)]
+        found += [".".join(map(str, t.path)) for t in own if not type(t.instance).__module__.startswith(_STATELESS)]
+        return list(dict.fromkeys(found))
+
     def _watch(self) -> Watch | None:
         return self.engine.watch if self.engine.asynchronous else None
 
@@ -144,6 +166,14 @@ class ManagedEnv(VecEnv):
     def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         returns, terms = self.reward_manager.episode(ended)
         return returns, terms, self.termination_manager.causes(ended)
+
+    @property
+    def reward_names(self) -> list[str]:
+        """The terms of the reward."""
+        return [term.name for term in self.reward_manager.terms]
+
+    def _paid(self) -> Tensor:
+        return self.reward_manager.paid
 
     def _start_over(self) -> None:
         self.curriculum_manager.advance(self._steps)  # the clock may have been set back

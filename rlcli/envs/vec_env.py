@@ -98,6 +98,22 @@ class StepResult:
 
 
 @dataclass(frozen=True, slots=True)
+class Lived:
+    """What a step was, for whoever watches; tensors are the environment's own, to be copied at once."""
+
+    obs: Mapping[str, Tensor]
+    """Group -> observations that the action was taken for. (num_envs, d) float32"""
+    action: Tensor
+    """(num_envs, a) float32"""
+    reward: Tensor
+    """(num_envs,) float32"""
+    reward_terms: Tensor
+    """What each term of `reward_names` paid. (terms, num_envs) float32"""
+    episodes: Episodes | None
+    """The episodes that end; None if none does."""
+
+
+@dataclass(frozen=True, slots=True)
 class TermLayout:
     """Some columns of an observation group or of the action: where they come from."""
 
@@ -202,9 +218,14 @@ class VecEnv(ABC):
         """Called before anything is done in a step, which it may prevent by raising."""
         self.after_physics: Callable[[], None] | None = None
         """Called in every step with the state that it is judged by, before anything ends or begins."""
-        self.on_divergence: Callable[[list[Divergence], bool], None] | None = None
+        self.instead_of_physics: Callable[[], None] | None = None
+        """Called to step the simulations in the engine's place; it leaves their states and derived fields there."""
+        self.on_divergence: list[Callable[[list[Divergence], bool], None]] = []
         """Called where simulations have diverged, as `engine.trace` still shows them, with the first of them and
         whether their next call of the engine is the one that goes wrong: then an event or a reset wrote the state."""
+        self.on_lived: Callable[[Lived], None] | None = None
+        """Called in every step once it is judged, as the engine still shows it: before anything begins anew."""
+        self._seen: dict[str, Tensor] = {}
         self._written_causes: dict[str, int] = {}
         self._told_causes: dict[str, int] = {}
         self._playing = True
@@ -225,15 +246,20 @@ class VecEnv(ABC):
 
     # --- what callers use ---
 
-    def reset(self, seed: int | None = None) -> dict[str, Tensor]:
+    def reset(self, seed: int | None = None, *, episode: int = 0) -> dict[str, Tensor]:
         """Start a new episode everywhere. With a seed, the random streams start over as in a new environment.
+
+        Args:
+            seed: of every draw from now on; None: draws go on.
+            episode: with a seed, the number of the episode that begins; what `carried` names is not as it would be
+                after those before it.
 
         Returns:
             Group -> observations. (num_envs, d) float32
         """
         if seed is not None:
             self.seed = seed
-            self.episode_index.zero_()
+            self.episode_index.fill_(episode)
             self._steps.zero_()
             if self.terrain is not None:
                 self.terrain.start(seed)
@@ -245,7 +271,8 @@ class VecEnv(ABC):
         self._between()
         self.sim.settle()
         self._set_aside()
-        return self._observe()
+        self._seen = self._observe()
+        return self._seen
 
     def step(self, action: Tensor, begin: Tensor | None = None) -> StepResult:
         """Apply one action for `decimation` physics steps. action (num_envs, a) float32
@@ -294,6 +321,9 @@ class VecEnv(ABC):
             if self.final_obs_of == "finished" or self._maybe(truncated & ~terminated):
                 final_obs = self._final()
             episodes = self._episodes(ended, finished, terminated, truncated)
+        if self.on_lived is not None:
+            self.on_lived(Lived(self._seen, action, reward, self._paid(), episodes))
+        if ended is not None:
             self._conclude(ended)
             self._restart(ended)
         again = None if begin is None else self._select(begin)
@@ -302,7 +332,7 @@ class VecEnv(ABC):
         self._between()
         self.sim.settle()
         self._set_aside()
-        obs = self._observe()
+        obs = self._seen = self._observe()
         self.seconds["step"] += time.perf_counter() - start
         return StepResult(obs, reward, terminated, truncated, final_obs, episodes)
 
@@ -321,8 +351,8 @@ class VecEnv(ABC):
             DivergedError: as `step`, or because the device ran out of room for contacts.
         """
         noted = self.engine.noted()
-        if self.engine.asynchronous and self.on_divergence is not None and self.engine.found:
-            self.on_divergence(self.engine.found, False)
+        if self.engine.asynchronous and self.on_divergence and self.engine.found:
+            self._tell_divergence(self.engine.found, False)
         for what in noted:
             raise DivergedError(f"{what} is not finite, within the last steps before step {self.common_step}")
 
@@ -348,6 +378,20 @@ class VecEnv(ABC):
     def calls_per_step(self) -> int:
         """Calls of the engine in an environment step: one, or one a physics step where actuator models act between."""
         return self.config.decimation if self._actuators else 1
+
+    def compute_efforts(self) -> None:
+        """Let the actuator models write the controls of the coming physics step."""
+        for actuator in self._actuators.values():
+            actuator.compute()
+
+    def carried(self) -> list[str]:
+        """What makes an episode depend on those before it, by its place in the configuration; empty: nothing known."""
+        return ["scene.terrain"] if self.terrain is not None else []
+
+    @property
+    def reward_names(self) -> list[str]:
+        """The terms of the reward, in the order of `Lived.reward_terms`; none where the task pays one sum."""
+        return []
 
     def is_playing(self) -> bool:
         """False while paused; no step runs then."""
@@ -435,7 +479,8 @@ class VecEnv(ABC):
         for name, sensor in self.sensors.items():
             sensor.load_state_dict(_below(state, f"sensors.{name}."))
         self._load_workflow_state(_below(state, "workflow."))
-        return self._observe_again()
+        self._seen = self._observe_again()
+        return self._seen
 
     # --- the workflow's part ---
 
@@ -490,6 +535,10 @@ class VecEnv(ABC):
         """The task's own numbers to log."""
         return {}
 
+    def _paid(self) -> Tensor:
+        """What each term of the reward paid in the step. (terms, num_envs)"""
+        return torch.zeros(0, self.num_envs, device=self.device)
+
     def _conclude(self, ended: Selection) -> None:
         """Called with the environments whose episode ends, before anything of it is forgotten."""
 
@@ -514,18 +563,19 @@ class VecEnv(ABC):
 
     def _simulate(self) -> Tensor | None:
         start = time.perf_counter()
-        if not self._actuators:
+        if self.instead_of_physics is not None:
+            self.instead_of_physics()
+        elif not self._actuators:
             self.engine.step(self.config.decimation)
         else:
             for left in reversed(range(self.config.decimation)):
-                for actuator in self._actuators.values():
-                    actuator.compute()
+                self.compute_efforts()
                 self.engine.step(1, derive=left == 0)
         self.seconds["physics"] += time.perf_counter() - start
         diverged = self.engine.diverged()
         if not self.engine.asynchronous:
-            if diverged is not None and self.on_divergence is not None:
-                self.on_divergence(self.engine.found, False)
+            if diverged is not None:
+                self._tell_divergence(self.engine.found, False)
             if self._any_aside:
                 diverged = self._aside.clone() if diverged is None else diverged | self._aside
                 self._aside.zero_()
@@ -535,6 +585,10 @@ class VecEnv(ABC):
         self.sim.refresh()
         self.sim.keep()
         return diverged
+
+    def _tell_divergence(self, found: list[Divergence], pending: bool) -> None:
+        for told in list(self.on_divergence):  # a copy: who has heard enough leaves
+            told(found, pending)
 
     def _put_back(self, diverged: Tensor) -> None:
         """Return diverged worlds to their last finite state: they are judged by that, not by MuJoCo's own reset."""
@@ -566,8 +620,7 @@ class VecEnv(ABC):
         found = [self._written_badly(env) for env in bad.nonzero().flatten().tolist()]
         for divergence in found:
             self._written_causes[divergence.cause] = self._written_causes.get(divergence.cause, 0) + 1
-        if self.on_divergence is not None:
-            self.on_divergence(found[:SHOWN], True)
+        self._tell_divergence(found[:SHOWN], True)
         begun = bad & (self.episode_length_buf == 0)
         for rows, restore in ((bad & ~begun, True), (begun, False)):
             selection = self._select(rows)
@@ -735,6 +788,8 @@ class VecEnv(ABC):
                 root = entity.data.default_root_state[:1].double().cpu()
                 local = rotate_inverse(root[:, 3:7], root[:, 10:])  # a free joint's is in the body's frame
                 qvel[dof : dof + 6] = torch.cat([root[:, 7:10], local], dim=1)[0]
+        self.default_state = {"qpos": qpos, "qvel": qvel}
+        """What episodes start from, but for what resets draw. (nq,), (nv,)"""
         self.engine.set_default(qpos, qvel)
         self.engine.reset(self._everyone())
         self.sim.refresh()
@@ -789,4 +844,4 @@ def _below(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
-__all__ = ["Episodes", "Layout", "StepResult", "TermLayout", "VecEnv", "grid", "make_env"]
+__all__ = ["Episodes", "Layout", "Lived", "StepResult", "TermLayout", "VecEnv", "grid", "make_env"]

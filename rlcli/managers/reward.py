@@ -78,6 +78,11 @@ class RewardManager:
         """Take the step's terms into the sums of the running episodes."""
         self._sums += self._values
 
+    @property
+    def paid(self) -> Tensor:
+        """What each term paid in the last step, weight included, live. (terms, num_envs)"""
+        return self._values
+
     def values(self) -> dict[str, Tensor]:
         """Term -> what it paid in the last step, weight included; zeros where it is not called. (num_envs,) each"""
         return {term.name: row for term, row in zip(self.terms, self._rows, strict=True)}

@@ -43,6 +43,8 @@ class _JointAction:
         self.elements = tuple(entity.joint_names[c] for c in columns)
         self._drive = JointCommand(entity, self.actuator, columns)
         self.sinks = self._drive.sinks
+        self.actuators = self._drive.actuators
+        """MuJoCo's actuator behind each joint; None where an actuator model drives it."""
         self.size = len(columns)
         self._scale = self._by_joint(scale, 1.0, env)
         self._clip = self._bounds(clip, env)

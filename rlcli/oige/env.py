@@ -23,6 +23,8 @@ from rlcli.sim.scene import Scene
 from rlcli.sim.selection import Selection
 
 _MEASURED = ("get_measured_joint_forces", "get_force_sensor_forces", "get_net_contact_forces")
+_LIFTED = ("disable_gravities",)
+_NEXT_TO_NONE = 1e-30
 
 
 class OigeEnv(DirectEnv):
@@ -57,6 +59,8 @@ class OigeEnv(DirectEnv):
                     f"{task_class.__name__}.set_up_scene does not call RLTask's", hint="super().set_up_scene(scene)"
                 )
             self.stage.attach(scene, joint_forces=self._reads(_MEASURED))
+        if self._reads(_LIFTED):  # MuJoCo looks at any compensation only where the model has some
+            scene.spec.bodies[-1].gravcomp = scene.spec.bodies[-1].gravcomp or _NEXT_TO_NONE
         scene.add_motors()
         _ground(scene, config.oige.get("sim", {}).get("default_physics_material") or {})
 

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from rlcli.config.oige_randomization import Gate, gates
 from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
-from rlcli.oige.rotations import quat_from_euler_xyz, quat_mul
+from rlcli.oige.maths import normalize_angle
+from rlcli.oige.rotations import get_euler_xyz, quat_from_euler_xyz, quat_mul
 from rlcli.oige.views import ArticulationView, RigidPrimView
 from rlcli.random import stream
 from rlcli.sim.selection import IdSelection
@@ -240,13 +241,9 @@ class Randomizer:
     def _fire(self, gate: Gate, ids: Tensor, step: int | None) -> None:
         field = self._fields[gate.path]
         current = field.read(ids)
-        size = math.prod(current.shape[1:])
-        drawn = self._draw(gate, ids, step, size, tuple(current.shape[1:])).to(current.dtype)
-        if gate.operation == "additive":
-            drawn = field.add(current, drawn)
-        elif gate.operation == "scaling":
-            drawn = current * drawn
-        field.write(ids, drawn)
+        shape = tuple(current.shape[1:]) if field.change is _changed else (current.shape[1] // 4 * 3,)  # or angles
+        drawn = self._draw(gate, ids, step, math.prod(shape), shape).to(current.dtype)
+        field.write(ids, field.change(gate.operation, current, drawn))
 
     def _set_constants(self, fired: list[Gate]) -> None:
         if any(gate.path[-1] in _CONSTANTS for gate in fired):
@@ -300,10 +297,10 @@ class _Field:
         read: Callable[[Tensor], Tensor],
         write: Callable[[Tensor, Tensor], None],
         env: OigeEnv,
-        add: Callable[[Tensor, Tensor], Tensor] = torch.add,
+        change: Callable[[str, Tensor, Tensor], Tensor] | None = None,
         state: bool = False,
     ) -> None:
-        self.read, self.write, self.add = read, write, add
+        self.read, self.write, self.change = read, write, change or _changed
         everyone = torch.arange(env.num_envs, device=env.device)
         self._of_state = state
         self.first = torch.empty(0) if state else read(everyone).clone()
@@ -329,6 +326,21 @@ class _Field:
             self.first, self._started = self.base.clone(), True
 
 
+def _changed(operation: str, current: Tensor, drawn: Tensor) -> Tensor:
+    if operation == "additive":
+        return current + drawn
+    return current * drawn if operation == "scaling" else drawn
+
+
+def _turned(operation: str, current: Tensor, drawn: Tensor) -> Tensor:
+    """Orientations, changed by roll, pitch and yaw. (n, 4 k), (n, 3 k) -> (n, 4 k)"""
+    now, angles = current.reshape(-1, 4), drawn.reshape(-1, 3)
+    if operation == "scaling":
+        angles = angles * normalize_angle(torch.stack(get_euler_xyz(now), dim=1))
+    turn = quat_from_euler_xyz(angles[:, 0], angles[:, 1], angles[:, 2]).to(current.dtype)
+    return (quat_mul(turn, now) if operation == "additive" else turn).reshape(current.shape)
+
+
 _VIEW_STATE = (*_STATE, "joint_efforts", "force")
 
 
@@ -343,11 +355,6 @@ def _state_field(view: Any, attribute: str, env: OigeEnv) -> _Field:
 
     def grouped(values: Tensor, ids: Tensor) -> Tensor:
         return values.reshape(len(ids), -1)
-
-    def turned(current: Tensor, change: Tensor) -> Tensor:
-        angles = change.reshape(-1, 4)[:, :3] if change.shape[-1] % 4 == 0 else change.reshape(-1, 3)
-        by = quat_from_euler_xyz(angles[:, 0], angles[:, 1], angles[:, 2]).to(current.dtype)
-        return quat_mul(by, current.reshape(-1, 4)).reshape(current.shape)
 
     readers: dict[str, Callable[[Tensor], Tensor]] = {
         "position": lambda ids: grouped(view.get_world_poses(rows(ids))[0], ids),
@@ -371,8 +378,8 @@ def _state_field(view: Any, attribute: str, env: OigeEnv) -> _Field:
         "joint_efforts": lambda ids, v: view.set_joint_efforts(v, ids),
         "force": lambda ids, v: env.push_later(view, rows(ids), flat(v, 3)),
     }
-    add = turned if attribute == "orientation" else torch.add
-    return _Field(readers[attribute], writers[attribute], env, add, state=True)
+    change = _turned if attribute == "orientation" else _changed
+    return _Field(readers[attribute], writers[attribute], env, change, state=True)
 
 
 def _articulation_field(view: ArticulationView, attribute: str, env: OigeEnv) -> _Field:

@@ -320,6 +320,9 @@ class RigidPrimView(XFormPrimView):
         self._gravity(1.0, indices)
 
     def _gravity(self, compensation: float, indices: Any) -> None:
+        if not self.env.engine.model.ngravcomp:  # MuJoCo compensates in no body then
+            hint = "call disable_gravities in the file of the task's class"
+            raise TaskError(f"view '{self.name}': gravity cannot be lifted", hint=hint)
         field = self.env.engine.expand("body_gravcomp")
         for which, body in enumerate(self._bodies):
             rows, _ = self._rows_of(which, indices)
@@ -463,7 +466,11 @@ class ArticulationView(XFormPrimView):
         if len(self._bare):  # a drive holds the joint: an effort acts beside it
             field = self.env.engine.field("qfrc_applied")
             bare = self._dof_columns[self._bare]
-            field[rows[:, None], bare] = self._efforts[rows[:, None], self._bare].to(field.dtype)
+            efforts = self._efforts[rows[:, None], self._bare]
+            if self._max_efforts is not None:
+                limit = self._max_efforts[rows[:, None], self._bare]
+                efforts = torch.maximum(torch.minimum(efforts, limit), -limit)
+            field[rows[:, None], bare] = efforts.to(field.dtype)
 
     def apply_action(self, control_actions: Any, indices: Any = None) -> None:
         """An `ArticulationAction`: targets and efforts at once."""

@@ -203,7 +203,7 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     file = folder / "manifest.json"
     try:
         manifest = parse_json(read_file(file, JSON_LIMIT), file)
-    except (FileNotFoundError, NotADirectoryError):
+    except FileNotFoundError:
         raise CheckpointError(f"{folder} is not a checkpoint: it has no manifest.json") from None
     if type(manifest.get("format")) is not int or manifest["format"] != FORMAT:
         raise CheckpointError(
@@ -324,7 +324,7 @@ def _is_shard(entry: Any) -> bool:
 def _require_header(data: bytes, file: Path) -> None:
     """What the file says of its tensors must be of a size that torch takes; whether it is true, safetensors checks."""
     length = int.from_bytes(data[:8], "little")
-    if len(data) < 8 or length > min(_HEADER_LIMIT, len(data) - 8):
+    if length > min(_HEADER_LIMIT, len(data) - 8):
         raise CheckpointError(f"{file} is corrupt: it is no safetensors file, or its header is too long")
     header = parse_json(data[8 : 8 + length], file)
     if len(header) > _MOST_TENSORS:

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rlcli.config.dump import to_data
+from rlcli.envs.deployment import describe
 from rlcli.envs.vec_env import make_env
 from rlcli.errors import DivergedError, RlcliError, Stopped
 from rlcli.random import derive
+from rlcli.rl.autopsy import open_keeper
 from rlcli.rl.build import build
 from rlcli.rl.checkpoint import steps
 from rlcli.rl.environment import built_record, differences, environment_record
@@ -62,11 +64,16 @@ def conduct(job: Job, trainer: Trainer, env: Any, stop: StopRequest, view: View,
         **{key: run.record[key] for key in ("task", "agent", "seed")},
         "trainer": agent.trainer,
         "layout": env.layout.record(),
+        "deployment": describe(env),
         "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
     }
     keep = Keep() if job.stages else Keep.of(agent.keep_last, agent.keep_every, agent.save_interval)
     budgets = [Budget(end, None) for end in job.stages] or [Budget(agent.max_iterations, agent.max_steps)]
-    saver = Saver(run.checkpoints, keep, manifest, resumed=job.resume_from)
+    cases = None
+    if job.writes and not job.stages:
+        begun = None if job.resume_from is None else job.resume_from.step
+        cases = open_keeper(env, agent.autopsy, run.folder, begun, tell)
+    saver = Saver(run.checkpoints, keep, manifest, resumed=job.resume_from, cases=cases)
     sinks: list[Any] = []
     trained = run.record.get("trained_s", 0.0)
 

@@ -1,8 +1,9 @@
-"""Dumps: the engine calls that led to a divergence, in one file that a replay steps again bit by bit.
+"""Dumps: the engine calls that led to a divergence or to an episode's end, in one file that a replay steps again.
 
 A file is safetensors with a JSON document in its header, as a recording's. Of each environment it holds the integration
 states that its last engine calls began with, the state after the last one, and the model fields of its own. The model
-is that of the task, as installed, with the configuration that the file holds.
+is that of the task, as installed, with the configuration that the file holds. What the policy saw and did and what it
+was paid in these steps is there of an episode that training kept (`rlcli.rl.autopsy`).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import mujoco
 import numpy as np
@@ -34,42 +35,22 @@ from rlcli.rl.environment import model_digest
 from rlcli.rl.files import disk_error, write_atomic
 from rlcli.rl.load import recorded_task
 from rlcli.rl.recording import content_digest
+from rlcli.rl.resimulation import Where, differs, follows, locate, open_world, step
 from rlcli.sim.batch import BatchEngine
-from rlcli.sim.engine import Engine, open_engine
-from rlcli.sim.guard import FIELD_OF, SHOWN, Call, Divergence
+from rlcli.sim.guard import SHOWN, Call, Divergence
 
 FORMAT = 1
 KIND = "dump"
 CALLS = 64
-"""Engine calls that a dump holds of an environment, where memory allows."""
+"""Engine calls that the dump of a divergence holds of an environment, where memory allows."""
+MOST_SUBSTEPS = 300_000
+"""Physics steps of a file that is stepped again."""
 _LARGEST = 2**28
 """Bytes of a file that is read."""
 
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
-
-class Where(_Strict):
-    """The physics step in which an environment went wrong, and what showed it."""
-
-    call: int = Field(ge=0)
-    """Number of the engine call in the dump."""
-    substep: int = Field(ge=0)
-    """Physics step of that call, counted from 0."""
-    time: float
-    """Simulated time at its beginning [s]."""
-    cause: str
-    """As `rlcli.sim.guard.Divergence`."""
-    place: str
-    """The joint, actuator or element."""
-    value: str
-    """What was found there, as Python writes it: `nan`, `1e+30`."""
-
-    def __str__(self) -> str:
-        """One line."""
-        what = f"{self.place} = {self.value}" if self.value else self.place
-        return f"{self.cause} in physics step {self.substep} of call {self.call}, t = {self.time:.6g} s: {what}"
 
 
 class Life(_Strict):
@@ -81,7 +62,7 @@ class Life(_Strict):
     """What the guard called it."""
     detail: str
     """Where, as the guard saw it."""
-    nstep: list[Annotated[int, Field(ge=1, le=1000)]] = Field(min_length=1, max_length=CALLS + 1)
+    nstep: list[Annotated[int, Field(ge=1, le=1000)]] = Field(min_length=1, max_length=MOST_SUBSTEPS)
     """Physics steps of each engine call."""
     follows: list[bool]
     """Of each call but the first: whether it began exactly where the one before ended, controls and forces aside; else
@@ -90,6 +71,41 @@ class Life(_Strict):
     """The engine call that begins the environment step that went wrong."""
     where: Where | None
     """None where a single world shows nothing: then the cause lies outside of what is kept."""
+
+
+Kind = Literal["diverged", "low return", "high return", "terminated"]
+"""Why an episode was kept."""
+
+
+class Ending(_Strict):
+    """An episode that training kept the end of."""
+
+    iteration: int = Field(ge=1)
+    """Iteration of the run in which it ended."""
+    step: int = Field(ge=0)
+    """Environment steps of the run after that iteration."""
+    episode: int = Field(ge=0)
+    """Number of the environment's episode."""
+    length: int = Field(ge=1)
+    """Environment steps of all of it."""
+    total_reward: float
+    """Undiscounted sum of all of it."""
+    causes: list[str]
+    """Terminations that fired at its end."""
+    truncated: bool
+    """Ended by time alone."""
+    kind: Kind
+    """Why it was kept."""
+    usual: tuple[float, float] | None
+    """Quartiles of the returns of the episodes before; None where they were too few."""
+    step_dt: float = Field(gt=0)
+    """Control period [s]."""
+    observations: list[str]
+    """Columns of what the policy saw."""
+    actions: list[str]
+    """Columns of its actions."""
+    reward_terms: list[str]
+    """Terms of the reward."""
 
 
 class Document(_Strict):
@@ -109,6 +125,8 @@ class Document(_Strict):
     step: int
     """Environment steps of the run before the one that went wrong."""
     lives: list[Life] = Field(min_length=1, max_length=SHOWN)
+    ending: Ending | None = None
+    """Of the one environment of a kept episode; None in the dump of a divergence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +193,7 @@ class Watch:
     def __init__(self, env: VecEnv, folder: Path, tell: Callable[[str], None]) -> None:
         self._env, self._folder, self._tell = env, folder, tell
         env.engine.remember(CALLS)
-        env.on_divergence = self
+        env.on_divergence.append(self)
 
     def __call__(self, found: list[Divergence], pending: bool) -> None:
         """Called by the environment, with what it found and whether the next engine call is the one to go wrong."""
@@ -193,9 +211,103 @@ class Watch:
                 said += f"; dump {file}; see rlcli replay {shlex.quote(str(file))}"
             except MachineError as error:
                 said += f"; there is no dump: {error.message}"
-        env.on_divergence = None
-        env.engine.remember(1)
+        env.on_divergence.remove(self)
+        if not env.on_divergence:
+            env.engine.remember(1)
         self._tell(said)
+
+
+@dataclass(slots=True)
+class Trace:
+    """An environment's last engine calls, copied: what is slow is done with it later, elsewhere."""
+
+    env: int
+    cause: str
+    detail: str
+    calls: list[Call]
+    after: np.ndarray
+    """The state after the last call; or, of a call that is yet to come, before it."""
+    own: dict[str, Tensor]
+    """Model fields of the environment's own."""
+    last: int
+    """How many of the calls belong to the last environment step."""
+    pending: bool
+    """Whether the last call is yet to come."""
+
+
+def trace(env: VecEnv, found: Divergence, pending: bool) -> Trace:
+    """What led to a divergence, as the divergence left the environment; see `write_dump`."""
+    engine = env.engine
+    assert isinstance(engine, BatchEngine)
+    calls, after = engine.trace(found.env), engine.row(found.env)
+    if pending:
+        calls = [*calls, Call(after, env.config.decimation)]
+    own = {name: torch.from_numpy(np.atleast_1d(values)) for name, values in engine.own_model(found.env).items()}
+    return Trace(found.env, found.cause, found.detail, calls, after, own, 1 if pending else env.calls_per_step, pending)
+
+
+class Scene:
+    """What the files of one environment have in common: its model and its configuration."""
+
+    def __init__(self, env: VecEnv) -> None:
+        self._model, self._resolved, self._num_envs = env.engine.model, env.resolved, env.num_envs
+        self._config, self._digest = to_yaml(to_data(env.resolved)), model_digest(env.engine.model)
+
+    def encode(
+        self, traces: list[Trace], constants: bool, step: int, kept: tuple[Ending, dict[str, Tensor]] | None = None
+    ) -> bytes:
+        """The content of a file.
+
+        Args:
+            traces: one an environment.
+            constants: whether constants follow the model fields of each environment's own.
+            step: environment steps of the run before.
+            kept: of an episode that was kept, how it ended and the tensors of its last steps.
+        """
+        lives, tensors = [], {}
+        ending, more = kept or (None, {})
+        for number, traced in enumerate(traces):
+            life, after = self._life(traced, constants, diverged=ending is None or ending.kind == "diverged")
+            lives.append(life)
+            tensors[f"{number}.state"] = torch.from_numpy(np.stack([call.state for call in traced.calls]))
+            tensors[f"{number}.after"] = torch.from_numpy(after)
+            tensors |= {f"{number}.model.{name}": values for name, values in traced.own.items()}
+        document = Document(
+            format=FORMAT,
+            kind=KIND,
+            rlcli=rlcli.__version__,
+            mujoco=mujoco.__version__,
+            task=self._resolved.source.record(),
+            config=self._config,
+            model=self._digest,
+            constants=constants,
+            num_envs=self._num_envs,
+            step=step,
+            lives=lives,
+            ending=ending,
+        ).model_dump(mode="json")
+        if ending is None:
+            del document["ending"]
+        tensors |= more
+        document["sha256"] = content_digest(tensors, document)
+        return safetensors.torch.save(tensors, metadata={"rlcli": json.dumps(document)})
+
+    def _life(self, traced: Trace, constants: bool, *, diverged: bool) -> tuple[Life, np.ndarray]:
+        """What stepping the calls again shows, and the state after the last one."""
+        world = open_world(self._model, self._resolved, traced.own, constants)
+        calls = traced.calls
+        first = max(0, len(calls) - traced.last)
+        after = step(world, calls[-1]) if traced.pending else traced.after
+        life = Life(
+            env=traced.env,
+            cause=traced.cause,
+            detail=traced.detail,
+            nstep=[call.nstep for call in calls],
+            follows=[follows(world, *pair) for pair in itertools.pairwise(calls)],
+            first=first,
+            where=locate(world, calls, first) if diverged else None,
+        )
+        return life, after
 
 
 def write_dump(env: VecEnv, found: list[Divergence], pending: bool, folder: Path) -> Path:
@@ -212,50 +324,25 @@ def write_dump(env: VecEnv, found: list[Divergence], pending: bool, folder: Path
     """
     engine = env.engine
     assert isinstance(engine, BatchEngine)
-    lives, tensors = [], {}
-    for number, divergence in enumerate(found[:SHOWN]):
-        calls, after = engine.trace(divergence.env), engine.row(divergence.env)
-        own = {name: torch.from_numpy(np.atleast_1d(v)) for name, v in engine.own_model(divergence.env).items()}
-        world = _world(engine.model, env.resolved, own, engine.follows_constants)
-        if pending:
-            calls = [*calls, Call(after, env.config.decimation)]
-            after = _step(world, calls[-1])
-        first = max(0, len(calls) - (1 if pending else env.calls_per_step))
-        lives.append(
-            Life(
-                env=divergence.env,
-                cause=divergence.cause,
-                detail=divergence.detail,
-                nstep=[call.nstep for call in calls],
-                follows=[_follows(world, *pair) for pair in itertools.pairwise(calls)],
-                first=first,
-                where=_locate(world, calls, first),
-            )
-        )
-        tensors[f"{number}.state"] = torch.from_numpy(np.stack([call.state for call in calls]))
-        tensors[f"{number}.after"] = torch.from_numpy(after)
-        tensors |= {f"{number}.model.{name}": values for name, values in own.items()}
-    document = Document(
-        format=FORMAT,
-        kind=KIND,
-        rlcli=rlcli.__version__,
-        mujoco=mujoco.__version__,
-        task=env.resolved.source.record(),
-        config=to_yaml(to_data(env.resolved)),
-        model=model_digest(engine.model),
-        constants=engine.follows_constants,
-        num_envs=env.num_envs,
-        step=env.common_step,
-        lives=lives,
-    ).model_dump(mode="json")
-    document["sha256"] = content_digest(tensors, document)
+    traces = [trace(env, divergence, pending) for divergence in found[:SHOWN]]
+    for traced in traces:
+        traced.calls = traced.calls[-CALLS - 1 :]
     file = folder / f"step-{env.common_step:012d}.safetensors"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise disk_error(folder, error) from error
-    write_atomic(file, safetensors.torch.save(tensors, metadata={"rlcli": json.dumps(document)}))
+    put(file, Scene(env).encode(traces, engine.follows_constants, env.common_step))
     return file
+
+
+def put(file: Path, content: bytes) -> None:
+    """Write a file into a folder that is made if it is not there.
+
+    Raises:
+        MachineError: if the disk refuses.
+    """
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(file.parent, error) from error
+    write_atomic(file, content)
 
 
 def is_dump(file: Path) -> bool:
@@ -278,6 +365,8 @@ def read_dump(file: Path) -> Dump:
         CheckpointError: if it is missing, corrupt or of another format.
     """
     try:
+        if file.exists() and not file.is_file():
+            raise CheckpointError(f"{file} is no plain file")  # a pipe would be waited for
         if file.stat().st_size > _LARGEST:
             raise CheckpointError(f"{file} is too large for a dump: more than {_LARGEST >> 20} MiB")
         with safe_open(file, "pt") as opened:
@@ -307,14 +396,45 @@ def read_dump(file: Path) -> Dump:
             and state.dim() == 2
             and after.shape == state.shape[1:]
             and len(state) == len(life.nstep) == len(life.follows) + 1
+            and life.first < len(state)
         )
         if not fits:
             raise CheckpointError(f"{file} is corrupt: its states are not those of its engine calls")
+    if sum(count for life in document.lives for count in life.nstep) > MOST_SUBSTEPS:
+        raise CheckpointError(f"{file} is not stepped again: it has more than {MOST_SUBSTEPS} physics steps")
+    if document.ending is not None:
+        _check_ending(file, document, document.ending, tensors)
     return Dump(file, document, tensors)
 
 
-def replay_dump(dump: Dump, named: TaskSource | None = None) -> Replay:
-    """Step every engine call of a dump again, and compare every state that must come out, bit by bit.
+def _check_ending(file: Path, document: Document, ending: Ending, tensors: Mapping[str, Tensor]) -> None:
+    """The steps of a kept episode are there, as many of everything."""
+    rewards = tensors.get("0.reward")
+    count = 0 if rewards is None or rewards.dim() != 1 else len(rewards)
+    widths = {"obs": ending.observations, "action": ending.actions, "reward_terms": ending.reward_terms}
+    shapes = {f"0.{name}": (count, len(columns)) for name, columns in widths.items()} | {"0.reward": (count,)}
+    found = {name: (tuple(tensors[name].shape), tensors[name].dtype) for name in shapes if name in tensors}
+    whole = len(document.lives) == 1 and 1 <= count <= ending.length
+    if not whole or document.lives[0].first < count - 1 or document.lives[0].first % max(1, count - 1):
+        raise CheckpointError(f"{file} is corrupt: it does not hold the end of one episode")
+    for name, shape in shapes.items():
+        if found.get(name) != (shape, torch.float32):
+            raise CheckpointError(f"{file} is corrupt: its {name[2:]} is not that of its steps")
+
+
+@dataclass(frozen=True, slots=True)
+class Staged:
+    """A dump with worlds of the installed task to step it in."""
+
+    resolved: Resolved
+    model: mujoco.MjModel
+    same_model: bool
+    worlds: list[tuple[Life, BatchEngine, list[Call], np.ndarray]]
+    """Of each environment the world, its calls, and the state after the last one."""
+
+
+def stage(dump: Dump, named: TaskSource | None = None) -> Staged:
+    """Build the task of a dump, and a world for each of its environments.
 
     Raises:
         TaskError: if the task is not installed any more.
@@ -325,15 +445,13 @@ def replay_dump(dump: Dump, named: TaskSource | None = None) -> Replay:
     env = make_env(resolved)
     model = env.engine.model
     env.close()
-    calls = compared = 0
-    where: dict[int, Where | None] = {}
-    same = model_digest(model) == dump.document.model
+    worlds = []
     for number, life in enumerate(dump.document.lives):
         prefix = f"{number}.model."
         own = {n.removeprefix(prefix): v for n, v in dump.tensors.items() if n.startswith(prefix)}
         states, after = dump.tensors[f"{number}.state"].numpy(), dump.tensors[f"{number}.after"].numpy()
         try:
-            world = _world(model, resolved, own, dump.document.constants)
+            world = open_world(model, resolved, own, dump.document.constants)
             if world.row(0).shape != after.shape:
                 raise ValueError(f"a state has {len(after)} numbers, the model's {len(world.row(0))}")
         except (ValueError, RuntimeError) as error:
@@ -341,101 +459,34 @@ def replay_dump(dump: Dump, named: TaskSource | None = None) -> Replay:
                 f"{dump.file} does not fit the installed task: {' '.join(str(error).split())}",
                 hint=f"install the version that made it: {dump.document.task}",
             ) from None
-        steps = [Call(state, nstep) for state, nstep in zip(states, life.nstep, strict=True)]
+        calls = [Call(state, nstep) for state, nstep in zip(states, life.nstep, strict=True)]
+        worlds.append((life, world, calls, after))
+    return Staged(resolved, model, model_digest(model) == dump.document.model, worlds)
+
+
+def replay_dump(dump: Dump, named: TaskSource | None = None) -> Replay:
+    """Step every engine call of a dump again, and compare every state that must come out, bit by bit.
+
+    Raises:
+        CheckpointError, ConfigError, TaskError: see `stage`.
+    """
+    staged, ending = stage(dump, named), dump.document.ending
+    calls = compared = 0
+    where: dict[int, Where | None] = {}
+    for life, world, steps, after in staged.worlds:
         for index, call in enumerate(steps):
-            now = _step(world, call)
+            now = step(world, call)
             calls += 1
             last = index == len(steps) - 1
             if not last and not life.follows[index]:
                 continue
             compared += 1
-            difference = _differs(world, after if last else steps[index + 1].state, now, whole=last)
+            difference = differs(world, after if last else steps[index + 1].state, now, whole=last)
             if difference is not None:
                 field, recorded, replayed = difference
-                where[life.env] = _locate(world, steps, life.first)
+                where[life.env] = locate(world, steps, life.first)
                 different = Difference(life.env, index, field, recorded, replayed)
-                return Replay(calls, compared, different, where, same)
-        where[life.env] = _locate(world, steps, life.first)
-    return Replay(calls, compared, None, where, same)
-
-
-def _world(model: mujoco.MjModel, resolved: Resolved, own: Mapping[str, Tensor], constants: bool) -> BatchEngine:
-    """One world of the model, with model fields of its own."""
-    config = resolved.task.sim.model_copy(update={"engine": "batch", "engine_threads": 1})
-    world: Engine = open_engine(model, 1, config)
-    assert isinstance(world, BatchEngine)
-    for name, values in own.items():
-        world.take_model(name, values.reshape(world.expand(name).shape))
-    if constants:
-        world.set_constants()
-    return world
-
-
-def _step(world: BatchEngine, call: Call) -> np.ndarray:
-    """The state after a call."""
-    world.put(0, call.state)
-    world.step(call.nstep)
-    world.diverged()
-    return world.row(0)
-
-
-def _follows(world: BatchEngine, call: Call, following: Call) -> bool:
-    return _differs(world, following.state, _step(world, call), whole=False) is None
-
-
-def _differs(
-    world: BatchEngine, recorded: np.ndarray, now: np.ndarray, *, whole: bool
-) -> tuple[str, list[float], list[float]] | None:
-    """The first field whose bits differ: of all, or of those that only physics writes."""
-    for name, columns in world.state_layout.fields():
-        if whole or name in ("time", "qpos", "qvel", "act", "qacc_warmstart"):
-            left, right = recorded[columns], now[columns]
-            if left.tobytes() != right.tobytes():
-                return name, left.tolist(), right.tolist()
-    return None
-
-
-def _locate(world: BatchEngine, calls: list[Call], first: int) -> Where | None:
-    """The first physics step that goes wrong, from a call on."""
-    layout = world.state_layout
-    for number, call in enumerate(calls[first:], start=first):
-        world.put(0, call.state)
-        for substep in range(call.nstep):
-            before = world.row(0)
-            world.step(1)
-            if world.diverged() is None:
-                continue
-            found = world.found[0]
-            place, value = _what(world, found, before)
-            return Where(
-                call=number,
-                substep=substep,
-                time=float(before[layout.columns("time")][0]),
-                cause=found.cause,
-                place=place,
-                value=value,
-            )
-    return None
-
-
-def _what(world: BatchEngine, found: Divergence, before: np.ndarray) -> tuple[str, str]:
-    """The element that a divergence showed itself at, and its value."""
-    layout, field = world.state_layout, FIELD_OF.get(found.cause)
-    if field is None:
-        name = found.cause.removesuffix(" not finite")
-        values = world.own_model(0).get(name)
-        if values is None and name in dict(layout.fields()):
-            values = world.row(0)[layout.columns(name)]
-        if values is None:
-            return found.detail, ""
-        flat = np.asarray(values).flatten()
-        index = int((~np.isfinite(flat)).argmax())
-        return f"{name}[{index}]", repr(float(flat[index]))
-    if field == "qacc":
-        world.put(0, before)
-        _, data = world.world(0)
-        values = data.qacc
-    else:
-        values = before[layout.columns(field)]
-    value = f"{field} {float(values[found.index])!r}" if 0 <= found.index < len(values) else ""
-    return found.detail, value
+                return Replay(calls, compared, different, where, staged.same_model)
+        went_wrong = ending is None or ending.kind == "diverged"
+        where[life.env] = locate(world, steps, life.first) if went_wrong else None
+    return Replay(calls, compared, None, where, staged.same_model)

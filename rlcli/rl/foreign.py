@@ -167,6 +167,7 @@ def as_run(foreign: Foreign, resolved: Resolved, record: Mapping[str, Any], runs
         MachineError: if the disk refuses.
     """
     from rlcli.config.dump import to_data, to_yaml
+    from rlcli.envs.deployment import describe
     from rlcli.envs.vec_env import make_env
     from rlcli.rl.environment import environment_record
     from rlcli.rl.run import create_run
@@ -176,7 +177,7 @@ def as_run(foreign: Foreign, resolved: Resolved, record: Mapping[str, Any], runs
     task = resolved.task
     one = task.model_copy(update={"scene": task.scene.model_copy(update={"num_envs": 1})})
     env = make_env(replace(resolved, task=one), seed=0)
-    layout = env.layout
+    layout, deployment = env.layout, describe(env)
     env.close()
     sizes = {"observation_size": layout.size("policy"), "action_size": layout.action_size}
     differing = [(key, str(foreign.spec[key]), str(size)) for key, size in sizes.items() if foreign.spec[key] != size]
@@ -204,6 +205,7 @@ def as_run(foreign: Foreign, resolved: Resolved, record: Mapping[str, Any], runs
         "iteration": 0,
         "trainer": record["imported"]["form"],
         "layout": layout.record(),
+        "deployment": deployment,
         "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
     }
     values = {"policy": foreign.spec, "iteration": 0, "env_steps": 0}

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rlcli.errors import DependencyError, MachineError, UsageError
+from rlcli.errors import MachineError, UsageError
 from rlcli.rl.files import write_atomic
 from rlcli.rl.sweeps import Point, Sweep
 
@@ -78,8 +76,9 @@ def check_picture(file: Path) -> None:
         raise UsageError(f"--output {file} is no picture", hint=f"a name that ends in {' or '.join(FORMATS)}")
     if not file.absolute().parent.is_dir():
         raise MachineError(f"--output: there is no folder {file.absolute().parent}")
-    if importlib.util.find_spec("matplotlib") is None:
-        raise DependencyError("pictures are drawn with matplotlib", hint='pip install "rlcli[plot]"')
+    from rlcli.rl.figures import check_drawing
+
+    check_drawing()
 
 
 def draw(file: Path, maps: Sequence[HeatMap]) -> None:
@@ -88,11 +87,14 @@ def draw(file: Path, maps: Sequence[HeatMap]) -> None:
     Raises:
         MachineError: if the file cannot be written.
     """
+    import matplotlib
+    from matplotlib.figure import Figure
+
     settings: dict[str, Any] = {"svg.hashsalt": "rlcli", "text.parse_math": False}  # the same bytes again
-    with importlib.import_module("matplotlib").rc_context(settings):
+    with matplotlib.rc_context(settings):
         wide, tall = max(len(m.columns) for m in maps), max(len(m.rows) for m in maps)
         size = (len(maps) * max(3.6, 0.75 * wide + 2.0), max(2.2, 0.5 * tall + 1.6))
-        figure = importlib.import_module("matplotlib.figure").Figure(figsize=size, layout="constrained")
+        figure = Figure(figsize=size, layout="constrained")
         for place, drawn in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, strict=True):
             _panel(place, drawn)
         buffer = io.BytesIO()

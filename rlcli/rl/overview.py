@@ -48,6 +48,8 @@ class Overview:
     """`return` and `success` of the newest iteration in which episodes ended."""
     best: dict[str, float] = field(default_factory=dict)
     """`step`, `return` and `success` of the best evaluation between iterations."""
+    evaluation: dict[str, Any] = field(default_factory=dict)
+    """`step`, `episodes`, `return` and `success` of the newest checkpoint that `rlcli eval` has looked at."""
     started: str | None = None
     age_s: float | None = None
     """Since it was started."""
@@ -118,6 +120,7 @@ def overview_of(run: Run) -> Overview:
     best = record.get("best")
     if best is not None:
         seen.best = {"step": best, **_score(_row_at(run, best), "Eval/")}
+    seen.evaluation = _evaluation(run)
     seen.age_s, seen.duration_s = times(run)
     if not (run.folder / CONFIG).is_file():
         seen.state, seen.reason, seen.resumable = "broken", f"it has no {CONFIG}", False
@@ -203,6 +206,25 @@ def _row_at(run: Run, step: int) -> dict[str, Any]:
 def _score(row: Mapping[str, Any], prefix: str) -> dict[str, float]:
     names = {"return": f"{prefix}mean_reward", "success": f"{prefix}success_rate"}
     return {word: float(row[name]) for word, name in names.items() if name in row}
+
+
+def _evaluation(run: Run) -> dict[str, Any]:
+    try:
+        names = sorted(name for name in os.listdir(run.folder / "evaluations") if name.endswith(".json"))
+    except OSError:
+        return {}
+    from rlcli.rl.evaluations import read_evaluation  # only where there is one: it takes longer than all the rest
+
+    for name in names[: -_ROWS - 1 : -1]:
+        try:
+            found = read_evaluation(run, name.removesuffix(".json"))
+        except CheckpointError:
+            continue
+        if found is not None:
+            score = {"step": int(name.removesuffix(".json")), "episodes": found["episodes"]}
+            score["return"] = found["return"]["mean"]
+            return score | ({"success": found["success"]["rate"]} if "success" in found else {})
+    return {}
 
 
 def count(value: Any) -> int | None:

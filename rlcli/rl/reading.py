@@ -67,12 +67,12 @@ def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
 
 def _open(file: Path) -> tuple[int, os.stat_result]:
     """A plain file, opened."""
-    if file.is_symlink():
-        raise CheckpointError(f"{file} is a link; links in runs are not followed")
     try:
+        if file.is_symlink():
+            raise CheckpointError(f"{file} is a link; links in runs are not followed")
         handle = os.open(file, os.O_RDONLY | _NO_LINKS)  # a pipe must not make this wait
-    except FileNotFoundError:
-        raise
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise FileNotFoundError(*error.args) from None
     except (OSError, ValueError) as error:
         why = "it is no plain file" if _kind(error) in _ODD else getattr(error, "strerror", None) or error
         raise CheckpointError(f"{file} cannot be read: {why}") from None

@@ -65,11 +65,14 @@ class Recorder:
         env: the environment.
         act: what acts in it.
         episodes: how many to keep; how many each environment contributes is fixed beforehand, as in an evaluation.
+        only: the one environment that contributes them; None: all.
     """
 
-    def __init__(self, env: VecEnv, act: Callable[[Tensor], Tensor], episodes: int) -> None:
+    def __init__(self, env: VecEnv, act: Callable[[Tensor], Tensor], episodes: int, *, only: int | None = None) -> None:
         self._env, self._act = env, act
         self._quota = [episodes // env.num_envs + (i < episodes % env.num_envs) for i in range(env.num_envs)]
+        if only is not None:
+            self._quota = [episodes * (i == only) for i in range(env.num_envs)]
         self._start: dict[str, Tensor] = {}
         self._before: list[dict[str, Tensor]] = []
         self._after: list[dict[str, Tensor]] = []

@@ -97,6 +97,8 @@ def gather_page(run: Run, checkpoint: Path | None) -> Page:
     curve = _curve(run, page)
     _charts(curve, page)
     page.facts = list(_facts(run, curve))
+    if page.checkpoint is not None and page.checkpoint.isdecimal():
+        page.facts.insert(0, ("Checkpoint", f"step {int(page.checkpoint):,}"))
     page.machine = list(_machine(record))
     page.commands = list(_commands(run, checkpoint))
     return page
@@ -116,7 +118,7 @@ def _card(run: Run, document: strict_yaml.Document | None, checkpoint: Path | No
 
 
 def _layout(checkpoint: Path | None) -> dict[str, Any] | None:
-    from rlcli.rl.export import LayoutRecord
+    from rlcli.rl.export_record import LayoutRecord
 
     if checkpoint is None:
         return None

@@ -357,6 +357,8 @@ def _check(record: Any, file: Path) -> None:
         raise CheckpointError(f"{file} is corrupt: its loggers are malformed")
     if not 0 < record.get("torch_threads", 1) <= _MOST_THREADS:
         raise CheckpointError(f"{file} is corrupt: its torch_threads is out of range")
+    if not 0 <= record.get("video_every", 0) < 2**31:
+        raise CheckpointError(f"{file} is corrupt: its video_every is out of range")
 
 
 def _is_word(text: str) -> bool:

@@ -17,6 +17,7 @@ import safetensors.torch
 from torch import Tensor
 
 from rlcli.errors import CheckpointError
+from rlcli.rl.autopsy import FOLDER, Batch, Keeper
 from rlcli.rl.checkpoint import FORMAT, LOG_FOLDER, Checkpoint, Shard, open_checkpoint, sha256, steps
 from rlcli.rl.files import disk_error, sync_folder, to_json, write_atomic, write_synced
 from rlcli.rl.trainer import Rows, TrainerState
@@ -49,12 +50,19 @@ class Saver:
         keep: which of them stay.
         manifest: further JSON-able entries of every manifest.
         resumed: the checkpoint that training goes on from; rows of logs that it has are not written again.
+        cases: keeps ends of episodes, which are written with each checkpoint.
     """
 
     def __init__(
-        self, checkpoints: Path, keep: Keep, manifest: Mapping[str, Any], *, resumed: Checkpoint | None = None
+        self,
+        checkpoints: Path,
+        keep: Keep,
+        manifest: Mapping[str, Any],
+        *,
+        resumed: Checkpoint | None = None,
+        cases: Keeper | None = None,
     ) -> None:
-        self.checkpoints = checkpoints
+        self.checkpoints, self.cases = checkpoints, cases
         self.best: int | None = None
         """Environment steps of the checkpoint with the best evaluation."""
         self.at: tuple[int, int] | None = None if resumed is None else (resumed.iteration, resumed.step)
@@ -80,9 +88,17 @@ class Saver:
         self.wait()  # it knows which rows are written
         fresh = {name: self._copy_new(name, rows) for name, rows in state.logs.items()}
         self.at = (iteration, step)
-        arguments = (state, fresh, iteration, step)
+        arguments = (state, fresh, iteration, step, None if self.cases is None else self.cases.take(step))
         self._thread = threading.Thread(target=self._write, args=arguments, name="checkpoint", daemon=True)
         self._thread.start()
+
+    def save_cases(self, iteration: int, step: int) -> None:
+        """Write what is kept of an iteration that failed: there will be no checkpoint after it."""
+        if self.cases is not None:
+            self.cases.commit(iteration, step)
+            batch = self.cases.take(step)
+            self.cases.write(batch)
+            self.cases.drop(batch)
 
     def wait(self) -> None:
         """Return when everything is on the disk.
@@ -120,12 +136,17 @@ class Saver:
         fresh: Mapping[str, list[tuple[int, int, dict[str, Tensor]]]],
         iteration: int,
         step: int,
+        batch: Batch | None,
     ) -> None:
         try:
+            if self.cases is not None and batch is not None:
+                self.cases.write(batch)  # before the checkpoint: what is there too early is removed on resuming
             logs = {name: self._write_rows(name, state.logs[name], parts) for name, parts in fresh.items()}
             extra = {**self._manifest, "iteration": iteration, **({"logs": logs} if logs else {})}
             write(self.checkpoints, step, state, extra)
             self.written = (iteration, step)
+            if self.cases is not None and batch is not None:
+                self.cases.drop(batch)
             prune(self.checkpoints, self._keep, self.best)
         except BaseException as error:
             self._failure = error
@@ -241,7 +262,7 @@ def clean(checkpoints: Path) -> None:
     for leftover in checkpoints.glob(".tmp-*"):
         shutil.rmtree(leftover, ignore_errors=True)
     run = checkpoints.parent
-    for folder in (checkpoints, run, run / "tb", *(checkpoints / LOG_FOLDER).glob("*")):
+    for folder in (checkpoints, run, run / "tb", run / FOLDER, *(checkpoints / LOG_FOLDER).glob("*")):
         for file in folder.glob(".*.tmp-*"):
             file.unlink(missing_ok=True)
 

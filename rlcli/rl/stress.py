@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from rlcli.config.dump import given
 from rlcli.config.load import Resolved
 from rlcli.envs.vec_env import VecEnv, make_env
 from rlcli.random import derive
@@ -94,6 +95,11 @@ def _run(
     finally:
         env.close()
     return [found.part(number * size, (number + 1) * size).by_life() for number in range(len(points))]
+
+
+def one_each(resolved: Resolved, episodes: int) -> Resolved:
+    """The same task with an environment for each episode, if the user has not said how many there are."""
+    return resolved if "scene.num_envs" in given(resolved) else with_envs(resolved, min(episodes, MOST_ENVS))
 
 
 def with_envs(resolved: Resolved, count: int) -> Resolved:

@@ -97,6 +97,8 @@ def fit(
             before, tried = divergences(), trials is not None and trials.due(trainer.iteration + 1)
             with boundaries.iteration(long=tried):
                 report = trainer.iterate()
+                if saver.cases is not None:
+                    saver.cases.commit(trainer.iteration, trainer.env_steps)
                 trial = trials.run(trainer.policy) if trials is not None and tried else {}
                 better = trials is not None and trials.improves(trial)
                 late = save_interval is None and boundaries.late()
@@ -123,9 +125,11 @@ def fit(
         raise _stopped(f"stopped in iteration {boundaries.number + 1}; resumed, it begins again", run, stop) from None
     except KeyboardInterrupt:
         raise _stopped("stopped at once; what came after the last checkpoint is lost", run, stop) from None
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(Exception):  # the first error is the one to report
             saver.wait()  # a good checkpoint may be on its way
+            if isinstance(error, DivergedError):
+                saver.save_cases(boundaries.number + 1, boundaries.step + trainer.steps_per_iteration)
         raise
     if stopped and not budget.spent(trainer):
         raise _stopped(f"stopped at iteration {trainer.iteration}, checkpoint written", run, stop)
@@ -138,8 +142,8 @@ class _Boundaries:
         self._trainer, self._saver, self._stop, self._peers = trainer, saver, stop, peers
         self._saved_at = time.monotonic()
         self._took = 0.0
-        self.number = trainer.iteration
-        """Iterations before the one that runs."""
+        self.number, self.step = trainer.iteration, trainer.env_steps
+        """Iterations, and environment steps, before the one that runs."""
 
     def save(self) -> None:
         """Write this one, unless it is written."""
@@ -164,7 +168,7 @@ class _Boundaries:
         several processes all are.
         """
         at = self._trainer.iteration, self._trainer.env_steps
-        self.number = at[0]
+        self.number, self.step = at
         prompt, saved = self._stop.can_interrupt and self._peers.size == 1, self._saver.at == at
         copied = prompt and not saved and (long or self._took > LONG_S)
         before = self._trainer.state() if copied else None

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rlcli.errors import DivergedError, did_you_mean
 from rlcli.sim.engine import force_sensors
-from rlcli.sim.guard import ENGINE_ERROR, FIELD_OF, SHOWN, Call, Divergence, History, StateLayout
+from rlcli.sim.guard import ENGINE_ERROR, FIELD_OF, MEMORY, SHOWN, Call, Divergence, History, StateLayout
 from rlcli.sim.mjcf import quiet_mujoco
 from rlcli.sim.selection import IdSelection, Selection
 
@@ -128,9 +128,18 @@ class BatchEngine:
         """Worlds that diverged, ever."""
         return sum(self.causes.values())
 
-    def remember(self, calls: int) -> None:
-        """Keep what the last calls began with, for `trace`: as many as asked for, or as fit into 64 MiB."""
-        self._history = History(self._batch.state, self._history.width, self._default, calls)
+    @property
+    def history(self) -> History:
+        """What the last calls began with."""
+        return self._history
+
+    def remember(self, calls: int, memory: int = MEMORY) -> None:
+        """Keep what the last calls began with, for `trace`: as many as asked for, or as fit into so many bytes."""
+        self._history = self._fresh_history(self._history.width, calls, memory)
+
+    def _fresh_history(self, width: int, calls: int, memory: int) -> History:
+        state, count = self._batch.state, self._history.count
+        return History(state, width, self._default, calls, memory=memory, count=count)
 
     def trace(self, env: int) -> list[Call]:
         """The last calls of a world in its running episode, the oldest first."""
@@ -145,6 +154,10 @@ class BatchEngine:
         """A copy of a world's integration state. (nstate,)"""
         return self._batch.state[env].copy()
 
+    def rows(self, ids: np.ndarray) -> np.ndarray:
+        """Copies of the integration states of some worlds. (n, nstate)"""
+        return self._batch.state[ids]
+
     def own_model(self, env: int) -> dict[str, np.ndarray]:
         """Copies of the model fields of a world's own."""
         return {name: np.array(values[env]) for name, values in self._batch._expanded.items()}
@@ -153,6 +166,13 @@ class BatchEngine:
         """Give a world an integration state; derived fields stay behind."""
         self._batch.state[env] = row
         self._batch.warning[env] = 0
+
+    def take(self, env: int, data: mujoco.MjData) -> None:
+        """Give a world the state of an MjData, and its derived fields."""
+        mujoco.mj_getState(self.model, data, self._batch.state[env], int(_STATE.mjSTATE_INTEGRATION))
+        for name, field in self._fields.items():
+            if name not in _NOT_DERIVED and hasattr(data, name):
+                field[env] = torch.from_numpy(np.array(getattr(data, name))).reshape(field[env].shape)
 
     def attach(self) -> None:
         """Nothing to do: calls return when their work is done."""
@@ -180,7 +200,7 @@ class BatchEngine:
     def _keep(self, name: str) -> None:
         """Have the history hold a field that somebody may write to from now on."""
         if self.state_layout.until(name) > self._history.width:
-            self._history = History(self._batch.state, self._batch.nstate, self._default, self._history.calls)
+            self._history = self._fresh_history(self._batch.nstate, self._history.wanted, self._history.memory)
 
     def can_expand(self, name: str) -> bool:
         """Whether a model field may differ between worlds."""
@@ -392,7 +412,7 @@ class BatchEngine:
             np.broadcast_to(self._default[width:], (self.num_envs, self._batch.nstate - width)),
         ):
             self._keep("plastic")
-        self._history.forget(np.arange(self.num_envs))
+        self._history.forget_all()
         self._batch.warning[:] = state["warning"].numpy()
         for name, values in state.items():
             if name.startswith("model."):

@@ -13,7 +13,7 @@ from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DependencyError, Problem
 from rlcli.machine import available_cores, require_device
 from rlcli.sim.capacity import capacity
-from rlcli.sim.guard import Call, Divergence
+from rlcli.sim.guard import MEMORY, Call, Divergence
 from rlcli.sim.selection import Selection
 
 if TYPE_CHECKING:
@@ -50,8 +50,8 @@ class Engine(Protocol):
         """The first worlds of the last `diverged`, described; of an `asynchronous` engine the first one ever."""
         ...
 
-    def remember(self, calls: int) -> None:
-        """Keep what the last calls of `step` began with, as many as asked for or fit."""
+    def remember(self, calls: int, memory: int = MEMORY) -> None:
+        """Keep what the last calls of `step` began with, as many as asked for or fit into so many bytes."""
         ...
 
     def trace(self, env: int) -> list[Call]:

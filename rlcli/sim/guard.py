@@ -14,8 +14,8 @@ SHOWN = 4
 """Environments of a divergence that are described one by one."""
 ENGINE_ERROR = "engine error"
 """Cause of an environment that the engine could not step."""
-_MEMORY = 64 * 2**20
-"""Bytes that a history may take."""
+MEMORY = 64 * 2**20
+"""Bytes that a history may take, if nobody says otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,18 +56,32 @@ class History:
         width: leading columns that are kept.
         default: a row nobody has written to. (nstate,)
         calls: how many to keep, if they fit.
+        memory: bytes that the ring may take.
+        count: calls that were noted before, elsewhere.
     """
 
-    def __init__(self, state: np.ndarray, width: int, default: np.ndarray, calls: int) -> None:
+    def __init__(
+        self,
+        state: np.ndarray,
+        width: int,
+        default: np.ndarray,
+        calls: int,
+        *,
+        memory: int = MEMORY,
+        count: int = 0,
+    ) -> None:
         self._state, self._default = state, default
         self._kept = state[:, :width]
-        fits = _MEMORY // max(1, self._kept.nbytes)
-        self.calls = max(1, min(calls, fits))
+        self.memory = memory
+        self.wanted = calls
+        """How many were asked for."""
+        self.calls = max(1, min(calls, memory // max(1, self._kept.nbytes)))
         """How many are kept."""
         self._ring = np.empty((self.calls, *self._kept.shape))
         self._nstep = [0] * self.calls
-        self._count = 0
-        self._begin = np.zeros(len(state), dtype=np.int64)
+        self.count = self._floor = count
+        """Calls that were noted, ever."""
+        self._begin = np.full(len(state), count, dtype=np.int64)
 
     @property
     def width(self) -> int:
@@ -76,26 +90,34 @@ class History:
 
     def note(self, nstep: int) -> None:
         """Called before the engine steps."""
-        slot = self._count % self.calls
+        slot = self.count % self.calls
         self._ring[slot] = self._kept
         self._nstep[slot] = nstep
-        self._count += 1
+        self.count += 1
+
+    def forget_all(self) -> None:
+        """Called when all worlds are put elsewhere: nothing that was before leads there."""
+        self._floor = self.count
+        self._begin[:] = self.count
 
     def forget(self, rows: np.ndarray) -> None:
         """Called when worlds begin anew: what was before belongs to another episode."""
-        self._begin[rows] = self._count
+        self._begin[rows] = self.count
 
     def last(self, env: int) -> np.ndarray | None:
         """What the newest call began with, of one environment."""
-        if self._count == 0 or self._begin[env] == self._count:
+        if self._begin[env] == self.count:
             return None
-        return self._ring[(self._count - 1) % self.calls, env]
+        return self._ring[(self.count - 1) % self.calls, env]
 
     def of(self, env: int) -> list[Call]:
         """The calls of an environment since its episode began, the oldest first."""
-        first = max(int(self._begin[env]), self._count - self.calls)
+        return self.between(env, int(self._begin[env]), self.count)
+
+    def between(self, env: int, first: int, stop: int) -> list[Call]:
+        """The calls of an environment from one number to another, as far as they are still kept."""
         calls = []
-        for number in range(first, self._count):
+        for number in range(max(first, self._floor, self.count - self.calls), min(stop, self.count)):
             row = self._default.copy()
             row[: self.width] = self._ring[number % self.calls, env]
             calls.append(Call(row, self._nstep[number % self.calls]))

@@ -181,7 +181,7 @@ class WarpEngine:
         name = kernels.CAUSES[cause]
         return [Divergence(world - 1, name, StateLayout(self.model, {}).place(name.split()[0], column))]
 
-    def remember(self, calls: int) -> None:
+    def remember(self, calls: int, memory: int = 0) -> None:
         """Nothing is kept: no replay gives the bits of a GPU again."""
 
     def trace(self, env: int) -> list[Call]:

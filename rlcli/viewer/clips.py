@@ -7,14 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rlcli.rl.rng import seed_generators, undisturbed
-from rlcli.rl.rollout import acting, evaluate
-from rlcli.viewer.video import Renderer
-from rlcli.viewer.writer import VideoWriter
+from rlcli.rl.rollout import acting
+from rlcli.viewer.clip import film
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
-    from rlcli.envs.vec_env import StepResult, VecEnv
+    from rlcli.envs.vec_env import VecEnv
     from rlcli.rl.policy import Policy
 
 
@@ -62,7 +59,7 @@ class Clips:
                     self._env = self._make_env()
                     self._env.before_step = self._go_on
                 seed_generators(self._env.seed)
-                film(self._env, policy(), file)
+                film(self._env, acting(self._env, policy()), file)
         except Abandoned:
             return None
         except Exception as error:  # a full disk, a driver, an encoder, a task's own code
@@ -81,25 +78,3 @@ class Clips:
     def _go_on(self) -> None:
         if self._stopping():
             raise Abandoned
-
-
-def film(env: VecEnv, policy: Policy, file: Path) -> int:
-    """One episode of an environment's first world as a video: a picture of each state that the policy acts in.
-
-    Returns the number of pictures.
-    """
-    stride = max(1, env.config.sim.render_interval // env.config.decimation)
-    act, ended = acting(env, policy), False
-    with Renderer(env.engine.model, env.config.viewer) as renderer, VideoWriter(file, stride * env.step_dt) as writer:
-
-        def draw(obs: Tensor) -> Tensor:
-            if not ended and int(env.episode_length_buf[0]) % stride == 0:
-                writer.add(renderer.draw(*env.world(0), env.origins[0].tolist()))
-            return act(obs)
-
-        def note_end(step: StepResult) -> None:
-            nonlocal ended
-            ended = ended or bool(step.terminated[0] | step.truncated[0])
-
-        evaluate(env, draw, env.num_envs, note_end)
-    return writer.frames

@@ -73,7 +73,7 @@ class Player:
     """See the module.
 
     Args:
-        env: the environment; its episodes begin when the player is made.
+        env: the environment; its episodes begin when the player is made, unless they have `begun`.
         act: the policy.
         shelf: other policies, if there are.
         checkpoint: the step of the first policy.
@@ -91,6 +91,8 @@ class Player:
     """Play each new checkpoint as it appears."""
     patience: float = 0.1
     """How long steps may go on before a viewer is asked again what it wants [s]."""
+    begun: Tensor | None = None
+    """Observations of an environment that goes on from where it stands; None: its episodes begin now."""
     steps: int = 0
     message: str = ""
     _knob: int = 0
@@ -108,7 +110,7 @@ class Player:
 
     def __post_init__(self) -> None:
         self._commands = _commands(self.env)
-        self._obs = self.env.reset(seed=self.env.seed)["policy"]
+        self._obs = self.env.reset(seed=self.env.seed)["policy"] if self.begun is None else self.begun
         self._reward = torch.zeros(self.env.num_envs)
         self.ended = torch.zeros(self.env.num_envs, dtype=torch.int64)
         self.reread()

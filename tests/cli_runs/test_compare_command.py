@@ -7,21 +7,33 @@ import pytest
 SMALL = ("scene.num_envs=8", "sim.engine_threads=1", "agent.torch_threads=1", "--logger", "none", "-q")
 
 
-@pytest.fixture
-def train(cli):
-    """Train a little, and give the run's folder."""
-
-    def make(task, *words):
-        from rlcli.rl.run import default_runs_dir, list_runs
-
-        assert cli("train", task, *SMALL, "--max-iterations", 1, *words).code == 0
-        return list_runs(default_runs_dir(), None)[-1].folder
-
-    return make
+TRAINED = {
+    "cartpole": ("cartpole",),
+    "changed": ("cartpole", "rewards.alive.weight=3.0", "episode_length_s=2.0"),
+    "other": ("cartpole", "--num-envs", 4, "viewer.width=64"),
+    "direct": ("cartpole-direct",),
+}
 
 
-def test_a_policy_against_itself_is_no_better_and_no_different(cli, train):
-    run = train("cartpole")
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """trained(name) -> the folder of a run, trained once."""
+    from rlcli.cli.app import main
+
+    folder, runs = tmp_path_factory.mktemp("compared"), {}
+
+    def find(name):
+        if name not in runs:
+            words = [*TRAINED[name], *SMALL, "--max-iterations", 1, "--runs-dir", folder / name]
+            assert main(["train", *map(str, words)]) == 0
+            (runs[name],) = (folder / name).glob("*/*")
+        return runs[name]
+
+    return find
+
+
+def test_a_policy_against_itself_is_no_better_and_no_different(cli, trained):
+    run = trained("cartpole")
     done = cli("eval", "--compare", run, run, "--episodes", 20, "--json").json
     one, same = done["policies"]
     assert {**one, "name": ""} == {**same, "name": ""}
@@ -31,8 +43,8 @@ def test_a_policy_against_itself_is_no_better_and_no_different(cli, train):
         assert compared[metric]["improvement"] == {"probability": 0.5, "low": 0.5, "high": 0.5}
 
 
-def test_each_policy_has_the_numbers_of_its_own_evaluation(cli, train):
-    run = train("cartpole")
+def test_each_policy_has_the_numbers_of_its_own_evaluation(cli, trained):
+    run = trained("cartpole")
     done = cli("eval", "--compare", run, f"{run}@step:0", "lqr", "--episodes", 10, "--json").json
     assert [policy["policy"] for policy in done["policies"]] == ["trained", "trained", "lqr"]
     keys = ("episodes", "success", "return", "length", "reward_terms", "terminations")
@@ -52,16 +64,17 @@ def test_each_policy_has_the_numbers_of_its_own_evaluation(cli, train):
     assert gap["mean"] == pytest.approx(means[0] - means[2])
 
 
-def test_where_chance_alone_decides_two_policies_share_it(cli, coin, train):
-    run = train(coin)
+def test_where_chance_alone_decides_two_policies_share_it(cli, coin, only_run):
+    cli("train", coin, *SMALL, "--max-iterations", 1)
+    run = only_run()
     done = cli("eval", "--compare", run, "zero", "--episodes", 100, "--json").json
     assert 0.35 < done["policies"][0]["success"]["rate"] < 0.65
     assert done["comparisons"][0]["return"]["difference"]["mean"] == 0.0
     assert done["comparisons"][0]["success"]["improvement"]["probability"] == 0.5
 
 
-def test_what_is_shown(cli, train):
-    run = train("cartpole")
+def test_what_is_shown(cli, trained):
+    run = trained("cartpole")
     done = cli("eval", "--compare", run, "zero", "--episodes", 4, "episode_length_s=0.5")
     assert done.code == 0, done.err
     first, *_ = done.out.splitlines()
@@ -73,8 +86,8 @@ def test_what_is_shown(cli, train):
     assert f"return: {run.name} - zero" in done.out
 
 
-def test_runs_whose_tasks_differ_are_refused_with_what_differs(cli, train):
-    one, other = train("cartpole"), train("cartpole", "rewards.alive.weight=3.0", "episode_length_s=2.0")
+def test_runs_whose_tasks_differ_are_refused_with_what_differs(cli, trained):
+    one, other = trained("cartpole"), trained("changed")
     done = cli("eval", "--compare", one, other)
     assert done.code == 3
     assert "episode_length_s: 2.0, and in" in done.err
@@ -86,21 +99,21 @@ def test_runs_whose_tasks_differ_are_refused_with_what_differs(cli, train):
     assert cli("eval", "--compare", one, other, *alike, "--episodes", 2).code == 0
 
 
-def test_how_many_environments_a_run_was_trained_in_makes_no_difference(cli, train):
-    one, other = train("cartpole"), train("cartpole", "--num-envs", 4, "viewer.width=64", "--agent", "sb3-ppo")
+def test_how_many_environments_a_run_was_trained_in_makes_no_difference(cli, trained):
+    one, other = trained("cartpole"), trained("other")
     assert cli("eval", "--compare", one, other, "--episodes", 2).code == 0
 
 
-def test_runs_of_other_tasks_are_refused(cli, train):
-    one, other = train("cartpole"), train("cartpole-direct")
+def test_runs_of_other_tasks_are_refused(cli, trained):
+    one, other = trained("cartpole"), trained("direct")
     done = cli("eval", "--compare", one, other)
     assert done.code == 2
     assert "of the task cartpole, and" in done.err
     assert "of cartpole-direct" in done.err
 
 
-def test_the_first_policy_is_the_one_that_must_not_fall_short(cli, train):
-    run = train("cartpole")
+def test_the_first_policy_is_the_one_that_must_not_fall_short(cli, trained):
+    run = trained("cartpole")
     words = ("eval", "--compare", run, "lqr", "--episodes", 6, "--json")
     done = cli(*words, "--fail-under", "success=0.9")
     assert done.code == 9

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from rlcli.cli.runs import age, size
+from rlcli.rl.evaluations import keep_evaluation
 from rlcli.rl.overview import overviews
 from rlcli.rl.run import create_run, is_locked, open_run
 
@@ -114,6 +115,17 @@ def test_the_best_is_that_of_the_evaluations(cli, made):
     made("a", rows, "finished", best=128)
     assert listed(cli)[0]["best"] == {"step": 128, "return": 2.0, "success": 0.2}
     assert "20.0%" in cli("runs").out
+
+
+def test_what_eval_found_is_shown(cli, made):
+    run = made("a", [row(1)], "finished")
+    mean, none = {"mean": 4.5, "std": 0.1, "low": 4.4, "high": 4.6}, {"rate": 0.875, "low": 0.5, "high": 1.0}
+    document = {"command": "eval", "episodes": 8, "seed": 1, "return": mean, "length": mean, "success": none}
+    document |= {"reward_terms": {}, "terminations": {}, "diverged": 0, "diverged_by": {}}
+    keep_evaluation(run, f"{64:012d}", document)
+    (run.folder / "evaluations" / "000000000128.json").write_text("{")
+    assert listed(cli)[0]["evaluation"] == {"step": 64, "episodes": 8, "return": 4.5, "success": 0.875}
+    assert "87.5%" in cli("runs").out
 
 
 def test_newest_first_of_one_task_and_no_more_than_asked_for(cli, made):

@@ -109,7 +109,7 @@ def test_clips_change_nothing_of_training(cli, weights, task, agent):
         )
         fps, frames, spread = json.loads(read.stdout)
         assert fps == pytest.approx(60, rel=1e-2)
-        assert 1 <= frames <= 18
+        assert 1 <= frames <= 19  # 0.3 s: 18 steps of the one task, 19 of the other
         assert spread > 1
 
 

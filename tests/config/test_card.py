@@ -101,6 +101,14 @@ def test_events_have_their_time_and_ranges():
     assert "`range` = [0.8, 1.2]" in terms["mass"]["Ranges and parameters"]
 
 
+def test_models_of_actuators_are_on_the_card():
+    drive = "{joints: slider_to_cart, kind: pd, stiffness: 5, damping: 1, effort_limit: 9, delay: [1, 3]}"
+    terms = rows(built("cartpole", f"scene.entities.robot.actuators={{drive: {drive}}}"), "Actuators")
+    assert terms["drive"]["Kind"] == "pd"
+    assert "stiffness: 5, damping: 1, effort_limit: 9" in terms["drive"]["Settings"]
+    assert "delay: [1, 3]" in terms["drive"]["Settings"]
+
+
 def test_tables_and_columns_without_content_are_left_out():
     content = built("cartpole")
     titles = [table.title for table in content.tables]

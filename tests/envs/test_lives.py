@@ -62,7 +62,7 @@ def lived(task, *overrides, lives=0, steps=50):
 
 @pytest.mark.parametrize("engine", ["batch", "warp"])
 def test_environments_of_one_life_are_equal_and_live_as_in_a_smaller_set(noisy, engine):
-    steps = 50 if engine == "batch" else 25
+    steps = 50 if engine == "batch" else 22
     setting = f"sim.engine={engine}"
     folded = lived(noisy, setting, lives=2, steps=steps)
     torch.testing.assert_close(folded[:, 0:2], folded[:, 2:4], rtol=0, atol=0)

@@ -136,7 +136,7 @@ def test_an_exported_file_runs_without_rlcli(newest, tmp_path, suffix):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--format", "numpy"], "formats: onnx, torch"),
+        (["--format", "keras"], "formats: onnx, torch, numpy"),
         (["--format", "onxx"], "did you mean 'onnx'?"),
         (["--output", "policy.pt2"], "--format torch"),
         (["--format", "torch", "--output", "policy.onnx"], "--format onnx"),

@@ -1,9 +1,11 @@
 """What an exported file computes and what it says of itself."""
 
+import copy
 import hashlib
 import json
 import os
 import re
+import runpy
 import shutil
 from pathlib import Path
 
@@ -37,6 +39,10 @@ def exported(newest, tmp_path):
         file = tmp_path / f"policy{module.FORMATS[format_]}"
         done = export(checkpoint, file, format_)
         policy = policy_of(checkpoint)
+        if format_ == "numpy":
+            space = runpy.run_path(str(file))
+            numpy_run = lambda obs: {k: torch.from_numpy(v) for k, v in space["run"]({"obs": obs.numpy()}).items()}  # noqa: E731
+            return policy, numpy_run, space["METADATA"], done
         if format_ == "torch":
             extra = {"rlcli": ""}
             program = torch.export.load(file, extra_files=extra).module()
@@ -62,7 +68,7 @@ def thousand(newest, task):
 
 
 @pytest.mark.parametrize("batch", [1, 7])
-@pytest.mark.parametrize("format_", ["onnx", "torch"])
+@pytest.mark.parametrize("format_", ["onnx", "torch", "numpy"])
 @pytest.mark.parametrize("task", POLICIES)
 def test_export_equals_the_policy_on_1000_observations(exported, newest, task, format_, batch):
     policy, run, metadata, _ = exported(task, format_)
@@ -108,7 +114,7 @@ def test_the_deployed_policy_does_not_depend_on_the_batch(newest):
     torch.testing.assert_close(whole, single, atol=1e-6, rtol=1e-6)
 
 
-@pytest.mark.parametrize("format_", ["onnx", "torch"])
+@pytest.mark.parametrize("format_", ["onnx", "torch", "numpy"])
 def test_export_writes_exactly_one_file(exported, tmp_path, format_):
     _, _, _, done = exported("cartpole", format_)
     assert [file for file in tmp_path.rglob("*") if file.is_file()] == [done.file]
@@ -149,12 +155,27 @@ SCHEMA = {
         {"name": str, "size": int, "elements": list, "unit": str, "scale": (list, type(None)),
          "clip": (list, type(None)), "columns": list, "history": int, "modifiers": list}
     ],
+    "memory": list,
     "actions": [
         {"name": str, "size": int, "elements": list, "unit": str, "scale": (list, type(None)),
          "offset": (list, type(None)), "clip": (list, type(None)), "limits": (list, type(None)), "columns": list,
          "command": str}
     ],
     "applied": {"before_obs": list, "inside": list, "between_action_and_command": list},
+    "deployment": {
+        "joints": [
+            {"name": str, "entity": str, "qpos": int, "dof": int, "default": float,
+             "stiffness": (float, type(None)), "damping": (float, type(None))}
+        ],
+        "actuators": [{"name": str, "range": (list, type(None))}],
+        "observations": [
+            {"name": str, "func": str, "params": dict, "columns": list, "history": int, "closed": bool, "value": dict}
+        ],
+        "controls": [
+            {"name": str, "func": str, "ctrl": list, "actuators": list, "closed": bool, "value": dict}
+        ],
+        "commands": list, "start": {"qpos": list, "qvel": list}, "forces_after_reset": bool, "derived": str,
+    },
     "normalizer": bool, "action_bound": float, "step_dt": float, "dt": float, "decimation": int, "quaternions": str,
     "policy": str, "task": {"name": str, "distribution": (str, type(None)), "version": (str, type(None))},
     "agent": str, "run": str, "step": int, "seed": int, "versions": {"rlcli": str, "torch": str, "mujoco": str},
@@ -174,7 +195,7 @@ def require_shape(value, schema, path="metadata"):
         assert isinstance(value, schema), path
 
 
-@pytest.mark.parametrize("format_", ["onnx", "torch"])
+@pytest.mark.parametrize("format_", ["onnx", "torch", "numpy"])
 @pytest.mark.parametrize("task", [*POLICIES, "arm"])
 def test_metadata_is_complete_and_fits_the_run(exported, runs, task, format_):
     _, _, metadata, _ = exported(task, format_)
@@ -276,20 +297,17 @@ def test_action_stays_in_a_bound_other_than_one(exported):
     assert float(action.abs().max()) == pytest.approx(0.8)
 
 
-@pytest.mark.parametrize("format_", ["onnx", "torch"])
+@pytest.mark.parametrize("format_", ["onnx", "torch", "numpy"])
 def test_a_file_that_does_not_compute_the_policy_is_not_kept(newest, tmp_path, monkeypatch, format_):
     # the graph is given other weights behind the checker's back
-    name = {"onnx": "_onnx_bytes", "torch": "_torch_bytes"}[format_]
-    write = getattr(module, name)
+    write = module.formats.write
 
-    def wrong(graph, metadata):
-        import copy
-
+    def wrong(format_, graph, *rest):
         other = copy.deepcopy(graph)
         other.policy.actor[-1].bias += 1e-3
-        return write(other, metadata)
+        return write(format_, other, *rest)
 
-    monkeypatch.setattr(module, name, wrong)
+    monkeypatch.setattr(module.formats, "write", wrong)
     file = tmp_path / "deep" / f"policy{module.FORMATS[format_]}"
     with pytest.raises(VerdictError, match=re.escape("'action' differs")):
         export(open_checkpoint(newest("cartpole")), file, format_)

@@ -33,6 +33,8 @@ KILLED_AT = {
     "before replay rows have their name": ("replace", r"checkpoints/logs/replay/", "before"),
     "before run.json": ("replace", r"/run\.json$", "before"),
     "in the middle of run.json": ("write", r"/\.run\.json\.tmp-", "middle"),
+    "in the middle of a kept episode": ("write", r"/autopsy/\.\d+-env.*tmp-", "middle"),
+    "before a kept episode has its name": ("replace", r"/autopsy/\d+-env", "before"),
     # while a run is resumed
     "before the metrics are cut": ("replace", r"/metrics\.jsonl$", "before"),
     "after the metrics are cut": ("replace", r"/metrics\.jsonl$", "after"),

@@ -7,7 +7,9 @@ from typing import Any
 
 import torch
 
+from rlcli.rl.autopsy import FOLDER
 from rlcli.rl.checkpoint import Checkpoint, open_checkpoint, steps
+from rlcli.rl.dump import read_dump
 from rlcli.rl.loggers import read_metrics
 from rlcli.rl.run import open_run
 
@@ -51,6 +53,17 @@ def leftovers(run: Path) -> list[str]:
     return found + sorted(have - needed)
 
 
+def assert_cases(run: Path) -> None:
+    """Every kept episode is whole, belongs to the run that was finished, and is there once."""
+    keys = []
+    for file in (run / FOLDER).glob("*.safetensors"):
+        document = read_dump(file).document
+        assert document.ending is not None
+        assert document.ending.step <= newest(run).step
+        keys.append((document.lives[0].env, document.ending.episode))
+    assert len(keys) == len(set(keys))
+
+
 def tensorboard_steps(run: Path) -> dict[str, list[int]]:
     """Steps of every scalar but times, in the order of the files."""
     from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
@@ -65,6 +78,7 @@ def tensorboard_steps(run: Path) -> dict[str, list[int]]:
 
 def assert_same_run(run: Path, whole: Path, *, state: str = "finished") -> None:
     """A run that was interrupted and resumed is the one that never was."""
+    assert_cases(run)
     assert rows_of(run) == rows_of(whole)
     wanted, found = content(newest(whole)), content(newest(run))
     assert found == wanted

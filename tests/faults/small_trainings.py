@@ -12,11 +12,13 @@ import yaml
 from worlds import CRITTER_TASK, critter, dump
 
 from rlcli.config.load import resolve
+from rlcli.config.schema import AutopsyConfig
 from rlcli.envs.vec_env import make_env
 from rlcli.errors import Stopped
 from rlcli.random import derive
 from rlcli.registry import find_task, load_object
 from rlcli.rl import train as loop
+from rlcli.rl.autopsy import open_keeper
 from rlcli.rl.checkpoint import open_checkpoint, steps
 from rlcli.rl.loggers import JsonLines, read_metrics
 from rlcli.rl.run import Run
@@ -116,6 +118,7 @@ def train(
     keep: Keep | None = None,
     save_interval: int | None = 1,
     eval_interval: int | None = None,
+    autopsy: AutopsyConfig | None = None,
 ) -> Run:
     """Train as `rlcli train` does, or go on.
 
@@ -130,6 +133,7 @@ def train(
         keep: which checkpoints stay.
         save_interval: iterations between checkpoints.
         eval_interval: iterations between evaluations.
+        autopsy: which ends of episodes are kept; None: none.
     """
     resolved, record = resolved_of(case, place), Run(run, {})
     new = resume is None
@@ -152,7 +156,9 @@ def train(
         saved = open_checkpoint(record.checkpoints / f"{step:012d}")
         trainer.load(saved.state())
         drop_after(record.checkpoints, saved.step)
-    saver = Saver(record.checkpoints, keep or Keep(None), {"case": str(case)}, resumed=saved)
+    told: list[str] = []
+    cases = open_keeper(env, autopsy, run, None if saved is None else saved.step, told.append)
+    saver = Saver(record.checkpoints, keep or Keep(None), {"case": str(case)}, resumed=saved, cases=cases)
     log = JsonLines(record.metrics, resume_after=None if new else trainer.iteration)
     trials = None
     if eval_interval is not None:
@@ -175,6 +181,7 @@ def train(
     else:
         assert within is None, "the step was never reached"
     finally:
+        assert not told
         log.close()
         env.close()
         if trials is not None:

@@ -17,6 +17,7 @@ from fault_sizes import SIZE, amount, chosen
 from run_comparison import assert_loads, assert_same_run, newest
 
 from rlcli.rl.checkpoint import steps
+from rlcli.rl.dump import read_dump
 
 SAC = """
 agents:
@@ -53,7 +54,10 @@ RESUMING = [
 ]  # fmt: skip
 ROWS = ["in the middle of replay rows", "before replay rows have their name"]
 RECORD = ["before run.json", "in the middle of run.json"]
-WRITING = [point for point in KILLED_AT if point not in (*RESUMING, *ROWS, *RECORD)]
+KEPT = ["in the middle of a kept episode", "before a kept episode has its name"]
+WRITING = [point for point in KILLED_AT if point not in (*RESUMING, *ROWS, *RECORD, *KEPT)]
+FALLING = ("cartpole", "agent.n_steps=8", *MINI, "agent.autopsy.keep=1000",
+           "terminations.cart_out_of_bounds.bounds=[-0.3,0.3]")  # fmt: skip
 NAMED = [
     *((point, nth, name) for point in WRITING for nth, name in ((1, "sb3-ppo"), (4, "sac"), (3, "ppo"))),
     # its first time the run begins to be one
@@ -119,6 +123,35 @@ def test_a_run_killed_at_this_moment_goes_on_as_if_it_had_not_been(child, whole,
     resumed = child(folder, "train", "--resume", "latest", "-q").ended()
     assert resumed.code == 0, resumed.err
     assert_same_run(run, whole(name)[0])
+
+
+def terminated(run):
+    """The episodes of a run that a termination ended, as they were kept."""
+    documents = [read_dump(file).document for file in (run / "autopsy").glob("*.safetensors")]
+    return sorted(
+        (d.ending.step, d.lives[0].env, d.ending.episode, d.ending.length, d.ending.total_reward)
+        for d in documents
+        if d.ending.kind == "terminated"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("point", KEPT)
+def test_a_run_killed_while_it_writes_kept_episodes_has_each_once_and_whole(child, tmp_path, point):
+    runs = []
+    for name, faults in (("whole", []), ("killed", killed_at(point, 3))):
+        (tmp_path / name).mkdir()
+        ended = child(tmp_path / name, "train", *FALLING, *SMALL, *SHORT, "--seed", 5, faults=faults).ended()
+        assert ended.code == (-signal.SIGKILL if faults else 0), ended.err
+        runs.append(run_in(tmp_path / name))
+    whole, killed = runs
+    for file in (killed / "autopsy").glob("*.safetensors"):
+        read_dump(file)  # also before anything is cleaned away
+    resumed = child(tmp_path / "killed", "train", "--resume", "latest", "-q").ended()
+    assert resumed.code == 0, resumed.err
+    assert_same_run(killed, whole)
+    assert len(terminated(whole)) > 3
+    assert terminated(killed) == terminated(whole)
 
 
 @pytest.mark.slow

@@ -108,6 +108,7 @@ def test_where_there_is_none_the_reason_is_said(task, overrides, more, said):
     assert "there is no LQR of" in caught.value.message
 
 
+@pytest.mark.slow
 def test_on_the_other_engine_it_is_the_same_regulator_and_variants_have_the_same_numbers():
     found = {}
     for engine in ("batch", "warp"):

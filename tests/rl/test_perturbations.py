@@ -161,6 +161,31 @@ def test_what_an_event_of_the_task_draws_is_scaled_once_whenever_it_is_drawn(wor
     assert len(masses) == 4  # drawn anew in each of the four episodes
 
 
+def test_sweeps_of_the_same_values_multiply_once_in_any_order(world):
+    event = (
+        "events.mass={func: randomize_body_mass, mode: reset, bodies: [arm], operation: set, range: [2.0, 6.0],"
+        " with_inertia: false}"
+    )
+    for names in (
+        ("body_mass", "body_mass.arm", "body_inertia.arm"),
+        ("body_inertia.arm", "body_mass.arm", "body_mass"),
+    ):
+        plain, other = world(event), world(event)
+        factor = {"body_mass": 2.0, "body_mass.arm": 3.0, "body_inertia.arm": 5.0}
+        sweeps = read_sweeps([f"{name}=1:9" for name in names], 5)
+        values = torch.tensor([[factor[name] for name in names]] * 4, dtype=torch.float64)
+        Perturbations(other, sweeps, values)
+        for _ in range(25):
+            for env in (plain, other):
+                env.step(torch.zeros(4, 1))
+            other.before_step()
+            mass, inertia = other.engine.expanded("body_mass"), other.engine.expanded("body_inertia")
+            assert mass[:, 1].tolist() == [4.0] * 4
+            assert (mass[:, 2] / plain.engine.expanded("body_mass")[:, 2]).tolist() == pytest.approx([6.0] * 4)
+            own = torch.tensor(other.engine.model.body_inertia[2])
+            assert (inertia[:, 2] / own).flatten().tolist() == pytest.approx([30.0] * 12)
+
+
 class Counting:
     """A policy that counts its steps, and notes what it sees."""
 

@@ -6,6 +6,8 @@ outlives a step is written in place, and tensors are few.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from pydantic import Field
 from torch import Tensor
@@ -139,6 +141,26 @@ class AntTask(DirectTask):
             dim=1,
             out=self.obs_buf,
         )
+
+    def in_terms(self) -> dict[str, list[dict[str, Any]]]:
+        """The same in the vocabulary of manager-based tasks."""
+        target = (*self.params.target, 0.0)
+        return {
+            "observations": [
+                {"func": "base_pos_z"},
+                {"func": "base_lin_vel"},
+                {"func": "base_ang_vel"},
+                {"func": "base_yaw_roll"},
+                {"func": "base_angle_to_target", "target": target},
+                {"func": "base_up_proj"},
+                {"func": "base_heading_proj", "target": target},
+                {"func": "joint_pos_limit_normalized"},
+                {"func": "joint_vel", "scale": 0.2},
+                {"func": "sensor_data", "sensors": ".*", "scale": 0.1},
+                {"func": "last_action"},
+            ],
+            "actions": [{"func": "joint_effort", "joints": list(JOINTS), "scale": self.params.effort}],
+        }
 
     def calculate_metrics(self) -> None:
         """Progress, posture and life, less what they cost; a fall costs the rest."""

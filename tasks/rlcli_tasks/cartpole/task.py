@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from pydantic import Field
@@ -67,6 +68,15 @@ class CartpoleTask(DirectTask):
         self.obs_buf[:, 2] = position[:, self.pole]
         self.obs_buf[:, 3] = velocity[:, self.pole]
         return {self.cartpoles.name: {"obs_buf": self.obs_buf}}
+
+    def in_terms(self) -> dict[str, list[dict[str, Any]]]:
+        """The same in the vocabulary of manager-based tasks."""
+        cart, pole = ["slider_to_cart"], ["cart_to_pole"]
+        observed = [{"func": func, "joints": joints} for joints in (cart, pole) for func in ("joint_pos", "joint_vel")]
+        return {
+            "observations": observed,
+            "actions": [{"func": "joint_effort", "joints": cart, "scale": self.params.max_effort}],
+        }
 
     def calculate_metrics(self) -> None:
         """Upright and calm is good, out of bounds costs 2."""

@@ -1,0 +1,91 @@
+"""A trained policy that needs numpy alone: `outputs = run({"obs": obs})`, rows of float32 in and out.
+
+`METADATA` says what the columns are; outputs are `action`, what env.step takes, and `command`, what the actuators
+receive. With a memory, inputs have `h_in` and `c_in` besides, zeros when an episode begins, and outputs `h_out` and
+`c_out`, the next step's inputs. `run` keeps nothing from call to call; an `Episode` does.
+"""
+
+import base64
+import io
+
+import numpy as np
+
+METADATA: dict = {}
+NETWORK: dict = {}
+WEIGHTS = ""
+
+
+def run(inputs):
+    """(n, observations) -> name: (n, columns); layers compute in float64"""
+    x = np.asarray(inputs["obs"], np.float32)
+    if NETWORK["normalize"]:
+        x = (x - _W["mean"]) * _W["scale"]
+        x = (
+            x
+            if NETWORK["normalize_clip"] is None
+            else np.clip(x, -NETWORK["normalize_clip"], NETWORK["normalize_clip"])
+        )
+    x, outputs = x.astype(np.float64), {}
+    if NETWORK["cells"]:
+        hidden, cells = [], []
+        for layer, (h, c) in enumerate(zip(inputs["h_in"], inputs["c_in"], strict=True)):
+            gates = x @ _W[f"in{layer}"].T + h.astype(np.float64) @ _W[f"rec{layer}"].T + _W[f"bias{layer}"]
+            i, f, g, o = np.split(gates, 4, axis=1)
+            c = _sigmoid(f) * c + _sigmoid(i) * np.tanh(g)
+            x = _sigmoid(o) * np.tanh(c)
+            hidden.append(x)
+            cells.append(c)
+        outputs = {"h_out": np.array(hidden, np.float32), "c_out": np.array(cells, np.float32)}
+    for layer in range(NETWORK["layers"]):
+        x = x @ _W[f"w{layer}"].T + _W[f"b{layer}"]
+        if layer < NETWORK["layers"] - 1:
+            x = _ACTIVATIONS[NETWORK["activation"]](x)
+    action, bound = x.astype(np.float32), NETWORK["bound"]
+    if NETWORK["squashed"]:
+        action = np.tanh(action) * np.float32(bound)
+    if bound is not None:
+        action = np.clip(action, np.float32(-bound), np.float32(bound))
+    command = action * _W["command_scale"] + _W["command_offset"] if NETWORK["scaled"] else action.copy()
+    for low, high in NETWORK["bounds"]:
+        command = np.minimum(np.maximum(command, np.float32(low)), np.float32(high))
+    return {"action": action, "command": command, **outputs}
+
+
+class Episode:
+    """Remembers for one robot: past steps of observation terms with a history, and the policy's memory."""
+
+    def __init__(self):
+        self.terms, self.rows, self.memory = METADATA["observations"], {}, {}
+        for part in METADATA["memory"]:
+            self.memory[part["input"]] = np.zeros(part["single"], np.float32)
+
+    def step(self, now):
+        """From the observation of this step alone, each term's columns once, to action and command, a row each."""
+        start, seen = 0, []
+        for term in self.terms:
+            width = term["size"] // term["history"]
+            row = np.asarray(now, np.float32)[start : start + width]
+            rows = self.rows.get(term["name"], [row] * term["history"])  # an episode's first value fills it
+            self.rows[term["name"]] = [*rows[1:], row]
+            seen += self.rows[term["name"]]
+            start += width
+        out = run({"obs": np.concatenate(seen)[None], **self.memory})
+        self.memory = {part["input"]: out[part["output"]] for part in METADATA["memory"]}
+        return out["action"][0], out["command"][0]
+
+
+def _sigmoid(x):
+    small = np.exp(-np.abs(x))
+    return np.where(x >= 0, 1.0, small) / (1.0 + small)
+
+
+_ACTIVATIONS: dict = {
+    "elu": lambda x: np.where(x > 0, x, np.exp(np.minimum(x, 0.0)) - 1.0),
+    "relu": lambda x: np.maximum(x, 0.0),
+    "tanh": np.tanh,
+    "silu": lambda x: x * _sigmoid(x),
+}
+_W = {}
+if WEIGHTS:
+    with np.load(io.BytesIO(base64.b64decode(WEIGHTS)), allow_pickle=False) as _file:
+        _W = {_name: _file[_name] for _name in _file.files}

@@ -1,0 +1,152 @@
+"""The history of engine calls and the names of what diverged."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from rlcli.sim import guard
+from rlcli.sim.guard import Divergence, History, StateLayout
+
+MODEL = """
+<mujoco>
+  <worldbody>
+    <body name="base"><freejoint name="root"/><geom size="0.1"/>
+      <body><joint name="swing" axis="0 1 0"/><geom size="0.1"/>
+        <body><joint axis="0 1 0"/><geom size="0.1"/></body></body></body>
+  </worldbody>
+  <actuator><motor name="turn" joint="swing"/><motor joint="swing"/></actuator>
+</mujoco>
+"""
+COLUMNS = {"time": (0, 1), "qpos": (1, 3), "qvel": (4, 2), "ctrl": (6, 1), "qacc_warmstart": (7, 2)}
+
+
+@pytest.fixture
+def layout():
+    return StateLayout(mujoco.MjModel.from_xml_string(MODEL), COLUMNS)
+
+
+def history(envs=2, columns=4, width=3, calls=3):
+    state = np.zeros((envs, columns))
+    return state, History(state, width, np.array([-1.0, -2.0, -3.0, -4.0]), calls)
+
+
+def test_a_divergence_says_environment_cause_and_place():
+    assert str(Divergence(3, "BADQACC", "joint 'swing'")) == "environment 3: BADQACC (joint 'swing')"
+    assert str(Divergence(0, "engine error")) == "environment 0: engine error"
+    assert Divergence(0, "x").index == -1
+
+
+def test_the_last_calls_are_kept_oldest_first_with_what_nobody_wrote_from_the_default():
+    state, kept = history()
+    assert (kept.calls, kept.width) == (3, 3)
+    assert kept.of(0) == []
+    for number in range(5):
+        state[:] = number
+        kept.note(nstep=10 + number)
+        found = kept.of(1)
+        assert [call.nstep for call in found] == [10 + n for n in range(max(0, number - 2), number + 1)]
+    state[:] = 99.0
+    assert [call.state.tolist() for call in kept.of(0)] == [[n, n, n, -4.0] for n in (2.0, 3.0, 4.0)]
+    assert kept.last(0).tolist() == [4.0, 4.0, 4.0]
+
+
+def test_an_episode_that_begins_anew_has_no_past_and_the_others_keep_theirs():
+    state, kept = history()
+    assert kept.last(0) is None
+    for number in (1.0, 2.0):
+        state[:] = number
+        kept.note(1)
+    kept.forget(np.array([1]))
+    assert kept.last(1) is None
+    assert kept.of(1) == []
+    assert kept.last(0).tolist() == [2.0] * 3
+    state[:] = 3.0
+    kept.note(1)
+    assert [call.state[0] for call in kept.of(1)] == [3.0]
+    assert [call.state[0] for call in kept.of(0)] == [1.0, 2.0, 3.0]
+    assert kept.last(1).tolist() == [3.0] * 3
+
+
+@pytest.mark.parametrize(
+    ("envs", "calls", "kept"), [(1, 64, 64), (2**14, 64, 64), (2**15, 64, 32), (2**21, 64, 1), (1, 0, 1)]
+)
+def test_a_history_takes_64_mb_and_always_keeps_a_call(envs, calls, kept, monkeypatch):
+    monkeypatch.setattr(guard.np, "empty", lambda shape: np.zeros(1))
+    state = np.broadcast_to(np.zeros((1, 8)), (envs, 8))
+    assert History(state, 8, np.zeros(8), calls).calls == kept
+
+
+def test_a_model_without_columns_has_a_history_too():
+    kept = History(np.zeros((2, 0)), 0, np.zeros(0), 4)
+    kept.note(1)
+    assert [call.state.tolist() for call in kept.of(0)] == [[]]
+
+
+def test_columns_are_those_of_the_layout(layout):
+    assert layout.columns("qpos") == slice(1, 4)
+    assert layout.until("qvel") == 6
+    assert layout.fields() == [
+        ("time", slice(0, 1)), ("qpos", slice(1, 4)), ("qvel", slice(4, 6)), ("ctrl", slice(6, 7)),
+        ("qacc_warmstart", slice(7, 9)),
+    ]  # fmt: skip
+
+
+def test_what_is_written_is_named_before_what_comes_of_it(layout):
+    row = np.zeros(9)
+    assert layout.unfit(row) == []
+    row[[0, 3, 5, 6, 8]] = np.nan, np.inf, -np.inf, np.nan, np.nan
+    assert layout.unfit(row) == ["ctrl", "qpos", "qvel", "qacc_warmstart", "time"]
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "found"),
+    [
+        (0, np.nan, None),
+        (1, 1e10, None),
+        (1, -1e10, None),
+        (1, 1.0000001e10, ("qpos", 0)),
+        (3, -1e11, ("qpos", 2)),
+        (2, np.nan, ("qpos", 1)),
+        (4, np.inf, ("qvel", 0)),
+        (5, np.nan, ("qvel", 1)),
+        (6, 1e30, None),
+    ],
+)
+def test_the_first_position_or_velocity_that_mujoco_would_not_take_is_found(layout, column, value, found):
+    row = np.zeros(9)
+    row[column] = value
+    assert layout.unbounded(row) == found
+
+
+def test_positions_are_named_before_velocities_and_the_first_of_several(layout):
+    row = np.zeros(9)
+    row[[5, 3, 2]] = np.nan
+    assert layout.unbounded(row) == ("qpos", 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "index", "place"),
+    [
+        ("qpos", 0, "joint 'root'"),
+        ("qpos", 6, "joint 'root'"),
+        ("qpos", 7, "joint 'swing'"),
+        ("qpos", 8, "joint '2'"),
+        ("qpos", 9, "qpos[9]"),
+        ("qpos", -1, "qpos[-1]"),
+        ("qvel", 0, "joint 'root'"),
+        ("qvel", 5, "joint 'root'"),
+        ("qvel", 6, "joint 'swing'"),
+        ("qvel", 7, "joint '2'"),
+        ("qvel", 8, "qvel[8]"),
+        ("qvel", -1, "qvel[-1]"),
+        ("qacc", 6, "joint 'swing'"),
+        ("qacc", 8, "qacc[8]"),
+        ("ctrl", 0, "actuator 'turn'"),
+        ("ctrl", 1, "actuator '1'"),
+        ("ctrl", 2, "ctrl[2]"),
+        ("ctrl", -1, "ctrl[-1]"),
+        ("act", 0, "act[0]"),
+    ],
+)
+def test_a_place_is_named_by_what_it_belongs_to(layout, name, index, place):
+    assert layout.place(name, index) == place
