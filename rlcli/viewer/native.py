@@ -21,10 +21,12 @@ from rlcli.viewer.video import free_camera
 
 KEYS = (
     "Space: pause, go on. Right: one step. Backspace: new episodes. - and =: speed. Up, Down: environment."
-    " PageUp, PageDown: newer, older checkpoint. Double click, then Ctrl and drag: push a body"
+    " PageUp, PageDown: newer, older checkpoint. Home, End: choose a command; Insert, Delete: raise, lower it."
+    " Double click, then Ctrl and drag: push a body"
 )
 _SPACE, _BACKSPACE, _MINUS, _EQUAL = 32, 259, 45, 61
 _RIGHT, _DOWN, _UP, _PAGE_UP, _PAGE_DOWN = 262, 264, 265, 266, 267
+_INSERT, _DELETE, _HOME, _END = 260, 261, 268, 269
 _FRAME = 1.0 / 60.0
 _REREAD = 1.0
 
@@ -80,6 +82,10 @@ def press(player: Player, code: int) -> None:
         _DOWN: partial(player.show, view.shown - 1),
         _PAGE_UP: partial(player.neighbour, 1),
         _PAGE_DOWN: partial(player.neighbour, -1),
+        _HOME: partial(player.choose_knob, -1),
+        _END: partial(player.choose_knob, 1),
+        _INSERT: partial(player.turn_knob, 1),
+        _DELETE: partial(player.turn_knob, -1),
     }
     if code in asked:
         player.ask(asked[code])
@@ -95,7 +101,9 @@ def captions(view: View) -> tuple[str, str]:
     }
     if view.checkpoint is not None:
         rows["checkpoint"] = f"{view.checkpoint}"
-    rows |= {name: f"{value:g}" for name, value in view.held.items()}
+    for place, knob in enumerate(view.knobs):
+        asked = f"{view.held[knob.name]:g}" if knob.name in view.held else "as drawn"
+        rows[f"{'> ' if place == view.knob else ''}{knob.name}"] = asked
     if view.message:
         rows[""] = view.message[:80]
     return "\n".join(rows), "\n".join(rows.values())

@@ -63,6 +63,8 @@ class View:
     follow: bool
     knobs: tuple[Knob, ...]
     held: Mapping[str, float]
+    knob: int
+    """Which of the knobs a key turns."""
     message: str
 
 
@@ -93,6 +95,7 @@ class Player:
     """Observations of an environment that goes on from where it stands; None: its episodes begin now."""
     steps: int = 0
     message: str = ""
+    _knob: int = 0
     _asked: queue.SimpleQueue[Callable[[], None]] = field(default_factory=queue.SimpleQueue)
     _obs: Tensor = field(init=False)
     _due: float = 0.0
@@ -184,6 +187,21 @@ class Player:
         """Ask this of the policy, whatever the task would ask; None: what the task asks."""
         hold_command(self.env, name, value)
 
+    def choose_knob(self, places: int) -> None:
+        """Which command `turn_knob` changes: the next one, or the one before."""
+        if self._commands is not None and (knobs := self._commands.knobs()):
+            self._knob = (self._knob + places) % len(knobs)
+
+    def turn_knob(self, places: int) -> None:
+        """Hold the chosen command, some tenths of its range higher or lower; beyond the range it is let go."""
+        if self._commands is None or not (knobs := self._commands.knobs()):
+            return
+        knob = knobs[self._knob]
+        start = min(max(0.0, knob.low), knob.high)
+        value = self._commands.held.get(knob.name, start) + places * (knob.high - knob.low) / 10.0
+        inside = knob.low - 1e-6 <= value <= knob.high + 1e-6
+        self.hold(knob.name, round(value, 6) if inside else None)
+
     def reread(self) -> None:
         """Read the list of checkpoints again; with `follow`, play the newest."""
         if self.shelf is None:
@@ -272,6 +290,7 @@ class Player:
             follow=self.follow,
             knobs=() if self._commands is None else tuple(self._commands.knobs()),
             held={} if self._commands is None else dict(self._commands.held),
+            knob=self._knob,
             message=self.message,
         )
 

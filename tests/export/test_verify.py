@@ -120,6 +120,7 @@ def pushed(tmp_path_factory):
     return next((folder / "runs" / "pushed").iterdir())
 
 
+@pytest.mark.slow
 def test_histories_memories_pushes_masses_and_commands_are_lived_through(pushed, tmp_path, capfd):
     verified = verify(capfd, pushed, tmp_path / "p.py", "--format", "numpy", "--episodes", "24")["verified"]
     assert verified["passed"]
@@ -245,7 +246,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 """
 
 
-@pytest.mark.parametrize("format_", ["onnx", "numpy"])
+@pytest.mark.parametrize("format_", [pytest.param("onnx", marks=pytest.mark.slow), "numpy"])
 def test_the_program_is_80_lines_and_runs_without_rlcli(newest, tmp_path, capfd, format_):
     run, suffix = newest("cartpole").parent.parent, {"onnx": ".onnx", "numpy": ".py"}[format_]
     verify(capfd, run, tmp_path / f"policy{suffix}", "--format", format_, "--episodes", "2")

@@ -74,6 +74,15 @@ def test_what_this_machine_has_no_memory_for_is_not_read(folder, monkeypatch):
         checkpoint.open_checkpoint(folder).tensors("env")
 
 
+def test_a_part_has_the_limit_of_its_kind_also_where_there_are_several(folder, monkeypatch):
+    shutil.copy(folder / "env.safetensors", folder / "env.1.safetensors")
+    edit_manifest(lambda m: m["files"].update({"env.1.safetensors": m["files"]["env.safetensors"]}))(folder)
+    monkeypatch.setitem(checkpoint._LIMITS, "env", 20)
+    for part in ("env", "env.1"):
+        with pytest.raises(CheckpointError, match=rf"{part}\.safetensors is too large: .* at most 20 are read"):
+            checkpoint.open_checkpoint(folder).tensors(part)
+
+
 def edit_manifest(change):
     def damage(folder):
         document = json.loads((folder / "manifest.json").read_text())

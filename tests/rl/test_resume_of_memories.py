@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from conftest import MODEL, YAML
+from scheduled_task import MODEL, YAML
 
 from rlcli.cli.app import main
 from rlcli.rl.loggers import read_metrics

@@ -1,6 +1,8 @@
 """The window's keys and captions; the window itself needs a display."""
 
 import pytest
+import yaml
+from worlds import CRITTER_TASK, build, critter
 
 from rlcli.config.load import resolve
 from rlcli.envs.vec_env import make_env
@@ -10,11 +12,22 @@ from rlcli.viewer.native import captions, press
 from rlcli.viewer.player import Player
 
 SPACE, BACKSPACE, MINUS, EQUAL, RIGHT, DOWN, UP, PAGE_UP = 32, 259, 45, 61, 262, 264, 265, 266
+INSERT, DELETE, HOME, END = 260, 261, 268, 269
 
 
 @pytest.fixture
 def player():
     env = make_env(resolve(find_task("cartpole"), overrides=["scene.num_envs=3", "sim.engine_threads=1"]))
+    return Player(env, zero_policy(env))
+
+
+def commanded(folder):
+    """A player of a task with a velocity command."""
+    task = yaml.safe_load(CRITTER_TASK)
+    task["commands"] = {
+        "velocity": {"func": "uniform_velocity", "resampling_time_s": [1.0, 2.0], "lin_vel_x": [-1.0, 2.0]}
+    }
+    env = build(critter(folder, yaml.safe_dump(task, sort_keys=False)))
     return Player(env, zero_policy(env))
 
 
@@ -44,6 +57,19 @@ def test_the_keys_ask_the_player(player):
 def test_keys_that_mean_nothing_here_do_nothing(player, key):
     before = player.view
     assert pressed(player, key) == before
+
+
+def test_keys_turn_commands_within_their_ranges(tmp_path):
+    player = commanded(tmp_path)
+    assert pressed(player, END).held == {}
+    assert pressed(player, INSERT, INSERT).held == {"vy": pytest.approx(0.4)}
+    assert pressed(player, HOME, DELETE).held["vx"] == pytest.approx(-0.3)
+    names, values = captions(player.view)
+    said = dict(zip(names.splitlines(), values.splitlines(), strict=True))
+    assert (said["> vx"], said["vy"], said["wz"]) == ("-0.3", "0.4", "as drawn")
+    pressed(player, DELETE, DELETE)
+    assert player.view.held["vx"] == pytest.approx(-0.9)
+    assert "vx" not in pressed(player, DELETE).held
 
 
 def test_the_captions_say_what_is_shown(player):
