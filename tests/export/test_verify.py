@@ -156,7 +156,9 @@ def weaken(manifest):
 
 
 @pytest.mark.parametrize(
-    ("change", "fails"), [(swap, "observation"), (shift, "observation"), (weaken, "control")], ids=lambda x: str(x)
+    ("change", "fails"),
+    [(swap, "observation"), (shift, "observation"), (weaken, "control")],
+    ids=["swapped columns", "shifted value", "weakened control"],
 )
 def test_metadata_that_says_something_else_than_the_task_does_is_found_out(copied, tmp_path, capfd, change, fails):
     tamper(copied, change)
