@@ -9,7 +9,8 @@ import yaml
 from torch import Tensor
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import StepResult, VecEnv, make_env
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv, make_env
 from rlcli.registry import find_task
 
 torch.set_num_threads(1)

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from rlcli.config.load import Resolved, resolve
 from rlcli.config.schema import TaskConfig
-from rlcli.envs.vec_env import StepResult, VecEnv, make_env
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv, make_env
 from rlcli.registry import find_task
 
 Floats = NDArray[np.float32]

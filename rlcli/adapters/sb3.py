@@ -11,7 +11,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv as Sb3Base
 
 from rlcli.adapters.gymnasium import Changes, open_task
-from rlcli.envs.vec_env import StepResult, VecEnv
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv
 
 UNBOUNDED = 1e6
 """Stands for an infinite action bound: SB3 wants finite ones."""

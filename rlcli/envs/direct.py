@@ -11,7 +11,8 @@ from torch import Tensor
 
 from rlcli.config.schema import StrictModel, TaskConfig
 from rlcli.envs.articulation import ArticulationView
-from rlcli.envs.vec_env import Layout, TermLayout, VecEnv
+from rlcli.envs.layout import Layout, TermLayout
+from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, RlcliError, TaskError
 from rlcli.managers.memory import Memory
 from rlcli.managers.termination import DIVERGED

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from rlcli.config.schema import ObservationConfig
 from rlcli.config.terms import SELECTORS
-from rlcli.envs.vec_env import Layout, TermLayout, VecEnv
+from rlcli.envs.layout import Layout, TermLayout
+from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.action import ActionManager, CommandMap
 from rlcli.managers.command import CommandManager
 from rlcli.managers.curriculum import CurriculumManager

@@ -10,7 +10,6 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,8 @@ from torch import Tensor
 from rlcli.config.load import Resolved, resolve
 from rlcli.config.python import source_of
 from rlcli.config.schema import InitialStateConfig, TaskConfig
+from rlcli.envs.layout import Layout
+from rlcli.envs.step import Episodes, Lived, StepResult
 from rlcli.errors import DivergedError
 from rlcli.machine import require_device
 from rlcli.managers.term import Binder
@@ -35,153 +36,6 @@ from rlcli.sim.scene import Scene
 from rlcli.sim.selection import Selection
 from rlcli.sim.sensors import ContactSensor, RaySensor, make_sensors
 from rlcli.sim.terrain import Terrain
-
-
-@dataclass(frozen=True, slots=True)
-class Episodes:
-    """Episodes that just ended, one a row."""
-
-    ids: Tensor
-    """Environments. (n,) int64"""
-    returns: Tensor
-    """Undiscounted sums of rewards. (n,)"""
-    lengths: Tensor
-    """Environment steps. (n,) int64"""
-    reward_terms: dict[str, Tensor]
-    """Term -> its share of the return, weight included. (n,) each"""
-    causes: dict[str, Tensor]
-    """Termination -> whether it fired at the end. (n,) bool each"""
-    truncated: Tensor
-    """Ended by time alone. (n,) bool"""
-    success: Tensor | None
-    """Met the task's success condition; None where the task has none. (n,) bool"""
-    metrics: dict[str, Tensor] = field(default_factory=dict)
-    """`command/metric` -> its mean over the episode. (n,) each"""
-    mask: Tensor | None = None
-    """A GPU gives a row for every environment, valid until the next step, and which of them count. (num_envs,) bool;
-    None: all rows do."""
-
-    def ended(self) -> Episodes:
-        """Only the rows that count; waits for the device."""
-        if self.mask is None:
-            return self
-        rows = self.mask
-        return Episodes(
-            self.ids[rows],
-            self.returns[rows],
-            self.lengths[rows],
-            {name: values[rows] for name, values in self.reward_terms.items()},
-            {name: values[rows] for name, values in self.causes.items()},
-            self.truncated[rows],
-            None if self.success is None else self.success[rows],
-            {name: values[rows] for name, values in self.metrics.items()},
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class StepResult:
-    """What one step gave. Tensors are not written to again before the step after the next one."""
-
-    obs: dict[str, Tensor]
-    """Group -> observations, of the new episode where one has just begun. (num_envs, d) float32"""
-    reward: Tensor
-    """(num_envs,) float32"""
-    terminated: Tensor
-    """The task ended the episode: its last state has no future. (num_envs,) bool"""
-    truncated: Tensor
-    """Time ran out: bootstrap from `final_obs`, unless it was terminated as well. (num_envs,) bool"""
-    final_obs: dict[str, Tensor] | None
-    """True last observations, full size; rows are valid where an episode ended (with `final_obs_of = "truncated"`:
-    where it ended by time). None if there is known to be no such row. Valid until the next step."""
-    episodes: Episodes | None
-    """The episodes that ended; None if it is known that none did."""
-
-
-@dataclass(frozen=True, slots=True)
-class Lived:
-    """What a step was, for whoever watches; tensors are the environment's own, to be copied at once."""
-
-    obs: Mapping[str, Tensor]
-    """Group -> observations that the action was taken for. (num_envs, d) float32"""
-    action: Tensor
-    """(num_envs, a) float32"""
-    reward: Tensor
-    """(num_envs,) float32"""
-    reward_terms: Tensor
-    """What each term of `reward_names` paid. (terms, num_envs) float32"""
-    episodes: Episodes | None
-    """The episodes that end; None if none does."""
-
-
-@dataclass(frozen=True, slots=True)
-class TermLayout:
-    """Some columns of an observation group or of the action: where they come from."""
-
-    name: str
-    size: int
-    elements: tuple[str, ...] = ()
-    unit: str = ""
-    scale: tuple[float, ...] | None = None
-    """Factor of each column; None: not scaled, or (an action) in the task's own way."""
-    clip: tuple[float, float] | tuple[tuple[float, float], ...] | None = None
-    """Limits: of an observation's columns before they are scaled; of an action's, each its own, after scale and
-    offset."""
-    offset: tuple[float, ...] | None = None
-    """What is added to each column of an action after scaling."""
-    limits: tuple[tuple[float, float], ...] | None = None
-    """What the actuator of each column of an action can take, infinite where it has no limit."""
-    history: int = 1
-    """Steps that an observation holds, columns of the oldest first."""
-    modifiers: tuple[dict[str, Any], ...] = ()
-    """What is done to an observation's value before it is clipped, as the YAML says it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """The contract between a policy and its environment; a checkpoint keeps it."""
-
-    observations: dict[str, tuple[TermLayout, ...]]
-    actions: tuple[TermLayout, ...]
-    step_dt: float
-    dt: float
-    decimation: int
-
-    def size(self, group: str = "policy") -> int:
-        """Columns of an observation group."""
-        return sum(term.size for term in self.observations[group])
-
-    @property
-    def action_size(self) -> int:
-        """Columns of the action."""
-        return sum(term.size for term in self.actions)
-
-    def record(self) -> dict[str, Any]:
-        """As plain JSON."""
-
-        def term(t: TermLayout) -> dict[str, Any]:
-            return {
-                "name": t.name,
-                "size": t.size,
-                "elements": list(t.elements),
-                "unit": t.unit,
-                "scale": None if t.scale is None else list(t.scale),
-            }
-
-        def observation(t: TermLayout) -> dict[str, Any]:
-            clip = None if t.clip is None else list(t.clip)
-            return {**term(t), "clip": clip, "history": t.history, "modifiers": list(t.modifiers)}
-
-        def action(t: TermLayout) -> dict[str, Any]:
-            bounds = {"clip": _finite_pairs(t.clip), "limits": _finite_pairs(t.limits)}  # type: ignore[arg-type]
-            return {**term(t), "offset": None if t.offset is None else list(t.offset), **bounds}
-
-        return {
-            "observations": {group: [observation(t) for t in items] for group, items in self.observations.items()},
-            "actions": [action(t) for t in self.actions],
-            "step_dt": self.step_dt,
-            "dt": self.dt,
-            "decimation": self.decimation,
-        }
 
 
 class VecEnv(ABC):
@@ -814,11 +668,6 @@ def grid(num_envs: int, spacing: float) -> Tensor:
     return torch.cat([xy * spacing, torch.zeros(num_envs, 1)], dim=1)
 
 
-def _finite_pairs(pairs: tuple[tuple[float, float], ...] | None) -> list[list[float | None]] | None:
-    """As JSON, which has no infinity."""
-    return [[x if math.isfinite(x) else None for x in pair] for pair in pairs or ()] or None
-
-
 def make_env(
     task: Resolved | TaskConfig, *, seed: int = 42, device: str = "cpu", root: Path | None = None, lives: int = 0
 ) -> VecEnv:
@@ -844,4 +693,4 @@ def _below(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
-__all__ = ["Episodes", "Layout", "Lived", "StepResult", "TermLayout", "VecEnv", "grid", "make_env"]
+__all__ = ["VecEnv", "grid", "make_env"]

@@ -24,7 +24,9 @@ import torch
 from torch import Tensor
 
 from rlcli.config.schema import AutopsyConfig
-from rlcli.envs.vec_env import Episodes, Lived, TermLayout, VecEnv
+from rlcli.envs.layout import TermLayout
+from rlcli.envs.step import Episodes, Lived
+from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, RlcliError
 from rlcli.managers.termination import DIVERGED
 from rlcli.rl.dump import MOST_SUBSTEPS, Ending, Kind, Scene, Trace, put, read_dump, trace

@@ -18,7 +18,7 @@ from rlcli.rl.policy import Policy
 from rlcli.rl.run import Run, require_inside
 
 if TYPE_CHECKING:
-    from rlcli.envs.vec_env import Layout
+    from rlcli.envs.layout import Layout
 
 
 def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from rlcli import random
-from rlcli.envs.vec_env import TermLayout, VecEnv
+from rlcli.envs.layout import TermLayout
+from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import UsageError, listing
 from rlcli.rl.physical import Physical
 from rlcli.rl.sweeps import SIGNALS, Sweep

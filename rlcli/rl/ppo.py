@@ -15,7 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.envs.vec_env import StepResult, VecEnv
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import DivergedError
 from rlcli.random import derive
 from rlcli.rl import distributed

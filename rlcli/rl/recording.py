@@ -23,7 +23,8 @@ from torch import Tensor
 import rlcli
 from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
-from rlcli.envs.vec_env import StepResult, VecEnv
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, ConfigError
 from rlcli.registry import TaskSource
 from rlcli.rl.files import write_atomic

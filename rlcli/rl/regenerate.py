@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rlcli.envs.vec_env import StepResult, VecEnv
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError
 from rlcli.rl.rng import load_rng_state, rng_state
 from rlcli.rl.rollout import PATIENCE, Act

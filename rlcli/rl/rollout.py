@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.envs.vec_env import StepResult, VecEnv
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError
 from rlcli.managers.termination import DIVERGED
 from rlcli.rl.intervals import mean, proportion

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.managed import ManagedEnv
-from rlcli.envs.vec_env import StepResult, VecEnv
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv
 from rlcli.testing.subject import (
     NUM_ENVS,
     Finding,

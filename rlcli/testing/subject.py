@@ -14,7 +14,8 @@ from torch import Tensor
 
 from rlcli.config.load import Resolved, agent_names, resolve
 from rlcli.envs.direct import DirectEnv, DirectTask
-from rlcli.envs.vec_env import StepResult, VecEnv, make_env
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv, make_env
 from rlcli.errors import DependencyError
 from rlcli.registry import TaskSource
 

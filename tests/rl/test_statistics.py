@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from rlcli.envs.vec_env import Episodes
+from rlcli.envs.step import Episodes
 from rlcli.rl.statistics import EpisodeStatistics
 
 LENGTH_S = 2.0

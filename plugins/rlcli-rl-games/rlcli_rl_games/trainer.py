@@ -18,7 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.envs.vec_env import StepResult, VecEnv
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DependencyError, DivergedError
 from rlcli.random import derive
 from rlcli.rl.optimizers import below, load_optimizer, optimizer_tensors
