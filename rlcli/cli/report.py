@@ -186,7 +186,6 @@ def _film(page: Page, run: Run, checkpoint: Path, stage: _Stage) -> str:
 
 
 def _filmed(run: Run, file: Path, stage: _Stage) -> bytes | None:
-    from rlcli.errors import MachineError
     from rlcli.rl.run import require_own
     from rlcli.viewer.writer import check_video
 
@@ -196,10 +195,7 @@ def _filmed(run: Run, file: Path, stage: _Stage) -> bytes | None:
 
     from rlcli.viewer.clip import film
 
-    try:
-        frames, fps, backend = film(session.env, session.act, file, longest_s=_LONGEST_S)
-    except (OSError, RuntimeError) as error:  # imageio's own, where there is no ffmpeg
-        raise MachineError(f"cannot write {file}: {getattr(error, 'strerror', None) or error}") from None
+    frames, fps, backend = film(session.env, session.act, file, longest_s=_LONGEST_S)
     console.info(f"{file}: {frames} frames, {fps:g} a second, drawn with {backend}")
     return _read(run, file)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -23,12 +24,31 @@ def check_video(file: Path) -> None:
     Raises:
         UsageError: for a file that is neither .mp4 nor .gif, or whose folder is a file.
         DependencyError: if imageio is not installed.
+        MachineError: if there is no ffmpeg for an .mp4.
     """
     if file.suffix not in FORMATS:
         raise UsageError(f"'{file}' is not a video file", hint=f"name it *{' or *'.join(FORMATS)}")
     needed = ["imageio"] if file.suffix == ".gif" else ["imageio", "imageio_ffmpeg"]
     if any(importlib.util.find_spec(name) is None for name in needed):
         raise DependencyError("imageio is not installed", hint='pip install "rlcli[video]"')
+    if file.suffix == ".mp4":
+        _require_ffmpeg()
+
+
+def _require_ffmpeg() -> None:
+    """imageio-ffmpeg brings one, where the platform has a wheel with it."""
+    import imageio_ffmpeg
+
+    try:
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError:
+        said = "there is no ffmpeg, which writes .mp4"
+    else:
+        if shutil.which(program):
+            return
+        said = f"IMAGEIO_FFMPEG_EXE names no program: {program}"
+    hint = "install it (Debian, Ubuntu: apt install ffmpeg), or name a .gif, which needs none"
+    raise MachineError(said, hint=hint)
 
 
 class VideoWriter:

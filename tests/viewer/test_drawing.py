@@ -147,6 +147,26 @@ def test_a_folder_that_cannot_be_made_is_a_machine_error(tmp_path):
         VideoWriter(tmp_path / "file" / "x.gif", 0.02)
 
 
+def test_without_ffmpeg_a_video_is_refused_and_a_gif_is_not(monkeypatch, tmp_path):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "nothing"))
+    with pytest.raises(MachineError, match="IMAGEIO_FFMPEG_EXE names no program") as caught:
+        check_video(tmp_path / "x.mp4")
+    assert ".gif" in caught.value.hint
+    check_video(tmp_path / "x.gif")
+
+
+def test_a_machine_without_any_ffmpeg_is_told_where_to_get_one(monkeypatch, tmp_path):
+    import imageio_ffmpeg
+
+    def fails():
+        raise RuntimeError("No ffmpeg exe could be found.")
+
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", fails)
+    with pytest.raises(MachineError, match="there is no ffmpeg") as caught:
+        check_video(tmp_path / "x.mp4")
+    assert "apt install ffmpeg" in caught.value.hint
+
+
 def test_without_imageio_the_pip_line_is_given(monkeypatch, tmp_path):
     import importlib.util
 
