@@ -239,6 +239,20 @@ def test_a_program_that_somebody_has_changed_stays(newest, tmp_path, capfd):
     assert "stays as it is" in capfd.readouterr().err
 
 
+def test_nothing_takes_the_place_of_somebodys_own_file(newest, tmp_path, capfd):
+    run = newest("cartpole").parent.parent
+    asked = ["export", "--checkpoint", str(run), "--format", "numpy", "--verify", "--episodes", "1", "--output"]
+    assert main([*asked, str(tmp_path / "run_policy.py")]) == 2
+    assert list(tmp_path.iterdir()) == []
+    for _ in range(2):  # its own may be replaced
+        assert main([*asked, str(tmp_path / "policy.py")]) == 0
+    (tmp_path / "model.xml").write_text("<mujoco/>")
+    capfd.readouterr()
+    assert main([*asked, str(tmp_path / "policy.py")]) == 2
+    assert "model.xml" in capfd.readouterr().err
+    assert (tmp_path / "model.xml").read_text() == "<mujoco/>"
+
+
 PROGRAM = """
 import sys
 sys.modules.update(dict.fromkeys({blocked!r}))
