@@ -8,6 +8,8 @@ from typing import Any
 
 PARTS = ("physics", "task", "policy", "update")
 """What the seconds of an iteration are split into."""
+_FOREVER_S = 1e10
+"""What is further away than that [s] is not foreseen."""
 
 
 @dataclass(slots=True)
@@ -42,6 +44,8 @@ def progress_of(rows: Sequence[Mapping[str, Any]], iterations: int | None, elaps
     rate = (last["step"] - before) / took if took > 0.0 else 0.0
     one = last["step"] / max(1, last["iteration"])
     left = None if iterations is None or rate <= 0.0 else max(0, iterations - last["iteration"]) * one / rate
+    if left is not None and not left < _FOREVER_S:
+        left = None
     seconds = {part: _number(last, f"Perf/{part}_share") for part in PARTS}
     return Progress(last["iteration"], iterations, last["step"], elapsed_s, left, rate, seconds, metrics)
 
