@@ -9,6 +9,8 @@ from typing import Any
 from rlcli.cli.console import console
 
 _SEED = 42
+_MOST = 10
+"""Places that are named."""
 
 
 @dataclass(slots=True)
@@ -47,8 +49,10 @@ def open_referee(run: Any, checkpoint: Any, task: str | None) -> Referee:
 
 def close(referee: Referee, checkpoint: Any, file: Path, format_: str, episodes: int) -> dict[str, Any]:
     """Write the model and the program, drive, and tell. What is given back is the document's."""
+    from rlcli.errors import listing
     from rlcli.random import derive
     from rlcli.rl.export_bundle import PROGRAM, program, write_model, write_program
+    from rlcli.rl.export_record import unlike
     from rlcli.rl.load import policy_of
     from rlcli.rl.verify import verify
 
@@ -60,7 +64,9 @@ def close(referee: Referee, checkpoint: Any, file: Path, format_: str, episodes:
             f"{file.parent / PROGRAM} is not what would be written, and stays as it is: remove it for a new one"
         )
     console.info(f"{file.name} drives plain MuJoCo with {model.name} for {episodes} episodes")
-    verdict = verify(env, policy_of(checkpoint), code, file, model, episodes, derive(_SEED, "task"))
+    differing = unlike(checkpoint, env.layout.record(), referee.deployment, _draws(env))
+    seed = derive(_SEED, "task")
+    verdict = verify(env, policy_of(checkpoint), code, file, model, episodes, seed, differing)
     for what, terms in (("the metadata", verdict.by_metadata), ("the task's own code", verdict.by_task)):
         if terms:
             console.info(f"closed by {what}: {', '.join(terms)}")
@@ -68,6 +74,8 @@ def close(referee: Referee, checkpoint: Any, file: Path, format_: str, episodes:
         ["", "FOUND", "ALLOWED", ""],
         [[what, f"{x:.2e}", f"{most:g}", "holds" if held else "FAILS"] for what, x, most, held in verdict.rows()],
     )
+    if differing:
+        console.info(f"the metadata says something else than the task of {listing(differing[:_MOST])}")
     console.info(
         f"{verdict.episodes} episodes, mean return {verdict.driven:.6g} in plain MuJoCo, {verdict.evaluated:.6g} in"
         " the run's evaluation"
@@ -91,6 +99,15 @@ def close(referee: Referee, checkpoint: Any, file: Path, format_: str, episodes:
             {"check": what, "found": found, "allowed": allowed, "passed": held}
             for what, found, allowed, held in verdict.rows()
         ],
+        "unlike": differing,
         "closed_by_metadata": verdict.by_metadata,
         "closed_by_task": verdict.by_task,
     }
+
+
+def _draws(env: Any) -> bool:
+    """Whether a task may draw gains or the state to start from: one that does more than to reset."""
+    from rlcli.envs.direct import DirectEnv
+
+    events = env.config.events.values()
+    return isinstance(env, DirectEnv) or not all(event.func.startswith("reset_") for event in events)

@@ -52,7 +52,9 @@ def command(
         if run is None:
             raise UsageError(f"{folder} lies outside a run", hint="--verify needs the run's configuration")
         from rlcli.cli.closing import open_referee
+        from rlcli.rl.export_bundle import require_room
 
+        require_room(output)
         session = open_referee(Run(run), saved, task)
     done = export(saved, output, format_, None if session is None else session.deployment)
     console.info(

@@ -15,6 +15,8 @@ from rlcli.rl.progress import PARTS, Progress
 LINE_EVERY_S = 5.0
 _MOST_ROWS = 100
 """Of a table: metrics may be a stranger's."""
+_LONGEST_S = 1e10
+"""No training takes longer."""
 
 
 class TrainingView:
@@ -120,7 +122,9 @@ def _left(progress: Progress) -> str:
 
 
 def clock(seconds: float) -> str:
-    """Hours, minutes and seconds."""
+    """Hours, minutes and seconds; of what no training has taken, a question mark."""
+    if not 0.0 <= seconds < _LONGEST_S:
+        return "?"
     whole = int(seconds)
     return (
         f"{whole // 3600}:{whole % 3600 // 60:02}:{whole % 60:02}"

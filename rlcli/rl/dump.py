@@ -34,7 +34,7 @@ from rlcli.registry import TaskSource
 from rlcli.rl.environment import model_digest
 from rlcli.rl.files import disk_error, write_atomic
 from rlcli.rl.load import recorded_task
-from rlcli.rl.recording import content_digest
+from rlcli.rl.recording import check_task, content_digest
 from rlcli.rl.resimulation import Where, differs, follows, locate, open_world, step
 from rlcli.sim.batch import BatchEngine
 from rlcli.sim.guard import SHOWN, Call, Divergence
@@ -47,6 +47,8 @@ MOST_SUBSTEPS = 300_000
 """Physics steps of a file that is stepped again."""
 _LARGEST = 2**28
 """Bytes of a file that is read."""
+_MOST = 2**53
+"""Of whatever is counted."""
 
 
 class _Strict(BaseModel):
@@ -56,7 +58,7 @@ class _Strict(BaseModel):
 class Life(_Strict):
     """One environment of a dump."""
 
-    env: int = Field(ge=0)
+    env: int = Field(ge=0, le=_MOST)
     """Environment of the run."""
     cause: str
     """What the guard called it."""
@@ -80,13 +82,13 @@ Kind = Literal["diverged", "low return", "high return", "terminated"]
 class Ending(_Strict):
     """An episode that training kept the end of."""
 
-    iteration: int = Field(ge=1)
+    iteration: int = Field(ge=1, le=_MOST)
     """Iteration of the run in which it ended."""
-    step: int = Field(ge=0)
+    step: int = Field(ge=0, le=_MOST)
     """Environment steps of the run after that iteration."""
-    episode: int = Field(ge=0)
+    episode: int = Field(ge=0, le=_MOST)
     """Number of the environment's episode."""
-    length: int = Field(ge=1)
+    length: int = Field(ge=1, le=_MOST)
     """Environment steps of all of it."""
     total_reward: float
     """Undiscounted sum of all of it."""
@@ -98,7 +100,7 @@ class Ending(_Strict):
     """Why it was kept."""
     usual: tuple[float, float] | None
     """Quartiles of the returns of the episodes before; None where they were too few."""
-    step_dt: float = Field(gt=0)
+    step_dt: float = Field(gt=0, le=1e6)
     """Control period [s]."""
     observations: list[str]
     """Columns of what the policy saw."""
@@ -385,6 +387,7 @@ def read_dump(file: Path) -> Dump:
         raise CheckpointError(f"{file} is corrupt, or no dump: {place}: {first['msg']}") from None
     except (SafetensorError, OSError, ValueError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{file} is corrupt, or no dump: {' '.join(str(error).split())}") from None
+    check_task(file, document.task)
     if found != content_digest(tensors, data):
         raise CheckpointError(f"{file} is corrupt: it is not what was written")
     for number, life in enumerate(document.lives):

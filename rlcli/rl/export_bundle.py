@@ -10,11 +10,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from rlcli.errors import MachineError
+from rlcli.errors import MachineError, UsageError
 from rlcli.rl.export_numpy import literal
 from rlcli.rl.files import disk_error, write_atomic
 
 PROGRAM = "run_policy.py"
+MODEL = "model.xml"
+_MARK = "<!-- written by rlcli export -->\n"
+"""The first line of a model, by which it is known as one that may be replaced."""
 _TEMPLATE = Path(__file__).parent / "deployed" / PROGRAM
 _OPEN_ONNX = """        session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
         self.about = json.loads(session.get_modelmeta().custom_metadata_map["rlcli"])
@@ -51,6 +54,29 @@ def program(policy: Path, model: Path, format_: str) -> str:
     return text if model.suffix == ".xml" else text.replace("from_xml_path", "from_binary_path")
 
 
+def require_room(policy: Path) -> None:
+    """What is written beside a policy file takes no other file's place.
+
+    Raises:
+        UsageError: if the policy has the program's name, or a model stands there that is somebody's own.
+    """
+    if policy.name == PROGRAM:
+        raise UsageError(f"{PROGRAM} is the program that --verify writes beside the policy", hint="another --output")
+    own = policy.with_name(MODEL)
+    try:
+        with own.open("rb") as file:
+            ours = file.read(len(_MARK)) == _MARK.encode()
+    except FileNotFoundError:
+        return
+    except OSError:  # a folder, or not to be read
+        ours = False
+    if not ours:
+        raise UsageError(
+            f"{own} stands where --verify writes the model, and is not one that export has written",
+            hint="an --output in a folder of its own",
+        )
+
+
 def write_program(folder: Path, text: str) -> bool:
     """Write the program, unless another stands there, which may be somebody's work; whether it is there now.
 
@@ -74,10 +100,10 @@ def write_model(spec: mujoco.MjSpec, model: mujoco.MjModel, folder: Path) -> Pat
         MachineError: if the disk refuses.
     """
     text = _as_text(spec, model)
-    file = folder / ("model.xml" if text is not None else "model.mjb")
+    file = folder / (MODEL if text is not None else "model.mjb")
     try:
         if text is not None:
-            write_atomic(file, text)
+            write_atomic(file, _MARK + text)
         else:
             temporary = file.with_name(f".{file.name}.tmp")
             temporary.unlink(missing_ok=True)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
@@ -66,6 +68,10 @@ def _are_numbers(values: Any) -> bool:
     return isinstance(values, list) and all(type(value) in (int, float) for value in values)
 
 
+def _is_asked_for(value: Any) -> bool:
+    return isinstance(value, dict) and set(value) == {"given"} and str(value["given"]).startswith("observation/")
+
+
 class _Record(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -118,9 +124,13 @@ class LayoutRecord(_Record):
 class _Formula(_Record):
     @model_validator(mode="after")
     def _good(self) -> Self:
-        value = getattr(self, "value", None)
+        value, closed = getattr(self, "value", None), getattr(self, "closed", False)
         if value is not None:
             check_formula(value)
+        if closed and value is None:
+            raise ValueError("closed, and without a formula")
+        if not closed and isinstance(self, ObservationFormula) and not _is_asked_for(value):
+            raise ValueError("not closed, and yet with a formula")
         return self
 
 
@@ -229,6 +239,52 @@ def deployment_of(checkpoint: Checkpoint, policy: Policy, found: Any = None) -> 
     if len(columns) != len(terms) + 1 or columns[-1] != policy.spec.observation_size:
         raise CheckpointError(f"{checkpoint.folder}/manifest.json: deployment: its columns are not the policy's")
     return record
+
+
+def unlike(checkpoint: Checkpoint, layout: Any, deployment: Any, drawn: bool) -> list[str]:
+    """Where a checkpoint says something else of its robot than an environment of its task; formulas aside.
+
+    Args:
+        checkpoint: the checkpoint.
+        layout: the environment's layout, as plain JSON.
+        deployment: what `rlcli.envs.deployment.describe` says of it.
+        drawn: gains and the state to start from may be drawn at random, and are not compared.
+    """
+    said, own = checkpoint.manifest.get("layout"), checkpoint.manifest.get("deployment")
+    found = list(_unlike(said, layout, "layout"))
+    if own is not None:
+        found += _unlike(_robot(own, drawn), _robot(deployment, drawn), "deployment")
+    return found
+
+
+def _robot(deployment: Any, drawn: bool) -> dict[str, Any]:
+    """The part of a description that does not depend on the engine, and that no formula is checked by."""
+    terms = {group: [_facts(t) for t in found] for group, found in deployment["observations"].items()}
+    rest = {key: deployment[key] for key in ("actuators", "commands", *(() if drawn else ("start",)))}
+    joints = [_facts(joint, *(("default", "stiffness", "damping") if drawn else ())) for joint in deployment["joints"]]
+    controls = [_facts(term) for term in deployment["controls"]]
+    return {"observations": terms, "controls": controls, "joints": joints, **rest}
+
+
+def _facts(entry: Mapping[str, Any], *drawn: str) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if key != "value" and key not in drawn}
+
+
+def _unlike(one: Any, other: Any, place: str) -> Iterator[str]:
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in {**one, **other}:
+            yield from _unlike(one.get(key, _ABSENT), other.get(key, _ABSENT), f"{place}.{key}")
+    elif isinstance(one, list | tuple) and isinstance(other, list | tuple) and len(one) == len(other):
+        for number, pair in enumerate(zip(one, other, strict=True)):
+            yield from _unlike(*pair, f"{place}.{number}")
+    elif type(one) in (int, float) and type(other) in (int, float):
+        if not math.isclose(one, other, rel_tol=1e-5, abs_tol=1e-6):  # engines keep other digits
+            yield place
+    elif one != other:
+        yield place
+
+
+_ABSENT = object()
 
 
 def _width(term: ObservationFormula) -> int:

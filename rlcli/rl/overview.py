@@ -25,6 +25,8 @@ _LONGEST_ROW = 1024**2
 _MOST_ROWS = 64 * 1024**2
 """Bytes of the metrics that are searched for one row."""
 _MOST_FILES = 20_000
+_LARGEST = 1e300
+"""A larger number is none: an integer of many digits is no float."""
 _BEGINNING_S = 5.0
 """A run that is so young may not have its lock yet."""
 
@@ -189,7 +191,7 @@ def _row(line: bytes) -> dict[str, Any] | None:
         return None
     if not isinstance(row, dict) or any(count(row.get(key)) is None for key in ("iteration", "step")):
         return None
-    return {name: value for name, value in row.items() if type(value) is int or _finite(value)}
+    return {name: value for name, value in row.items() if _is_number(value)}
 
 
 def _row_at(run: Run, step: int) -> dict[str, Any]:
@@ -232,8 +234,8 @@ def count(value: Any) -> int | None:
     return value if type(value) is int and 0 <= value < 2**63 else None
 
 
-def _finite(value: Any) -> bool:
-    return type(value) is float and math.isfinite(value)
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and -_LARGEST < value < _LARGEST  # neither NaN nor infinite
 
 
 def times(run: Run) -> tuple[float | None, float | None]:

@@ -8,6 +8,8 @@ from typing import Any
 
 PARTS = ("physics", "task", "policy", "update")
 """What the seconds of an iteration are split into."""
+_FOREVER_S = 1e10
+"""What is further away than that [s] is not foreseen."""
 
 
 @dataclass(slots=True)
@@ -45,6 +47,8 @@ def progress_of(rows: Sequence[Mapping[str, Any]], iterations: int | None, elaps
     if iterations is not None and rate > 0.0:
         done = max(1, last["iteration"])
         left = max(0, iterations - done) * max(one / rate, elapsed_s / done)  # rows leave clips and checkpoints out
+    if left is not None and not left < _FOREVER_S:
+        left = None
     seconds = {part: _number(last, f"Perf/{part}_share") for part in PARTS}
     return Progress(last["iteration"], iterations, last["step"], elapsed_s, left, rate, seconds, metrics)
 

@@ -259,19 +259,28 @@ def read_recording(file: Path) -> Recording:
     return Recording(file, document, tensors, [Episode(**entry) for entry in document["episodes"]])
 
 
-def _check(file: Path, document: dict[str, Any], tensors: Mapping[str, Tensor]) -> None:
-    """The document has the fields that are read, and its episodes lie within the recording.
+def check_task(file: Path, task: Any) -> None:
+    """The record of a task names it, and says where it is from.
 
     Raises:
-        CheckpointError: naming the first that does not.
+        CheckpointError: if not.
     """
-    task, episodes = document.get("task"), document.get("episodes")
     task = task if isinstance(task, dict) else {}
     names = [value for value in task.values() if value is not None]
     if not task.get("name") or not all(isinstance(name, str) and name.isprintable() for name in names):
         raise CheckpointError(f"{file} is corrupt: its task is malformed")
     if not (task.get("folder") or task.get("distribution")):
         raise CheckpointError(f"{file} is corrupt: it does not say where the task is from")
+
+
+def _check(file: Path, document: dict[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    """The document has the fields that are read, and its episodes lie within the recording.
+
+    Raises:
+        CheckpointError: naming the first that does not.
+    """
+    check_task(file, document.get("task"))
+    episodes = document.get("episodes")
     if not isinstance(document.get("config"), str):
         raise CheckpointError(f"{file} is corrupt: its configuration is malformed")
     actions = tensors.get("session.actions")

@@ -14,7 +14,7 @@ agree is not mended, so that an error shows in the return.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,8 @@ class Verdict:
     """Steps in which the two sides did not agree."""
     by_metadata: list[str] = field(default_factory=list)
     """Terms that plain code computed from the metadata."""
+    unlike: list[str] = field(default_factory=list)
+    """Where the metadata says something else of the robot than the task."""
     by_task: list[str] = field(default_factory=list)
     """Terms that only the task's own code knows, which computed them from the plain states."""
 
@@ -82,6 +84,7 @@ class Verdict:
         """(what, found, allowed, whether it holds)"""
         aside = "" if self.beside is None else ", rounding set aside"
         checks = (
+            ("description: places unlike the task", float(len(self.unlike)), 0.0),
             ("action: the file against the policy", self.action, TOLERANCE),
             ("observation: formulas against the task", self.observation, CLOSE),
             ("control: formulas against the task", self.control, CLOSE),
@@ -95,7 +98,16 @@ class Verdict:
         return all(row[3] for row in self.rows())
 
 
-def verify(env: VecEnv, policy: Policy, code: str, file: Path, model: Path, episodes: int, task_seed: int) -> Verdict:
+def verify(
+    env: VecEnv,
+    policy: Policy,
+    code: str,
+    file: Path,
+    model: Path,
+    episodes: int,
+    task_seed: int,
+    unlike: Sequence[str] = (),
+) -> Verdict:
     """Evaluate the policy in its environment, then let the file live the same episodes in plain MuJoCo.
 
     Args:
@@ -106,6 +118,7 @@ def verify(env: VecEnv, policy: Policy, code: str, file: Path, model: Path, epis
         model: the model that was written beside it.
         episodes: how many.
         task_seed: of the random numbers that tasks draw by themselves.
+        unlike: where the metadata says something else of the robot than the task.
 
     Raises:
         CheckpointError: if the metadata makes no sense to the program.
@@ -127,6 +140,7 @@ def verify(env: VecEnv, policy: Policy, code: str, file: Path, model: Path, epis
 
     driver, driven = drive(beside=False)
     verdict = driver.verdict(evaluated, driven)
+    verdict.unlike = list(unlike)
     if not verdict.holds and all(held for *_, held in verdict.rows()[:-1]):
         driver, driven = drive(beside=True)
         verdict.beside, verdict.parted = float(np.mean(driven.returns)), driver.parted
@@ -153,9 +167,12 @@ class _Driver:
         self._plan = controller.about["deployment"]
         closed = [c for control in self._plan["controls"] if control["closed"] for c in control["ctrl"]]
         self._closed = np.zeros(model.nu, dtype=bool)
-        self._closed[closed] = True
+        try:
+            self._closed[closed] = True
+            self._ends = _ends(controller, model)
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise _misfit(error) from error
         self._open_terms = [term for term in self._plan["observations"] if not term["closed"]]
-        self._ends = _ends(controller, model)
         self._decimation = controller.about["decimation"]
         self._steps = 0
         self._worst = {"action": 0.0, "observation": 0.0, "control": 0.0}
@@ -171,8 +188,7 @@ class _Driver:
             try:
                 self._ctrl[i] = controller.act(self._datas[i], inputs)
             except (KeyError, IndexError, TypeError, ValueError) as error:
-                said = f"{type(error).__name__}: {error}"
-                raise CheckpointError(f"the file's metadata does not fit the model: {said}") from error
+                raise _misfit(error) from error
         actions = torch.from_numpy(np.stack([controller.action for controller in self._controllers]))
         seen = torch.from_numpy(np.stack([controller.obs for controller in self._controllers])).float()
         self._note("observation", seen, obs)
@@ -287,6 +303,10 @@ class _Driver:
         for name in ("nq", "nv", "nu", "na", "nbody", "nsensordata"):
             if getattr(model, name) != getattr(own, name):
                 raise CheckpointError(f"the written model has another {name} than the run's")
+
+
+def _misfit(error: Exception) -> CheckpointError:
+    return CheckpointError(f"the file's metadata does not fit the model: {type(error).__name__}: {error}")
 
 
 def _apart(found: Tensor, expected: Tensor) -> Tensor:

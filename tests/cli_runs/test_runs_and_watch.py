@@ -198,6 +198,7 @@ def test_a_broken_run_is_a_row_with_its_reason(cli, made, kind):
 STRANGE = {
     "half a line": b'{"iteration": 9, "st',
     "a number too large": b'{"iteration": 1e999, "step": 3}\n',
+    "an integer larger than any float": b'{"iteration": 4, "step": 256, "Train/mean_reward": 1' + b"0" * 400 + b"}\n",
     "a list": b"[1, 2]\n",
     "deep": b"[" * 100_000 + b"\n",
     "binary": bytes(range(256)) * 300 + b"\n",
@@ -212,6 +213,14 @@ def test_strange_metrics_are_passed_over(cli, made, kind):
         file.write(STRANGE[kind])
     assert listed(cli)[0]["state"] == "finished"
     assert cli("watch").code == 0
+
+
+def test_a_training_without_end_in_sight_is_shown(cli, made):
+    made("a", [row(1) | {"Perf/collection_time": 9e299}], "stopped", iterations=10**18, trained_s=1e300)
+    done = cli("watch")
+    assert (done.code, "? left" in done.err) == (0, True)
+    (line,) = [line for line in cli("runs").out.splitlines() if line.startswith("arm/")]
+    assert len(line) < 200
 
 
 def test_what_metrics_hold_cannot_steer_the_terminal(made):

@@ -172,7 +172,43 @@ def test_metadata_that_says_something_else_than_the_task_does_is_found_out(copie
 def test_timing_that_is_not_the_runs_shows_in_the_return(copied, tmp_path, capfd):
     tamper(copied, lambda manifest: manifest["layout"].update(decimation=8))
     document = verify(capfd, copied, tmp_path / "policy.py", "--format", "numpy", "--episodes", "16", code=9)
-    assert checks(document) == {"action": True, "observation": True, "control": True, "return": False}
+    found = checks(document)
+    assert found == {"description": False, "action": True, "observation": True, "control": True, "return": False}
+
+
+ELSEWHERE = {
+    "layout.dt": lambda m: m["layout"].update(dt=0.5),
+    "layout.actions.0.limits.0.1": lambda m: m["layout"]["actions"][0]["limits"][0].__setitem__(1, 500.0),
+    "deployment.joints.0.default": lambda m: m["deployment"]["joints"][0].update(default=0.1),
+    "deployment.joints.1.name": lambda m: m["deployment"]["joints"][1].update(name="pole"),
+    "deployment.start.qpos.0": lambda m: m["deployment"]["start"]["qpos"].__setitem__(0, 0.5),
+    "deployment.controls.0.closed": lambda m: m["deployment"]["controls"][0].update(closed=False),
+    "deployment.actuators.0.name": lambda m: m["deployment"]["actuators"][0].update(name="motor"),
+}
+
+
+@pytest.mark.parametrize("place", ELSEWHERE)
+def test_a_robot_that_is_described_otherwise_than_by_its_task_is_found_out(copied, tmp_path, capfd, place):
+    """None of it need show in the episodes that are lived."""
+    tamper(copied, ELSEWHERE[place])
+    document = verify(capfd, copied, tmp_path / "policy.py", "--format", "numpy", "--episodes", "2", code=9)
+    assert not checks(document)["description"]
+    assert document["verified"]["unlike"] == [place]
+
+
+SENSELESS = {
+    "a control that is not there": lambda d: d["controls"][0].update(ctrl=[7]),
+    "a command that is not there": lambda d: d["controls"][0]["value"].update(at=[7]),
+    "a formula that nobody computes": lambda d: d["observations"]["policy"][0].update(closed=False),
+    "a control without a formula": lambda d: d["controls"][0].update(value=None),
+}
+
+
+@pytest.mark.parametrize("kind", SENSELESS)
+def test_a_description_that_contradicts_itself_is_refused(copied, tmp_path, capfd, kind):
+    tamper(copied, lambda manifest: SENSELESS[kind](manifest["deployment"]))
+    asked = ["export", "--checkpoint", str(copied), "--format", "numpy", "--output", str(tmp_path / "p.py"), "--verify"]
+    assert main([*asked, "--episodes", "1"]) == 5
 
 
 def test_a_table_says_what_failed(copied, tmp_path, capfd):
@@ -237,6 +273,20 @@ def test_a_program_that_somebody_has_changed_stays(newest, tmp_path, capfd):
     assert main([*asked, "--verify", "--episodes", "4"]) == 0
     assert own.read_text() == "raise SystemExit('mine')\n"
     assert "stays as it is" in capfd.readouterr().err
+
+
+def test_nothing_takes_the_place_of_somebodys_own_file(newest, tmp_path, capfd):
+    run = newest("cartpole").parent.parent
+    asked = ["export", "--checkpoint", str(run), "--format", "numpy", "--verify", "--episodes", "1", "--output"]
+    assert main([*asked, str(tmp_path / "run_policy.py")]) == 2
+    assert list(tmp_path.iterdir()) == []
+    for _ in range(2):  # its own may be replaced
+        assert main([*asked, str(tmp_path / "policy.py")]) == 0
+    (tmp_path / "model.xml").write_text("<mujoco/>")
+    capfd.readouterr()
+    assert main([*asked, str(tmp_path / "policy.py")]) == 2
+    assert "model.xml" in capfd.readouterr().err
+    assert (tmp_path / "model.xml").read_text() == "<mujoco/>"
 
 
 PROGRAM = """

@@ -67,6 +67,38 @@ def test_an_episode_that_begins_anew_has_no_past_and_the_others_keep_theirs():
     assert kept.last(1).tolist() == [3.0] * 3
 
 
+def test_worlds_that_are_all_put_elsewhere_have_no_past_and_calls_of_before_are_not_given_out():
+    state, kept = history()
+    for number in (1.0, 2.0):
+        state[:] = number
+        kept.note(1)
+    kept.forget_all()
+    assert [kept.of(env) for env in (0, 1)] == [[], []]
+    assert kept.last(0) is None
+    assert kept.between(0, 0, kept.count) == []
+    state[:] = 3.0
+    kept.note(1)
+    assert [call.state[0] for call in kept.between(0, 0, kept.count)] == [3.0]
+
+
+def test_calls_are_asked_for_by_number_and_those_to_come_are_not_there():
+    state, kept = history(calls=4)
+    for number in range(4):
+        state[:] = number
+        kept.note(1)
+    assert [call.state[0] for call in kept.between(0, 1, 3)] == [1.0, 2.0]
+    assert [call.state[0] for call in kept.between(0, 2, 99)] == [2.0, 3.0]
+
+
+def test_calls_are_counted_on_from_where_another_history_ended():
+    state = np.zeros((1, 2))
+    kept = History(state, 2, np.zeros(2), 5, memory=3 * state.nbytes, count=7)
+    assert (kept.count, kept.calls, kept.wanted, kept.memory) == (7, 3, 5, 48)
+    assert kept.between(0, 0, 99) == []
+    kept.note(1)
+    assert len(kept.of(0)) == len(kept.between(0, 0, 99)) == 1
+
+
 @pytest.mark.parametrize(
     ("envs", "calls", "kept"), [(1, 64, 64), (2**14, 64, 64), (2**15, 64, 32), (2**21, 64, 1), (1, 0, 1)]
 )
