@@ -173,6 +173,24 @@ def _compute(answer: dict[str, Any] | None, reason: str) -> list[Check]:
     return [*checks, Check("gpu", "ok", "none; the CPU engine needs none")]
 
 
+_OTHER_CHOICES = {
+    "disable",
+    "disabled",
+    "off",
+    "false",
+    "0",
+    "enable",
+    "enabled",
+    "on",
+    "true",
+    "1",
+    "glx",
+    "wgl",
+    "cgl",
+}
+"""Of MUJOCO_GL, beside the names of libraries: MuJoCo's own."""
+
+
 def _graphics(answers: dict[str, tuple[dict[str, Any] | None, str]]) -> Check:
     works = [BACKENDS[name] for name, (answer, _) in answers.items() if answer is not None]
     fails = {BACKENDS[name]: reason for name, (answer, reason) in answers.items() if answer is None}
@@ -182,6 +200,14 @@ def _graphics(answers: dict[str, tuple[dict[str, Any] | None, str]]) -> Check:
     details = {name: answer is not None for name, (answer, _) in answers.items()}
     if wanted in BACKENDS and answers[wanted][0] is None:
         return Check("graphics", "broken", f"MUJOCO_GL={wanted} cannot draw; {said}", "unset MUJOCO_GL", details)
+    if wanted and wanted not in BACKENDS and wanted not in _OTHER_CHOICES:
+        return Check(
+            "graphics",
+            "broken",
+            f"MUJOCO_GL={wanted}, with which MuJoCo does not start; {said}",
+            "unset MUJOCO_GL",
+            details,
+        )
     if not works:
         hint = "for videos: install libegl1 or libosmesa6 (Debian, Ubuntu: apt install libegl1 libosmesa6)"
         return Check("graphics", "warning", said, hint, details)

@@ -116,7 +116,7 @@ class Stopped(RlcliError):
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str | None:
     """`did you mean 'x'?` for the nearest of `candidates`, or None."""
-    close = difflib.get_close_matches(name, list(candidates), n=3, cutoff=0.6)
+    close = difflib.get_close_matches(name, dict.fromkeys(candidates), n=3, cutoff=0.6)
     return f"did you mean {' or '.join(repr(match) for match in close)}?" if close else None
 
 

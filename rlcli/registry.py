@@ -412,7 +412,7 @@ def find_entry(group: str, name: str, *, what: str) -> Entry:
     installed = listing(sorted({f"{e.distribution} {e.version}" for e in entries}))
     near = did_you_mean(name, [*names, *(e.qualified for e in entries)] if ":" in name else names)
     where = f"installed: {listing(names)} (from {installed})"
-    raise TaskError(f"no {what} '{name}'", hint=f"{near}; {where}" if near else where)
+    raise TaskError(f"no {what} '{name}'", hint=f"{near} {where}" if near else where)
 
 
 def load_entry(entry: Entry, kind: type) -> Any:

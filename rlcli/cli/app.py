@@ -133,6 +133,10 @@ def _run(arguments: list[str]) -> int:
     except OSError as error:
         return _machine(error)
     except Exception as error:
+        from rlcli.viewer.gl import unusable_choice
+
+        if (unusable := unusable_choice(error)) is not None:
+            return _report(unusable)
         traceback.print_exc()
         said = f"this is a bug in rlcli: {type(error).__name__}: {error}"
         console.error("bug", 1, said, "please report it with the lines above", [])

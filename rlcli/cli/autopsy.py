@@ -44,7 +44,9 @@ def command(
 
     console.quiet = quiet
     if sort not in _SORTS:
-        raise UsageError(f"no order '{sort}'", hint=did_you_mean(sort, _SORTS) or f"orders: {', '.join(_SORTS)}")
+        raise UsageError(
+            f"--sort {sort}: there is no such order", hint=did_you_mean(sort, _SORTS) or f"orders: {', '.join(_SORTS)}"
+        )
     if video is not None:
         from rlcli.viewer.writer import check_video
 

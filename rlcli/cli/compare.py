@@ -108,7 +108,9 @@ def _find(
     plain = [name for name in names if name in POLICIES and name != "trained"]
     if len(names) < 2 or len(plain) == len(names):
         raise UsageError(
-            "compare what?" if len(names) < 2 else "none of these is a run, so that there is no task",
+            " ".join(["--compare", *names]) + ": with what?"
+            if len(names) < 2
+            else "none of these is a run, so that there is no task",
             hint="rlcli eval --compare RUN1 RUN2 [...]; beside a run also lqr, zero or random",
         )
     runs = {

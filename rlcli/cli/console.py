@@ -92,18 +92,13 @@ class Console:
             _write(sys.stderr, f"hint: {_harmless(hint)}")
 
     def table(self, columns: list[str], rows: list[list[str]], title: str | None = None) -> None:
-        """A table on stdout; plain columns where stdout is not a terminal."""
+        """A table on stdout: plain columns, or what fits on a terminal."""
         if self.json:
             return
         if sys.stdout is not None and sys.stdout.isatty():
-            from rich.console import Console as Rich
-            from rich.table import Table
-            from rich.text import Text
+            from rlcli.cli.tables import draw_table
 
-            table = Table(*columns, title=title, title_justify="left")
-            for row in rows:
-                table.add_row(*(Text(plain(cell)) for cell in row))
-            Rich().print(table)
+            draw_table([*map(plain, columns)], [[*map(plain, row)] for row in rows], title and plain(title))
             return
         widths = [max(len(cell) for cell in column) for column in zip(columns, *rows, strict=True)]
         for row in [columns, *rows]:
@@ -115,23 +110,16 @@ class Console:
 
         `drawn` has `rows`, `columns`, `cells` and `share(number)`, the place of a number on the scale from 0 to 1.
         """
-        columns = [corner, *drawn.columns]
         rows = [[name, *(f"{x:.2f}" for x in cells)] for name, cells in zip(drawn.rows, drawn.cells, strict=True)]
         if self.json or sys.stdout is None or not sys.stdout.isatty():
             self.data(title)
-            self.table(columns, rows)
+            self.table([corner, *drawn.columns], rows)
             return
-        from rich.console import Console as Rich
-        from rich.table import Table
-        from rich.text import Text
+        from rlcli.cli.tables import draw_map
 
-        table = Table(title=Text(plain(title)), title_justify="left")
-        for name in columns:
-            table.add_column(Text(plain(name)))
-        for row, cells in zip(rows, drawn.cells, strict=True):
-            styles = ["", *(_shade(drawn.share(x)) for x in cells)]
-            table.add_row(*(Text(f" {plain(text)} ", style) for text, style in zip(row, styles, strict=True)))
-        Rich().print(table)
+        styles = [[_shade(drawn.share(x)) for x in cells] for cells in drawn.cells]
+        heading = [plain(title) + ":", plain(corner)]
+        draw_map(heading, [*map(plain, drawn.columns)], [[*map(plain, row)] for row in rows], styles)
 
 
 def _shade(share: float) -> str:

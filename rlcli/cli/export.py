@@ -83,6 +83,7 @@ def command(
 
 def _find(reference: str, runs_dir: Path, task: str | None) -> tuple[Path, Path | None, str]:
     """A checkpoint, the run it lies in, and why it was chosen; a checkpoint folder needs no run around it."""
+    from rlcli.cli.session import require_no_run
     from rlcli.registry import TASKS, find_entry
     from rlcli.rl.run import RECORD, find_checkpoint, list_runs
 
@@ -93,7 +94,9 @@ def _find(reference: str, runs_dir: Path, task: str | None) -> tuple[Path, Path 
     if task is not None:
         given, is_folder = task, Path(task).is_dir()
         task = Path(task).resolve().name if is_folder else task.rpartition(":")[2]
-        if reference == "latest" and not is_folder and not list_runs(runs_dir, task):
-            find_entry(TASKS, given, what="task")  # no run of it: if it is no task either, that is what to say
+        if reference == "latest" and not list_runs(runs_dir, task):
+            require_no_run(given, runs_dir)
+            if not is_folder:
+                find_entry(TASKS, given, what="task")  # no run of it: if it is no task either, that is what to say
     found, folder, why = find_checkpoint(reference, runs_dir, task, tell=console.warn)
     return folder, found.folder, why

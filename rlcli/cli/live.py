@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Any
 
 from rlcli.cli.console import console, plain
+from rlcli.cli.tables import flow
 from rlcli.rl.progress import PARTS, Progress
 
 LINE_EVERY_S = 5.0
@@ -63,13 +64,16 @@ class TrainingView:
 
         m = progress.metrics
         total = max(sum(progress.seconds.values()), 1e-9)
-        split = "  ".join(f"{part} {progress.seconds.get(part, 0.0) / total:4.0%}" for part in PARTS)
-        head = Text.assemble(
-            (self._title, "bold"),
-            f"   {_iteration(progress)}   {progress.env_steps:,} steps"
-            f"   {progress.steps_per_s:,.0f} steps/s   {_left(progress)}\n",
-            (split, "dim"),
-        )
+        split = [f"{part} {progress.seconds.get(part, 0.0) / total:4.0%}" for part in PARTS]
+        stands = [
+            self._title,
+            _iteration(progress),
+            f"{progress.env_steps:,} steps",
+            f"{progress.steps_per_s:,.0f} steps/s",
+            _left(progress),
+        ]
+        width = self._live.console.width
+        head = Text.assemble(("\n".join(flow(stands, width)), "bold"), "\n", ("\n".join(flow(split, width)), "dim"))
         tables = []
         for heading, prefix in (
             ("training", "Train/"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -67,7 +68,6 @@ def find_subject(
     from rlcli.errors import UsageError
     from rlcli.rl.load import resolve_run
     from rlcli.rl.run import default_runs_dir, find_checkpoint
-    from rlcli.rl.trust import named_task
 
     require_policy(policy)
     if task is not None and "=" in task:
@@ -78,7 +78,7 @@ def find_subject(
     run = folder = None
     as_trained = False
     if policy == "trained" or checkpoint is not None:
-        named = None if task is None else named_task(task)
+        named = None if task is None else task_named(task, runs_dir)
         name = None if named is None else named.name
         runs = runs_dir or default_runs_dir()
         run, folder, why = find_checkpoint(checkpoint or "latest", runs, name, tell=console.warn)
@@ -88,13 +88,36 @@ def find_subject(
         as_trained = own and policy == "trained" and not overrides and config is None
     else:
         assert task is not None
-        configure = partial(resolve, named_task(task), play=True, config_file=config, overrides=overrides)
+        configure = partial(resolve, task_named(task, runs_dir), play=True, config_file=config, overrides=overrides)
     resolved = configure(flags=values)
     if resolved.task.scene.num_envs < at_least:
         resolved = configure(flags={**values, "scene.num_envs": at_least})
     check(resolved)
     tell_notes(resolved)
     return Subject(resolved, run, folder, policy, stochastic, seed, as_trained)
+
+
+def task_named(task: str, runs_dir: Path | None) -> Any:
+    """The task that the user names; where a run is named instead, that is said."""
+    from rlcli.errors import TaskError
+    from rlcli.rl.run import default_runs_dir
+    from rlcli.rl.trust import named_task
+
+    try:
+        return named_task(task)
+    except TaskError:
+        require_no_run(task, runs_dir or default_runs_dir())
+        raise
+
+
+def require_no_run(task: str, runs_dir: Path) -> None:
+    """Refuse a run where a task should be named."""
+    from rlcli.errors import CheckpointError, TaskError
+    from rlcli.rl.run import find_run
+
+    with contextlib.suppress(CheckpointError):
+        find_run(task.partition("@")[0], runs_dir)
+        raise TaskError(f"'{task}' is a run, not a task", hint=f"--checkpoint {task}")
 
 
 def open_session(

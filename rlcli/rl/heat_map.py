@@ -29,6 +29,9 @@ class HeatMap:
     high: float
     """The numbers at the ends of the scale of colours."""
 
+    row_unit: str = ""
+    column_unit: str = ""
+
     def share(self, value: float) -> float:
         """Where a number lies on the scale, from 0 to 1."""
         return 1.0 if self.high <= self.low else min(1.0, max(0.0, (value - self.low) / (self.high - self.low)))
@@ -56,7 +59,18 @@ def heat_map(
         title += f", the worst over {', '.join(sweep.name for sweep in sweeps[2:])}"
     low, high = scale or (min(values.values()), max(values.values()))
     columns = tuple(map(number, across.values))
-    return HeatMap(title, "" if down is None else down.name, rows, across.name, columns, tuple(cells), low, high)
+    return HeatMap(
+        title,
+        "" if down is None else down.name,
+        rows,
+        across.name,
+        columns,
+        tuple(cells),
+        low,
+        high,
+        "" if down is None else down.unit,
+        across.unit,
+    )
 
 
 def number(value: float) -> str:
@@ -108,10 +122,16 @@ def _panel(place: Any, drawn: HeatMap) -> None:
     shares = [[drawn.share(value) for value in row] for row in drawn.cells]
     place.imshow(shares, cmap="RdYlGn", vmin=0.0, vmax=1.0, aspect="auto")
     place.set_title(drawn.title, fontsize=10)
-    place.set_xlabel(drawn.column_name)
-    place.set_ylabel(drawn.row_name)
+    place.set_xlabel(_axis(drawn.column_name, drawn.column_unit))
+    place.set_ylabel(_axis(drawn.row_name, drawn.row_unit))
     place.set_xticks(range(len(drawn.columns)), drawn.columns)
     place.set_yticks(range(len(drawn.rows)), drawn.rows)
     for y, row in enumerate(drawn.cells):
         for x, value in enumerate(row):
-            place.text(x, y, f"{value:.3g}", ha="center", va="center", fontsize=8)
+            dark = not 0.15 < shares[y][x] < 0.85
+            colour = "white" if dark else "black"
+            place.text(x, y, f"{value:.2f}", ha="center", va="center", fontsize=9, color=colour)
+
+
+def _axis(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if len(unit) < 20 else f"{name}\n[{unit}]"

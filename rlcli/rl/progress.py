@@ -43,7 +43,10 @@ def progress_of(rows: Sequence[Mapping[str, Any]], iterations: int | None, elaps
     before = rows[0]["step"] - rows[0]["step"] // max(1, rows[0]["iteration"])
     rate = (last["step"] - before) / took if took > 0.0 else 0.0
     one = last["step"] / max(1, last["iteration"])
-    left = None if iterations is None or rate <= 0.0 else max(0, iterations - last["iteration"]) * one / rate
+    left = None
+    if iterations is not None and rate > 0.0:
+        done = max(1, last["iteration"])
+        left = max(0, iterations - done) * max(one / rate, elapsed_s / done)  # rows leave clips and checkpoints out
     if left is not None and not left < _FOREVER_S:
         left = None
     seconds = {part: _number(last, f"Perf/{part}_share") for part in PARTS}

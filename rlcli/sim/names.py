@@ -63,5 +63,5 @@ def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
     if not found:
         near = did_you_mean(pattern, names)
         have = f"{'bodies' if what == 'body' else f'{what}s'}: {listing(names)}"
-        raise NameProblem(f"no {what} matches '{pattern}'", f"{near}; {have}" if near else have)
+        raise NameProblem(f"no {what} matches '{pattern}'", f"{near} {have}" if near else have)
     return found

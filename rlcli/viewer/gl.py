@@ -8,11 +8,34 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+import traceback
+from pathlib import Path
 from typing import Any
 
 from rlcli.errors import MachineError
 
 _PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6", "glfw": "a running display server"}
+
+
+def unusable_choice(error: BaseException) -> MachineError | None:
+    """What to say where MuJoCo could not be imported for what MUJOCO_GL says; None for any other error.
+
+    MuJoCo loads the library of its choice at import, whether or not something is drawn.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "").strip()
+    raised_in = [frame.filename for frame in traceback.extract_tb(error.__traceback__) if frame.name == "<module>"]
+    if not chosen or not any(Path(file).parts[-2:] == ("classic", "gl_context.py") for file in raised_in):
+        return None
+    backend = chosen.lower()
+    if backend not in _PACKAGES:
+        return MachineError(
+            f"MUJOCO_GL={chosen}: MuJoCo knows no such OpenGL",
+            hint="egl, osmesa, glfw or disable; unset MUJOCO_GL: rlcli then takes what works",
+        )
+    return MachineError(
+        f"MUJOCO_GL={chosen}: its library cannot be loaded ({' '.join(str(error).split())[:100]})",
+        hint=f"install {_PACKAGES[backend]}, or unset MUJOCO_GL: rlcli then takes what works",
+    )
 
 
 def has_display() -> bool:
@@ -33,6 +56,8 @@ def open_context(width: int, height: int) -> tuple[Any, str]:
         try:
             context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
             context.make_current()
+            if backend == "glfw" and not _has_window():
+                raise MachineError("the display does not answer")
         except Exception as error:  # every backend fails in its own way: missing library, device, display
             tried.append(f"{backend} ({' '.join(str(error).split())[:100] or type(error).__name__})")
             _forget_opengl()
@@ -43,6 +68,13 @@ def open_context(width: int, height: int) -> tuple[Any, str]:
         f"nothing can draw on this machine; tried {', '.join(tried)}",
         hint=f"install {packages} (Debian, Ubuntu: apt install libegl1 libosmesa6), or set MUJOCO_GL",
     )
+
+
+def _has_window() -> bool:
+    """GLFW says with a warning alone that it has none."""
+    import glfw
+
+    return bool(glfw.get_current_context())
 
 
 def _candidates() -> list[str]:

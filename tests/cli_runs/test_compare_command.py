@@ -124,8 +124,8 @@ def test_the_first_policy_is_the_one_that_must_not_fall_short(cli, trained):
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        ((), 2, "compare what?"),
-        (("nowhere",), 2, "compare what?"),
+        ((), 2, "--compare: with what?"),
+        (("nowhere",), 2, "--compare nowhere: with what?"),
         (("lqr", "zero"), 2, "none of these is a run"),
         (("nowhere", "zero"), 5, "no run 'nowhere'"),
         (("a", "b", "--checkpoint", "c"), 2, "as words"),

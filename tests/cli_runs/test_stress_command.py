@@ -214,9 +214,9 @@ def test_the_map_is_drawn(cli, name):
     content = Path(name).read_bytes()
     if name.endswith("svg"):
         text = content.decode()
-        for word in ("success, lqr", "success, zero", "body_mass.pole", "push.slider_to_cart"):
+        for word in ("success, lqr", "success, zero", "body_mass.pole [factor]", "push.slider_to_cart [m/s or rad/s]"):
             assert f"<!-- {word} -->" in text
-        assert text.count("<!-- 0 -->") >= 6  # zero succeeds in none of the variants
+        assert text.count("<!-- 0.00 -->") >= 6  # zero succeeds in none of the variants
         cli(*words, "-o", "again.svg")
         assert Path("again.svg").read_bytes() == content
     else:
