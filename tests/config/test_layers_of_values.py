@@ -29,6 +29,13 @@ def test_mappings_are_merged_key_by_key_and_everything_else_is_replaced():
     assert ("c", "z") not in layers.origins
 
 
+def test_a_mapping_in_the_place_of_a_list_takes_what_was_known_of_it():
+    layers = layered({"a": [1, 2]})
+    layers.merge({"a": {"x": 1}}, lambda path: PATCH)
+    assert layers.data == {"a": {"x": 1}}
+    assert {path: origin for path, origin in layers.origins.items() if path} == {("a",): PATCH, ("a", "x"): PATCH}
+
+
 def test_a_patch_is_asked_for_its_own_paths_and_lands_where_it_should():
     layers, asked = layered({"agents": {"ppo": {"gamma": 0.9}}}), []
     layers.merge({"lr": {"start": 1}}, lambda path: asked.append(path) or PATCH, ("agents", "ppo", "deep"))
