@@ -152,7 +152,7 @@ def test_fewer_environments_than_minibatches_are_a_configuration_error(rememberi
         trainer_of(remembering, "agent.num_minibatches=5")
 
 
-def test_a_recurrent_run_is_resumed_and_evaluated_and_not_exported(remembering, tmp_path, monkeypatch, capfd):
+def test_a_recurrent_run_is_resumed_evaluated_and_exported(remembering, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments):
@@ -167,9 +167,9 @@ def test_a_recurrent_run_is_resumed_and_evaluated_and_not_exported(remembering, 
     for extra in ((), ("--stochastic",)):
         code, played = run("play", "--checkpoint", done["run"], "--viewer", "none", *extra)
         assert (code, played["episodes"]) == (0, 4)
-    code, refused = run("export", "--checkpoint", done["run"])
-    assert (code, refused["error"]["kind"]) == (2, "usage")
-    assert "memory" in refused["error"]["message"]
+    code, exported = run("export", "--checkpoint", done["run"], "--format", "numpy")
+    assert (code, exported["metadata"]["run"]) == (0, Path(done["run"]).name)
+    assert [part["input"] for part in exported["metadata"]["memory"]] == ["h_in", "c_in"]
 
 
 @pytest.mark.slow
