@@ -47,7 +47,7 @@ def _require_ffmpeg() -> None:
         if shutil.which(program):
             return
         said = f"IMAGEIO_FFMPEG_EXE names no program: {program}"
-    hint = "install it (Debian, Ubuntu: apt install ffmpeg), or name a .gif, which needs none"
+    hint = "install it (Debian, Ubuntu: apt install ffmpeg); a .gif needs none"
     raise MachineError(said, hint=hint)
 
 
