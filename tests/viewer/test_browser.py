@@ -50,11 +50,12 @@ def until(what, condition):
         assert time.monotonic() < end, f"not seen: {what}"
 
 
-def press(page, key):
-    """A key that stays down for some frames."""
+def press(page, key, what, condition):
+    """A key that stays down until its effect is seen: without a GPU a frame may take seconds. It does not repeat."""
     page.keyboard.down(key)
-    time.sleep(1.5)
+    until(what, condition)
     page.keyboard.up(key)
+    time.sleep(3.0)
 
 
 def differ(one, other):
@@ -90,15 +91,12 @@ def test_a_trained_cartpole_moves_is_paused_and_changes_its_policy(cartpole_run)
             assert picture(page).std() > 5
             until("a movement", lambda: moves(page))
 
-            press(page, "Space")
-            until("a pause", lambda: stands_still(page))
+            press(page, "Space", "a pause", lambda: stands_still(page))
 
-            press(page, "PageDown")
             steps = sorted(int(folder.name) for folder in (cartpole_run / "checkpoints").glob("0*"))
-            until("another policy", lambda: f"now playing step {steps[-2]}" in playing.err)
-            assert stands_still(page)
-            press(page, "Space")
-            until("a movement again", lambda: moves(page))
+            press(page, "PageDown", "another policy", lambda: f"now playing step {steps[-2]}" in playing.err)
+            until("that it still stands", lambda: stands_still(page))
+            press(page, "Space", "a movement again", lambda: moves(page))
 
             hosts = {re.match(r"\w+://([^/]+)/", url)[1] for url in page.requested if not url.startswith("blob:")}
             assert hosts == {playing.host}
