@@ -104,6 +104,7 @@ def _find(
     """A subject for each name: those of policies that need no checkpoint play the first run's task."""
     from rlcli.cli.session import POLICIES, baseline, find_subject
     from rlcli.errors import UsageError
+    from rlcli.rl.choice import SHIPPED
 
     plain = [name for name in names if name in POLICIES and name != "trained"]
     if len(names) < 2 or len(plain) == len(names):
@@ -111,11 +112,15 @@ def _find(
             " ".join(["--compare", *names]) + ": with what?"
             if len(names) < 2
             else "none of these is a run, so that there is no task",
-            hint="rlcli eval --compare RUN1 RUN2 [...]; beside a run also lqr, zero or random",
+            hint="rlcli eval --compare RUN1 RUN2 [...]; beside a run also shipped, lqr, zero or random",
         )
-    runs = {
-        name: find_subject(
-            None,
+    runs: dict[str, Subject] = {}
+    for name in sorted(dict.fromkeys(names), key=SHIPPED.__eq__):  # last: what a task ships, the others' task
+        if name in plain:
+            continue
+        task = next(iter(runs.values())).resolved.source.name if name == SHIPPED and runs else None
+        runs[name] = find_subject(
+            task,
             overrides,
             checkpoint=name,
             policy="trained",
@@ -125,10 +130,7 @@ def _find(
             config=config,
             runs_dir=runs_dir,
         )
-        for name in dict.fromkeys(names)
-        if name not in plain
-    }
-    first = next(iter(runs.values()))
+    first = next(runs[name] for name in names if name in runs)
     return [baseline(first, name) if name in plain else runs[name] for name in names]
 
 

@@ -31,14 +31,14 @@ _LIMIT = re.compile(r"(?:success|return|length)(?:\.low)?|(?:reward_terms|termin
 
 def command(
     task: Annotated[
-        str | None, typer.Argument(help="A task: its newest run is evaluated. Not needed with --checkpoint.")
+        str | None, typer.Argument(help="A task: its newest run is evaluated, else the policy it ships. Not needed with --checkpoint.")
     ] = None,
     overrides: Overrides = None,
     compare: Annotated[
         bool,
         typer.Option(
             "--compare",
-            help="RUN1 RUN2 [...] in the same episodes: eval --compare A B; beside a run also lqr, zero or random."
+            help="RUN1 RUN2 [...] in the same episodes: eval --compare A B; beside a run also shipped, lqr, zero or random."
             " --fail-under is of the first.",
         ),
     ] = False,
@@ -114,6 +114,7 @@ def command(
     show_summary(summary)
     said = {
         "checkpoint": str(session.checkpoint) if session.checkpoint else None,
+        "chosen": session.chosen,
         "policy": policy,
         "stochastic": stochastic,
         "seed": session.seed,
