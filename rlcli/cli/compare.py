@@ -21,6 +21,7 @@ def compare(
     words: list[str],
     *,
     limits: dict[str, float],
+    ceilings: dict[str, float],
     episodes: int,
     stochastic: bool,
     num_envs: int | None,
@@ -33,6 +34,7 @@ def compare(
     Args:
         words: what stood there without a dash: policies, and KEY.PATH=VALUE for all of them.
         limits: of --fail-under, for the first policy.
+        ceilings: of --fail-over, likewise.
         episodes: of each policy.
         stochastic: sample actions.
         num_envs: environments; None: one an episode.
@@ -53,14 +55,14 @@ def compare(
     for name, subject in zip(names[1:], subjects[1:], strict=True):
         _require_same(names[0], subjects[0], name, subject)
     resolved = subjects[0].resolved
-    require_success(resolved, limits)
+    require_success(resolved, limits | ceilings)
     from rlcli.rl.stress import one_each, run_points
 
     task = one_each(resolved, episodes)
     found = [run_points(task, actor(subject), [], [None], episodes, seed)[0] for subject in subjects]
     summaries = [evaluation.summary() for evaluation in found]
     rows = [_compared(found[0], other) for other in found[1:]]
-    failures = verdict(summaries[0], limits)
+    failures = verdict(summaries[0], limits, ceilings)
     labels = _labels(names)
     config_of = resolved.task
     console.data(

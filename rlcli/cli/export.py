@@ -16,12 +16,23 @@ if TYPE_CHECKING:
 
 def command(
     task: Annotated[
-        str | None, typer.Argument(help="A task: its newest run is exported, else the policy it ships. Not needed with --checkpoint.")
+        str | None,
+        typer.Argument(
+            help="A task: its newest run is exported, else the policy it ships. Not needed with --checkpoint."
+        ),
     ] = None,
     checkpoint: CheckpointRef = None,
-    format_: Annotated[str, typer.Option("--format", help="onnx, torch (a torch.export program), numpy, or bundle (a folder for rlcli itself).")] = "onnx",
+    format_: Annotated[
+        str,
+        typer.Option(
+            "--format", help="onnx, torch (a torch.export program), numpy, or bundle (a folder for rlcli itself)."
+        ),
+    ] = "onnx",
     output: Annotated[
-        Path | None, typer.Option("--output", help="File (or folder of a bundle) to write; else RUN/exports/policy.onnx, .pt2, .py or policy.")
+        Path | None,
+        typer.Option(
+            "--output", help="File (or folder of a bundle) to write; else RUN/exports/policy.onnx, .pt2, .py or policy."
+        ),
     ] = None,
     verify: Annotated[
         bool,

@@ -30,7 +30,10 @@ _FALLBACK_VIDEO = Path("play.mp4")
 
 def command(
     task: Annotated[
-        str | None, typer.Argument(help="A task: its newest run is played, else the policy it ships. Not needed with --checkpoint.")
+        str | None,
+        typer.Argument(
+            help="A task: its newest run is played, else the policy it ships. Not needed with --checkpoint."
+        ),
     ] = None,
     overrides: Overrides = None,
     checkpoint: CheckpointRef = None,
