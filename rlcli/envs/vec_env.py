@@ -265,6 +265,13 @@ class VecEnv(ABC):
         diverged = {f"Sim/diverged/{cause.replace(' ', '_')}": float(count) for cause, count in new.items() if count}
         return {**self._extras(), **diverged}
 
+    def measured(self) -> dict[str, Tensor]:
+        """The task's own numbers to log, of the state that a step was judged by: what `on_lived` may ask for.
+
+        Means over episodes of what commands measure are in `Episodes.metrics`. (num_envs,) each
+        """
+        return {}
+
     def unsaved(self) -> list[str]:
         """What the task keeps from step to step that `state_dict` cannot hold; empty: it goes on exactly."""
         return []

@@ -1,4 +1,4 @@
-"""Cartpole, in both workflows: balance a pole on a cart. Numbers and their sources: docs/cartpole.md."""
+"""Cartpole, in both workflows: balance a pole on a cart. Numbers and their sources: docs/zoo/cartpole.md."""
 
 from rlcli.task import TaskSpec
 
