@@ -213,6 +213,7 @@ def show_summary(summary: dict[str, Any]) -> None:
     rows += [[label, f"{summary[key]['mean']:.4f}", interval(summary[key])] for key, label in _LABELS.items()]
     rows += [[f"reward {name}", f"{v['mean']:.4f}", interval(v)] for name, v in summary["reward_terms"].items()]
     rows += [[f"ended by {name}", f"{v['rate']:.4f}", interval(v)] for name, v in summary["terminations"].items()]
+    rows += [[f"mean {name}", f"{v['mean']:.4f}", interval(v)] for name, v in summary["metrics"].items()]
     if summary["diverged"]:
         causes = ", ".join(f"{cause} {count}" for cause, count in summary["diverged_by"].items())
         rows.append(["diverged", str(summary["diverged"]), causes])

@@ -32,6 +32,8 @@ class Evaluation:
     truncated: list[bool] = field(default_factory=list)
     reward_terms: dict[str, list[float]] = field(default_factory=dict)
     causes: dict[str, list[bool]] = field(default_factory=dict)
+    metrics: dict[str, list[float]] = field(default_factory=dict)
+    """`command/metric` -> its mean over each episode."""
     diverged: int = 0
     diverged_by: dict[str, int] = field(default_factory=dict)
     """Cause -> how often."""
@@ -44,6 +46,7 @@ class Evaluation:
             "length": mean([float(n) for n in self.lengths]),
             "reward_terms": {name: mean(values) for name, values in self.reward_terms.items()},
             "terminations": {name: proportion(sum(v), max(1, len(v))) for name, v in self.causes.items()},
+            "metrics": {name: mean(values) for name, values in self.metrics.items()},
             "diverged": self.diverged,
             "diverged_by": self.diverged_by,
         }
@@ -70,6 +73,7 @@ class Evaluation:
             [self.truncated[row] for row in rows],
             {name: [values[row] for row in rows] for name, values in self.reward_terms.items()},
             causes,
+            {name: [values[row] for row in rows] for name, values in self.metrics.items()},
             sum(causes.get(DIVERGED, [])),
         )
 
@@ -184,6 +188,8 @@ def _take(result: Evaluation, step: StepResult, quota: Tensor) -> None:
             result.successes.append(bool(ended.success[row]))
         for name, values in ended.reward_terms.items():
             result.reward_terms.setdefault(name, []).append(float(values[row]))
+        for name, values in ended.metrics.items():
+            result.metrics.setdefault(name, []).append(float(values[row]))
         for name in ended.causes:  # `diverged` becomes one once something has
             result.causes.setdefault(name, [False] * (len(result.returns) - 1))
         for name, fired in result.causes.items():
