@@ -114,7 +114,9 @@ def test_a_velocity_counts_as_tracked_by_the_means_of_the_episode_so_far(tmp_pat
     limits = {"linear_tolerance": float(lin.sort()[0][5]), "angular_tolerance": float(ang.sort()[0][4])}
     limits = {name: value + 1e-4 for name, value in limits.items()}  # six are near enough, and five turn well enough
     tracked = velocity_tracked_on_average(env, command=velocity, **limits)
-    expected = [a < limits["linear_tolerance"] and b < limits["angular_tolerance"] for a, b in zip(lin, ang, strict=True)]
+    expected = [
+        a < limits["linear_tolerance"] and b < limits["angular_tolerance"] for a, b in zip(lin, ang, strict=True)
+    ]
     assert tracked.tolist() == [bool(e) for e in expected]
     assert 2 < sum(expected) < 6
     steps = torch.stack([now * (n + 1) for n, now in enumerate(linear)]).diff(dim=0)
