@@ -491,7 +491,9 @@ class EntityConfig(StrictModel):
 
     model: str | None = None
     """MJCF file, relative to the task's folder; `TASK:FILE` is one of an installed task, as
-    `cartpole:cartpole.xml`; `package:PACKAGE/FILE` one in any installed Python package."""
+    `cartpole:cartpole.xml`; `package:PACKAGE/FILE` one in any installed Python package; `models:FILE` one in a folder
+    of the user's that the environment variable RLCLI_MODELS names. Of several with ` | ` between them the first that is
+    there."""
     shape: Literal["box", "sphere", "cylinder", "capsule", "plane"] | None = None
     """Instead of a model: a body `body` with one geom `geom`."""
     size: list[Positive] | None = None

@@ -11,6 +11,7 @@ from rlcli.sim.rotations import length, wrap_to_pi
 from rlcli.task import Bodies, Command, Entity, Joints, Sites
 
 if TYPE_CHECKING:
+    from rlcli.envs.managed import ManagedEnv
     from rlcli.envs.vec_env import VecEnv
 
 
@@ -57,6 +58,18 @@ def velocity_tracked(
     data, asked = entity.data, command.command
     linear = length(asked[:, :2] - data.root_lin_vel_b[:, :2]) < linear_tolerance
     return linear & ((asked[:, 2] - data.root_ang_vel_b[:, 2]).abs() < angular_tolerance)
+
+
+def velocity_tracked_on_average(
+    env: ManagedEnv, *, command: Command, linear_tolerance: float, angular_tolerance: float
+) -> Tensor:
+    """The episode's mean errors of a velocity command are within these so far [m/s, rad/s]. (num_envs,)
+
+    Its starts and its changes of command count, too.
+    """
+    so_far = env.command_manager.so_far
+    linear = so_far(command, "error_vel_xy") < linear_tolerance
+    return linear & (so_far(command, "error_vel_yaw") < angular_tolerance)
 
 
 def body_at_goal(
