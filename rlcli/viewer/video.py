@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlcli.config.schema import ViewerConfig
 from rlcli.viewer.crowd import Crowd
-from rlcli.viewer.gl import open_context
+from rlcli.sim.gl import open_context
 
 
 def free_camera(viewer: ViewerConfig, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> mujoco.MjvCamera:
