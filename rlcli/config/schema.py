@@ -613,7 +613,8 @@ class CameraSensorConfig(StrictModel):
     kind: Literal["camera"]
     """camera."""
     data: Literal["rgb", "depth", "distance"] = "rgb"
-    """rgb: red, green and blue, 0 to 255; depth: distance along the camera's axis [m]; distance: from the camera [m]."""
+    """rgb: red, green and blue, 0 to 255; depth: distance along the camera's axis [m]; distance: from the camera's place
+    [m]."""
     width: Annotated[int, Field(ge=1, le=1024)]
     """Columns of the picture."""
     height: Annotated[int, Field(ge=1, le=1024)]
@@ -627,8 +628,8 @@ class CameraSensorConfig(StrictModel):
     eye: Vec3 = (-3.0, 0.0, 1.0)
     """Where the camera sits, in the frame of what carries it [m]."""
     lookat: Vec3 = (0.0, 0.0, 0.0)
-    """A point in the middle of the picture, in the same frame [m]. The frame's z axis is up in it, or x if the camera looks
-    along z."""
+    """A point in the middle of the picture, in the same frame [m]. The frame's z axis is up in it, or x if the camera
+    looks along z."""
     fov: Annotated[float, Field(gt=0, lt=180)] = 45.0
     """Field of view from the lower to the upper edge [degrees]."""
     clip: tuple[Positive, Positive] = (0.01, 20.0)
@@ -845,7 +846,7 @@ class SceneConfig(StrictModel):
     entities: Annotated[dict[str, EntityConfig], Field(json_schema_extra={"minProperties": 1})]
     """Name -> robot or object."""
     sensors: dict[str, SensorConfig] = {}
-    """Name -> contact sensor, ray sensor or camera, for terms that ask for one. Sensors of the MJCF need no entry here."""
+    """Name -> contact sensor, ray sensor or camera, for terms that ask for one. Sensors of the MJCF need no entry."""
 
     @field_validator("entities")
     @classmethod

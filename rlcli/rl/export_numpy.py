@@ -90,9 +90,9 @@ def _weights(graph: Deployed) -> dict[str, np.ndarray]:
     if policy.vision is not None:
         for picture, layers in enumerate(policy.vision.pictures):
             convolutions = [layer for layer in layers.modules() if isinstance(layer, torch.nn.Conv2d)]
-            for number, layer in enumerate(convolutions):
-                assert layer.bias is not None
-                arrays |= {f"cw{picture}_{number}": layer.weight.flatten(1), f"cb{picture}_{number}": layer.bias}
+            for number, conv in enumerate(convolutions):
+                assert conv.bias is not None
+                arrays |= {f"cw{picture}_{number}": conv.weight.flatten(1), f"cb{picture}_{number}": conv.bias}
     linear = [layer for layer in policy.actor if isinstance(layer, torch.nn.Linear)]
     for number, layer in enumerate(linear):
         arrays |= {f"w{number}": layer.weight, f"b{number}": layer.bias}

@@ -25,8 +25,8 @@ class PolicySpec(BaseModel):
     """What, besides the weights, a policy is made of.
 
     Kinds: `gaussian-mlp`, a mean with a state-independent deviation, clipped to the bound; `gaussian-lstm`, the same
-    behind a memory; `gaussian-cnn`, the same behind convolutions over pictures; `squashed-gaussian-mlp`, mean and deviation from the state, tanh times the bound;
-    `deterministic-mlp`, tanh times the bound.
+    behind a memory; `gaussian-cnn`, the same behind convolutions over pictures; `squashed-gaussian-mlp`, mean and
+    deviation from the state, tanh times the bound; `deterministic-mlp`, tanh times the bound.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

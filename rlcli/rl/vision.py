@@ -65,7 +65,7 @@ class VisionSpec(BaseModel):
         Raises:
             ValueError: if a window is larger than what it moves over.
         """
-        sizes = [tuple(picture.shape)]
+        sizes: list[tuple[int, int, int]] = [picture.shape]
         for number, (channels, kernel, stride) in enumerate(
             zip(self.channels, self.kernels, self.strides, strict=True)
         ):

@@ -328,7 +328,8 @@ def _metres(nearness: np.ndarray, eye: mujoco.MjvGLCamera, *, stretched: bool) -
     else:
         metres = near * far / (near + nearness * (far - near))
         if stretched:
-            metres *= _stretch(*nearness.shape, eye)
+            height, width = nearness.shape
+            metres *= _stretch(height, width, eye)
     metres[nearness == 0.0] = 0.0
     return metres
 
@@ -345,6 +346,6 @@ def _stretch(height: int, width: int, eye: mujoco.MjvGLCamera) -> np.ndarray:
 def _mean(values: np.ndarray, samples: int) -> np.ndarray:
     """Means of blocks, and rows from the top instead of the bottom. (h s, w s, c) -> (h, w, c)"""
     if samples > 1:
-        values = sum(values[k::samples].astype(np.float32) for k in range(samples))
-        values = sum(values[:, k::samples] for k in range(samples)) / np.float32(samples * samples)
+        rows = np.stack([values[k::samples] for k in range(samples)]).sum(axis=0, dtype=np.float32)
+        values = np.stack([rows[:, k::samples] for k in range(samples)]).sum(axis=0) / np.float32(samples * samples)
     return values[::-1]
