@@ -141,6 +141,7 @@ class ManagedEnv(VecEnv):
             else (tuple(scale) if isinstance(scale, list) else (scale,) * pipeline.width) * pipeline.history,
             clip=config.clip,
             history=pipeline.history,
+            shape=pipeline.shape if len(pipeline.shape) > 1 else (),
             modifiers=tuple(modifier.model_dump(mode="json") for modifier in config.modifiers),
         )
 
