@@ -46,10 +46,10 @@ def root_near(env: VecEnv, *, entity: Entity = "robot", target: tuple[float, flo
 
 
 def root_hovers(
-    env: VecEnv, *, entity: Entity = "robot", target: Entity = "target", tolerance: float, speed: float
+    env: VecEnv, *, entity: Entity = "robot", goal: Entity = "target", tolerance: float, speed: float
 ) -> Tensor:
-    """The root is within `tolerance` [m] of the root of `target`, and slower than `speed` [m/s]. (num_envs,)"""
-    near = length(entity.data.root_pos_w - target.data.root_pos_w) < tolerance
+    """The root is within `tolerance` [m] of the root of `goal`, and slower than `speed` [m/s]. (num_envs,)"""
+    near = length(entity.data.root_pos_w - goal.data.root_pos_w) < tolerance
     return near & (length(entity.data.root_lin_vel_w) < speed)
 
 
