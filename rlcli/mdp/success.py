@@ -46,6 +46,14 @@ def root_near(env: VecEnv, *, entity: Entity = "robot", target: tuple[float, flo
     return length(entity.data.root_pos_w - env.origins - vector(target, env.device)) < tolerance
 
 
+def root_hovers(
+    env: VecEnv, *, entity: Entity = "robot", goal: Entity = "target", tolerance: float, speed: float
+) -> Tensor:
+    """The root is within `tolerance` [m] of the root of `goal`, and slower than `speed` [m/s]. (num_envs,)"""
+    near = length(entity.data.root_pos_w - goal.data.root_pos_w) < tolerance
+    return near & (length(entity.data.root_lin_vel_w) < speed)
+
+
 def velocity_tracked(
     env: VecEnv,
     *,
