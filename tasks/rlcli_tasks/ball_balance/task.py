@@ -59,7 +59,9 @@ class BallBalanceTask(DirectTask):
         )
         start_height: tuple[float, float] = Field((1.0, 2.0), description="Start: height of the ball likewise [m].")
         start_speed: float = Field(
-            2.0, ge=0, description="Start: highest speed of the ball towards the middle, at the greatest distance [m/s]."
+            2.0,
+            ge=0,
+            description="Start: highest speed of the ball towards the middle, at the greatest distance [m/s].",
         )
         start_drop: float = Field(5.0, ge=0, description="Start: speed of the ball downwards [m/s].")
 
