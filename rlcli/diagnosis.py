@@ -36,7 +36,7 @@ from rlcli.registry import (
     unknown_wanted,
     unreadable_distributions,
 )
-from rlcli.viewer.gl import has_display
+from rlcli.sim.gl import has_display
 
 BACKENDS = {"egl": "EGL", "osmesa": "OSMesa", "glfw": "window"}
 SETTINGS = (

@@ -77,6 +77,8 @@ class TaskSource:
     """Further agents of a configuration in Python: (name, `module:attribute`)."""
     value: Any = None
     """The configuration itself, where it exists in memory only."""
+    policy: Path | None = None
+    """The folder of the policy that is shipped with the task; None: none is."""
 
     @property
     def label(self) -> str:
@@ -264,6 +266,7 @@ def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
     if not config.is_file():
         raise TaskError(f"task '{entry.qualified}' is broken: {config} does not exist")
     task_module = spec.task.partition(":")[0] if spec.task else None
+    policy = root / spec.policies / entry.name
     return TaskSource(
         name=entry.name,
         root=root,
@@ -276,6 +279,7 @@ def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
         task_file=_module_file(task_module, entry) if task_module else None,
         python=spec.config if in_python else None,
         agents=tuple(spec.agents.items()),
+        policy=policy if (policy / "manifest.json").is_file() else None,
     )
 
 

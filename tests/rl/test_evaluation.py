@@ -43,12 +43,12 @@ def test_how_well_commands_are_followed_is_a_mean_over_episodes(make):
     result = evaluate(env, zero_policy(env), 8, keep)
     errors = torch.cat(seen).tolist()
     assert len(set(errors)) == 8
-    assert sorted(result.metrics["velocity/error_vel_xy"]) == pytest.approx(sorted(errors))
-    summary = result.summary()["metrics"]
+    assert sorted(result.values["velocity/error_vel_xy"]) == pytest.approx(sorted(errors))
+    summary = result.summary()["values"]
     assert set(summary) == {"velocity/error_vel_xy", "velocity/error_vel_yaw"}
     assert summary["velocity/error_vel_xy"]["mean"] == pytest.approx(sum(errors) / 8)
     assert summary["velocity/error_vel_xy"]["low"] < sum(errors) / 8 < summary["velocity/error_vel_xy"]["high"]
-    assert result.part(0, 1).metrics["velocity/error_vel_xy"] == result.by_life().metrics["velocity/error_vel_xy"][:2]
+    assert result.part(0, 1).values["velocity/error_vel_xy"] == result.by_life().values["velocity/error_vel_xy"][:2]
 
 
 def test_groups_of_environments_run_as_many_episodes_each_and_are_told_apart(make, scheduled):
