@@ -1,4 +1,4 @@
-"""The quadruped: its model, what it observes, what it is paid for, where episodes end and start, the ground it is on."""
+"""The quadruped: its model, what it observes and is paid for, where episodes end and start, its ground."""
 
 import math
 
