@@ -132,7 +132,6 @@ class DirectTask:
         lives = self.env.engine.lives
         return IdSelection(ids, self.env.seed, episodes[ids], stream(f"direct.{name}"), device, lives)
 
-
     def selection(self, mask: Tensor, name: str) -> Selection | None:
         """The environments where `mask` (num_envs,) holds, to draw for in the middle of an episode; None for nobody.
 
