@@ -132,6 +132,14 @@ class DirectTask:
         lives = self.env.engine.lives
         return IdSelection(ids, self.env.seed, episodes[ids], stream(f"direct.{name}"), device, lives)
 
+    def step_draws(self, name: str = "step") -> Selection:
+        """Random numbers of this step for all environments: `step_draws().normal(0, 1, (k,))` is (num_envs, k).
+
+        They depend on the seed, the environment, the number of steps since the start and `name`, and on nothing else.
+        A GPU records them.
+        """
+        return self.env.everyone_now().stream(stream(f"direct.{name}"))
+
     def selection(self, mask: Tensor, name: str) -> Selection | None:
         """The environments where `mask` (num_envs,) holds, to draw for in the middle of an episode; None for nobody.
 
@@ -223,14 +231,29 @@ class DirectEnv(VecEnv):
         """The task."""
         return [self.task]
 
+    def _logged(self) -> dict[str, Any]:
+        """The task's `extras`, by name."""
+        return self.task.extras
+
     def _extras(self) -> dict[str, float]:
         """The task's `extras`: numbers, and means of tensors."""
         found = {}
-        for name, value in self.task.extras.items():
+        for name, value in self._logged().items():
             if isinstance(value, Tensor) and value.numel():
                 found[f"Task/{name}"] = float(value.float().mean())
             elif isinstance(value, int | float):
                 found[f"Task/{name}"] = float(value)
+        return found
+
+    def measured(self) -> dict[str, Tensor]:
+        """The task's `extras`: of each environment where there is a row for each, else the same for all."""
+        found = {}
+        for name, value in self._logged().items():
+            if isinstance(value, Tensor) and value.numel():
+                rows = value.float() if value.shape[:1] == (self.num_envs,) else value.float().mean().expand(1, 1)
+                found[name] = rows.reshape(len(rows), -1).mean(dim=1).expand(self.num_envs)
+            elif isinstance(value, int | float):
+                found[name] = torch.full((self.num_envs,), float(value), device=self.device)
         return found
 
     def carried(self) -> list[str]:

@@ -198,7 +198,7 @@ def test_the_states_add_the_ends_of_the_fingers(env):
     for action in actions(3, N, 16):
         obs = env.step(action).obs
     assert torch.equal(obs["critic"][:, :69], obs["policy"])
-    model, data = env.world(1)
+    _, data = env.world(1)
     places = obs["critic"][1, 69:81].view(4, 3).tolist()
     for finger, place in zip(FINGERS, places, strict=True):
         assert place == pytest.approx(data.body(f"robot/{finger}_distal").xpos.tolist(), abs=1e-5)

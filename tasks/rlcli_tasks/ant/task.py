@@ -28,7 +28,7 @@ JOINT_POS, JOINT_VEL = slice(12, 20), slice(20, 28)
 
 
 class AntTask(DirectTask):
-    """Run towards the target. Observations: docs/ant.md lists the 60 columns."""
+    """Run towards the target. Observations: docs/zoo/ant-direct.md lists the 60 columns."""
 
     num_observations = 60
     num_actions = 8
