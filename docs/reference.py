@@ -193,7 +193,7 @@ def _commands(command: Any, path: str) -> Iterator[str]:
 
 def _python() -> Iterator[str]:
     yield "# Python\n"
-    yield "What plugins and scripts may rely on. Before version 1.0 a minor version may change one: see the changelog.\n"
+    yield "What plugins and scripts may rely on. Before 1.0 a minor version may change one: see the changelog.\n"
     for module_name in MODULES:
         yield f"## {module_name}\n"
         yield "```{eval-rst}"
