@@ -72,6 +72,8 @@ ContactSensor: TypeAlias = Any
 """A contact sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.sensors.ContactSensor`."""
 RaySensor: TypeAlias = Any
 """A ray sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.sensors.RaySensor`."""
+CameraSensor: TypeAlias = Any
+"""A camera of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.camera.CameraSensor`."""
 Command: TypeAlias = Any
 """A term of `commands:`. YAML: its name. At run time: the term, whose `.command` is (num_envs, k)."""
 Address: TypeAlias = Any

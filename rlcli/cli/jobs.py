@@ -121,7 +121,7 @@ def _require_drawing(video_every: int | None) -> None:
     """
     if not video_every:
         return
-    from rlcli.viewer.gl import open_context
+    from rlcli.sim.gl import open_context
     from rlcli.viewer.writer import check_video
 
     check_video(Path("clip.mp4"))

@@ -57,7 +57,7 @@ def choose_viewers(viewer: str, port: int | None, *, headless: bool) -> list[Cho
         MachineError: if a window is wanted, and there is no display.
     """
     from rlcli.errors import MachineError
-    from rlcli.viewer.gl import has_display
+    from rlcli.sim.gl import has_display
 
     if viewer == "native" and not has_display():
         raise MachineError(

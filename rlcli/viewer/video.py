@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlcli.config.schema import ViewerConfig
+from rlcli.sim.gl import open_context
 from rlcli.viewer.crowd import Crowd
-from rlcli.viewer.gl import open_context
 
 
 def free_camera(viewer: ViewerConfig, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> mujoco.MjvCamera:

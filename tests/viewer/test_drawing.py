@@ -13,7 +13,7 @@ from rlcli.config.schema import ViewerConfig
 from rlcli.envs.vec_env import make_env
 from rlcli.errors import DependencyError, MachineError, UsageError
 from rlcli.registry import find_task
-from rlcli.viewer.gl import open_context
+from rlcli.sim.gl import open_context
 from rlcli.viewer.video import Renderer, free_camera
 from rlcli.viewer.writer import VideoWriter, check_video, gif_stride
 
@@ -69,7 +69,7 @@ def test_no_gl_at_all_says_what_was_tried_and_what_to_install():
         "import sys\nclass Hidden:\n    def find_spec(name, *_):\n"
         "        if name in ('mujoco.egl', 'mujoco.osmesa'): raise ImportError(name)\n"
         "sys.meta_path.insert(0, Hidden)\n"
-        "from rlcli.errors import MachineError\nfrom rlcli.viewer.gl import open_context\n"
+        "from rlcli.errors import MachineError\nfrom rlcli.sim.gl import open_context\n"
         "try: open_context(64, 48)\nexcept MachineError as e: print(e.message, '|', e.hint)"
     )
     env = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")}
