@@ -115,6 +115,8 @@ class RewardConfig(TermConfig):
 
     weight: Number
     """Signed weight."""
+    while_alive: bool = False
+    """True: pays nothing in the step in which the episode is terminated."""
 
 
 class TerminationConfig(TermConfig):
