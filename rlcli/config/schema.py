@@ -357,6 +357,9 @@ class ViewerConfig(StrictModel):
     """Camera position [m], world frame of the environment shown."""
     lookat: Vec3 = (0.0, 0.0, 0.0)
     """Point the camera looks at [m]."""
+    follow: str | None = None
+    """An entity that the camera of videos goes along with over the ground: `eye` and `lookat` are from where its root
+    is, in x and y; null: the camera stays."""
     width: Annotated[int, Field(ge=16, le=3840)] = 640
     """Picture width [pixels]."""
     height: Annotated[int, Field(ge=16, le=2160)] = 480

@@ -140,7 +140,6 @@ class DirectTask:
         """
         return self.env.everyone_now().stream(stream(f"direct.{name}"))
 
-
     def selection(self, mask: Tensor, name: str) -> Selection | None:
         """The environments where `mask` (num_envs,) holds, to draw for in the middle of an episode; None for nobody.
 

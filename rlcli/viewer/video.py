@@ -26,6 +26,12 @@ def free_camera(viewer: ViewerConfig, origin: Sequence[float] = (0.0, 0.0, 0.0))
     return camera
 
 
+def _root(model: mujoco.MjModel, entity: str) -> int | None:
+    """The first body of an entity; None where it has none."""
+    names = (model.body(number).name for number in range(model.nbody))
+    return next((number for number, name in enumerate(names) if name.startswith(f"{entity}/")), None)
+
+
 class Renderer:
     """Draws an environment offscreen.
 
@@ -49,6 +55,7 @@ class Renderer:
         if self._crowd is not None:
             self._crowd.stand_back(self._camera)
         self._lookat = self._camera.lookat.copy()
+        self._followed = None if viewer.follow is None else _root(model, viewer.follow)
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
         self._rect = mujoco.MjrRect(0, 0, viewer.width, viewer.height)
@@ -60,6 +67,9 @@ class Renderer:
 
         With a crowd it is environment 0.
         """
+        if self._followed is not None:
+            x, y, _ = data.xpos[self._followed]
+            origin = (x, y, origin[2])
         self._camera.lookat[:] = np.add(self._lookat, origin)
         everything = int(mujoco.mjtCatBit.mjCAT_ALL)
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self._scene)

@@ -5,13 +5,14 @@ import os
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 
 from rlcli.config.load import resolve
 from rlcli.config.schema import ViewerConfig
 from rlcli.envs.vec_env import make_env
-from rlcli.errors import DependencyError, MachineError, UsageError
+from rlcli.errors import ConfigError, DependencyError, MachineError, UsageError
 from rlcli.registry import find_task
 from rlcli.sim.gl import open_context
 from rlcli.viewer.video import Renderer, free_camera
@@ -38,6 +39,36 @@ def test_the_camera_stands_at_eye_and_looks_at_lookat():
     azimuth, elevation = np.radians(camera.azimuth), np.radians(camera.elevation)
     ahead = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     np.testing.assert_allclose(camera.lookat - camera.distance * np.array(ahead), [8.0, 0.0, 5.0], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_camera_that_follows_keeps_the_robot_where_it_is_in_the_picture():
+    flags = {"scene.num_envs": 1, "viewer.width": 160, "viewer.height": 120}
+    task = find_task("ant-direct")
+
+    def pictures(**viewer):
+        env = make_env(resolve(task, flags={**flags, **viewer}))
+        env.reset(seed=1)
+        model, data = env.world(0)
+        with Renderer(model, env.config.viewer) as renderer:
+            near = renderer.draw(model, data).astype(int)
+            data.qpos[:2] += (6.0, -3.0)
+            mujoco.mj_forward(model, data)
+            return near, renderer.draw(model, data).astype(int)
+
+    def ant(picture):  # what is not as grey as the ground and not the sky above
+        return np.ptp(picture[60:], axis=2) > 40
+
+    near, far = pictures(**{"viewer.follow": "robot"})
+    assert ant(near).sum() > 50
+    assert (ant(near) & ant(far)).sum() > 0.9 * ant(near).sum()
+    near, far = pictures(**{"viewer.follow": None})
+    assert (ant(near) & ant(far)).sum() < 0.5 * ant(near).sum()
+
+
+def test_an_entity_to_follow_that_there_is_not_is_named():
+    with pytest.raises(ConfigError, match=r"viewer.follow: no entity 'robbot'.*did you mean 'robot'"):
+        make_env(resolve(find_task("cartpole"), flags={"scene.num_envs": 1, "viewer.follow": "robbot"}))
 
 
 @pytest.mark.slow
