@@ -47,6 +47,7 @@ class Entry:
     bar: dict[str, Any]
     agent: str | None = None
     episodes: int = 1000
+    envs: int = 200
     picture: float = 4.0
     seeds: tuple[int, ...] = field(default=())
 
@@ -102,7 +103,7 @@ def learn(task: str, device: str | None, seed: int, runs: Path, episodes: int | 
     )
     minutes = (time.monotonic() - begin) / 60
     run = Path(trained["run"])
-    evaluation = _rlcli("eval", "--checkpoint", str(run), "--episodes", str(episodes or entry.episodes))
+    evaluation = _evaluate(run, entry, episodes)
     missed = entry.missed(evaluation)
     if minutes > entry.minutes and device == entry.device:
         missed.append(f"it took {minutes:.1f} minutes, more than {entry.minutes:g}")
@@ -153,7 +154,7 @@ def collect(task: str, runs: list[Path], hardware: str | None, ship: bool) -> No
         if run.record["task"]["name"] != task:
             sys.exit(f"{folder} is a run of {run.record['task']['name']}")
         _, checkpoint, _ = find_checkpoint(str(folder), folder.parent)
-        evaluation = _evaluated(run, checkpoint, entry.episodes)
+        evaluation = _evaluated(run, checkpoint, entry)
         rows.append(_row(run, checkpoint, evaluation, hardware))
         histories.append(read_history(run))
         found.append((rows[-1], checkpoint))
@@ -173,14 +174,21 @@ def collect(task: str, runs: list[Path], hardware: str | None, ship: bool) -> No
         print(f"{target} (seed {best[0]['seed']})")
 
 
-def _evaluated(run: Any, checkpoint: Path, episodes: int) -> dict[str, Any]:
+def _evaluate(policy: Path, entry: Entry, episodes: int | None = None) -> dict[str, Any]:
+    """A new evaluation, in many environments: the few that `play:` has would take longer."""
+    episodes = episodes or entry.episodes
+    several = ("--num-envs", str(min(episodes, entry.envs)))
+    return _rlcli("eval", "--checkpoint", str(policy), "--episodes", str(episodes), *several)
+
+
+def _evaluated(run: Any, checkpoint: Path, entry: Entry) -> dict[str, Any]:
     """The evaluation that the run keeps, or a new one where it is of too few episodes."""
     from rlcli.rl.evaluations import read_evaluation
 
     kept = read_evaluation(run, checkpoint.name)
-    if kept is not None and kept["episodes"] >= episodes and "values" in kept:
+    if kept is not None and kept["episodes"] >= entry.episodes and "values" in kept:
         return kept
-    return _rlcli("eval", "--checkpoint", str(checkpoint), "--episodes", str(episodes))
+    return _evaluate(checkpoint, entry)
 
 
 def _row(run: Any, checkpoint: Path, evaluation: dict[str, Any], hardware: str | None) -> dict[str, Any]:
