@@ -22,7 +22,7 @@ from rlcli.config.python import source_of
 from rlcli.config.schema import InitialStateConfig, TaskConfig
 from rlcli.envs.layout import Layout
 from rlcli.envs.step import Episodes, Lived, StepResult
-from rlcli.errors import DivergedError, did_you_mean, listing
+from rlcli.errors import DivergedError
 from rlcli.machine import require_device
 from rlcli.managers.term import Binder
 from rlcli.sim.actuators import ActuatorModel
@@ -623,10 +623,6 @@ class VecEnv(ABC):
                 self._binder.problems.append(resolved.problem(path, str(problem), problem.hint))
                 blank = entity.model_copy(update={"init": InitialStateConfig()})  # to go on to the other problems
                 self.entities[name] = Entity(name, blank, self.engine, self.sim)
-        followed = config.viewer.follow
-        if followed is not None and followed not in self.entities:
-            hint = did_you_mean(followed, self.entities) or f"entities: {listing(self.entities)}"
-            self._binder.problems.append(resolved.problem(("viewer", "follow"), f"no entity '{followed}'", hint))
         self._actuators: dict[str, ActuatorModel] = {}
         """`entity.name` -> actuator model, in the order of the configuration."""
         for built in self.entities.values():

@@ -106,6 +106,8 @@ OBSERVATIONS = [
     (o.joint_vel, SOME, lambda s: [s.v[3], s.v[0]]),
     (o.joint_pos_rel, ALL, lambda s: s.q - DEFAULT),
     (o.joint_vel_rel, ALL, lambda s: s.v),
+    (o.joint_angle, SOME, lambda s: [wrapped(s.q[3]), wrapped(s.q[0])]),
+    (o.joint_angle_sum, SOME, lambda s: [wrapped(s.q[3] + s.q[0])]),
     (o.joint_pos_limit_normalized, ALL, lambda s: (2 * s.q - LOW - HIGH) / (HIGH - LOW)),
     (o.joint_pos_limit_normalized, {**ARM, "joints": "elbow"}, lambda s: [0.0]),
     (o.joint_effort, SOME, lambda s: [s.effort[3], s.effort[0]]),
