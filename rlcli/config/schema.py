@@ -115,6 +115,8 @@ class RewardConfig(TermConfig):
 
     weight: Number
     """Signed weight."""
+    while_alive: bool = False
+    """True: pays nothing in the step in which the episode is terminated."""
 
 
 class TerminationConfig(TermConfig):
@@ -618,8 +620,7 @@ class CameraSensorConfig(StrictModel):
     kind: Literal["camera"]
     """camera."""
     data: Literal["rgb", "depth", "distance"] = "rgb"
-    """rgb: red, green and blue, 0 to 255; depth: distance along the camera's axis [m]; distance: from the camera's place
-    [m]."""
+    """rgb: red, green and blue, 0 to 255; depth: along the camera's axis [m]; distance: from the camera's place [m]."""
     width: Annotated[int, Field(ge=1, le=1024)]
     """Columns of the picture."""
     height: Annotated[int, Field(ge=1, le=1024)]

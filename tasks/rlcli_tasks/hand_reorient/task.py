@@ -19,19 +19,19 @@ from rlcli.sim.selection import Selection
 FINGERS = ("index", "middle", "ring", "thumb")
 JOINTS = tuple(f"{finger}_{joint}" for finger in FINGERS for joint in range(4))
 _QUAT, _XYZ = ("w", "x", "y", "z"), ("x", "y", "z")
-GOAL = slice(45, 56)
+GOAL = slice(45, 53)
 """Columns of the observation that a new goal changes."""
 
 
 class HandTask(DirectTask):
-    """Turn the cube to the goal, again and again. Observations: docs/zoo/hand-reorient.md lists the 72 columns.
+    """Turn the cube to the goal, again and again. Observations: docs/zoo/hand-reorient.md lists the 69 columns.
 
-    The critic's states are these and what the ends of the fingers do and feel, 148 columns in all.
+    The critic's states are these and what the ends of the fingers do and feel, 145 columns in all.
     """
 
-    num_observations = 72
+    num_observations = 69
     num_actions = 16
-    num_states = 148
+    num_states = 145
     observation_names = (
         *(f"{joint}_pos" for joint in JOINTS),
         *(f"{joint}_vel" for joint in JOINTS),
@@ -39,7 +39,6 @@ class HandTask(DirectTask):
         *(f"cube_quat_{axis}" for axis in _QUAT),
         *(f"cube_vel_{axis}" for axis in _XYZ),
         *(f"cube_rate_{axis}" for axis in _XYZ),
-        *(f"goal_{axis}" for axis in _XYZ),
         *(f"goal_quat_{axis}" for axis in _QUAT),
         *(f"turn_quat_{axis}" for axis in _QUAT),
         *(f"{joint}_action" for joint in JOINTS),
@@ -51,7 +50,6 @@ class HandTask(DirectTask):
         *("",) * 4,
         *("m/s",) * 3,
         *("5 rad/s",) * 3,
-        *("m",) * 3,
         *("",) * 24,
     )
     action_names = JOINTS
@@ -193,9 +191,9 @@ class HandTask(DirectTask):
         self.shown.write_root_pose(selection, selection.read(self.shown_pos), quat)
 
     def _goal(self) -> Tensor:
-        """Place and orientation of the goal, and the turn from it to the cube. (num_envs, 11)"""
+        """Orientation of the goal, and the turn from it to the cube. (num_envs, 8)"""
         turn = multiply(self.cube.data.root_quat_w, conjugate(self.goal_quat))
-        return torch.cat([self.goal_pos, self.goal_quat, unique(turn)], dim=1)
+        return torch.cat([self.goal_quat, unique(turn)], dim=1)
 
 
 def _any_rotation(selection: Selection) -> Tensor:
