@@ -10,7 +10,7 @@ from rlcli.envs.direct import DirectTask
 
 
 class Task(DirectTask):
-    """Draws a goal at the start, and again in every third step of an episode in the environments whose number is odd."""
+    """Draws a goal at the start; environments of odd number draw again in every third step of an episode."""
 
     num_observations = 3
     num_actions = 1
