@@ -106,8 +106,10 @@ def test_what_touches_what(env):
     links = [f"{f}_{part}" for f in FINGERS for part in ("proximal", "medial", "distal")]
     links.remove("thumb_proximal")
     ends = [f"{f}_distal" for f in FINGERS]
-    expected = {frozenset(["cube", other]) for other in [*links, "palm"]}
-    expected |= {frozenset([end, "palm"]) for end in ends} | {frozenset([a, b]) for a in ends for b in ends if a != b}
+    palm = [f"bar_{number}" for number in (1, 2, 3, 4)]
+    expected = {frozenset(["cube", other]) for other in [*links, *palm]}
+    expected |= {frozenset([end, bar]) for end in ends for bar in palm}
+    expected |= {frozenset([a, b]) for a in ends for b in ends if a != b}
     assert touching == expected
 
 
