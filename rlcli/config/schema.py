@@ -115,6 +115,8 @@ class RewardConfig(TermConfig):
 
     weight: Number
     """Signed weight."""
+    while_alive: bool = False
+    """True: pays nothing in the step in which the episode is terminated."""
 
 
 class TerminationConfig(TermConfig):
@@ -355,6 +357,9 @@ class ViewerConfig(StrictModel):
     """Camera position [m], world frame of the environment shown."""
     lookat: Vec3 = (0.0, 0.0, 0.0)
     """Point the camera looks at [m]."""
+    follow: str | None = None
+    """Entity that the camera of pictures and videos goes along with, as far as its root is from where the entity's
+    default state has it; null: the camera stands still."""
     width: Annotated[int, Field(ge=16, le=3840)] = 640
     """Picture width [pixels]."""
     height: Annotated[int, Field(ge=16, le=2160)] = 480
@@ -615,8 +620,7 @@ class CameraSensorConfig(StrictModel):
     kind: Literal["camera"]
     """camera."""
     data: Literal["rgb", "depth", "distance"] = "rgb"
-    """rgb: red, green and blue, 0 to 255; depth: distance along the camera's axis [m]; distance: from the camera's place
-    [m]."""
+    """rgb: red, green and blue, 0 to 255; depth: along the camera's axis [m]; distance: from the camera's place [m]."""
     width: Annotated[int, Field(ge=1, le=1024)]
     """Columns of the picture."""
     height: Annotated[int, Field(ge=1, le=1024)]
@@ -913,6 +917,15 @@ class TaskConfig(StrictModel):
             step_dt = info.data["sim"].dt * info.data["decimation"]
             if value < step_dt:
                 raise ValueError(f"{value:g} s is shorter than one step (dt x decimation = {step_dt:g} s)")
+        return value
+
+    @field_validator("viewer")
+    @classmethod
+    def _something_to_follow(cls, value: ViewerConfig, info: ValidationInfo) -> ViewerConfig:
+        scene = info.data.get("scene")
+        if value.follow is not None and scene is not None and value.follow not in scene.entities:
+            have = ", ".join(scene.entities)
+            raise ValueError(f"follow: there is no entity '{value.follow}' in the scene; entities: {have}")
         return value
 
     @property

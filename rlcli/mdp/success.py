@@ -24,11 +24,22 @@ def joints_near(
 
 
 def root_moves(
-    env: VecEnv, *, entity: Entity = "robot", direction: tuple[float, float, float] = (1.0, 0.0, 0.0), speed: float
+    env: VecEnv,
+    *,
+    entity: Entity = "robot",
+    direction: tuple[float, float, float] = (1.0, 0.0, 0.0),
+    speed: float,
+    limit_angle: float | None = None,
 ) -> Tensor:
-    """The root's velocity, projected on `direction` (world frame, of length 1), is above `speed` [m/s]. (num_envs,)"""
+    """The root's velocity, projected on `direction` (world frame, of length 1), is above `speed` [m/s]. (num_envs,)
+
+    With `limit_angle` its up axis must be within that of the way up too [rad].
+    """
     x, y, z = entity.data.root_lin_vel_w.unbind(dim=1)
-    return direction[0] * x + direction[1] * y + direction[2] * z > speed
+    moves = direction[0] * x + direction[1] * y + direction[2] * z > speed
+    if limit_angle is None:
+        return moves
+    return moves & (-entity.data.projected_gravity_b[:, 2] > cosine(limit_angle))
 
 
 def root_upright(

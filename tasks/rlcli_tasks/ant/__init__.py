@@ -2,6 +2,7 @@
 
 from rlcli.task import TaskSpec
 
+MANAGED = TaskSpec(package=__name__, summary="Run with a four-legged walker (manager-based).")
 DIRECT = TaskSpec(
     package=__name__,
     config="direct.yaml",

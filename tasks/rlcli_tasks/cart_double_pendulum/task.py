@@ -104,10 +104,9 @@ class CartDoublePendulumTask(DirectTask):
         """Both links upright and all joints calm; a failure costs."""
         params = self.params
         _, cart_vel, pole, pole_vel, tilt, _, pendulum_vel = self.obs_buf.unbind(dim=1)
-        reward = torch.where(self._failed(), params.failure_reward, params.alive_weight)
-        reward.sub_(pole.square().addcmul_(tilt, tilt), alpha=params.tilt_weight)
-        reward.sub_(cart_vel.abs() + pole_vel.abs() + pendulum_vel.abs(), alpha=params.speed_weight)
-        self.rew_buf.copy_(reward)
+        self.rew_buf.fill_(params.alive_weight).masked_fill_(self._failed(), params.failure_reward)
+        self.rew_buf.sub_(pole.square().addcmul_(tilt, tilt), alpha=params.tilt_weight)
+        self.rew_buf.sub_(cart_vel.abs() + pole_vel.abs() + pendulum_vel.abs(), alpha=params.speed_weight)
 
     def is_done(self) -> None:
         """Off the rail, or the pole has fallen; the framework adds the time-out."""
