@@ -40,7 +40,7 @@ from rlcli.sim.gl import has_display
 
 BACKENDS = {"egl": "EGL", "osmesa": "OSMesa", "glfw": "window"}
 SETTINGS = (
-    *("RLCLI_PLUGINS", "RLCLI_RUNS_DIR", "MUJOCO_GL", "DISPLAY", "CUDA_VISIBLE_DEVICES"),
+    *("RLCLI_MODELS", "RLCLI_PLUGINS", "RLCLI_RUNS_DIR", "MUJOCO_GL", "DISPLAY", "CUDA_VISIBLE_DEVICES"),
     *("OMP_NUM_THREADS", "MKL_NUM_THREADS", "LOCAL_WORLD_SIZE", "PYTHONPATH"),
 )
 LOW_DISK_BYTES = 1e9

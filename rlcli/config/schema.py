@@ -115,6 +115,8 @@ class RewardConfig(TermConfig):
 
     weight: Number
     """Signed weight."""
+    while_alive: bool = False
+    """True: pays nothing in the step in which the episode is terminated."""
 
 
 class TerminationConfig(TermConfig):
@@ -355,6 +357,9 @@ class ViewerConfig(StrictModel):
     """Camera position [m], world frame of the environment shown."""
     lookat: Vec3 = (0.0, 0.0, 0.0)
     """Point the camera looks at [m]."""
+    follow: str | None = None
+    """Entity that the camera of pictures and videos goes along with, as far as its root is from where the entity's
+    default state has it; null: the camera stands still."""
     width: Annotated[int, Field(ge=16, le=3840)] = 640
     """Picture width [pixels]."""
     height: Annotated[int, Field(ge=16, le=2160)] = 480
@@ -491,7 +496,9 @@ class EntityConfig(StrictModel):
 
     model: str | None = None
     """MJCF file, relative to the task's folder; `TASK:FILE` is one of an installed task, as
-    `cartpole:cartpole.xml`; `package:PACKAGE/FILE` one in any installed Python package."""
+    `cartpole:cartpole.xml`; `package:PACKAGE/FILE` one in any installed Python package; `models:FILE` one in a folder
+    of the user's that the environment variable RLCLI_MODELS names. Of several with ` | ` between them the first that is
+    there."""
     shape: Literal["box", "sphere", "cylinder", "capsule", "plane"] | None = None
     """Instead of a model: a body `body` with one geom `geom`."""
     size: list[Positive] | None = None
@@ -910,6 +917,15 @@ class TaskConfig(StrictModel):
             step_dt = info.data["sim"].dt * info.data["decimation"]
             if value < step_dt:
                 raise ValueError(f"{value:g} s is shorter than one step (dt x decimation = {step_dt:g} s)")
+        return value
+
+    @field_validator("viewer")
+    @classmethod
+    def _something_to_follow(cls, value: ViewerConfig, info: ValidationInfo) -> ViewerConfig:
+        scene = info.data.get("scene")
+        if value.follow is not None and scene is not None and value.follow not in scene.entities:
+            have = ", ".join(scene.entities)
+            raise ValueError(f"follow: there is no entity '{value.follow}' in the scene; entities: {have}")
         return value
 
     @property

@@ -46,6 +46,23 @@ def joint_vel_rel(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints =
     return entity.data.joint_vel[:, joints] - entity.data.default_joint_vel[:, joints]
 
 
+def joint_angle(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
+    """Joint positions wrapped to [-pi, pi], for hinges that turn all the way round [rad]. (num_envs, k)"""
+    return wrap_to_pi(entity.data.joint_pos[:, joints])
+
+
+def joint_angle_sum(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints) -> Tensor:
+    """Sum of joint positions, wrapped to [-pi, pi]: how far the last link of a planar chain is turned [rad].
+
+    (num_envs, 1)
+    """
+    position = entity.data.joint_pos[:, joints]
+    total = position[:, :1]
+    for column in position.split(1, dim=1)[1:]:  # one after the other: a sum rounds differently for other sizes
+        total = total + column
+    return wrap_to_pi(total)
+
+
 def joint_pos_limit_normalized(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Joint positions, -1 at the lower and 1 at the upper soft limit; 0 for a joint without limits. (num_envs, k)"""
     low, high = entity.data.soft_joint_pos_limits[joints].unbind(dim=1)

@@ -20,7 +20,7 @@ from rlcli.config.schema import (
     SceneConfig,
     SimConfig,
 )
-from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
+from rlcli.errors import ConfigError, MissingModelError, Problem, TaskError, did_you_mean, listing
 from rlcli.registry import model_file
 from rlcli.sim.mjcf import BadModel, model_roots, quiet_mujoco, read_mjcf
 from rlcli.sim.names import NameProblem, match
@@ -202,6 +202,8 @@ class Scene:
         assert entity.model is not None
         try:
             file = model_file(self.root, entity.model).resolve()
+        except MissingModelError:
+            raise
         except TaskError as error:
             self.problems.append(SceneProblem((*path, "model"), error.message, error.hint))
             return None

@@ -14,6 +14,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -310,13 +311,16 @@ def dead_actions(evidence: Evidence) -> Iterator[Remark]:
     env.reset(seed=0)
     start = env.state_dict()
     steps = max(5, math.ceil(0.1 / env.step_dt))
-    rest = _after(env, start, torch.zeros(8, env.layout.action_size), steps)
+    bound = evidence.subject.bound
+    # a column may multiply others, so that it moves nothing while they are 0
+    others = [torch.full((8, env.layout.action_size), level * bound) for level in (0.0, 0.5)]
+    without = [(action, _after(env, start, action, steps)) for action in others]
     names = [n for t in env.layout.actions for n in (t.elements if len(t.elements) == t.size else [t.name] * t.size)]
     for column, name in enumerate(names):
         moved = 0.0
-        for sign in (1.0, -1.0):
-            action = torch.zeros(8, env.layout.action_size)
-            action[:, column] = sign * evidence.subject.bound
+        for (base, rest), sign in product(without, (1.0, -1.0)):
+            action = base.clone()
+            action[:, column] = sign * bound
             moved = max(moved, float((_after(env, start, action, steps) - rest).abs().max()))
             if moved > DEAD:
                 break
@@ -325,7 +329,7 @@ def dead_actions(evidence: Evidence) -> Iterator[Remark]:
                 "dead-action",
                 "error",
                 f"actions, column {column} ({name})",
-                f"moves nothing: after {steps} steps at +-{evidence.subject.bound:g} the state differs by {moved:.1g}"
+                f"moves nothing: after {steps} steps at +-{bound:g} the state differs by {moved:.1g}"
                 " from that without action",
                 "see that it drives the meant actuator, with a scale, a gear and a limit that are not 0",
                 {"moved": moved, "steps": steps},

@@ -5,13 +5,14 @@ import os
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 
 from rlcli.config.load import resolve
 from rlcli.config.schema import ViewerConfig
 from rlcli.envs.vec_env import make_env
-from rlcli.errors import DependencyError, MachineError, UsageError
+from rlcli.errors import ConfigError, DependencyError, MachineError, UsageError
 from rlcli.registry import find_task
 from rlcli.sim.gl import open_context
 from rlcli.viewer.video import Renderer, free_camera
@@ -56,6 +57,30 @@ def test_the_pole_is_in_the_picture_and_moves():
     blue = (first[200:280, :, 2].astype(int) - first[200:280, :, 0] > 60).sum()
     assert orange > 150  # the pole
     assert blue > 100  # the cart
+
+
+@pytest.mark.slow
+def test_the_camera_goes_along_with_the_entity_that_it_follows():
+    drawn = {}
+    for follow in ("robot", None):
+        overrides = ["scene.num_envs=1", f"viewer.follow={follow or 'null'}"]
+        env = make_env(resolve(find_task("quadruped-flat"), overrides=overrides))
+        env.reset(seed=1)
+        model, data = env.world(0)
+        with Renderer(model, env.config.viewer) as renderer:
+            pictures = []
+            for x in (0.0, 8.0):  # the ground's pattern repeats every metre
+                data.qpos[0] = x
+                mujoco.mj_forward(model, data)
+                pictures.append(renderer.draw(model, data).astype(int))
+        drawn[follow] = np.abs(pictures[0] - pictures[1]).mean()
+        assert pictures[0].std() > 20
+    assert drawn["robot"] < 1.0 < drawn[None]
+
+
+def test_what_is_followed_must_be_in_the_scene():
+    with pytest.raises(ConfigError, match=r"there is no entity 'rover' in the scene; entities: robot"):
+        resolve(find_task("cartpole"), overrides=["viewer.follow=rover"])
 
 
 def test_drawing_switched_off_is_a_machine_error(monkeypatch):
