@@ -139,6 +139,7 @@ class ManagedEnv(VecEnv):
             else (tuple(scale) if isinstance(scale, list) else (scale,) * pipeline.width) * pipeline.history,
             clip=config.clip,
             history=pipeline.history,
+            shape=pipeline.shape if len(pipeline.shape) > 1 else (),
             modifiers=tuple(modifier.model_dump(mode="json") for modifier in config.modifiers),
         )
 
@@ -147,7 +148,7 @@ class ManagedEnv(VecEnv):
 
     def _judge(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         terminated, truncated = self.termination_manager.compute(diverged)
-        reward = self.reward_manager.compute(diverged)
+        reward = self.reward_manager.compute(terminated, diverged)
         self._require_finite(reward, "the reward")
         self.reward_manager.add_up()
         if diverged is not None:

@@ -27,7 +27,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, RlcliError, UsageError, did_you_mean
 from rlcli.registry import find_task
 from rlcli.testing.dummies import DUMMIES, Life, live
-from rlcli.testing.subject import Subject, column_names
+from rlcli.testing.subject import Subject, observed
 from rlcli.testing.timestep import energy_drift
 
 NUM_ENVS = 16
@@ -248,11 +248,12 @@ LARGE, SMALL = 50.0, 0.01
 
 
 def constant_observations(evidence: Evidence) -> Iterator[Remark]:
-    """No observation column keeps one value, whatever the agent does."""
+    """No observation column keeps one value, whatever the agent does; of a picture, some pixel does not."""
     for where, values in _columns(evidence):
-        low, high = float(values.min()), float(values.max())
-        if low == high:
-            message = f"is {low:g} in every step of every agent"
+        if bool((values == values[:, :1]).all()):
+            low = float(values.min())
+            what = f"is {low:g}" if len(values) == 1 else "is the same"
+            message = f"{what} in every step of every agent"
             hint = "leave it out, or compute it from what changes"
             yield Remark("constant-observation", "error", where, message, hint, {"value": low})
 
@@ -264,7 +265,7 @@ def observation_scale(evidence: Evidence) -> Iterator[Remark]:
     for where, values in _columns(evidence):
         sizes = values.abs()
         usual, largest = _quantile(sizes, 0.99), float(sizes.max())
-        if bool((values == values[0]).all()) or (largest >= SMALL and usual <= LARGE):
+        if bool((values == values[:, :1]).all()) or (largest >= SMALL and usual <= LARGE):
             continue
         message = f"is never larger than {largest:.3g}; below {SMALL:g} it drowns among the others"
         if usual > LARGE:
@@ -275,12 +276,12 @@ def observation_scale(evidence: Evidence) -> Iterator[Remark]:
 
 
 def _columns(evidence: Evidence) -> Iterator[tuple[str, Tensor]]:
-    """Each observation column, and its values in all lives."""
+    """Each observation column, or picture, and its values in all lives. (columns, steps)"""
     env = evidence.lives[0].env
     for group in env.layout.observations:
         seen = torch.cat([life.obs[group].flatten(0, 1) for life in evidence.lives if group in life.obs]).t()
-        for column, name in enumerate(column_names(env, group)):
-            yield f"observations.{group}, column {column} ({name})", seen[column].contiguous()
+        for where, columns in observed(env, group):
+            yield where, seen[columns].contiguous()
 
 
 SATURATED = 0.8
