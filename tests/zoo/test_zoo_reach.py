@@ -234,8 +234,8 @@ def test_inverse_kinematics_moves_the_hand_along_the_asked_axis():
     x, y, z = (moved - place)[0].tolist()
     assert z < -0.05
     assert max(abs(x), abs(y)) < 0.2 * abs(z)
-    assert float(turn_between(attitude, turned)[0]) < 0.1, "joints of unequal motors lag unequally"
-    assert float(turn_between(turned, attitude)[1]) > 0.2
+    assert float(turn_between(attitude, turned)[0]) < 0.2, "joints of unequal motors lag unequally"
+    assert float(turn_between(turned, attitude)[1]) > 0.3
     assert float((moved - place)[1].abs().max()) < 0.01
 
 
