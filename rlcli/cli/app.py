@@ -22,6 +22,7 @@ COMMANDS = {
     "show": "show",
     "validate": "validate",
     "train": "train",
+    "sweep": "sweep",
     "play": "play",
     "eval": "eval",
     "stress": "stress",
@@ -133,7 +134,7 @@ def _run(arguments: list[str]) -> int:
     except OSError as error:
         return _machine(error)
     except Exception as error:
-        from rlcli.viewer.gl import unusable_choice
+        from rlcli.sim.gl import unusable_choice
 
         if (unusable := unusable_choice(error)) is not None:
             return _report(unusable)

@@ -24,6 +24,7 @@ _FIXED = {
     "func",
     "mode",
     "time_out",
+    "while_alive",
     "history",
     "delay",
     "modifiers",

@@ -36,6 +36,8 @@ class RewardManager:
         self._sums = torch.zeros(len(terms), num_envs, device=device)
         self._sums_by_env = self._sums.t()
         self._rows = list(self._values.unbind(0))
+        kept = [term.config.while_alive for term in terms]  # type: ignore[attr-defined]
+        self._while_alive = torch.tensor(kept, device=device)[:, None] if any(kept) else None
         self._divergence_reward = divergence_reward
         self._divergence_sums = torch.zeros(num_envs, device=device)
         self._moved = [(row, weight) for row, weight in zip(self._rows, weights, strict=True) if _moves(weight)]
@@ -51,7 +53,7 @@ class RewardManager:
             if _moves(weight) or weight != 0.0:
                 check_shape(term, first_value(term), (num_envs,), "rewards")
 
-    def compute(self, diverged: Tensor | None = None) -> Tensor:
+    def compute(self, terminated: Tensor, diverged: Tensor | None = None) -> Tensor:
         """This step's reward; `add_up` takes it into the episode's sums. (num_envs,)
 
         On a CPU a term that is not finite where the simulation diverged pays nothing there.
@@ -63,6 +65,8 @@ class RewardManager:
             torch.mul(call(), factor, out=row)
         for row, weight in self._moved:
             row.mul_(weight * self._dt)
+        if self._while_alive is not None:
+            self._values.masked_fill_(self._while_alive & terminated, 0.0)
         if diverged is not None and not self._fused:
             self._values.masked_fill_(diverged & ~self._values.isfinite(), 0.0)
         self._next = (self._next + 1) % len(self._totals)

@@ -94,6 +94,18 @@ class JointPosLimitsPenaltyRatio:
         return torch.where(scaled > self._threshold, violation * self._ratio, 0.0).sum(dim=1)
 
 
+def joints_at_limit(
+    env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", threshold: float = 0.99
+) -> Tensor:
+    """How many joints are beyond `threshold` of their range, -1 and 1 at the soft limits. (num_envs,)
+
+    A joint without limits never is.
+    """
+    low, high = (limit[:, joints] for limit in entity.data.joint_limits(soft=True))
+    scaled = (2.0 * entity.data.joint_pos[:, joints] - low - high) / (high - low)
+    return (scaled.abs_() > threshold).sum(dim=1).float()
+
+
 class PowerConsumption:
     """Sum of |raw action x joint velocity x gear ratio|; `joints` are the driven ones, in the action's order [rad/s].
 
@@ -160,35 +172,42 @@ def move_to_target_bonus(
 
 
 class ProgressReward:
-    """Speed at which the root comes nearer to `target`, horizontally [m/s]. (num_envs,)"""
+    """Speed at which the root comes nearer to `target`, horizontally [m/s]. (num_envs,)
+
+    Of the way since the last step, not of two distances: those to a target 1 km away are known to 0.06 mm only, which
+    is 4 mm/s at 60 Hz.
+    """
 
     def __init__(self, env: ManagedEnv, *, entity: Entity = "robot", target: tuple[float, float, float]) -> None:
         self._entity, self._dt = entity, env.step_dt
-        self._origins, self._target = env.origins, vector(target, env.device)
-        self._potential = self._measure(entity.data.root_pos_w, env.origins)
+        self._origins, self._target = env.origins, vector(target, env.device)[:2]
+        self._position = entity.data.root_pos_w[:, :2].clone()
 
     def __call__(self) -> Tensor:
         """(num_envs,)"""
-        now = self._measure(self._entity.data.root_pos_w, self._origins)
-        progress = now - self._potential
-        self._potential.copy_(now)
+        now = self._entity.data.root_pos_w[:, :2]
+        ahead, ahead_before = self._target_from(now), self._target_from(self._position)
+        # |a| - |b| = (a - b) (a + b) / (|a| + |b|)
+        gained = _dot_xy(now - self._position, ahead + ahead_before)
+        progress = gained / ((_norm_xy(ahead) + _norm_xy(ahead_before)).clamp_(min=1e-9) * self._dt)
+        self._position.copy_(now)
         return progress
 
     def reset(self, selection: Selection) -> None:
         """The first step of an episode compares with its start state, which is set by now."""
-        position = selection.read(self._entity.engine.field("qpos"), _xyz(self._entity)).float()
-        selection.write(self._potential, self._measure(position, selection.peek(self._origins)))
+        position = selection.read(self._entity.engine.field("qpos"), _xy(self._entity)).float()
+        selection.write(self._position, position)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The potential of the last step."""
-        return {"potential": self._potential.clone()}
+        """Where the root was in the last step."""
+        return {"position": self._position.clone()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take back what `state_dict` gave."""
-        self._potential.copy_(state["potential"])
+        self._position.copy_(state["position"])
 
-    def _measure(self, position: Tensor, origins: Tensor) -> Tensor:
-        return -_norm_xy(self._target + origins - position) / self._dt
+    def _target_from(self, position: Tensor) -> Tensor:
+        return self._target + self._origins[:, :2] - position
 
 
 # --- episodes and actions ---
@@ -983,8 +1002,12 @@ def _spread(
     return values.view(-1)
 
 
-def _xyz(entity: Entity) -> Columns:
-    return slice(entity.root_qpos, entity.root_qpos + 3)
+def _xy(entity: Entity) -> Columns:
+    return slice(entity.root_qpos, entity.root_qpos + 2)
+
+
+def _dot_xy(left: Tensor, right: Tensor) -> Tensor:
+    return left[:, 0] * right[:, 0] + left[:, 1] * right[:, 1]
 
 
 def _norm_xy(vector: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from rlcli.sim.rotations import length, turn_between, wrap_to_pi
 from rlcli.task import Bodies, Command, Entity, Joints, Sites
 
 if TYPE_CHECKING:
+    from rlcli.envs.managed import ManagedEnv
     from rlcli.envs.vec_env import VecEnv
 
 
@@ -23,11 +24,22 @@ def joints_near(
 
 
 def root_moves(
-    env: VecEnv, *, entity: Entity = "robot", direction: tuple[float, float, float] = (1.0, 0.0, 0.0), speed: float
+    env: VecEnv,
+    *,
+    entity: Entity = "robot",
+    direction: tuple[float, float, float] = (1.0, 0.0, 0.0),
+    speed: float,
+    limit_angle: float | None = None,
 ) -> Tensor:
-    """The root's velocity, projected on `direction` (world frame, of length 1), is above `speed` [m/s]. (num_envs,)"""
+    """The root's velocity, projected on `direction` (world frame, of length 1), is above `speed` [m/s]. (num_envs,)
+
+    With `limit_angle` its up axis must be within that of the way up too [rad].
+    """
     x, y, z = entity.data.root_lin_vel_w.unbind(dim=1)
-    return direction[0] * x + direction[1] * y + direction[2] * z > speed
+    moves = direction[0] * x + direction[1] * y + direction[2] * z > speed
+    if limit_angle is None:
+        return moves
+    return moves & (-entity.data.projected_gravity_b[:, 2] > cosine(limit_angle))
 
 
 def root_upright(
@@ -45,6 +57,14 @@ def root_near(env: VecEnv, *, entity: Entity = "robot", target: tuple[float, flo
     return length(entity.data.root_pos_w - env.origins - vector(target, env.device)) < tolerance
 
 
+def root_hovers(
+    env: VecEnv, *, entity: Entity = "robot", goal: Entity = "target", tolerance: float, speed: float
+) -> Tensor:
+    """The root is within `tolerance` [m] of the root of `goal`, and slower than `speed` [m/s]. (num_envs,)"""
+    near = length(entity.data.root_pos_w - goal.data.root_pos_w) < tolerance
+    return near & (length(entity.data.root_lin_vel_w) < speed)
+
+
 def velocity_tracked(
     env: VecEnv,
     *,
@@ -57,6 +77,18 @@ def velocity_tracked(
     data, asked = entity.data, command.command
     linear = length(asked[:, :2] - data.root_lin_vel_b[:, :2]) < linear_tolerance
     return linear & ((asked[:, 2] - data.root_ang_vel_b[:, 2]).abs() < angular_tolerance)
+
+
+def velocity_tracked_on_average(
+    env: ManagedEnv, *, command: Command, linear_tolerance: float, angular_tolerance: float
+) -> Tensor:
+    """The episode's mean errors of a velocity command are within these so far [m/s, rad/s]. (num_envs,)
+
+    Its starts and its changes of command count, too.
+    """
+    so_far = env.command_manager.so_far
+    linear = so_far(command, "error_vel_xy") < linear_tolerance
+    return linear & (so_far(command, "error_vel_yaw") < angular_tolerance)
 
 
 def body_at_goal(

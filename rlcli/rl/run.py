@@ -21,6 +21,10 @@ from rlcli.rl.reading import JSON_LIMIT, parse_json, read_file, refuse_links
 
 CONFIG = "config.yaml"
 RECORD = "run.json"
+STUDY = "study.json"
+"""What a folder holds whose folders are runs of one study: the seeds of a training, or the trials of a sweep."""
+WAITING = "waiting"
+"""State of a run of a study whose turn has not come."""
 LOCK = ".lock"
 MAX_SEED = 2**62
 _TASK = re.compile(r"(?!\.{1,2}$)[^/\\:]{1,255}")
@@ -93,21 +97,47 @@ def create_run(runs_dir: Path, task: str, name: str | None, config: str, record:
         UsageError: for a name that cannot be part of a folder's.
         MachineError: if the folder cannot be made or written.
     """
-    if name is not None and not _NAME.fullmatch(name):
-        raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint="letters, digits, - and _")
+    return begin_run(new_folder(runs_dir, task, name), config, record)
+
+
+def new_folder(runs_dir: Path, task: str, name: str | None) -> Path:
+    """A folder for a run or a study of runs, with the time in its name.
+
+    Raises:
+        UsageError: for a name that cannot be part of a folder's.
+        MachineError: if the folder cannot be made.
+    """
+    require_name(name)
     parent = runs_dir / task
-    now = datetime.now(UTC)
-    stem = now.strftime("%Y-%m-%d_%H-%M-%S") + (f"-{name}" if name else "")
+    stem = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S") + (f"-{name}" if name else "")
     try:
         parent.mkdir(parents=True, exist_ok=True)
-        folder = _fresh_folder(parent, stem)
+        return _fresh_folder(parent, stem)
     except OSError as error:
         raise disk_error(parent, error) from error
+
+
+def require_name(name: str | None) -> None:
+    """A name can be part of a folder's.
+
+    Raises:
+        UsageError: if it cannot.
+    """
+    if name is not None and not _NAME.fullmatch(name):
+        raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint="letters, digits, - and _")
+
+
+def begin_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
+    """Write what a run is to do into its empty folder, and lock it.
+
+    Raises:
+        MachineError: if it cannot be written; the folder is gone then.
+    """
     run = Run(folder)
     try:
         run.checkpoints.mkdir()
         write_atomic(run.config, config)
-        run.update(started=now.isoformat(timespec="microseconds"), state="running", **record)
+        run.update(**{"started": datetime.now(UTC).isoformat(timespec="microseconds"), "state": "running", **record})
         run.lock()
     except (OSError, MachineError) as error:
         shutil.rmtree(folder, ignore_errors=True)
@@ -221,7 +251,9 @@ def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[R
 def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
     """Runs under a folder, oldest first; what is not a run is passed over."""
     runs = []
-    for file in runs_dir.glob(f"*/*/{RECORD}"):
+    for file in (*runs_dir.glob(f"*/*/{RECORD}"), *runs_dir.glob(f"*/*/*/{RECORD}")):
+        if not _stands_right(file, runs_dir):
+            continue
         try:
             run = open_run(file.parent)
         except CheckpointError:
@@ -229,6 +261,12 @@ def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
         if task is None or run.record["task"].get("name") == task:
             runs.append(run)
     return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name))
+
+
+def _stands_right(file: Path, runs_dir: Path) -> bool:
+    """Whether a run lies in a task's folder, or in a study that does."""
+    deep = len(file.relative_to(runs_dir).parts) == 4
+    return not deep or (file.parent.parent / STUDY).is_file()
 
 
 def find_checkpoint(
@@ -339,13 +377,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
 
 def _check(record: Any, file: Path) -> None:
     """The entries of run.json that are read again are what they should be."""
-    task = record.get("task") if isinstance(record, dict) else None
-    if not isinstance(task, dict) or not isinstance(task.get("name"), str):
-        raise CheckpointError(f"{file} is corrupt: it does not name a task")
-    wrong = [key for key, value in task.items() if value is not None and not isinstance(value, str)]
-    wrong += [key for key, value in task.items() if isinstance(value, str) and not _is_word(value)]
-    if wrong or not _TASK.fullmatch(task["name"]):
-        raise CheckpointError(f"{file} is corrupt: its task's {(wrong or ['name'])[0]} is malformed")
+    task = check_task(record.get("task") if isinstance(record, dict) else None, file)
     if not (task.get("folder") or task.get("distribution")) or type(record.get("seed")) is not int:
         raise CheckpointError(f"{file} is corrupt: it does not say where the task is from, or has no seed")
     if not 0 <= record["seed"] <= MAX_SEED:
@@ -359,6 +391,21 @@ def _check(record: Any, file: Path) -> None:
         raise CheckpointError(f"{file} is corrupt: its torch_threads is out of range")
     if not 0 <= record.get("video_every", 0) < 2**31:
         raise CheckpointError(f"{file} is corrupt: its video_every is out of range")
+
+
+def check_task(task: Any, file: Path) -> dict[str, Any]:
+    """What a stranger's file says of a task: it names one, and all that it says are words.
+
+    Raises:
+        CheckpointError: if that is not so.
+    """
+    if not isinstance(task, dict) or not isinstance(task.get("name"), str):
+        raise CheckpointError(f"{file} is corrupt: it does not name a task")
+    wrong = [key for key, value in task.items() if value is not None and not isinstance(value, str)]
+    wrong += [key for key, value in task.items() if isinstance(value, str) and not _is_word(value)]
+    if wrong or not _TASK.fullmatch(task["name"]):
+        raise CheckpointError(f"{file} is corrupt: its task's {(wrong or ['name'])[0]} is malformed")
+    return task
 
 
 def _is_word(text: str) -> bool:
@@ -380,6 +427,12 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
     ):
         if os.path.isfile(candidate / RECORD):
             return open_run(candidate), "as named"
+        if os.path.isfile(candidate / STUDY):
+            inside = sorted(file.parent.name for file in candidate.glob(f"*/{RECORD}"))
+            raise CheckpointError(
+                f"{candidate} is a study of several runs",
+                hint=f"name one: {listing(str(candidate / n) for n in inside)}",
+            )
     matches = [run for run in list_runs(runs_dir, None) if run.folder.name == reference]
     if len(matches) == 1:
         return matches[0], "as named"

@@ -4,10 +4,12 @@ import re
 
 import pytest
 import torch
+import yaml
 from worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, edited, pendulum, run
 
 from rlcli.errors import ConfigError, RlcliError, TaskError
 
+CRITTER_REWARDS = list(yaml.safe_load(CRITTER_TASK)["rewards"])
 JOINTS = ["hip_fl", "hip_fr", "hip_bl", "hip_br"]
 
 
@@ -266,6 +268,25 @@ def test_an_observation_term_with_memory_is_reset_with_its_environment(tmp_path)
     assert env.reset()["policy"][:, 0].tolist() == [1, 1, 1]
     env.episode_length_buf[1] = 9
     assert env.step(torch.zeros(3, 1)).obs["policy"][:, 0].tolist() == [1, 2, 1]
+
+
+def test_a_term_that_pays_while_alive_pays_nothing_in_the_step_of_a_failure(tmp_path):
+    rewards = {name: None for name in CRITTER_REWARDS}
+    rewards |= {
+        "always": {"func": "base_height_l2", "weight": 1.0, "target_height": 10.0},
+        "alive": {"func": "base_height_l2", "weight": 1.0, "target_height": 10.0, "while_alive": True},
+    }
+    env = build(critter(tmp_path, edited(CRITTER_TASK, rewards=rewards, reward_dt_scaling=False)), 3)
+    env.reset()
+    env.engine.field("qpos")[1, 2] = -5.0
+    env.episode_length_buf[2] = env.max_episode_length - 1
+    result = env.step(torch.zeros(3, 4))
+    assert result.terminated.tolist() == [False, True, False]
+    assert result.truncated.tolist() == [False, False, True]
+    paid = env.reward_manager.values()
+    assert paid["alive"].tolist() == [float(paid["always"][0]), 0.0, float(paid["always"][2])]
+    assert (paid["always"] > 50.0).all()
+    assert torch.equal(result.reward, paid["always"] + paid["alive"])
 
 
 def test_causes_name_every_termination_that_fired(tmp_path):

@@ -106,6 +106,8 @@ OBSERVATIONS = [
     (o.joint_vel, SOME, lambda s: [s.v[3], s.v[0]]),
     (o.joint_pos_rel, ALL, lambda s: s.q - DEFAULT),
     (o.joint_vel_rel, ALL, lambda s: s.v),
+    (o.joint_angle, SOME, lambda s: [wrapped(s.q[3]), wrapped(s.q[0])]),
+    (o.joint_angle_sum, SOME, lambda s: [wrapped(s.q[3] + s.q[0])]),
     (o.joint_pos_limit_normalized, ALL, lambda s: (2 * s.q - LOW - HIGH) / (HIGH - LOW)),
     (o.joint_pos_limit_normalized, {**ARM, "joints": "elbow"}, lambda s: [0.0]),
     (o.joint_effort, SOME, lambda s: [s.effort[3], s.effort[0]]),
@@ -178,6 +180,9 @@ REWARDS = [
     (r.joint_pos_limits, ALL, lambda s: np.maximum(LOW - s.q, 0).sum() + np.maximum(s.q - HIGH, 0).sum()),
     (r.JointPosLimitsPenaltyRatio, {**ROBOT, "joints": HIPS[:3], "threshold": 0.25, "gear_ratio": [2.0, 2.5, 3.0]},
      lambda s: sum(g * max(abs(q) / LIMIT - 0.25, 0) / 0.75 for q, g in zip(s.q[:3], (2, 2.5, 3), strict=True))),
+    (r.joints_at_limit, {**ALL, "threshold": 0.25}, lambda s:
+     sum(abs(2 * q - a - b) / (b - a) > 0.25 for q, a, b in zip(s.q, LOW, HIGH, strict=True))),
+    (r.joints_at_limit, {**ROBOT, "joints": HIPS[:3]}, lambda s: sum(abs(q) / LIMIT > 0.99 for q in s.q[:3])),
     (r.PowerConsumption, {**ALL, "gear_ratio": 2.0}, lambda s: 2 * abs(s.action * s.v).sum()),
     (r.action_rate_l2, {}, lambda s: ((s.action - s.previous) ** 2).sum()),
     (r.action_l2, {}, lambda s: s.action @ s.action),
@@ -321,11 +326,15 @@ SUCCESS = [
      abs(s.q[0] - 0.1) < 0.01),
     (u.root_moves, {**ROBOT, "speed": 0.2, "direction": (0.6, 0.0, 0.8)}, lambda s:
      0.6 * s.lin[0] + 0.8 * s.lin[2] > 0.2),
+    (u.root_moves, {**ROBOT, "speed": -2.0, "limit_angle": 0.7}, lambda s: s.lin[0] > -2.0 and -s.down_b[2] > cos(0.7)),
     (u.root_upright, {**ROBOT, "limit_angle": 0.7}, lambda s: -s.down_b[2] > cos(0.7)),
     (u.root_upright, {**ROBOT, "limit_angle": 3.0, "minimum_height": 0.52}, lambda s:
      -s.down_b[2] > cos(3.0) and s.above[2] > 0.52),
     (u.root_near, {**ROBOT, "target": (0.5, -0.5, 0.5), "tolerance": 1.0}, lambda s:
      norm(s.above - [0.5, -0.5, 0.5]) < 1.0),
+    (u.root_hovers, {**ROBOT, "goal": "object", "tolerance": 3.0, "speed": 9.0}, lambda s:
+     norm(s.pos - s.thing) < 3.0),
+    (u.root_hovers, {**ROBOT, "goal": "object", "tolerance": 99.0, "speed": 0.8}, lambda s: norm(s.lin) < 0.8),
     (u.velocity_tracked, {**VELOCITY, "linear_tolerance": 0.7, "angular_tolerance": 0.5}, lambda s:
      norm(s.velocity[:2] - s.lin_b[:2]) < 0.7 and abs(s.velocity[2] - s.ang[2]) < 0.5),
     (u.velocity_tracked, {**VELOCITY, "linear_tolerance": 9.0, "angular_tolerance": 0.5}, lambda s:

@@ -205,6 +205,18 @@ def test_moving_the_root_of_a_fixed_robot_is_refused_by_name(tmp_path, event):
         env.step(torch.zeros(3, 1))
 
 
+def test_progress_to_a_target_far_away_is_as_exact_as_to_a_near_one(tmp_path):
+    """Two distances of 1000 m in float32 differ by multiples of 0.06 mm."""
+    env = build(critter(tmp_path), 3)
+    env.reset()
+    term = rewards.ProgressReward(env, entity=env.entities["robot"], target=(1000.0, 0.0, 0.0))
+    env.engine.field("qpos")[:, 0] += torch.tensor([1e-3, 2.1e-3, -7.7e-3], dtype=torch.float64)
+    env.sim.refresh()
+    expected = torch.tensor([1e-3, 2.1e-3, -7.7e-3]) / env.step_dt
+    torch.testing.assert_close(term(), expected, rtol=0, atol=1e-5)
+    assert not term().any(), "nothing moved since"
+
+
 def test_unlimited_joints_never_violate_their_limits(tmp_path):
     from worlds import PENDULUM_TASK, pendulum
 
@@ -216,6 +228,7 @@ def test_unlimited_joints_never_violate_their_limits(tmp_path):
     env.sim.refresh()
     robot = env.entities["robot"]
     assert rewards.joint_pos_limits(env, entity=robot, joints=slice(0, 1)).tolist() == [0, 0, 0]
+    assert rewards.joints_at_limit(env, entity=robot, joints=slice(0, 1)).tolist() == [0, 0, 0]
     assert rewards.JointPosLimitsPenaltyRatio(env, entity=robot, joints=slice(0, 1))().tolist() == [0, 0, 0]
 
 

@@ -200,6 +200,7 @@ def test_a_new_episode_has_felt_nothing_yet(env):
 
 def test_standing_still_pays_for_life_posture_and_heading(env):
     put(env)
+    env.task.position_before.zero_()
     env.task.distance_before.fill_(1000.0)
     assert pay(env) == (pytest.approx(0.5 + 0.1 + 0.5), False)
 
@@ -228,6 +229,7 @@ def test_the_first_step_of_an_episode_counts_from_its_start(env):
 @pytest.mark.parametrize(("yaw", "share"), [(0.5, 1.0), (1.0, math.cos(1.0) / 0.8), (2.0, math.cos(2.0) / 0.8)])
 def test_heading_pays_in_full_up_to_an_angle_and_less_beyond(env, yaw, share):
     put(env, quat=about(3, yaw))
+    env.task.position_before.zero_()
     env.task.distance_before.fill_(1000.0)
     assert pay(env)[0] == pytest.approx(0.6 + 0.5 * share, abs=1e-4)
 
@@ -235,12 +237,14 @@ def test_heading_pays_in_full_up_to_an_angle_and_less_beyond(env, yaw, share):
 @pytest.mark.parametrize(("roll", "bonus"), [(0.37, 0.1), (0.39, 0.0)])
 def test_being_upright_pays_up_to_an_angle(env, roll, bonus):
     put(env, quat=about(1, roll))
+    env.task.position_before.zero_()
     env.task.distance_before.fill_(1000.0)
     assert pay(env)[0] == pytest.approx(1.0 + bonus, abs=1e-5)
 
 
 def test_actions_and_their_power_cost(env):
     put(env, rates=torch.tensor([1.0, -2, 3, -4, 5, -6, 7, -8]).double())
+    env.task.position_before.zero_()
     env.task.distance_before.fill_(1000.0)
     env.task.actions[0] = torch.tensor([0.1, 0.2, 0.3, 0.4, -0.5, -0.6, -0.7, -0.8])
     squares = sum(0.01 * i * i for i in range(1, 9))
@@ -254,6 +258,7 @@ def test_a_joint_at_either_limit_costs(env, end):
     joints[0], joints[3] = math.radians(40 * end), math.radians(65 + 35 * end)
     joints[4] = math.radians(0.98 * 40 * end)
     put(env, joints=joints)
+    env.task.position_before.zero_()
     env.task.distance_before.fill_(1000.0)
     assert pay(env)[0] == pytest.approx(1.1 - 2 * 0.1, abs=1e-5)
 
@@ -331,7 +336,7 @@ def test_the_hooks_of_a_step_are_few_operations_none_of_which_waits_for_the_devi
         task.is_done()
     assert not ON_THE_HOST & set(step.names)
     assert not {"index", "index_put_"} & set(step.names), "an index of booleans is a search"
-    assert len([name for name in step.names if name not in VIEWS]) < 60
+    assert len([name for name in step.names if name not in VIEWS]) < 68
 
 
 def test_buffers_keep_their_place_from_step_to_step_and_over_resets(env):

@@ -1,7 +1,8 @@
-"""Ant: a four-legged walker runs towards a far target. Numbers and their sources: docs/ant.md."""
+"""Ant: a four-legged walker runs towards a far target. Numbers and their sources: docs/zoo/ant-direct.md."""
 
 from rlcli.task import TaskSpec
 
+MANAGED = TaskSpec(package=__name__, summary="Run with a four-legged walker (manager-based).")
 DIRECT = TaskSpec(
     package=__name__,
     config="direct.yaml",

@@ -1,0 +1,11 @@
+"""Humanoid: a human figure runs towards a far target. Numbers and their sources: docs/zoo/humanoid.md."""
+
+from rlcli.task import TaskSpec
+
+MANAGED = TaskSpec(package=__name__, summary="Run with a human figure (manager-based).")
+DIRECT = TaskSpec(
+    package=__name__,
+    config="direct.yaml",
+    summary="Run with a human figure (direct, OmniIsaacGymEnvs' numbers).",
+    task="rlcli_tasks.humanoid.task:HumanoidTask",
+)

@@ -1,0 +1,64 @@
+"""Humanoid in the direct workflow: a human figure runs towards a far target. docs/zoo/humanoid-direct.md."""
+
+from __future__ import annotations
+
+from pydantic import Field
+from torch import Tensor
+
+from rlcli.config.schema import StrictModel
+from rlcli_tasks.locomotion import LocomotionTask, observation_names, observation_units
+
+LEG = {"hip_roll": 45.0, "hip_yaw": 45.0, "hip_pitch": 135.0, "knee": 90.0, "ankle_pitch": 22.5, "ankle_roll": 22.5}
+ARM = {"shoulder_1": 67.5, "shoulder_2": 67.5, "elbow": 45.0}
+EFFORTS = {
+    **{"waist_yaw": 67.5, "waist_pitch": 67.5, "waist_roll": 67.5},
+    **{f"{joint}_{side}": effort for side in "lr" for joint, effort in LEG.items()},
+    **{f"{joint}_{side}": effort for side in "lr" for joint, effort in ARM.items()},
+}
+"""Torque of each motor at action 1 [N m]."""
+JOINTS = tuple(EFFORTS)
+
+
+class HumanoidTask(LocomotionTask):
+    """Run towards the target on two legs."""
+
+    num_observations = 87
+    num_actions = 21
+    joints = JOINTS
+    rate_scale, joint_vel_scale, force_scale = 0.25, 0.1, 0.01
+    observation_names = observation_names(JOINTS, ("foot_l", "foot_r"))
+    observation_units = observation_units(21, 2, rate="4 rad/s", joint_rate="10 rad/s", force="100")
+    action_names = JOINTS
+
+    class Params(StrictModel):
+        """The task's own settings."""
+
+        power: float = Field(1.0, gt=0, description="Factor on the motors' torques.")
+        target: tuple[float, float] = Field((1000.0, 0.0), description="Where to run, x and y [m].")
+        termination_height: float = Field(0.8, description="Torso height below which the episode fails [m].")
+        death_reward: float = Field(-1.0, description="Reward of the step that fails, in place of all others.")
+        alive_weight: float = Field(2.0, description="Reward a step.")
+        progress_weight: float = Field(1.0, description="Reward on the speed towards the target [s/m].")
+        up_weight: float = Field(0.1, description="Reward where the torso is upright to within acos(0.93).")
+        heading_weight: float = Field(0.5, description="Reward where the torso faces the target, to within acos(0.8).")
+        action_cost: float = Field(0.01, ge=0, description="Penalty on squared actions.")
+        energy_cost: float = Field(
+            0.05, ge=0, description="Penalty on |action x joint velocity / (10 rad/s)| x the motor's share of 135 N m."
+        )
+        limit_cost: float = Field(
+            0.25,
+            ge=0,
+            description="Penalty on a joint at its limit, from 0 at 98% of its half range, by the same share.",
+        )
+        joint_pos_noise: float = Field(0.2, ge=0, description="Start: joint positions +-, inside the limits [rad].")
+        joint_vel_noise: float = Field(0.1, ge=0, description="Start: joint velocities +- [rad/s].")
+
+    params: Params
+
+    def efforts(self) -> tuple[float, ...]:
+        """Each motor's own."""
+        return tuple(self.params.power * effort for effort in EFFORTS.values())
+
+    def at_limits(self, position: Tensor) -> Tensor:
+        """0 at 98% of the half range, 1 times the motor's share at the limit."""
+        return (position.abs() - 0.98).clamp_(min=0.0).mul_(self.share / 0.02)
