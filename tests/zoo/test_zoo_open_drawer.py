@@ -173,10 +173,10 @@ def test_actions_move_the_targets_and_stop_at_the_limits(env):
     action[:, 0], action[:, 6], action[:, 7] = 0.2, -0.2, -1.0
     env.step(action)
     moved = (env.task.targets - before)[0].tolist()
-    assert moved[0] == pytest.approx(0.2 * 7.5 / 60, abs=1e-5)
-    assert moved[6] == pytest.approx(-0.2 * 7.5 / 60, abs=1e-5)
-    assert moved[7] == pytest.approx(max(-0.75 / 60, -float(before[0, 7])), abs=1e-5)
-    for _ in range(60):
+    assert moved[0] == pytest.approx(0.2 * 2.5 / 60, abs=1e-5)
+    assert moved[6] == pytest.approx(-0.2 * 2.5 / 60, abs=1e-5)
+    assert moved[7] == pytest.approx(max(-0.25 / 60, -float(before[0, 7])), abs=1e-5)
+    for _ in range(200):
         env.step(torch.ones(4, 9))
     high = env.entities["robot"].data.joint_pos_limits[:, 1]
     torch.testing.assert_close(env.task.targets, high.expand(4, 9))
