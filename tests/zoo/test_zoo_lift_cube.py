@@ -30,7 +30,7 @@ def place(env, cube, row=None):
 
 def pay(env):
     """What each term pays in the state as it is. (num_envs,) each"""
-    env.reward_manager.compute()
+    env.reward_manager.compute(torch.zeros(env.num_envs, dtype=torch.bool))
     return {name: value.clone() for name, value in env.reward_manager.values().items()}
 
 
