@@ -4,10 +4,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 RUNS ?= runs
+# of `make learn-TASK`: cpu or cuda (else the device that docs/zoo/zoo.yaml names), and the seed
+DEVICE ?=
+SEED ?= 1
 # Tests run beside each other: threads of theirs that wait must not keep a core busy.
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: demo test test-all test-faults test-faults-long check bench setup clean
+.PHONY: demo test test-all test-faults test-faults-long check bench zoo-pages setup clean
 
 # The installation is repeated when what is installed changes.
 $(VENV)/.demo: pyproject.toml constraints.txt
@@ -50,6 +53,14 @@ check: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# Trains a built-in task with its default agent, evaluates it, and compares with its bar in docs/zoo/zoo.yaml.
+learn-%: $(VENV)/.demo
+	$(BIN)/python benchmarks/zoo.py learn $* --device "$(DEVICE)" --seed $(SEED) --runs-dir $(RUNS)
+
+# The generated parts of docs/zoo.
+zoo-pages: $(VENV)/.demo
+	$(BIN)/python benchmarks/zoo.py pages
 
 bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/env_step.py

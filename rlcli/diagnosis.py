@@ -36,11 +36,11 @@ from rlcli.registry import (
     unknown_wanted,
     unreadable_distributions,
 )
-from rlcli.viewer.gl import has_display
+from rlcli.sim.gl import has_display
 
 BACKENDS = {"egl": "EGL", "osmesa": "OSMesa", "glfw": "window"}
 SETTINGS = (
-    *("RLCLI_PLUGINS", "RLCLI_RUNS_DIR", "MUJOCO_GL", "DISPLAY", "CUDA_VISIBLE_DEVICES"),
+    *("RLCLI_MODELS", "RLCLI_PLUGINS", "RLCLI_RUNS_DIR", "MUJOCO_GL", "DISPLAY", "CUDA_VISIBLE_DEVICES"),
     *("OMP_NUM_THREADS", "MKL_NUM_THREADS", "LOCAL_WORLD_SIZE", "PYTHONPATH"),
 )
 LOW_DISK_BYTES = 1e9

@@ -62,6 +62,10 @@ class TaskError(RlcliError):
     kind = "task"
 
 
+class MissingModelError(TaskError):
+    """A model that the user is to have is not there."""
+
+
 class CheckpointError(RlcliError):
     """A checkpoint or run is missing, corrupt or does not fit."""
 

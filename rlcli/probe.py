@@ -40,7 +40,18 @@ class Details:
     action_size: int | None = None
     num_envs: int | None = None
     agent: str | None = None
+    policy: bool = False
+    """Whether a trained policy is shipped with it."""
     broken: str | None = None
+
+    @property
+    def status(self) -> str:
+        """In a few words: `ok`, `ok, policy`, `broken: WHY`, or `?` where nobody has looked yet."""
+        if self.broken:
+            return f"broken: {self.broken}"
+        if self.workflow is None:
+            return "?"
+        return "ok, policy" if self.policy else "ok"
 
     def record(self) -> dict[str, Any]:
         """As plain JSON."""
@@ -51,6 +62,7 @@ _KINDS: dict[str, Any] = {
     **dict.fromkeys(("observation_size", "action_size", "num_envs"), int | None),
     **dict.fromkeys(("workflow", "agent", "broken"), str | None),
     "summary": str,
+    "policy": bool,
 }
 
 

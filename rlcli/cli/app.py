@@ -133,7 +133,7 @@ def _run(arguments: list[str]) -> int:
     except OSError as error:
         return _machine(error)
     except Exception as error:
-        from rlcli.viewer.gl import unusable_choice
+        from rlcli.sim.gl import unusable_choice
 
         if (unusable := unusable_choice(error)) is not None:
             return _report(unusable)

@@ -59,6 +59,9 @@ def command(
     from rlcli.rl.trust import named_task
 
     named = None if task is None else named_task(task)
+    if _is_bundle(run):
+        _refuse_bundle(run, case)
+        return
     found, why = find_run(run, runs_dir or default_runs_dir())
     console.info(f"run {found.folder} ({why})")
     cases = list_cases(found, console.warn)
@@ -69,6 +72,28 @@ def command(
         hint = f"it has {len(cases)}, counted from 0" if cases else _why_none(found)
         raise UsageError(f"no case {case} in {found.folder}", hint=hint)
     _show(found, cases[case], case, steps, video, named)
+
+
+def _is_bundle(word: str) -> bool:
+    from rlcli.rl.bundle import is_bundle
+
+    return is_bundle(Path(word))
+
+
+def _refuse_bundle(folder: str, case: int | None) -> None:
+    """A policy without its training has no episodes of it."""
+    from rlcli.errors import UsageError
+    from rlcli.rl.bundle import open_bundle
+
+    open_bundle(Path(folder))
+    why = (
+        f"it is a policy without its training; rlcli eval --checkpoint {folder} --record FILE --record-mode failed"
+        " keeps episodes of it"
+    )
+    if case is not None:
+        raise UsageError(f"no case {case} in {folder}", hint=why)
+    console.info(f"no episode was kept: {why}")
+    console.document("autopsy", run=folder, cases=[], why_none=why)
 
 
 def _list(run: Any, cases: list[Case], sort: str) -> None:

@@ -21,25 +21,29 @@ class Referee:
     deployment: dict[str, Any]
 
 
-def open_referee(run: Any, checkpoint: Any, task: str | None) -> Referee:
-    """Build the environment of a run, without what corrupts observations: no file can know that."""
+def open_referee(choice: Any, checkpoint: Any, task: str | None) -> Referee:
+    """Build the environment that a policy is for, without what corrupts observations: no file can know that.
+
+    Args:
+        choice: the `rlcli.rl.choice.Choice` that found the policy.
+        checkpoint: what it found, opened.
+        task: what the command line names.
+    """
     import torch
 
     from rlcli.envs.deployment import describe
     from rlcli.envs.vec_env import make_env
     from rlcli.random import derive
-    from rlcli.rl.load import require_fit, resolve_run
+    from rlcli.rl.load import require_fit
     from rlcli.rl.rng import seed_generators
-    from rlcli.rl.run import open_run
     from rlcli.rl.trust import named_task
 
-    run = open_run(run.folder)
     named = None if task is None else named_task(task)
-    resolved = resolve_run(run, play=True, named=named)
+    resolved = choice.configure(named)
     corrupted = [name for name, group in resolved.task.observations.items() if group.enable_corruption]
     if corrupted:
         clean = [f"observations.{name}.enable_corruption=false" for name in corrupted]
-        resolved = resolve_run(run, play=True, overrides=clean, named=named)
+        resolved = choice.configure(named, overrides=clean)
     torch.set_num_threads(1)
     seed_generators(derive(_SEED, "task"))
     env = make_env(resolved, seed=derive(_SEED, "evaluation"))

@@ -21,6 +21,7 @@ def compare(
     words: list[str],
     *,
     limits: dict[str, float],
+    ceilings: dict[str, float],
     episodes: int,
     stochastic: bool,
     num_envs: int | None,
@@ -33,6 +34,7 @@ def compare(
     Args:
         words: what stood there without a dash: policies, and KEY.PATH=VALUE for all of them.
         limits: of --fail-under, for the first policy.
+        ceilings: of --fail-over, likewise.
         episodes: of each policy.
         stochastic: sample actions.
         num_envs: environments; None: one an episode.
@@ -53,14 +55,14 @@ def compare(
     for name, subject in zip(names[1:], subjects[1:], strict=True):
         _require_same(names[0], subjects[0], name, subject)
     resolved = subjects[0].resolved
-    require_success(resolved, limits)
+    require_success(resolved, limits | ceilings)
     from rlcli.rl.stress import one_each, run_points
 
     task = one_each(resolved, episodes)
     found = [run_points(task, actor(subject), [], [None], episodes, seed)[0] for subject in subjects]
     summaries = [evaluation.summary() for evaluation in found]
     rows = [_compared(found[0], other) for other in found[1:]]
-    failures = verdict(summaries[0], limits)
+    failures = verdict(summaries[0], limits, ceilings)
     labels = _labels(names)
     config_of = resolved.task
     console.data(
@@ -104,6 +106,7 @@ def _find(
     """A subject for each name: those of policies that need no checkpoint play the first run's task."""
     from rlcli.cli.session import POLICIES, baseline, find_subject
     from rlcli.errors import UsageError
+    from rlcli.rl.choice import SHIPPED
 
     plain = [name for name in names if name in POLICIES and name != "trained"]
     if len(names) < 2 or len(plain) == len(names):
@@ -111,11 +114,15 @@ def _find(
             " ".join(["--compare", *names]) + ": with what?"
             if len(names) < 2
             else "none of these is a run, so that there is no task",
-            hint="rlcli eval --compare RUN1 RUN2 [...]; beside a run also lqr, zero or random",
+            hint="rlcli eval --compare RUN1 RUN2 [...]; beside a run also shipped, lqr, zero or random",
         )
-    runs = {
-        name: find_subject(
-            None,
+    runs: dict[str, Subject] = {}
+    for name in sorted(dict.fromkeys(names), key=SHIPPED.__eq__):  # last: what a task ships, the others' task
+        if name in plain:
+            continue
+        task = next(iter(runs.values())).resolved.source.name if name == SHIPPED and runs else None
+        runs[name] = find_subject(
+            task,
             overrides,
             checkpoint=name,
             policy="trained",
@@ -125,10 +132,7 @@ def _find(
             config=config,
             runs_dir=runs_dir,
         )
-        for name in dict.fromkeys(names)
-        if name not in plain
-    }
-    first = next(iter(runs.values()))
+    first = next(runs[name] for name in names if name in runs)
     return [baseline(first, name) if name in plain else runs[name] for name in names]
 
 

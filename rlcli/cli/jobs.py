@@ -30,14 +30,17 @@ def created(
     from rlcli.rl.environment import environment_record, file_digest
     from rlcli.rl.job import Job, threads
     from rlcli.rl.loggers import check_loggers
-    from rlcli.rl.run import create_run, find_checkpoint
+    from rlcli.rl.run import create_run
 
     loggers = check_loggers(logger)
     _require_drawing(video_every)
     initial = None
     if init_from is not None:
-        _, initial, why = find_checkpoint(init_from, runs, tell=console.warn)
-        console.info(f"weights of {initial} ({why})")
+        from rlcli.rl.choice import choose
+
+        choice = choose(init_from, runs, resolved.source, any_task=True, tell=console.warn)
+        initial = choice.folder
+        console.info(f"weights of {initial} ({choice.why})")
     record |= {
         "task": resolved.source.record() | {"file": resolved.source.config.name},
         "agent": resolved.agent_name,
@@ -118,7 +121,7 @@ def _require_drawing(video_every: int | None) -> None:
     """
     if not video_every:
         return
-    from rlcli.viewer.gl import open_context
+    from rlcli.sim.gl import open_context
     from rlcli.viewer.writer import check_video
 
     check_video(Path("clip.mp4"))

@@ -37,7 +37,7 @@ def command(
         details.update(probe(entries, timeout))
     rows = [(entry, details.get(entry.qualified, Details())) for entry in entries]
     console.table(
-        ["TASK", "PLUGIN", "WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "SUMMARY"],
+        ["TASK", "PLUGIN", "WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "STATUS", "SUMMARY"],
         [
             [
                 entry.qualified if entry.name in shared and entry.distribution != OWN else entry.name,
@@ -47,9 +47,8 @@ def command(
                 _number(known.action_size),
                 _number(known.num_envs),
                 known.agent or "",
-                (known.broken and f"broken: {known.broken}")
-                or known.summary
-                or "(rlcli list-tasks --probe tells more)",
+                known.status,
+                known.summary or ("" if known.broken else "(rlcli list-tasks --probe tells more)"),
             ]
             for entry, known in rows
         ],
@@ -67,6 +66,7 @@ def command(
                 "ambiguous": entry.name in shared - built_in,
                 "distribution": entry.distribution,
                 "version": entry.version,
+                "status": known.status,
                 **known.record(),
             }
             for entry, known in rows

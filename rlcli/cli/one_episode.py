@@ -79,6 +79,7 @@ def play_episode(
     console.document(
         "play",
         checkpoint=str(session.checkpoint) if session.checkpoint else None,
+        chosen=session.chosen,
         env=who,
         episode=episode,
         seed=session.seed,

@@ -40,7 +40,10 @@ RecordMode = Annotated[
 ]
 CheckpointRef = Annotated[
     str | None,
-    typer.Option("--checkpoint", help="RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest."),
+    typer.Option(
+        "--checkpoint",
+        help="RUN, RUN@best, RUN@step:N, a checkpoint folder, a bundle, latest, or shipped (the task's own policy).",
+    ),
 ]
 Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Accepted; nothing opens a window unasked.")]
 

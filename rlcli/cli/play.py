@@ -30,7 +30,10 @@ _FALLBACK_VIDEO = Path("play.mp4")
 
 def command(
     task: Annotated[
-        str | None, typer.Argument(help="A task: its newest run is played. Not needed with --checkpoint.")
+        str | None,
+        typer.Argument(
+            help="A task: its newest run is played, else the policy it ships. Not needed with --checkpoint."
+        ),
     ] = None,
     overrides: Overrides = None,
     checkpoint: CheckpointRef = None,
@@ -179,7 +182,7 @@ def _video(session: Any, file: Path, together: int) -> None:
     shown = "environment 0" if together == 1 else f"environments 0 to {together - 1}"
     console.info(f"{frames} frames of {shown} at {fps:g} a second, drawn with {backend}")
     console.data(str(file))
-    console.document("play", video=str(file), frames=frames, fps=fps, gl=backend, **summary)
+    console.document("play", **_origin(session), video=str(file), frames=frames, fps=fps, gl=backend, **summary)
 
 
 def _statistics(session: Any, record: Path | None, record_mode: str) -> None:
@@ -189,4 +192,9 @@ def _statistics(session: Any, record: Path | None, record_mode: str) -> None:
     console.info("one episode an environment, as numbers (--video FILE.mp4 draws)")
     summary, recorded = run_episodes(session, session.env.num_envs, record, record_mode)
     show_summary(summary)
-    console.document("play", video=None, recorded=recorded, **summary)
+    console.document("play", **_origin(session), video=None, recorded=recorded, **summary)
+
+
+def _origin(session: Any) -> dict[str, Any]:
+    checkpoint = str(session.checkpoint) if session.checkpoint else None
+    return {"checkpoint": checkpoint, "chosen": session.chosen, "policy": session.policy}

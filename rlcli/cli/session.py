@@ -22,6 +22,8 @@ class Subject:
     resolved: Any
     run: Any
     checkpoint: Path | None
+    chosen: str | None
+    """Why this checkpoint."""
     policy: str
     stochastic: bool
     seed: int
@@ -36,7 +38,10 @@ class Session:
     env: Any
     act: Any
     run: Any
+    """The run of the checkpoint; None for a policy without one."""
     checkpoint: Path | None
+    chosen: str | None
+    """Why this checkpoint."""
     resolved: Any
     policy: str
     """One of POLICIES."""
@@ -66,8 +71,7 @@ def find_subject(
     """
     from rlcli.config.load import resolve
     from rlcli.errors import UsageError
-    from rlcli.rl.load import resolve_run
-    from rlcli.rl.run import default_runs_dir, find_checkpoint
+    from rlcli.rl.run import default_runs_dir
 
     require_policy(policy)
     if task is not None and "=" in task:
@@ -75,16 +79,18 @@ def find_subject(
     if task is None and checkpoint is None:
         raise UsageError("play what?", hint="a TASK, or --checkpoint RUN|latest")
     values = flags(scene__num_envs=num_envs)
-    run = folder = None
+    run = folder = why = None
     as_trained = False
+    configure: Callable[..., Any]
     if policy == "trained" or checkpoint is not None:
+        from rlcli.rl.choice import choose
+
         named = None if task is None else task_named(task, runs_dir)
-        name = None if named is None else named.name
-        runs = runs_dir or default_runs_dir()
-        run, folder, why = find_checkpoint(checkpoint or "latest", runs, name, tell=console.warn)
+        choice = choose(checkpoint, runs_dir or default_runs_dir(), named, tell=console.warn)
+        run, folder, why = choice.run, choice.folder, choice.why
         console.info(f"checkpoint {folder} ({why})")
-        configure = partial(resolve_run, run, play=True, config_file=config, overrides=overrides, named=named)
-        own = folder.resolve().parent == run.checkpoints.resolve()
+        configure = partial(choice.configure, named, config_file=config, overrides=overrides)
+        own = run is not None and folder.resolve().parent == run.checkpoints.resolve()
         as_trained = own and policy == "trained" and not overrides and config is None
     else:
         assert task is not None
@@ -94,7 +100,7 @@ def find_subject(
         resolved = configure(flags={**values, "scene.num_envs": at_least})
     check(resolved)
     tell_notes(resolved)
-    return Subject(resolved, run, folder, policy, stochastic, seed, as_trained)
+    return Subject(resolved, run, folder, why, policy, stochastic, seed, as_trained)
 
 
 def task_named(task: str, runs_dir: Path | None) -> Any:
@@ -247,6 +253,7 @@ def _build(subject: Subject) -> Session:
         act=put(env),
         run=subject.run,
         checkpoint=subject.checkpoint,
+        chosen=subject.chosen,
         resolved=subject.resolved,
         policy=subject.policy,
         seed=subject.seed,

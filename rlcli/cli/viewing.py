@@ -57,7 +57,7 @@ def choose_viewers(viewer: str, port: int | None, *, headless: bool) -> list[Cho
         MachineError: if a window is wanted, and there is no display.
     """
     from rlcli.errors import MachineError
-    from rlcli.viewer.gl import has_display
+    from rlcli.sim.gl import has_display
 
     if viewer == "native" and not has_display():
         raise MachineError(
@@ -133,7 +133,8 @@ def _open(session: Any, name: str, reason: str, port: int | None, together: int,
             if command is not None:
                 console.info(f"from where you came over SSH: {command}, then open http://localhost:{url.split(':')[2]}")
 
-        where = f"{task}, {Path(run.folder).name}" if trained else f"{task}, policy {session.policy}"
+        acting = session.chosen if session.chosen and session.policy == "trained" else f"policy {session.policy}"
+        where = f"{task}, {Path(run.folder).name}" if trained else f"{task}, {acting}"
         web.run(player, port=web.PORT if port is None else port, title=where, together=together, ready=ready)
     console.document(
         "play",
@@ -144,4 +145,5 @@ def _open(session: Any, name: str, reason: str, port: int | None, together: int,
         steps=player.steps,
         episodes=int(player.ended.sum()),
         checkpoint=player.checkpoint,
+        chosen=session.chosen,
     )

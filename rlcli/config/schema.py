@@ -357,6 +357,9 @@ class ViewerConfig(StrictModel):
     """Camera position [m], world frame of the environment shown."""
     lookat: Vec3 = (0.0, 0.0, 0.0)
     """Point the camera looks at [m]."""
+    follow: str | None = None
+    """Entity that the camera of pictures and videos goes along with, as far as its root is from where the entity's
+    default state has it; null: the camera stands still."""
     width: Annotated[int, Field(ge=16, le=3840)] = 640
     """Picture width [pixels]."""
     height: Annotated[int, Field(ge=16, le=2160)] = 480
@@ -493,7 +496,9 @@ class EntityConfig(StrictModel):
 
     model: str | None = None
     """MJCF file, relative to the task's folder; `TASK:FILE` is one of an installed task, as
-    `cartpole:cartpole.xml`; `package:PACKAGE/FILE` one in any installed Python package."""
+    `cartpole:cartpole.xml`; `package:PACKAGE/FILE` one in any installed Python package; `models:FILE` one in a folder
+    of the user's that the environment variable RLCLI_MODELS names. Of several with ` | ` between them the first that is
+    there."""
     shape: Literal["box", "sphere", "cylinder", "capsule", "plane"] | None = None
     """Instead of a model: a body `body` with one geom `geom`."""
     size: list[Positive] | None = None
@@ -609,7 +614,50 @@ class RaySensorConfig(StrictModel):
     """ground: the plane or the terrain; all: every geom but those of the body; or a list of geom groups."""
 
 
-SensorConfig = Annotated[ContactSensorConfig | RaySensorConfig, Field(discriminator="kind")]
+class CameraSensorConfig(StrictModel):
+    """Pictures of every environment, drawn offscreen once an environment step: colours, or how far things are."""
+
+    kind: Literal["camera"]
+    """camera."""
+    data: Literal["rgb", "depth", "distance"] = "rgb"
+    """rgb: red, green and blue, 0 to 255; depth: along the camera's axis [m]; distance: from the camera's place [m]."""
+    width: Annotated[int, Field(ge=1, le=1024)]
+    """Columns of the picture."""
+    height: Annotated[int, Field(ge=1, le=1024)]
+    """Rows of the picture."""
+    entity: str | None = None
+    """The entity that the camera belongs to; null: it stands in the environment."""
+    camera: str | None = None
+    """A camera of the entity's MJCF, with its place and its field of view; null: what follows says them."""
+    body: str | None = None
+    """The body of the entity that carries the camera; null: its root."""
+    eye: Vec3 = (-3.0, 0.0, 1.0)
+    """Where the camera sits, in the frame of what carries it [m]."""
+    lookat: Vec3 = (0.0, 0.0, 0.0)
+    """A point in the middle of the picture, in the same frame [m]. The frame's z axis is up in it, or x if the camera
+    looks along z."""
+    fov: Annotated[float, Field(gt=0, lt=180)] = 45.0
+    """Field of view from the lower to the upper edge [degrees]."""
+    clip: tuple[Positive, Positive] = (0.01, 20.0)
+    """What is nearer or farther than this along the camera's axis is not seen [m]."""
+    samples: Annotated[int, Field(ge=1, le=8)] = 1
+    """Each pixel is the mean of so many by so many: edges are soft, and things smaller than a pixel show."""
+
+    @model_validator(mode="after")
+    def _relations(self) -> CameraSensorConfig:
+        if self.entity is None and (self.camera or self.body):
+            raise ValueError("camera and body are those of an entity: name it")
+        placed = sorted({"body", "eye", "lookat", "fov"} & self.model_fields_set)
+        if self.camera is not None and placed:
+            raise ValueError(f"a camera of the MJCF has its own place and field of view: leave {', '.join(placed)} out")
+        if self.clip[0] >= self.clip[1]:
+            raise ValueError(f"clip: {self.clip[0]:g} is not below {self.clip[1]:g}")
+        if self.eye == self.lookat:
+            raise ValueError("eye and lookat are one point: the camera has no direction")
+        return self
+
+
+SensorConfig = Annotated[ContactSensorConfig | RaySensorConfig | CameraSensorConfig, Field(discriminator="kind")]
 
 
 class PatchConfig(StrictModel):
@@ -804,7 +852,7 @@ class SceneConfig(StrictModel):
     entities: Annotated[dict[str, EntityConfig], Field(json_schema_extra={"minProperties": 1})]
     """Name -> robot or object."""
     sensors: dict[str, SensorConfig] = {}
-    """Name -> contact or ray sensor, for terms that ask for one. Sensors of the MJCF need no entry here."""
+    """Name -> contact sensor, ray sensor or camera, for terms that ask for one. Sensors of the MJCF need no entry."""
 
     @field_validator("entities")
     @classmethod
@@ -869,6 +917,15 @@ class TaskConfig(StrictModel):
             step_dt = info.data["sim"].dt * info.data["decimation"]
             if value < step_dt:
                 raise ValueError(f"{value:g} s is shorter than one step (dt x decimation = {step_dt:g} s)")
+        return value
+
+    @field_validator("viewer")
+    @classmethod
+    def _something_to_follow(cls, value: ViewerConfig, info: ValidationInfo) -> ViewerConfig:
+        scene = info.data.get("scene")
+        if value.follow is not None and scene is not None and value.follow not in scene.entities:
+            have = ", ".join(scene.entities)
+            raise ValueError(f"follow: there is no entity '{value.follow}' in the scene; entities: {have}")
         return value
 
     @property

@@ -50,7 +50,7 @@ SECTIONS: dict[str, type[TermConfig]] = {
 SELECTORS = ("Joints", "Bodies", "Sites", "Sensors", "Actuators", "Geoms", "Tendons", "Pairs")
 """Aliases of `rlcli.task` that pick elements of the term's `entity`."""
 
-NAMED = ("Entity", "Command", "Address", "ContactSensor", "RaySensor")
+NAMED = ("Entity", "Command", "Address", "ContactSensor", "RaySensor", "CameraSensor")
 """Aliases of `rlcli.task` that name one thing."""
 
 _TYPES: dict[str, Any] = {

@@ -35,6 +35,7 @@ def describe(name: str) -> Details:
         action_size=env.layout.action_size,
         num_envs=task.task.scene.num_envs,
         agent=task.agent_name,
+        policy=source.policy is not None,
     )
 
 

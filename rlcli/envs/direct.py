@@ -73,6 +73,9 @@ class DirectTask:
         """Steps of the running episode. (num_envs,) int64"""
         self.extras: dict[str, Any] = {}
         """Numbers and tensors to log, by name: `Task/<name>` in the metrics is their mean, once an iteration."""
+        self.episode_metrics: dict[str, Tensor] = {}
+        """Numbers of the running episodes, by name, (num_envs,) each: `Metrics/<name>` is their mean over the episodes
+        that end, as they were in the last step. Fill it in `post_reset`; write to the tensors in place."""
 
     def set_up_scene(self, scene: Scene) -> None:
         """Register views with `scene.add`; `scene.spec` is the MjSpec, still open."""
@@ -128,6 +131,25 @@ class DirectTask:
         device = None if self.device.type == "cpu" else self.device
         lives = self.env.engine.lives
         return IdSelection(ids, self.env.seed, episodes[ids], stream(f"direct.{name}"), device, lives)
+
+    def step_draws(self, name: str = "step") -> Selection:
+        """Random numbers of this step for all environments: `step_draws().normal(0, 1, (k,))` is (num_envs, k).
+
+        They depend on the seed, the environment, the number of steps since the start and `name`, and on nothing else.
+        A GPU records them.
+        """
+        return self.env.everyone_now().stream(stream(f"direct.{name}"))
+
+    def selection(self, mask: Tensor, name: str) -> Selection | None:
+        """The environments where `mask` (num_envs,) holds, to draw for in the middle of an episode; None for nobody.
+
+        What is drawn depends on the seed, the environment, its episode, the step of that and `name`. A GPU, which
+        cannot know whether there is anybody, never gives None.
+        """
+        env = self.env
+        counters = env.episode_index * (self.max_episode_length + 1) + env.episode_length_buf
+        selected = env.engine.select(mask, env.seed, counters)
+        return None if selected is None else selected.stream(stream(f"direct.in_episode.{name}"))
 
 
 class DirectEnv(VecEnv):
@@ -209,14 +231,29 @@ class DirectEnv(VecEnv):
         """The task."""
         return [self.task]
 
+    def _logged(self) -> dict[str, Any]:
+        """The task's `extras`, by name."""
+        return self.task.extras
+
     def _extras(self) -> dict[str, float]:
         """The task's `extras`: numbers, and means of tensors."""
         found = {}
-        for name, value in self.task.extras.items():
+        for name, value in self._logged().items():
             if isinstance(value, Tensor) and value.numel():
                 found[f"Task/{name}"] = float(value.float().mean())
             elif isinstance(value, int | float):
                 found[f"Task/{name}"] = float(value)
+        return found
+
+    def measured(self) -> dict[str, Tensor]:
+        """The task's `extras`: of each environment where there is a row for each, else the same for all."""
+        found = {}
+        for name, value in self._logged().items():
+            if isinstance(value, Tensor) and value.numel():
+                rows = value.float() if value.shape[:1] == (self.num_envs,) else value.float().mean().expand(1, 1)
+                found[name] = rows.reshape(len(rows), -1).mean(dim=1).expand(self.num_envs)
+            elif isinstance(value, int | float):
+                found[name] = torch.full((self.num_envs,), float(value), device=self.device)
         return found
 
     def carried(self) -> list[str]:
@@ -272,6 +309,9 @@ class DirectEnv(VecEnv):
             {},
             {name: ended.peek(fired) for name, fired in self._causes.items()},
         )
+
+    def _metrics_of(self, ended: Selection) -> dict[str, Tensor]:
+        return {name: ended.read(values).float() for name, values in self.task.episode_metrics.items()}
 
     def _restart_workflow(self, selection: Selection) -> None:
         task = self.task

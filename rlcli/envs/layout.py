@@ -26,6 +26,9 @@ class TermLayout:
     """What the actuator of each column of an action can take, infinite where it has no limit."""
     history: int = 1
     """Steps that an observation holds, columns of the oldest first."""
+    shape: tuple[int, ...] = ()
+    """What the columns of one step of an observation are row by row, as (channels, rows, columns) of a picture; (): a
+    plain row."""
     modifiers: tuple[dict[str, Any], ...] = ()
     """What is done to an observation's value before it is clipped, as the YAML says it."""
 
@@ -63,7 +66,8 @@ class Layout:
 
         def observation(t: TermLayout) -> dict[str, Any]:
             clip = None if t.clip is None else list(t.clip)
-            return {**term(t), "clip": clip, "history": t.history, "modifiers": list(t.modifiers)}
+            shape = {"shape": list(t.shape)} if t.shape else {}
+            return {**term(t), "clip": clip, "history": t.history, **shape, "modifiers": list(t.modifiers)}
 
         def action(t: TermLayout) -> dict[str, Any]:
             bounds = {"clip": _finite_pairs(t.clip), "limits": _finite_pairs(t.limits)}  # type: ignore[arg-type]

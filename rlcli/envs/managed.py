@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from rlcli.config.schema import ObservationConfig
@@ -64,7 +63,6 @@ class ManagedEnv(VecEnv):
 
     def _build(self) -> None:
         # in this order: a term's first value may use what stands before it
-        self._everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         n, device, live = self.num_envs, self.device, self._binder.live
         self.command_manager = CommandManager(self._commands, n, self.step_dt, device, live)
         self.action_manager = ActionManager(self._actions, n, device)
@@ -81,7 +79,7 @@ class ManagedEnv(VecEnv):
             n,
             self.step_dt,
             device,
-            self._everyone_now,
+            self.everyone_now,
             live,
             self._watch(),
         )
@@ -141,6 +139,7 @@ class ManagedEnv(VecEnv):
             else (tuple(scale) if isinstance(scale, list) else (scale,) * pipeline.width) * pipeline.history,
             clip=config.clip,
             history=pipeline.history,
+            shape=pipeline.shape if len(pipeline.shape) > 1 else (),
             modifiers=tuple(modifier.model_dump(mode="json") for modifier in config.modifiers),
         )
 
@@ -201,15 +200,6 @@ class ManagedEnv(VecEnv):
         running = (self.episode_length_buf > 0).long()  # no time has passed for those just reset
         self.command_manager.compute(self._now, running)
         self.event_manager.interval(self._now, running, self._written)
-
-    def _everyone_now(self) -> Selection:
-        everyone = self._now(self._everywhere)
-        assert everyone is not None
-        return everyone
-
-    def _now(self, mask: Tensor) -> Selection | None:
-        """A selection that draws from the step's own counter."""
-        return self.engine.select(mask, self.seed, self._steps.expand(self.num_envs).contiguous())
 
     def _written(self, selection: Selection) -> None:
         self.sim.moved(selection)

@@ -34,7 +34,7 @@ from rlcli.sim.rotations import rotate_inverse
 from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import Scene
 from rlcli.sim.selection import Selection
-from rlcli.sim.sensors import ContactSensor, RaySensor, make_sensors
+from rlcli.sim.sensors import Sensor, make_sensors
 from rlcli.sim.terrain import Terrain
 
 
@@ -190,6 +190,12 @@ class VecEnv(ABC):
         self.seconds["step"] += time.perf_counter() - start
         return StepResult(obs, reward, terminated, truncated, final_obs, episodes)
 
+    def everyone_now(self) -> Selection:
+        """All environments, drawing by the number of steps since the start instead of by their episodes."""
+        everyone = self._now(self._everywhere)
+        assert everyone is not None
+        return everyone
+
     def succeeding(self) -> Tensor | None:
         """Where the success condition holds as things are; None for a task without one. (num_envs,) bool"""
         return None if self._success is None else self._success()
@@ -265,12 +271,21 @@ class VecEnv(ABC):
         diverged = {f"Sim/diverged/{cause.replace(' ', '_')}": float(count) for cause, count in new.items() if count}
         return {**self._extras(), **diverged}
 
+    def measured(self) -> dict[str, Tensor]:
+        """The task's own numbers to log, of the state that a step was judged by: what `on_lived` may ask for.
+
+        Means over episodes of what commands measure are in `Episodes.metrics`. (num_envs,) each
+        """
+        return {}
+
     def unsaved(self) -> list[str]:
         """What the task keeps from step to step that `state_dict` cannot hold; empty: it goes on exactly."""
         return []
 
     def close(self) -> None:
-        """Let go of the engine."""
+        """Let go of the engine and of what draws."""
+        for sensor in self.sensors.values():
+            sensor.close()
         self.engine.close()
 
     def world(self, env: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -549,8 +564,12 @@ class VecEnv(ABC):
     def _select(self, mask: Tensor) -> Selection | None:
         return self.engine.select(mask, self.seed, self.episode_index)
 
+    def _now(self, mask: Tensor) -> Selection | None:
+        """A selection that draws from the step's own counter."""
+        return self.engine.select(mask, self.seed, self._steps.expand(self.num_envs).contiguous())
+
     def _everyone(self) -> Selection:
-        everyone = self._select(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
+        everyone = self._select(self._everywhere)
         assert everyone is not None
         return everyone
 
@@ -608,8 +627,8 @@ class VecEnv(ABC):
         """`entity.name` -> actuator model, in the order of the configuration."""
         for built in self.entities.values():
             self._add_actuators(built)
-        self.sensors: dict[str, ContactSensor | RaySensor] = make_sensors(scene.sensors, self.sim, self.entities)
-        """Contact and ray sensors of `scene.sensors`, by name."""
+        self.sensors: dict[str, Sensor] = make_sensors(scene.sensors, self.sim, self.entities)
+        """Those of `scene.sensors`, by name."""
         self._set_default(model)
         self.views = scene.views
         self.origins = torch.zeros(self.num_envs, 3, device=self.device)
@@ -657,6 +676,7 @@ class VecEnv(ABC):
         self._aside = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._any_aside = False
         self._ids = torch.arange(self.num_envs, device=self.device)
+        self._everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         self._steps: Tensor = torch.zeros((), dtype=torch.int64, device=self.device)
 
 

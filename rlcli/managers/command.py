@@ -139,6 +139,11 @@ class CommandManager:
         means = ended.peek(self._sums) / ended.peek(self._steps).clamp(min=1.0)[:, None]
         return {name: column for (name, _, _), column in zip(self._measured, means.unbind(1), strict=True)}
 
+    def so_far(self, term: CommandTerm, metric: str) -> Tensor:
+        """Mean of a metric of a term over the running episode, 0 before its first step. (num_envs,)"""
+        column = [(other.instance, name) for _, other, name in self._measured].index((term, metric))
+        return self._sums[:, column] / self._steps.clamp(min=1.0)
+
     def reset(self, selection: Selection) -> None:
         """New episodes begin with new commands."""
         selection.write(self._sums, 0.0)

@@ -146,9 +146,10 @@ class ObservationManager:
         pipelines = []
         for term in terms:
             value = first_value(term)
-            width = value.shape[1] if isinstance(value, Tensor) and value.dim() == 2 else 1
-            check_shape(term, value, (self.num_envs, width), "observations")
-            pipelines.append(Pipeline(term, width, config, self.num_envs, self._step_dt, self._device, self._live))
+            dims = value.dim() if isinstance(value, Tensor) else 0
+            shape = tuple(value.shape[1:]) if dims in (2, 4) else (1,)  # columns, or a picture
+            check_shape(term, value, (self.num_envs, *shape), "observations")
+            pipelines.append(Pipeline(term, shape, config, self.num_envs, self._step_dt, self._device, self._live))
         size = sum(pipeline.size for pipeline in pipelines)
         buffers = [torch.zeros(self.num_envs, size, device=self._device) for _ in range(3)]
         return _Group(pipelines, buffers, [_split(buffer, pipelines) for buffer in buffers])

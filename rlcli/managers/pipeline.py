@@ -6,6 +6,7 @@ Whatever has a memory stands still while the last observation of a finished epis
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
@@ -70,7 +71,7 @@ class Pipeline:
     def __init__(
         self,
         term: BoundTerm,
-        width: int,
+        shape: tuple[int, ...],
         group: ObservationGroupConfig,
         num_envs: int,
         step_dt: float,
@@ -80,7 +81,9 @@ class Pipeline:
         config = term.config
         assert isinstance(config, ObservationConfig)
         self.term = term
-        self.width = width
+        self.shape = shape
+        """Of the term's value in one environment; its columns are these numbers row by row."""
+        self.width = width = math.prod(shape)
         self.history = group.history or config.history or 1
         make = _Maker(term, width, num_envs, step_dt, device, live)
         self._stages: list[Stage] = [make.modifier(number, m) for number, m in enumerate(config.modifiers)]
@@ -110,7 +113,7 @@ class Pipeline:
     def write(self, view: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         """Compute the term into its columns. view (num_envs, size)"""
         value = view if self._value is None else self._value
-        value.copy_(self.term.call())
+        value.copy_(self.term.call().reshape(value.shape))
         for stage in self._stages:
             stage(value, draws, fresh, advance)
         if self._frames is not None:

@@ -24,10 +24,10 @@ from rlcli.sim.names import NameProblem
 
 if TYPE_CHECKING:
     from rlcli.envs.vec_env import VecEnv
-    from rlcli.sim.sensors import ContactSensor, RaySensor
+    from rlcli.sim.sensors import Sensor
 
 
-SENSORS = {"ContactSensor": "contact", "RaySensor": "rays"}
+SENSORS = {"ContactSensor": "contact", "RaySensor": "rays", "CameraSensor": "camera"}
 """Alias of `rlcli.task` -> kind of the sensor that it names."""
 
 
@@ -191,7 +191,7 @@ class Binder:
                 params[parameter.name], elements[parameter.name] = index, names
         return (params if good else None), elements
 
-    def _sensor(self, path: Path, parameter: str, name: str, kind: str) -> ContactSensor | RaySensor | None:
+    def _sensor(self, path: Path, parameter: str, name: str, kind: str) -> Sensor | None:
         configs = self.resolved.task.scene.sensors
         found = configs.get(name)
         if found is not None and found.kind == kind:

@@ -150,6 +150,22 @@ def reset_scene_to_default(env: ManagedEnv, selection: Selection) -> None:
             entity.write_root_velocity(selection, root[:, 7:10], root[:, 10:])
 
 
+class RandomizeTerrainLevel:
+    """A random level of the terrain for each episode, on the environment's own kind of ground.
+
+    It stands before the event that places the robot. mjlab: `randomize_terrain`, which draws the kind of ground, too.
+    """
+
+    def __init__(self, env: ManagedEnv) -> None:
+        if env.terrain is None:
+            raise ValueError("the scene has no terrain; add scene.terrain")
+        self._terrain = env.terrain
+
+    def __call__(self, selection: Selection) -> None:
+        """Draw the levels of the selected environments."""
+        self._terrain.scatter(selection)
+
+
 def push_by_setting_velocity(
     env: ManagedEnv,
     selection: Selection,

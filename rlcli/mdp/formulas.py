@@ -182,6 +182,11 @@ def _joint_vel_rel(env: VecEnv, entity: Entity, joints: Columns) -> Formula:
     return op("sub", field("qvel", _joints(entity, joints)[1]), default)
 
 
+def _joint_angle_sum(env: VecEnv, entity: Entity, joints: Columns) -> Formula:
+    qpos = field("qpos", _joints(entity, joints)[0])
+    return op("wrap", op("dot", qpos, [1.0] * len(_joints(entity, joints)[0])))
+
+
 def _joint_pos_limit_normalized(env: VecEnv, entity: Entity, joints: Columns) -> Formula:
     low, high = entity.data.soft_joint_pos_limits[joints].unbind(dim=1)
     limited = high - low < torch.inf
@@ -308,6 +313,8 @@ _OBSERVATIONS: Mapping[str, Callable[..., Formula]] = {
     "joint_vel": lambda env, entity, joints: field("qvel", _joints(entity, joints)[1]),
     "joint_pos_rel": _joint_pos_rel,
     "joint_vel_rel": _joint_vel_rel,
+    "joint_angle": lambda env, entity, joints: op("wrap", field("qpos", _joints(entity, joints)[0])),
+    "joint_angle_sum": _joint_angle_sum,
     "joint_pos_limit_normalized": _joint_pos_limit_normalized,
     "joint_effort": lambda env, entity, joints: field("qfrc_actuator", _joints(entity, joints)[1]),
     "base_pos_z": _base_pos_z,

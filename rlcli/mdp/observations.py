@@ -11,6 +11,7 @@ from rlcli.mdp.measures import only, vector
 from rlcli.sim.rotations import atan2, conjugate, length, multiply, roll_pitch_yaw, rotate_inverse, unique, wrap_to_pi
 from rlcli.task import (
     Bodies,
+    CameraSensor,
     Command,
     ContactSensor,
     Entity,
@@ -43,6 +44,23 @@ def joint_pos_rel(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints =
 def joint_vel_rel(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Joint velocities less their defaults [m/s or rad/s]. (num_envs, k)"""
     return entity.data.joint_vel[:, joints] - entity.data.default_joint_vel[:, joints]
+
+
+def joint_angle(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
+    """Joint positions wrapped to [-pi, pi], for hinges that turn all the way round [rad]. (num_envs, k)"""
+    return wrap_to_pi(entity.data.joint_pos[:, joints])
+
+
+def joint_angle_sum(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints) -> Tensor:
+    """Sum of joint positions, wrapped to [-pi, pi]: how far the last link of a planar chain is turned [rad].
+
+    (num_envs, 1)
+    """
+    position = entity.data.joint_pos[:, joints]
+    total = position[:, :1]
+    for column in position.split(1, dim=1)[1:]:  # one after the other: a sum rounds differently for other sizes
+        total = total + column
+    return wrap_to_pi(total)
 
 
 def joint_pos_limit_normalized(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
@@ -225,6 +243,18 @@ def height_scan(env: ManagedEnv, *, sensor: RaySensor, offset: float = 0.5) -> T
     A ray that hits nothing counts as having hit at its full length. Isaac Lab: infinite there.
     """
     return sensor.position[:, 2:3] - sensor.hits[:, :, 2] - offset
+
+
+def image(env: ManagedEnv, *, sensor: CameraSensor, normalize: bool = True) -> Tensor:
+    """Picture of a camera, rows from the top: colours, or distances [m], 0 where nothing is seen. (num_envs, c, h, w)
+
+    Colours are 0 to 255; normalised they are 0 to 1, less the picture's mean of each. Isaac Lab: channels last.
+    """
+    picture = sensor.image.movedim(-1, 1).float().contiguous()
+    if sensor.config.data != "rgb" or not normalize:
+        return picture
+    picture = picture / 255.0
+    return picture - picture.flatten(2).mean(dim=2)[:, :, None, None]
 
 
 def foot_height(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> Tensor:

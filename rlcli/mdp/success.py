@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from rlcli.mdp.measures import cosine, goal_in_world, only, vector
-from rlcli.sim.rotations import length, wrap_to_pi
+from rlcli.mdp.measures import cosine, goal_in_world, goal_quat_in_world, only, vector
+from rlcli.sim.rotations import length, turn_between, wrap_to_pi
 from rlcli.task import Bodies, Command, Entity, Joints, Sites
 
 if TYPE_CHECKING:
+    from rlcli.envs.managed import ManagedEnv
     from rlcli.envs.vec_env import VecEnv
 
 
@@ -56,6 +57,14 @@ def root_near(env: VecEnv, *, entity: Entity = "robot", target: tuple[float, flo
     return length(entity.data.root_pos_w - env.origins - vector(target, env.device)) < tolerance
 
 
+def root_hovers(
+    env: VecEnv, *, entity: Entity = "robot", goal: Entity = "target", tolerance: float, speed: float
+) -> Tensor:
+    """The root is within `tolerance` [m] of the root of `goal`, and slower than `speed` [m/s]. (num_envs,)"""
+    near = length(entity.data.root_pos_w - goal.data.root_pos_w) < tolerance
+    return near & (length(entity.data.root_lin_vel_w) < speed)
+
+
 def velocity_tracked(
     env: VecEnv,
     *,
@@ -70,11 +79,36 @@ def velocity_tracked(
     return linear & ((asked[:, 2] - data.root_ang_vel_b[:, 2]).abs() < angular_tolerance)
 
 
-def body_at_goal(
-    env: VecEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command, tolerance: float
+def velocity_tracked_on_average(
+    env: ManagedEnv, *, command: Command, linear_tolerance: float, angular_tolerance: float
 ) -> Tensor:
-    """A body is within `tolerance` of the goal of a pose command of `entity` [m]. (num_envs,)"""
-    return length(only(entity.data.body_pos_w[:, bodies], "body") - goal_in_world(entity, command)) < tolerance
+    """The episode's mean errors of a velocity command are within these so far [m/s, rad/s]. (num_envs,)
+
+    Its starts and its changes of command count, too.
+    """
+    so_far = env.command_manager.so_far
+    linear = so_far(command, "error_vel_xy") < linear_tolerance
+    return linear & (so_far(command, "error_vel_yaw") < angular_tolerance)
+
+
+def body_at_goal(
+    env: VecEnv,
+    *,
+    entity: Entity = "robot",
+    bodies: Bodies,
+    command: Command,
+    tolerance: float,
+    angle_tolerance: float | None = None,
+) -> Tensor:
+    """A body is within `tolerance` of the goal of a pose command of `entity` [m]. (num_envs,)
+
+    With `angle_tolerance` its attitude also is, of the goal's [rad].
+    """
+    near = length(only(entity.data.body_pos_w[:, bodies], "body") - goal_in_world(entity, command)) < tolerance
+    if angle_tolerance is None:
+        return near
+    attitude = only(entity.data.body_quat_w[:, bodies], "body").contiguous()
+    return near & (turn_between(attitude, goal_quat_in_world(entity, command)) < angle_tolerance)
 
 
 def site_at_goal(env: VecEnv, *, entity: Entity = "robot", sites: Sites, command: Command, tolerance: float) -> Tensor:

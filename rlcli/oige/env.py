@@ -140,18 +140,12 @@ class OigeEnv(DirectEnv):
         outer = self.sim.derived("cfrc_ext")[:, body, 3:]
         return outer - self.sim.derived("xfrc_applied")[:, body, :3]
 
-    def _extras(self) -> dict[str, float]:
-        """The task's `extras`: numbers, and means of tensors, one level deep."""
+    def _logged(self) -> dict[str, Any]:
+        """The task's `extras`, one level deep."""
         flat: dict[str, Any] = {}
         for name, value in self.task.extras.items():
             flat.update(value if isinstance(value, dict) else {name: value})
-        found = {}
-        for name, value in flat.items():
-            if isinstance(value, Tensor) and value.numel():
-                found[f"Task/{name}"] = float(value.float().mean())
-            elif isinstance(value, int | float):
-                found[f"Task/{name}"] = float(value)
-        return found
+        return flat
 
     def _act(self, action: Tensor) -> None:
         if self.pushed:  # a force acts for one step

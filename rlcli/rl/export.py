@@ -28,8 +28,10 @@ from rlcli.rl.files import sync_folder, write_synced
 from rlcli.rl.load import policy_of
 from rlcli.rl.policy import Policy, PolicySpec
 
-__all__ = ["FORMATS", "TOLERANCE", "Exported", "check_target", "export", "refusal", "require_self_contained"]
+__all__ = ["BUNDLE", "FORMATS", "TOLERANCE", "Exported", "check_target", "export", "refusal", "require_self_contained"]
 
+BUNDLE = "bundle"
+"""The format that is a folder, `rlcli.rl.bundle`: the policy for rlcli itself."""
 TOLERANCE = 1e-5
 """Largest accepted difference from the policy, relative to max(1, |value|)."""
 _RANDOM = 256
@@ -53,9 +55,16 @@ def check_target(format_: str, output: Path | None) -> None:
     Raises:
         UsageError: for an unknown format, or a file that does not end as the format's do.
     """
-    if format_ not in FORMATS:
-        near = did_you_mean(format_, FORMATS) or f"formats: {', '.join(FORMATS)}"
-        raise UsageError(f"no export format '{format_}'", hint=near)
+    known = [*FORMATS, BUNDLE]
+    if format_ not in known:
+        raise UsageError(
+            f"no export format '{format_}'", hint=did_you_mean(format_, known) or f"formats: {', '.join(known)}"
+        )
+    if format_ == BUNDLE:
+        other = None if output is None else next((n for n, ending in FORMATS.items() if ending == output.suffix), None)
+        if other is not None:
+            raise UsageError(f"'{output}' is a file, and a bundle is a folder", hint=f"--format {other}")
+        return
     suffix = FORMATS[format_]
     if output is not None and output.suffix != suffix:
         other = next((name for name, ending in FORMATS.items() if ending == output.suffix), None)
@@ -114,7 +123,8 @@ def export(
 def _observations(checkpoint: Checkpoint, size: int) -> Tensor:
     """What the file is checked on: recorded in training where there is a record, random, and both x 1000. (n, size)"""
     random = torch.randn(_RANDOM, size, generator=torch.Generator().manual_seed(0))
-    recorded = checkpoint.tensors("trainer").get("observations")
+    held = "trainer.safetensors" in checkpoint.manifest["files"]  # a bundle has none
+    recorded = checkpoint.tensors("trainer").get("observations") if held else None
     if recorded is not None and recorded.shape[1:] == (size,) and bool(recorded.isfinite().all()):
         random = torch.cat([recorded.float(), random])
     return torch.cat([random, 1000.0 * random])

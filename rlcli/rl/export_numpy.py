@@ -61,6 +61,8 @@ def _network(graph: Deployed) -> dict[str, Any]:
         "normalize": normalizer is not None,
         "normalize_clip": None if normalizer is None else normalizer.clip,
         "cells": list(spec.memory),
+        "pictures": [] if spec.vision is None else [(p.start, *p.shape) for p in spec.vision.pictures],
+        "windows": [] if spec.vision is None else list(zip(spec.vision.kernels, spec.vision.strides, strict=True)),
         "layers": len(spec.hidden) + 1,
         "activation": spec.activation,
         "squashed": not spec.kind.startswith("gaussian-"),
@@ -85,6 +87,12 @@ def _weights(graph: Deployed) -> dict[str, np.ndarray]:
             assert isinstance(cell, torch.nn.LSTMCell)
             arrays |= {f"in{number}": cell.weight_ih, f"rec{number}": cell.weight_hh}
             arrays[f"bias{number}"] = cell.bias_ih.double() + cell.bias_hh.double()
+    if policy.vision is not None:
+        for picture, layers in enumerate(policy.vision.pictures):
+            convolutions = [layer for layer in layers.modules() if isinstance(layer, torch.nn.Conv2d)]
+            for number, conv in enumerate(convolutions):
+                assert conv.bias is not None
+                arrays |= {f"cw{picture}_{number}": conv.weight.flatten(1), f"cb{picture}_{number}": conv.bias}
     linear = [layer for layer in policy.actor if isinstance(layer, torch.nn.Linear)]
     for number, layer in enumerate(linear):
         arrays |= {f"w{number}": layer.weight, f"b{number}": layer.bias}

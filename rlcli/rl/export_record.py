@@ -100,6 +100,8 @@ class ObservationColumns(_Columns):
 
     clip: tuple[float, float] | None
     history: int = Field(ge=1)
+    shape: list[int] = []
+    """Of one step's columns, where they are a picture: (channels, rows, columns)."""
     modifiers: list[dict[str, Any]]
 
 

@@ -113,9 +113,10 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
     if not differing:
         return
     table = _table([("field", "in the checkpoint", "now"), *differing])
+    names = "manifest.json" if "bundle" in checkpoint.manifest else "run.json"
     raise CheckpointError(
         f"{checkpoint.folder} does not fit the installed task:\n{table}",
-        hint="install the task's version that run.json names, or train again",
+        hint=f"install the task's version that {names} names, or train again",
     )
 
 

@@ -10,8 +10,9 @@ from torch import Tensor, nn
 
 from rlcli.rl.policy import ACTIVATIONS, Lstm, Normalizer
 from rlcli.rl.ppo_config import NetworkConfig, PpoConfig
+from rlcli.rl.vision import Vision, VisionSpec
 
-_POLICY = ("memory.", "actor.")
+_POLICY = ("memory.", "vision.", "actor.")
 _MIN_STD = 1e-6
 _VALUE_CLIP = 5.0
 _VALUE_EPS = 1e-5
@@ -25,18 +26,30 @@ class ActorCritic(nn.Module):
         critic_obs_size: what the critic sees.
         action_size: columns of the action.
         config: networks, initial weights, parametrisation of the deviation.
+        vision: convolutions over the actor's pictures.
+        critic_vision: over the critic's, if it sees any.
     """
 
-    def __init__(self, obs_size: int, critic_obs_size: int, action_size: int, config: PpoConfig) -> None:
+    def __init__(
+        self,
+        obs_size: int,
+        critic_obs_size: int,
+        action_size: int,
+        config: PpoConfig,
+        vision: VisionSpec | None = None,
+        critic_vision: VisionSpec | None = None,
+    ) -> None:
         super().__init__()
         cells = [config.rnn.hidden] * config.rnn.layers if config.rnn else []
         self.memory = Lstm(obs_size, cells) if cells else None
+        self.vision, obs_size = _eyes(vision, obs_size, config.actor, config.init)
         self.actor = _mlp(cells[-1] if cells else obs_size, config.actor, action_size, config.init, gain=0.01)
         if config.std == "log":
             self.log_std = nn.Parameter(torch.full((action_size,), math.log(config.init_std)))
         else:
             self.raw_std = nn.Parameter(torch.full((action_size,), config.init_std))
         self.critic_memory = Lstm(critic_obs_size, cells) if cells else None
+        self.critic_vision, critic_obs_size = _eyes(critic_vision, critic_obs_size, config.critic, config.init)
         self.critic = _mlp(cells[-1] if cells else critic_obs_size, config.critic, 1, config.init, gain=1.0)
 
     @property
@@ -44,8 +57,15 @@ class ActorCritic(nn.Module):
         """Deviation of each action. (a,)"""
         return self.log_std.exp() if hasattr(self, "log_std") else self.raw_std.clamp(min=_MIN_STD)
 
+    def mean(self, obs: Tensor) -> Tensor:
+        """The mean action. (n, d) -> (n, a)"""
+        return self.actor(obs if self.vision is None else self.vision(obs))
+
     def value(self, critic_obs: Tensor) -> Tensor:
-        """(n, c) -> (n,)"""
+        """(..., c) -> (...)"""
+        if self.critic_vision is not None:
+            *rows, _ = critic_obs.shape
+            return self.critic(self.critic_vision(critic_obs.flatten(0, -2))).view(rows)
         return self.critic(critic_obs).squeeze(-1)
 
     def policy_tensors(self) -> dict[str, Tensor]:
@@ -136,6 +156,17 @@ def _mlp(inputs: int, config: NetworkConfig, outputs: int, init: str, gain: floa
     return nn.Sequential(*layers, _linear(inputs, outputs, init, gain))
 
 
+def _eyes(spec: VisionSpec | None, columns: int, config: NetworkConfig, init: str) -> tuple[Vision | None, int]:
+    """Convolutions, if there is something to see, and how many columns the network behind them gets."""
+    if spec is None:
+        return None, columns
+    vision = Vision(spec, ACTIVATIONS[config.activation])
+    for layer in vision.modules():
+        if isinstance(layer, nn.Conv2d):
+            _begin(layer, init, math.sqrt(2.0))
+    return vision, spec.features(columns)
+
+
 def _activation(name: str) -> nn.Module:
     """In place where the gradient can be had from the result: nothing reads a linear layer's output otherwise."""
     return ACTIVATIONS[name](inplace=True) if name in ("elu", "relu") else ACTIVATIONS[name]()
@@ -143,8 +174,14 @@ def _activation(name: str) -> nn.Module:
 
 def _linear(inputs: int, outputs: int, init: str, gain: float) -> nn.Linear:
     layer = nn.Linear(inputs, outputs)
+    _begin(layer, init, gain)
+    return layer
+
+
+def _begin(layer: nn.Linear | nn.Conv2d, init: str, gain: float) -> None:
+    """Initial weights, where they are not torch's."""
     if init == "orthogonal":
         nn.init.orthogonal_(layer.weight, gain)
     if init != "default":
+        assert layer.bias is not None
         nn.init.zeros_(layer.bias)
-    return layer

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationErro
 from torch import Tensor, nn
 
 from rlcli.errors import CheckpointError
+from rlcli.rl.vision import Vision, VisionSpec
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 _LOG_STD_RANGE = (-20.0, 2.0)
@@ -24,13 +25,15 @@ class PolicySpec(BaseModel):
     """What, besides the weights, a policy is made of.
 
     Kinds: `gaussian-mlp`, a mean with a state-independent deviation, clipped to the bound; `gaussian-lstm`, the same
-    behind a memory; `squashed-gaussian-mlp`, mean and deviation from the state, tanh times the bound;
-    `deterministic-mlp`, tanh times the bound.
+    behind a memory; `gaussian-cnn`, the same behind convolutions over pictures; `squashed-gaussian-mlp`, mean and
+    deviation from the state, tanh times the bound; `deterministic-mlp`, tanh times the bound.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    kind: Literal["gaussian-mlp", "gaussian-lstm", "squashed-gaussian-mlp", "deterministic-mlp"] = "gaussian-mlp"
+    kind: Literal["gaussian-mlp", "gaussian-lstm", "gaussian-cnn", "squashed-gaussian-mlp", "deterministic-mlp"] = (
+        "gaussian-mlp"
+    )
     group: Annotated[str, Field(max_length=200)] = "policy"
     observation_size: Width
     action_size: Width
@@ -44,6 +47,8 @@ class PolicySpec(BaseModel):
     """Of a squashed-gaussian-mlp: tanh maps the logarithm of the deviation into this; null: it is clamped."""
     memory: Layers = []
     """Cells of each layer of the memory."""
+    vision: VisionSpec | None = None
+    """Convolutions, and the pictures that they see."""
 
     @model_validator(mode="after")
     def _bounded(self) -> PolicySpec:
@@ -51,6 +56,10 @@ class PolicySpec(BaseModel):
             raise ValueError(f"a {self.kind} needs an action_bound")
         if (self.kind == "gaussian-lstm") != bool(self.memory):
             raise ValueError("memory belongs to a gaussian-lstm, and a gaussian-lstm needs it")
+        if (self.kind == "gaussian-cnn") != (self.vision is not None):
+            raise ValueError("vision belongs to a gaussian-cnn, and a gaussian-cnn needs it")
+        if self.vision is not None and self.vision.stop > self.observation_size:
+            raise ValueError("a picture lies outside of the observation")
         return self
 
 
@@ -142,7 +151,7 @@ class Lstm(nn.Module):
 
 
 class Policy(nn.Module):
-    """A multilayer perceptron, with its observation normaliser, its memory and its action bound.
+    """A multilayer perceptron, with its observation normaliser, its memory or its eyes, and its action bound.
 
     Args:
         spec: its shape.
@@ -154,6 +163,10 @@ class Policy(nn.Module):
         self.normalizer = Normalizer(spec.observation_size, spec.normalize_clip) if spec.normalize else None
         self.memory = Lstm(spec.observation_size, spec.memory, wide=True) if spec.memory else None
         inputs = spec.memory[-1] if spec.memory else spec.observation_size
+        self.vision: Vision | None = None
+        if spec.vision is not None:
+            self.vision = Vision(spec.vision, ACTIVATIONS[spec.activation], wide=True)
+            inputs = spec.vision.features(inputs)
         self.actor = mlp(inputs, spec.hidden, spec.action_size, spec.activation)
         if spec.kind.startswith("gaussian-"):
             self.log_std = nn.Parameter(torch.zeros(spec.action_size))
@@ -186,6 +199,8 @@ class Policy(nn.Module):
         seen = self._seen(obs)
         if self.memory is not None:
             seen, memory = self.memory(seen, self.memory.blank(len(obs)) if memory is None else memory)
+        if self.vision is not None:
+            seen = self.vision(seen)
         features = self.actor[:-1](seen)
         mean = self.actor[-1](features).float()
         if not stochastic or self.spec.kind == "deterministic-mlp":

@@ -29,7 +29,7 @@ from rlcli.rl.policy import Lstm, Normalizer, Policy
 from rlcli.rl.ppo_config import PpoConfig
 from rlcli.rl.ppo_loss import KL, METRICS, Judged, Parts, log_prob
 from rlcli.rl.ppo_rollout import Rollout, Samples
-from rlcli.rl.ppo_setup import compilation, critic_groups, minibatch_sizes, policy_spec
+from rlcli.rl.ppo_setup import compilation, critic_groups, minibatch_sizes, policy_spec, vision_spec
 from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
@@ -68,7 +68,8 @@ class PpoTrainer:
 
         torch.set_num_threads(torch_threads)
         seed_generators(derive(seed, "trainer"))
-        self.networks = ActorCritic(obs_size, critic_size, self.spec.action_size, config).to(self.device)
+        eyes = (self.spec.vision, vision_spec(env, config, self._groups))
+        self.networks = ActorCritic(obs_size, critic_size, self.spec.action_size, config, *eyes).to(self.device)
         self._vector, self._shared, places = flatten(self.networks)
         self._gradient, self._shared_kl = self._shared[:-1], self._shared[-1]
         self.peers.lead_(self._vector.data)
@@ -88,7 +89,8 @@ class PpoTrainer:
         minibatches = minibatch_sizes(env, config, self._own_steps)
         self._rollout = Rollout(config.num_steps, env.num_envs, sizes, minibatches, config.rnn is not None, self.device)
         self._obs = {g: torch.zeros(env.num_envs, env.layout.size(g), device=self.device) for g in self._read()}
-        self._raw = {g: torch.zeros(config.num_steps, *obs.shape, device=self.device) for g, obs in self._obs.items()}
+        kept = self._obs if normalize else {}
+        self._raw = {g: torch.zeros(config.num_steps, *obs.shape, device=self.device) for g, obs in kept.items()}
         self._begins = torch.ones(env.num_envs, device=self.device)
         # what actor and critic remember now, and what they remembered when the rollout began
         self._memory, self._memory_before = ({k: m.blank(env.num_envs) for k, m in self._memories()} for _ in range(2))
@@ -168,7 +170,7 @@ class PpoTrainer:
         seen, begins = self._obs, self._begins
         for t in range(self.config.num_steps):
             obs, critic_obs = self._see(t, seen)
-            mean = self.networks.actor(self._recall(obs, begins))
+            mean = self.networks.mean(self._recall(obs, begins))
             action = mean + deviation[t]
             step = self.env.step(action if bound is None else action.clamp(-bound, bound))
             samples.obs[t].copy_(obs)
@@ -570,7 +572,7 @@ class PpoTrainer:
         tensors = {
             name: value
             for name, value in self.networks.named_parameters()
-            if not name.startswith(("actor.", "memory."))
+            if not name.startswith(("actor.", "memory.", "vision."))
         }
         for name, module in (
             ("critic_normalizer", self.critic_normalizer),

@@ -33,6 +33,24 @@ class RnnConfig(StrictModel):
     """Layers."""
 
 
+class CnnConfig(StrictModel):
+    """Convolutions over every picture of an observation, with the activation of the network behind them; no padding."""
+
+    channels: Annotated[tuple[Count, ...], Field(min_length=1)] = (16, 32)
+    """What each layer gives."""
+    kernels: Annotated[tuple[Count, ...], Field(min_length=1)] = (8, 4)
+    """Edge of each layer's square window [pixels]."""
+    strides: Annotated[tuple[Count, ...], Field(min_length=1)] = (4, 2)
+    """How far each layer's window moves [pixels]."""
+
+    @model_validator(mode="after")
+    def _layers(self) -> CnnConfig:
+        counts = [len(self.channels), len(self.kernels), len(self.strides)]
+        if len(set(counts)) > 1:
+            raise ValueError(f"channels, kernels and strides have a number for each layer, not {counts}")
+        return self
+
+
 class PpoConfig(AgentConfig):
     """Proximal policy optimisation, on the CPU or the GPU."""
 
@@ -118,6 +136,8 @@ class PpoConfig(AgentConfig):
     """The value's network."""
     rnn: RnnConfig | None = None
     """Actor and critic remember what they saw of the episode; null: they do not."""
+    cnn: CnnConfig | None = None
+    """Actor and critic see pictures through convolutions of their own; null: as columns like all others."""
     init: Literal["default", "zero_bias", "orthogonal"] = "default"
     """Initial weights: torch's; torch's with biases of zero; orthogonal, with a gain of sqrt(2) in the hidden layers,
     0.01 at the actor's output and 1 at the critic's, and biases of zero."""
@@ -148,6 +168,8 @@ class PpoConfig(AgentConfig):
             raise ValueError("desired_kl belongs to an adaptive schedule, and an adaptive schedule needs it")
         if self.kl_from == "last_pass" and self.shuffle == "epoch":
             raise ValueError("kl_from last_pass needs the same minibatches in every epoch: shuffle update or none")
+        if self.cnn is not None and self.rnn is not None:
+            raise ValueError("cnn and rnn cannot be had together: a history of pictures shows what moves")
         low, high = self.learning_rate_range
         if low > high:
             raise ValueError(f"learning_rate_range: {low:g} is above {high:g}")

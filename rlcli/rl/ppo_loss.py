@@ -55,7 +55,7 @@ def judge(
         old_std: deviation of the policy that `batch.mean` is of. (a,)
     """
     value_loss = _value_loss(networks.value(critic_obs), batch, config)
-    std, mean = networks.std, networks.actor(obs)
+    std, mean = networks.std, networks.mean(obs)
 
     log_ratio = log_prob((batch.action - mean) / std, std) - batch.log_prob
     ratio = log_ratio.exp()

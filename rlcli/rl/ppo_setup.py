@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import torch
+from pydantic import ValidationError
 
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError
 from rlcli.rl.policy import PolicySpec
 from rlcli.rl.ppo_config import PpoConfig
+from rlcli.rl.vision import VisionSpec
 
 _WORTH_COMPILING = 40_000
 """Minibatches of a run from which compiling pays on a GPU (docs/benchmarks.md)."""
@@ -15,8 +17,13 @@ _WORTH_COMPILING = 40_000
 
 def policy_spec(env: VecEnv, config: PpoConfig) -> PolicySpec:
     """What the trained policy is made of."""
+    vision = vision_spec(env, config, ("policy",))
+    if config.cnn is not None and vision is None:
+        message = "no term of the observation group 'policy' is a picture"
+        raise _problem(env, "cnn", message, "an observation term like `image`, or cnn: null")
     return PolicySpec(
-        kind="gaussian-lstm" if config.rnn else "gaussian-mlp",
+        kind="gaussian-lstm" if config.rnn else "gaussian-mlp" if vision is None else "gaussian-cnn",
+        vision=vision,
         memory=[config.rnn.hidden] * config.rnn.layers if config.rnn else [],
         observation_size=env.layout.size("policy"),
         action_size=env.layout.action_size,
@@ -25,6 +32,31 @@ def policy_spec(env: VecEnv, config: PpoConfig) -> PolicySpec:
         action_bound=config.action_bound,
         normalize=config.normalize_observations,
     )
+
+
+def vision_spec(env: VecEnv, config: PpoConfig, groups: tuple[str, ...]) -> VisionSpec | None:
+    """The pictures in observation groups side by side; None where there are none, or where they are not seen as such.
+
+    Raises:
+        ConfigError: if the layers do not fit them.
+    """
+    if config.cnn is None:
+        return None
+    pictures, start = [], 0
+    for term in (term for group in groups for term in env.layout.observations[group]):
+        if len(term.shape) == 3:
+            channels, *edges = term.shape
+            pictures.append({"start": start, "shape": [term.history * channels, *edges]})
+        start += term.size
+    if not pictures:
+        return None
+    cnn = config.cnn
+    layers = {name: list(getattr(cnn, name)) for name in ("channels", "kernels", "strides")}
+    try:
+        return VisionSpec.model_validate({"pictures": pictures, **layers})
+    except ValidationError as error:
+        message = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
+        raise _problem(env, "cnn", message, "smaller kernels or strides, fewer layers, or larger pictures") from None
 
 
 def critic_groups(env: VecEnv, config: PpoConfig) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.envs.step import StepResult
+from rlcli.envs.step import Lived, StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError
 from rlcli.managers.termination import DIVERGED
@@ -35,6 +36,9 @@ class Evaluation:
     diverged: int = 0
     diverged_by: dict[str, int] = field(default_factory=dict)
     """Cause -> how often."""
+    values: dict[str, list[float]] = field(default_factory=dict)
+    """The task's own numbers -> their mean over each episode: what a direct task logs, by name, and what commands
+    measure, as `command/metric`."""
 
     def summary(self) -> dict[str, Any]:
         """Means and shares with 95 % intervals, as plain JSON: Student's t of means, Wilson's of shares."""
@@ -44,6 +48,7 @@ class Evaluation:
             "length": mean([float(n) for n in self.lengths]),
             "reward_terms": {name: mean(values) for name, values in self.reward_terms.items()},
             "terminations": {name: proportion(sum(v), max(1, len(v))) for name, v in self.causes.items()},
+            "values": {name: _mean_of_finite(values) for name, values in self.values.items()},
             "diverged": self.diverged,
             "diverged_by": self.diverged_by,
         }
@@ -71,6 +76,7 @@ class Evaluation:
             {name: [values[row] for row in rows] for name, values in self.reward_terms.items()},
             causes,
             sum(causes.get(DIVERGED, [])),
+            values={name: [values[row] for row in rows] for name, values in self.values.items()},
         )
 
 
@@ -102,14 +108,14 @@ def evaluate(
     result = Evaluation()
     before = env.causes
     obs = env.reset(seed=env.seed)["policy"]
-    with torch.no_grad():
+    with torch.no_grad(), _Measures(env) as measures:
         while bool((quota > 0).any()):
             _require_end(env)
             step = env.step(act(obs))
             obs = step.obs["policy"]
             on_step(step)
             if step.episodes is not None:
-                _take(result, step, quota)
+                _take(result, step, quota, measures)
         env.check()
     after = {cause: count - before.get(cause, 0) for cause, count in env.causes.items()}
     result.diverged_by = {cause: count for cause, count in after.items() if count}
@@ -169,9 +175,51 @@ def _require_end(env: VecEnv) -> None:
         raise ConfigError([env.resolved.problem(("terminations",), message, hint)])
 
 
-def _take(result: Evaluation, step: StepResult, quota: Tensor) -> None:
+def _mean_of_finite(values: list[float]) -> dict[str, float | None]:
+    """A mean with its interval; of values that are not all finite nothing is known."""
+    if all(map(math.isfinite, values)):
+        return mean(values)
+    return {"mean": None, "std": None, "low": None, "high": None}
+
+
+class _Measures:
+    """Adds up what a task logs, environment by environment, step by step, and gives the means of finished episodes."""
+
+    def __init__(self, env: VecEnv) -> None:
+        self._env, self._heard = env, env.on_lived
+        self._sums: dict[str, Tensor] = {}
+        self._steps: dict[str, Tensor] = {}
+
+    def __enter__(self) -> _Measures:
+        self._env.on_lived = self._note
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._env.on_lived = self._heard
+
+    def _note(self, lived: Lived) -> None:
+        for name, values in self._env.measured().items():
+            sums = self._sums.setdefault(name, torch.zeros(self._env.num_envs, dtype=torch.float64))
+            steps = self._steps.setdefault(name, torch.zeros(self._env.num_envs, dtype=torch.float64))
+            sums += values.cpu()
+            steps += 1.0
+        if self._heard is not None:
+            self._heard(lived)
+
+    def take(self, ids: Tensor) -> dict[str, list[float]]:
+        """Means over the episodes that have just ended in these environments."""
+        ids, found = ids.cpu(), {}
+        for name, sums in self._sums.items():
+            steps = self._steps[name]
+            found[name] = (sums[ids] / steps[ids].clamp(min=1.0)).tolist()
+            sums[ids], steps[ids] = 0.0, 0.0
+        return found
+
+
+def _take(result: Evaluation, step: StepResult, quota: Tensor, measures: _Measures) -> None:
     assert step.episodes is not None
     ended = step.episodes.ended()
+    values = {name: column.tolist() for name, column in ended.metrics.items()} | measures.take(ended.ids)
     for row, env in enumerate(ended.ids.tolist()):
         if quota[env] <= 0:
             continue
@@ -182,8 +230,11 @@ def _take(result: Evaluation, step: StepResult, quota: Tensor) -> None:
         result.truncated.append(bool(ended.truncated[row]))
         if ended.success is not None:
             result.successes.append(bool(ended.success[row]))
-        for name, values in ended.reward_terms.items():
-            result.reward_terms.setdefault(name, []).append(float(values[row]))
+        for name, paid in ended.reward_terms.items():
+            result.reward_terms.setdefault(name, []).append(float(paid[row]))
+        for name, column in values.items():
+            told = result.values.setdefault(name, [math.nan] * (len(result.returns) - 1))
+            told.append(column[row])
         for name in ended.causes:  # `diverged` becomes one once something has
             result.causes.setdefault(name, [False] * (len(result.returns) - 1))
         for name, fired in result.causes.items():

@@ -339,13 +339,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
 
 def _check(record: Any, file: Path) -> None:
     """The entries of run.json that are read again are what they should be."""
-    task = record.get("task") if isinstance(record, dict) else None
-    if not isinstance(task, dict) or not isinstance(task.get("name"), str):
-        raise CheckpointError(f"{file} is corrupt: it does not name a task")
-    wrong = [key for key, value in task.items() if value is not None and not isinstance(value, str)]
-    wrong += [key for key, value in task.items() if isinstance(value, str) and not _is_word(value)]
-    if wrong or not _TASK.fullmatch(task["name"]):
-        raise CheckpointError(f"{file} is corrupt: its task's {(wrong or ['name'])[0]} is malformed")
+    task = check_task(record.get("task") if isinstance(record, dict) else None, file)
     if not (task.get("folder") or task.get("distribution")) or type(record.get("seed")) is not int:
         raise CheckpointError(f"{file} is corrupt: it does not say where the task is from, or has no seed")
     if not 0 <= record["seed"] <= MAX_SEED:
@@ -359,6 +353,21 @@ def _check(record: Any, file: Path) -> None:
         raise CheckpointError(f"{file} is corrupt: its torch_threads is out of range")
     if not 0 <= record.get("video_every", 0) < 2**31:
         raise CheckpointError(f"{file} is corrupt: its video_every is out of range")
+
+
+def check_task(task: Any, file: Path) -> dict[str, Any]:
+    """What a stranger's file says of a task: it names one, and all that it says are words.
+
+    Raises:
+        CheckpointError: if that is not so.
+    """
+    if not isinstance(task, dict) or not isinstance(task.get("name"), str):
+        raise CheckpointError(f"{file} is corrupt: it does not name a task")
+    wrong = [key for key, value in task.items() if value is not None and not isinstance(value, str)]
+    wrong += [key for key, value in task.items() if isinstance(value, str) and not _is_word(value)]
+    if wrong or not _TASK.fullmatch(task["name"]):
+        raise CheckpointError(f"{file} is corrupt: its task's {(wrong or ['name'])[0]} is malformed")
+    return task
 
 
 def _is_word(text: str) -> bool:

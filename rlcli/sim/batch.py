@@ -162,6 +162,10 @@ class BatchEngine:
         """Copies of the model fields of a world's own."""
         return {name: np.array(values[env]) for name, values in self._batch._expanded.items()}
 
+    def give_model(self, env: int, model: mujoco.MjModel) -> None:
+        """Write the model fields of a world's own into a copy of the model."""
+        self._batch.get_model(env, model)
+
     def put(self, env: int, row: np.ndarray) -> None:
         """Give a world an integration state; derived fields stay behind."""
         self._batch.state[env] = row

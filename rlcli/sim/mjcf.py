@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from rlcli.machine import read_plain
-from rlcli.registry import model_file
+from rlcli.registry import chosen_model, model_file
 
 MOST_TEXT = 16 * 1024 * 1024
 MOST_ASSET = 256 * 1024 * 1024
@@ -70,7 +70,7 @@ def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False) -> 
 
 def model_roots(root: Path, model: str) -> list[Path]:
     """Folders that a model of a task in `root` may read: its task's or package's; `model` as `model_file` takes it."""
-    task, _, inner = model.rpartition(":")
+    task, _, inner = chosen_model(root, model).rpartition(":")
     if not task:
         return package_roots(root)
     home = model_file(root, model)

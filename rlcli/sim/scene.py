@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from rlcli.config.schema import (
+    CameraSensorConfig,
     ContactSensorConfig,
     EntityConfig,
     JointConfig,
@@ -19,7 +20,7 @@ from rlcli.config.schema import (
     SceneConfig,
     SimConfig,
 )
-from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
+from rlcli.errors import ConfigError, MissingModelError, Problem, TaskError, did_you_mean, listing
 from rlcli.registry import model_file
 from rlcli.sim.mjcf import BadModel, model_roots, quiet_mujoco, read_mjcf
 from rlcli.sim.names import NameProblem, match
@@ -82,6 +83,14 @@ class RayMount:
     groups: tuple[int, ...] | None
 
 
+@dataclass(frozen=True, slots=True)
+class CameraMount:
+    """A camera sensor in the model: the full name of its camera."""
+
+    config: CameraSensorConfig
+    camera: str
+
+
 class SceneProblem(ValueError):
     """Something in the scene's configuration that the models do not fit; `path` is its key."""
 
@@ -104,7 +113,7 @@ class Scene:
         self.spec.copy_during_attach = True
         self.problems: list[SceneProblem] = []
         self.views: list[object] = []
-        self.sensors: dict[str, ContactSlots | RayMount] = {}
+        self.sensors: dict[str, ContactSlots | RayMount | CameraMount] = {}
         self.ground: Ground | None = None
         for name, entity in config.entities.items():
             self._attach(name, entity)
@@ -193,6 +202,8 @@ class Scene:
         assert entity.model is not None
         try:
             file = model_file(self.root, entity.model).resolve()
+        except MissingModelError:
+            raise
         except TaskError as error:
             self.problems.append(SceneProblem((*path, "model"), error.message, error.hint))
             return None
@@ -367,6 +378,8 @@ class Scene:
             try:
                 if isinstance(config, ContactSensorConfig):
                     self.sensors[name] = self._contact_sensor(name, config)
+                elif isinstance(config, CameraSensorConfig):
+                    self.sensors[name] = self._camera_sensor(name, config)
                 else:
                     self.sensors[name] = self._ray_sensor(name, config)
             except SceneProblem as problem:
@@ -426,6 +439,26 @@ class Scene:
         if config.sees == "ground":
             groups = (self._group_of_ground((*path, "sees")),)
         return RayMount(config, bodies[0], groups)
+
+    def _camera_sensor(self, name: str, config: CameraSensorConfig) -> CameraMount:
+        path = ("scene", "sensors", name)
+        body = self.spec.worldbody
+        if config.entity is not None:
+            bodies = self._bodies(config.entity, ".*" if config.body is None else config.body, path, "body")
+            if config.body is not None and len(bodies) > 1:
+                short = listing([body.removeprefix(f"{config.entity}/") for body in bodies])
+                raise SceneProblem((*path, "body"), f"'{config.body}' is several bodies: {short}", "name one")
+            body = self.spec.body(bodies[0])
+        if config.camera is None:
+            quat = _look(np.subtract(config.lookat, config.eye))
+            camera = body.add_camera(name=f"//{name}", pos=config.eye, quat=quat, fovy=config.fov)
+            return CameraMount(config, camera.name)
+        prefix = f"{config.entity}/"
+        names = [c.name.removeprefix(prefix) for c in self.spec.cameras if c.name.startswith(prefix)]
+        if config.camera not in names:
+            near = did_you_mean(config.camera, names) or f"cameras: {listing(names) if names else 'none'}"
+            raise SceneProblem((*path, "camera"), f"no camera '{config.camera}' in the MJCF of '{config.entity}'", near)
+        return CameraMount(config, prefix + config.camera)
 
     def _bodies(self, entity: str, patterns: str | list[str], path: tuple[str, ...], key: str) -> list[str]:
         """Full names of bodies of an entity."""
@@ -582,6 +615,18 @@ def _override(joint: mujoco.MjsJoint, change: JointConfig, *, degrees: bool) -> 
         turn = 180.0 / np.pi if degrees and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
         joint.range = [turn * end for end in change.range]
         joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+
+
+def _look(ray: np.ndarray) -> np.ndarray:
+    """The attitude of a camera, which looks along its own -z, that looks along a ray with z, or else x, up."""
+    back = -ray / np.linalg.norm(ray)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross([1.0, 0.0, 0.0], back)
+    right /= np.linalg.norm(right)
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).flatten())
+    return quat
 
 
 def _limit(actuator: mujoco.MjsActuator, effort: float) -> None:

@@ -1,4 +1,4 @@
-"""Contact and ray sensors of a scene, as terms see them: (num_envs, ...) tensors, current at every step."""
+"""Contact sensors, ray sensors and cameras of a scene, as terms see them: (num_envs, ...) tensors, always current."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from rlcli.config.schema import GridPatternConfig, RaySensorConfig
+from rlcli.sim.camera import CameraSensor, make_cameras
 from rlcli.sim.entity import Entity, SimData, as_index
 from rlcli.sim.rotations import rotate
-from rlcli.sim.scene import ContactSlots, RayMount
+from rlcli.sim.scene import CameraMount, ContactSlots, RayMount
 from rlcli.sim.selection import Columns, Selection
 
 _TIMES = ("air_time", "contact_time", "last_air_time", "last_contact_time")
@@ -89,6 +90,9 @@ class ContactSensor:
 
     def moved(self, selection: Selection) -> None:
         """Forces are those of the last step, wherever an event has put the bodies since."""
+
+    def close(self) -> None:
+        """Nothing is held."""
 
     def state_dict(self) -> dict[str, Tensor]:
         """What the sensor carries from step to step."""
@@ -178,6 +182,9 @@ class RaySensor:
         selection.write(self._hits, hits)
         selection.write(self._position, position)
 
+    def close(self) -> None:
+        """Nothing is held."""
+
     def state_dict(self) -> dict[str, Tensor]:
         """Nothing: rays follow from the state of the bodies."""
         return {}
@@ -225,16 +232,24 @@ class RaySensor:
         return torch.stack(rows, dim=1).unflatten(1, (3, 3))
 
 
+Sensor = ContactSensor | RaySensor | CameraSensor
+"""What `scene.sensors` has."""
+
+
 def make_sensors(
-    made: Mapping[str, ContactSlots | RayMount], sim: SimData, entities: Mapping[str, Entity]
-) -> dict[str, ContactSensor | RaySensor]:
+    made: Mapping[str, ContactSlots | RayMount | CameraMount], sim: SimData, entities: Mapping[str, Entity]
+) -> dict[str, Sensor]:
     """The sensors that the scene has put into the model."""
-    return {
-        name: ContactSensor(sensor, sim)
-        if isinstance(sensor, ContactSlots)
-        else RaySensor(sensor, sim, entities[sensor.config.entity])
-        for name, sensor in made.items()
-    }
+    cameras = make_cameras({name: mount for name, mount in made.items() if isinstance(mount, CameraMount)}, sim)
+
+    def sensor(name: str, found: ContactSlots | RayMount | CameraMount) -> Sensor:
+        if isinstance(found, CameraMount):
+            return cameras[name]
+        if isinstance(found, ContactSlots):
+            return ContactSensor(found, sim)
+        return RaySensor(found, sim, entities[found.config.entity])
+
+    return {name: sensor(name, found) for name, found in made.items()}
 
 
 def _pattern(config: RaySensorConfig) -> tuple[Tensor, Tensor]:

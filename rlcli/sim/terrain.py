@@ -35,6 +35,7 @@ _MOST = 1 << 24
 _HEADER = 10_000
 """Bytes of a NumPy file's header."""
 _START, _MOVE = random.stream("terrain.start"), random.stream("terrain.move")
+_SCATTER = random.stream("terrain.scatter")
 _SPAWN = 0.5
 """Half the edge of the square in a patch's middle whose highest point is where its origin lies [m]."""
 _THICK = 0.5
@@ -200,6 +201,12 @@ class Terrain:
         levels = selection.read(self.levels) + up.long() - (down & ~up).long()
         anywhere = selection.stream(_MOVE).choice(self.rows)
         levels = torch.where(levels >= self.rows, anywhere, levels.clamp(min=0))
+        selection.write(self.levels, levels)
+        selection.write(self._env_origins, self.origins[levels, selection.peek(self.types)])
+
+    def scatter(self, selection: Selection) -> None:
+        """Put environments on random levels, each on its own kind of ground."""
+        levels = selection.stream(_SCATTER).choice(self.rows)
         selection.write(self.levels, levels)
         selection.write(self._env_origins, self.origins[levels, selection.peek(self.types)])
 

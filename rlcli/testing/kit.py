@@ -37,6 +37,7 @@ CHECKS: dict[str, Check] = {
     "back-fill": lives.back_fill,
     "checkpoint": portability.checkpoint,
     "layout": portability.layout,
+    "policy": portability.policy,
     "threads": portability.threads,
     "num-envs": portability.num_envs,
     "speed": portability.speed,

@@ -14,6 +14,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,7 +27,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, RlcliError, UsageError, did_you_mean
 from rlcli.registry import find_task
 from rlcli.testing.dummies import DUMMIES, Life, live
-from rlcli.testing.subject import Subject, column_names
+from rlcli.testing.subject import Subject, observed
 from rlcli.testing.timestep import energy_drift
 
 NUM_ENVS = 16
@@ -247,11 +248,12 @@ LARGE, SMALL = 50.0, 0.01
 
 
 def constant_observations(evidence: Evidence) -> Iterator[Remark]:
-    """No observation column keeps one value, whatever the agent does."""
+    """No observation column keeps one value, whatever the agent does; of a picture, some pixel does not."""
     for where, values in _columns(evidence):
-        low, high = float(values.min()), float(values.max())
-        if low == high:
-            message = f"is {low:g} in every step of every agent"
+        if bool((values == values[:, :1]).all()):
+            low = float(values.min())
+            what = f"is {low:g}" if len(values) == 1 else "is the same"
+            message = f"{what} in every step of every agent"
             hint = "leave it out, or compute it from what changes"
             yield Remark("constant-observation", "error", where, message, hint, {"value": low})
 
@@ -263,7 +265,7 @@ def observation_scale(evidence: Evidence) -> Iterator[Remark]:
     for where, values in _columns(evidence):
         sizes = values.abs()
         usual, largest = _quantile(sizes, 0.99), float(sizes.max())
-        if bool((values == values[0]).all()) or (largest >= SMALL and usual <= LARGE):
+        if bool((values == values[:, :1]).all()) or (largest >= SMALL and usual <= LARGE):
             continue
         message = f"is never larger than {largest:.3g}; below {SMALL:g} it drowns among the others"
         if usual > LARGE:
@@ -274,12 +276,12 @@ def observation_scale(evidence: Evidence) -> Iterator[Remark]:
 
 
 def _columns(evidence: Evidence) -> Iterator[tuple[str, Tensor]]:
-    """Each observation column, and its values in all lives."""
+    """Each observation column, or picture, and its values in all lives. (columns, steps)"""
     env = evidence.lives[0].env
     for group in env.layout.observations:
         seen = torch.cat([life.obs[group].flatten(0, 1) for life in evidence.lives if group in life.obs]).t()
-        for column, name in enumerate(column_names(env, group)):
-            yield f"observations.{group}, column {column} ({name})", seen[column].contiguous()
+        for where, columns in observed(env, group):
+            yield where, seen[columns].contiguous()
 
 
 SATURATED = 0.8
@@ -309,13 +311,16 @@ def dead_actions(evidence: Evidence) -> Iterator[Remark]:
     env.reset(seed=0)
     start = env.state_dict()
     steps = max(5, math.ceil(0.1 / env.step_dt))
-    rest = _after(env, start, torch.zeros(8, env.layout.action_size), steps)
+    bound = evidence.subject.bound
+    # a column may multiply others, so that it moves nothing while they are 0
+    others = [torch.full((8, env.layout.action_size), level * bound) for level in (0.0, 0.5)]
+    without = [(action, _after(env, start, action, steps)) for action in others]
     names = [n for t in env.layout.actions for n in (t.elements if len(t.elements) == t.size else [t.name] * t.size)]
     for column, name in enumerate(names):
         moved = 0.0
-        for sign in (1.0, -1.0):
-            action = torch.zeros(8, env.layout.action_size)
-            action[:, column] = sign * evidence.subject.bound
+        for (base, rest), sign in product(without, (1.0, -1.0)):
+            action = base.clone()
+            action[:, column] = sign * bound
             moved = max(moved, float((_after(env, start, action, steps) - rest).abs().max()))
             if moved > DEAD:
                 break
@@ -324,7 +329,7 @@ def dead_actions(evidence: Evidence) -> Iterator[Remark]:
                 "dead-action",
                 "error",
                 f"actions, column {column} ({name})",
-                f"moves nothing: after {steps} steps at +-{evidence.subject.bound:g} the state differs by {moved:.1g}"
+                f"moves nothing: after {steps} steps at +-{bound:g} the state differs by {moved:.1g}"
                 " from that without action",
                 "see that it drives the meant actuator, with a scale, a gear and a limit that are not 0",
                 {"moved": moved, "steps": steps},

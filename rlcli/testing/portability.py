@@ -17,10 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rlcli.config.load import resolve
 from rlcli.envs.direct import DirectTask
 from rlcli.envs.managed import ManagedEnv
-from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import ConfigError, DeviceError
+from rlcli.envs.vec_env import VecEnv, make_env
+from rlcli.errors import ConfigError, DeviceError, RlcliError
+from rlcli.rl.bundle import open_bundle
+from rlcli.rl.checkpoint import open_checkpoint
+from rlcli.rl.load import require_fit
 from rlcli.testing.host import HostReadError, NoHost
 from rlcli.testing.lives import first_difference
 from rlcli.testing.subject import NUM_ENVS, Finding, NotRunError, Subject, flat, live, random_actions, task_of
@@ -120,6 +124,27 @@ def checkpoint(subject: Subject) -> Iterator[Finding]:
 def _go_on(env: VecEnv, actions: list[Tensor]) -> list[dict[str, Tensor]]:
     torch.manual_seed(0)
     return [{n: v.clone() for n, v in flat(env.step(action.clone())).items()} for action in actions]
+
+
+def policy(subject: Subject) -> Iterator[Finding]:
+    """The policy that is shipped with the task can be read, and fits the task as it is."""
+    folder = subject.source.policy
+    if folder is None:
+        raise NotRunError("the task ships none; rlcli export --format bundle writes one")
+    try:
+        checkpoint, bundle = open_checkpoint(folder), open_bundle(folder)
+        checkpoint.policy()
+        one = resolve(subject.source, agent=bundle.agent, play=True, flags={"scene.num_envs": 1})
+        env = make_env(one)
+        require_fit(checkpoint, env.layout)
+        env.close()
+    except RlcliError as error:
+        hint = "train again, and export the new policy as a bundle to the same folder"
+        yield Finding("policy", "error", str(folder), error.message, hint)
+        return
+    if bundle.task["name"] != subject.source.name:
+        message = f"is a policy for '{bundle.task['name']}'"
+        yield Finding("policy", "error", str(folder), message, f"export one of {subject.source.name}")
 
 
 def layout_file(subject: Subject) -> Path:

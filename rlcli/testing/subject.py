@@ -216,6 +216,21 @@ def column_names(env: VecEnv, group: str) -> list[str]:
     return names
 
 
+def observed(env: VecEnv, group: str) -> list[tuple[str, slice]]:
+    """What an observation group consists of, with a name for messages: its columns, and its pictures as a whole."""
+    names, parts, start = column_names(env, group), [], 0
+    for term in env.layout.observations[group]:
+        end = start + term.size
+        if len(term.shape) > 1:
+            where = f"observations.{group}, columns {start} to {end - 1} (picture {term.name})"
+            parts.append((where, slice(start, end)))
+        else:
+            columns = range(start, end)
+            parts += [(f"observations.{group}, column {c} ({names[c]})", slice(c, c + 1)) for c in columns]
+        start = end
+    return parts
+
+
 def same(left: Tensor, right: Tensor) -> bool:
     """Whether two tensors are equal bit for bit, NaN included."""
     return left.shape == right.shape and bool(((left == right) | ((left != left) & (right != right))).all())

@@ -23,9 +23,9 @@ from rlcli.testing.subject import (
     STEPS,
     Finding,
     Subject,
-    column_names,
     extreme_actions,
     flat,
+    observed,
     record,
     task_of,
 )
@@ -114,11 +114,7 @@ def shapes(subject: Subject) -> Iterator[Finding]:
     """Everything has the shape that the layout and the number of environments promise."""
     recording = subject.recording()
     env = recording.env
-    own = [
-        finding
-        for what, value, columns in _raw(env)
-        for finding in _shape(what, value, (NUM_ENVS,) if columns is None else (NUM_ENVS, columns))
-    ]
+    own = [finding for what, value, own_shape in _raw(env) for finding in _shape(what, value, (NUM_ENVS, *own_shape))]
     yield from own
     if own:
         return  # what the framework makes of it follows from that
@@ -170,22 +166,22 @@ def _name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-def _raw(env: VecEnv) -> Iterator[tuple[str, Tensor, int | None]]:
-    """What the task itself gives, before the framework casts it: (name, value, columns or None)."""
+def _raw(env: VecEnv) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]:
+    """What the task itself gives, before the framework casts it: (name, value, its shape in one environment)."""
     if not isinstance(env, ManagedEnv):
         task = task_of(env)
-        yield "obs_buf", task.obs_buf, task.num_observations
-        yield "states_buf", task.states_buf, task.num_states
-        yield "rew_buf", task.rew_buf, None
-        yield "reset_buf", task.reset_buf, None
+        yield "obs_buf", task.obs_buf, (task.num_observations,)
+        yield "states_buf", task.states_buf, (task.num_states,)
+        yield "rew_buf", task.rew_buf, ()
+        yield "reset_buf", task.reset_buf, ()
         return
     manager = env.observation_manager
     for group in manager.groups:
         for pipeline in manager.pipelines(group):
-            yield f"observations.{group}.{pipeline.term.name}", pipeline.term.call(), pipeline.width
+            yield f"observations.{group}.{pipeline.term.name}", pipeline.term.call(), pipeline.shape
     for section, terms in (("rewards", env.reward_manager.terms), ("terminations", env.termination_manager.terms)):
         for term in terms:
-            yield f"{section}.{term.name}", term.call(), None
+            yield f"{section}.{term.name}", term.call(), ()
 
 
 def random_actions_stay_stable(subject: Subject) -> Iterator[Finding]:
@@ -215,18 +211,19 @@ def _stable(check: str, subject: Subject, env: VecEnv, steps: int) -> Iterator[F
 
 
 def constant_columns(subject: Subject) -> Iterator[Finding]:
-    """No observation column keeps one value in all environments and steps."""
+    """No observation column keeps one value in all environments and steps; of a picture, some pixel does not."""
     recording = subject.recording()
     for group in recording.env.layout.observations:
         seen = torch.stack([obs[group] for obs in recording.obs])
-        for column, name in enumerate(column_names(recording.env, group)):
-            values = seen[:, :, column]
+        for where, columns in observed(recording.env, group):
+            values = seen[:, :, columns]
             if bool((values == values[0, 0]).all()):
+                what = f"is {float(values[0, 0]):g}" if values.shape[2] == 1 else "is the same"
                 yield Finding(
                     "constant-columns",
                     "error",
-                    f"observations.{group}, column {column} ({name})",
-                    f"is {float(values[0, 0]):g} in {NUM_ENVS} environments and {len(seen)} observations",
+                    where,
+                    f"{what} in {NUM_ENVS} environments and {len(seen)} observations",
                     "a policy cannot learn from it: compute it from the state, or leave it out",
                 )
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlcli.config.schema import ViewerConfig
+from rlcli.sim.gl import open_context
 from rlcli.viewer.crowd import Crowd
-from rlcli.viewer.gl import open_context
 
 
 def free_camera(viewer: ViewerConfig, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> mujoco.MjvCamera:
@@ -49,6 +49,7 @@ class Renderer:
         if self._crowd is not None:
             self._crowd.stand_back(self._camera)
         self._lookat = self._camera.lookat.copy()
+        self._followed = _root(model, viewer.follow)
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
         self._rect = mujoco.MjrRect(0, 0, viewer.width, viewer.height)
@@ -61,6 +62,9 @@ class Renderer:
         With a crowd it is environment 0.
         """
         self._camera.lookat[:] = np.add(self._lookat, origin)
+        if self._followed is not None:
+            body, start = self._followed
+            self._camera.lookat[:] += data.xpos[body] - start - origin
         everything = int(mujoco.mjtCatBit.mjCAT_ALL)
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self._scene)
         if self._crowd is not None:
@@ -80,3 +84,16 @@ class Renderer:
         """Free the context."""
         self._mjr.free()
         self._context.free()
+
+
+def _root(model: mujoco.MjModel, entity: str | None) -> tuple[int, NDArray[np.float64]] | None:
+    """The root body of an entity, and where its default state has it; None if there is nothing to follow."""
+    bodies = [body for body in range(model.nbody) if model.body(body).name.startswith(f"{entity}/")]
+    if entity is None or not bodies:
+        return None
+    root = min(bodies)
+    joint = model.body_jntadr[root]
+    if joint >= 0 and model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_FREE):
+        address = model.jnt_qposadr[joint]
+        return root, model.qpos0[address : address + 3].copy()
+    return root, model.body_pos[root].copy()

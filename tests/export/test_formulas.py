@@ -76,6 +76,8 @@ TERMS = {
     "joint_vel": "",
     "joint_pos_rel": "",
     "joint_vel_rel": "",
+    "joint_angle": "joints: [knee, hip]",
+    "joint_angle_sum": "joints: [knee, hip]",
     "joint_pos_limit_normalized": "",
     "joint_effort": "",
     "base_pos_z": "",

@@ -181,6 +181,14 @@ def test_action_that_moves_nothing_is_found(planted, managed, direct):
     assert remark.numbers["moved"] == 0.0
 
 
+def test_action_that_only_multiplies_another_is_alive(direct):
+    direct.replace("num_actions = 1", "num_actions = 2")
+    direct.replace(
+        "self.params.max_effort * actions", "self.params.max_effort * actions[:, :1] * (1.0 + 0.5 * actions[:, 1:])"
+    )
+    assert lint(direct) == []
+
+
 # --- time ---
 
 

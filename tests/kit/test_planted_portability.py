@@ -1,12 +1,16 @@
 """The checks of threads, sizes, engines, restarts, versions and speed find what is planted for them."""
 
 import json
+import shutil
+from dataclasses import replace
 from importlib.util import find_spec
 
 import pytest
 
 from rlcli.cli.app import main
-from rlcli.testing import check_task, record_layout
+from rlcli.registry import find_task
+from rlcli.testing import check_task, portability, record_layout
+from rlcli.testing.subject import Subject
 
 
 def only(folder, *names):
@@ -372,3 +376,45 @@ def test_model_that_the_gpu_engine_cannot_run_is_not_run_and_the_reason_is_said(
     found, notes = only(managed, "engines")
     assert found == []
     assert "not take it" in notes["engines"]
+
+
+@pytest.fixture
+def shipped(tmp_path):
+    """cartpole with a policy in a folder of the test's own, and that folder."""
+    source = find_task("cartpole")
+    folder = shutil.copytree(source.policy, tmp_path / "policies" / "cartpole")
+    return replace(source, policy=folder), folder
+
+
+def edit_manifest(folder, change):
+    document = json.loads((folder / "manifest.json").read_text())
+    change(document)
+    (folder / "manifest.json").write_text(json.dumps(document))
+
+
+def test_a_shipped_policy_that_fits_is_no_finding(shipped):
+    assert list(portability.policy(Subject(shipped[0]))) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda m: m["layout"].update(step_dt=0.02), "does not fit the installed task"),
+        (lambda m: m["layout"]["observations"]["policy"].reverse(), "does not fit the installed task"),
+        (lambda m: m.update(agent="nobody"), "nobody"),
+        (lambda m: m["task"].update(name="cartpole-direct"), "is a policy for 'cartpole-direct'"),
+        (lambda m: m["files"]["policy.safetensors"].update(sha256="0" * 64), "is corrupt"),
+    ],
+)
+def test_a_shipped_policy_that_does_not_fit_is_a_finding(shipped, change, said):
+    source, folder = shipped
+    edit_manifest(folder, change)
+    (finding,) = portability.policy(Subject(source))
+    assert (finding.check, finding.severity) == ("policy", "error")
+    assert said in finding.message
+
+
+def test_a_task_without_a_policy_is_told_how_to_ship_one(managed):
+    found, notes = only(managed, "policy")
+    assert found == []
+    assert "--format bundle" in notes["policy"]

@@ -9,6 +9,7 @@ import yaml
 from worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, dump, pendulum, run
 
 from rlcli.errors import ConfigError
+from rlcli.mdp.success import velocity_tracked_on_average
 
 VELOCITY = {"func": "uniform_velocity", "resampling_time_s": [0.1, 0.2], "lin_vel_x": [-1.0, 1.0],
             "lin_vel_y": [-0.5, 0.5], "ang_vel_z": [-2.0, 2.0]}  # fmt: skip
@@ -98,6 +99,31 @@ def test_metrics_are_means_over_the_episode(tmp_path):
         errors.append((asked[:, :2] - seen[:, 1:3]).norm(dim=1))
     found = result.episodes.ended().metrics["velocity/error_vel_xy"]
     assert torch.allclose(found, torch.stack(errors).mean(dim=0), rtol=1e-5)
+
+
+def test_a_velocity_counts_as_tracked_by_the_means_of_the_episode_so_far(tmp_path):
+    env = walker(tmp_path, 8, events={"push": None, "shove": None})
+    env.reset()
+    velocity = env.command_manager.get_term("velocity")
+    linear, angular = [], []
+    for _ in range(29):
+        env.step(torch.zeros(8, env.layout.action_size))  # what is asked is measured before it is drawn anew
+        lin, ang = (env.command_manager.so_far(velocity, name) for name in ("error_vel_xy", "error_vel_yaw"))
+        linear.append(lin)
+        angular.append(ang)
+    limits = {"linear_tolerance": float(lin.sort()[0][5]), "angular_tolerance": float(ang.sort()[0][4])}
+    limits = {name: value + 1e-4 for name, value in limits.items()}  # six are near enough, and five turn well enough
+    tracked = velocity_tracked_on_average(env, command=velocity, **limits)
+    expected = [
+        a < limits["linear_tolerance"] and b < limits["angular_tolerance"] for a, b in zip(lin, ang, strict=True)
+    ]
+    assert tracked.tolist() == [bool(e) for e in expected]
+    assert 2 < sum(expected) < 6
+    steps = torch.stack([now * (n + 1) for n, now in enumerate(linear)]).diff(dim=0)
+    assert (steps > 0).all()  # each step adds its error
+    metrics = env.step(torch.zeros(8, env.layout.action_size)).episodes.ended().metrics
+    assert torch.allclose(metrics["velocity/error_vel_yaw"], ang, atol=0.2)
+    assert env.command_manager.so_far(velocity, "error_vel_xy").tolist() == [0.0] * 8  # the next episode has begun
 
 
 def test_a_saved_state_goes_on_with_the_same_commands(tmp_path):

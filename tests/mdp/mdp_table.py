@@ -106,6 +106,8 @@ OBSERVATIONS = [
     (o.joint_vel, SOME, lambda s: [s.v[3], s.v[0]]),
     (o.joint_pos_rel, ALL, lambda s: s.q - DEFAULT),
     (o.joint_vel_rel, ALL, lambda s: s.v),
+    (o.joint_angle, SOME, lambda s: [wrapped(s.q[3]), wrapped(s.q[0])]),
+    (o.joint_angle_sum, SOME, lambda s: [wrapped(s.q[3] + s.q[0])]),
     (o.joint_pos_limit_normalized, ALL, lambda s: (2 * s.q - LOW - HIGH) / (HIGH - LOW)),
     (o.joint_pos_limit_normalized, {**ARM, "joints": "elbow"}, lambda s: [0.0]),
     (o.joint_effort, SOME, lambda s: [s.effort[3], s.effort[0]]),
@@ -330,6 +332,9 @@ SUCCESS = [
      -s.down_b[2] > cos(3.0) and s.above[2] > 0.52),
     (u.root_near, {**ROBOT, "target": (0.5, -0.5, 0.5), "tolerance": 1.0}, lambda s:
      norm(s.above - [0.5, -0.5, 0.5]) < 1.0),
+    (u.root_hovers, {**ROBOT, "goal": "object", "tolerance": 3.0, "speed": 9.0}, lambda s:
+     norm(s.pos - s.thing) < 3.0),
+    (u.root_hovers, {**ROBOT, "goal": "object", "tolerance": 99.0, "speed": 0.8}, lambda s: norm(s.lin) < 0.8),
     (u.velocity_tracked, {**VELOCITY, "linear_tolerance": 0.7, "angular_tolerance": 0.5}, lambda s:
      norm(s.velocity[:2] - s.lin_b[:2]) < 0.7 and abs(s.velocity[2] - s.ang[2]) < 0.5),
     (u.velocity_tracked, {**VELOCITY, "linear_tolerance": 9.0, "angular_tolerance": 0.5}, lambda s:

@@ -158,7 +158,7 @@ def sensors(num_envs=3):
 def bound(env, kwargs, made):
     """Parameters as the YAML has them -> what the term is given."""
     given = dict(kwargs)
-    for name in ("entity", "object", "cabinet"):
+    for name in ("entity", "object", "cabinet", "goal"):
         if name in given:
             given[name] = env.entities[given[name]]
     for name in ("joints", "bodies", "sites", "sensors"):

@@ -196,7 +196,7 @@ def test_the_page_on_lint_lists_every_rule():
 
 
 def test_links_between_pages_lead_somewhere():
-    for page in [*DOCS.glob("*.md"), README]:
+    for page in [*DOCS.rglob("*.md"), README]:
         for target in re.findall(r"\]\(([^)#:]+\.md)\)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).is_file(), f"{page.name}: {target}"
 

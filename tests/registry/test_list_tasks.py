@@ -125,6 +125,23 @@ def test_a_new_version_of_a_plugin_is_probed_anew(plugins, spec, tmp_path):
     assert _key(entry) != before
 
 
+def test_the_status_says_whether_a_task_works_and_ships_a_policy(plugins, spec, cli):
+    details = {"summary": "Fine.", "workflow": "direct", "observation_size": 3, "action_size": 1}
+    index = json.dumps({"good-task": {**details, "policy": True}})
+    plugins("good", spec, files={"index.json": index})
+    plugins("plain", spec)
+    done = cli("list-tasks")
+    head, *lines = done.stdout.splitlines()
+    assert head.split()[2:8] == ["WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "STATUS"]
+    told = {line.split()[0]: line for line in lines}
+    assert "  ok, policy  " in told["good-task"]
+    assert "  ok, policy  " in told["cartpole"]
+    assert "  ?  " in told["plain-task"]
+    found = rows(cli("list-tasks", "--json"))
+    assert [found[name]["status"] for name in ("good-task", "cartpole", "plain-task")] == ["ok, policy"] * 2 + ["?"]
+    assert (found["cartpole"]["policy"], found["ant-direct"]["policy"]) == (True, found["ant-direct"]["status"] != "ok")
+
+
 def test_a_plugin_may_ship_its_details(plugins, spec, cli):
     index = json.dumps({"good-task": {"summary": "Shipped.", "workflow": "direct", "observation_size": 3}})
     plugins("good", spec, files={"index.json": index})

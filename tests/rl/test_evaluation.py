@@ -32,6 +32,25 @@ def test_causes_are_shares_of_the_episodes(make, scheduled):
     assert "success" not in summary
 
 
+def test_how_well_commands_are_followed_is_a_mean_over_episodes(make):
+    env, _ = make("quadruped-flat", "scene.num_envs=4", "episode_length_s=0.2")
+    seen = []
+
+    def keep(step):
+        if step.episodes is not None:
+            seen.append(step.episodes.metrics["velocity/error_vel_xy"])
+
+    result = evaluate(env, zero_policy(env), 8, keep)
+    errors = torch.cat(seen).tolist()
+    assert len(set(errors)) == 8
+    assert sorted(result.values["velocity/error_vel_xy"]) == pytest.approx(sorted(errors))
+    summary = result.summary()["values"]
+    assert set(summary) == {"velocity/error_vel_xy", "velocity/error_vel_yaw"}
+    assert summary["velocity/error_vel_xy"]["mean"] == pytest.approx(sum(errors) / 8)
+    assert summary["velocity/error_vel_xy"]["low"] < sum(errors) / 8 < summary["velocity/error_vel_xy"]["high"]
+    assert result.part(0, 1).values["velocity/error_vel_xy"] == result.by_life().values["velocity/error_vel_xy"][:2]
+
+
 def test_groups_of_environments_run_as_many_episodes_each_and_are_told_apart(make, scheduled):
     env, _ = make(scheduled, "scene.num_envs=8")
     result = evaluate(env, zero_policy(env), 6, groups=2)

@@ -1,6 +1,8 @@
 """From MJCF files to a model: what the configuration says is what the compiled model has."""
 
 import math
+import os
+import re
 import warnings
 
 import mujoco
@@ -9,7 +11,7 @@ import pytest
 import torch
 from worlds import CRITTER, PENDULUM, PENDULUM_TASK, build, edited, write
 
-from rlcli.errors import ConfigError
+from rlcli.errors import ConfigError, TaskError
 
 ARM = """
 <mujoco model="arm">
@@ -368,6 +370,60 @@ def test_a_model_may_lie_in_an_installed_package_that_is_not_imported(tmp_path, 
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
     model = model_of(tmp_path, robot={"model": "package:armory/assets/arm.xml"})
     assert joint(model, "robot/elbow") >= 0
+
+
+def users_folder(tmp_path, monkeypatch):
+    folder = tmp_path / "models"
+    (folder / "arm").mkdir(parents=True)
+    (folder / "arm" / "arm.xml").write_text(ARM)
+    monkeypatch.setenv("RLCLI_MODELS", os.pathsep.join([str(tmp_path / "nowhere"), str(folder)]))
+    return folder
+
+
+def test_a_model_may_lie_in_a_folder_of_the_users(tmp_path, monkeypatch):
+    users_folder(tmp_path, monkeypatch)
+    assert joint(model_of(tmp_path / "a", robot={"model": "models:arm/arm.xml"}), "robot/elbow") >= 0
+
+
+def test_what_a_model_of_the_users_loads_lies_in_that_folder_too(tmp_path, monkeypatch):
+    folder = users_folder(tmp_path, monkeypatch)
+    (tmp_path / "secret.xml").write_text("<mujoco/>")
+    (folder / "arm" / "arm.xml").write_text(ARM.replace("<worldbody>", '<include file="../../secret.xml"/><worldbody>'))
+    with pytest.raises(ConfigError, match="lies outside of"):
+        model_of(tmp_path / "a", robot={"model": "models:arm/arm.xml"})
+
+
+@pytest.mark.parametrize("first", ["models:leg/leg.xml", "package:no_such_package_here/arm.xml", "absent.xml"])
+def test_of_several_models_the_first_that_is_there_counts(tmp_path, monkeypatch, first):
+    users_folder(tmp_path, monkeypatch)
+    model = model_of(tmp_path / "a", robot={"model": f"{first} | models:arm/arm.xml | package:numpy/arm.xml"})
+    assert joint(model, "robot/elbow") >= 0
+
+
+def test_a_model_that_the_user_has_not_got_is_no_error_of_the_task(tmp_path, monkeypatch):
+    monkeypatch.delenv("RLCLI_MODELS", raising=False)
+    with pytest.raises(TaskError) as missing:
+        model_of(tmp_path, robot={"model": "models:arm/arm.xml | package:no_such_package_here/arm.xml"})
+    assert missing.value.exit_code == 4
+    assert "RLCLI_MODELS is not set; no Python package 'no_such_package_here' is installed" in missing.value.message
+    assert missing.value.hint == (
+        "set RLCLI_MODELS to a folder that holds arm/arm.xml,"
+        " or install the package no_such_package_here, which carries it"
+    )
+
+
+@pytest.mark.parametrize(
+    ("reference", "error", "said"),
+    [
+        ("models:leg/leg.xml", TaskError, "no file 'leg/leg.xml' in"),
+        ("models:../secret.xml", ConfigError, "lies outside the folder"),
+    ],
+)
+def test_a_model_that_is_in_no_folder_of_the_users_is_refused(tmp_path, monkeypatch, reference, error, said):
+    users_folder(tmp_path, monkeypatch)
+    (tmp_path / "secret.xml").write_text(ARM)
+    with pytest.raises(error, match=re.escape(said)):
+        model_of(tmp_path / "a", robot={"model": reference})
 
 
 @pytest.mark.parametrize(

@@ -281,6 +281,32 @@ def test_the_curriculum_of_levels_goes_by_the_distance_covered(tmp_path):
     assert env.extras()["Curriculum/levels"] == pytest.approx(1.5)
 
 
+@ENGINES
+def test_every_episode_may_begin_on_a_random_level_of_the_same_ground(tmp_path, engine):
+    none = dict.fromkeys(("joints", "push", "shove"))
+    events = {**none, "root": None, "level": {"func": "randomize_terrain_level", "mode": "reset"},
+              "place": {"func": "reset_root_state_uniform", "mode": "reset"}}  # fmt: skip
+    env = on_terrain(tmp_path, {**HILLS, "max_start_level": 0}, 60, f"sim.engine={engine}", events=events,
+                     episode_length_s=0.02)  # fmt: skip
+    env.reset()
+    kinds, seen = env.terrain.types.clone(), [env.terrain.levels.clone()]
+    for _ in range(2):
+        assert env.step(torch.zeros(60, 4)).truncated.all()
+        seen.append(env.terrain.levels.clone())
+    assert all((torch.bincount(levels, minlength=4) > 3).all() for levels in seen)
+    assert not torch.equal(seen[1], seen[2])
+    assert torch.equal(env.terrain.types, kinds)
+    assert torch.equal(env.origins, env.terrain.origins[env.terrain.levels, kinds])
+    found = env.entities["robot"].data.root_pos_w - env.origins
+    torch.testing.assert_close(found, torch.tensor([[0.0, 0.0, 0.35]] * 60), atol=1e-5, rtol=0)
+
+
+def test_random_levels_without_a_terrain_are_refused(tmp_path):
+    task = edited(CRITTER_TASK, events={"level": {"func": "randomize_terrain_level", "mode": "reset"}})
+    with pytest.raises(ConfigError, match=r"events.level: the scene has no terrain"):
+        build(critter(tmp_path, task), 1)
+
+
 def test_a_curriculum_of_levels_without_a_terrain_is_refused(tmp_path):
     task = edited(CRITTER_TASK, curriculum={"levels": {"func": "terrain_levels"}})
     with pytest.raises(ConfigError, match=r"curriculum.levels: the scene has no terrain"):

@@ -5,15 +5,16 @@ import os
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 
 from rlcli.config.load import resolve
 from rlcli.config.schema import ViewerConfig
 from rlcli.envs.vec_env import make_env
-from rlcli.errors import DependencyError, MachineError, UsageError
+from rlcli.errors import ConfigError, DependencyError, MachineError, UsageError
 from rlcli.registry import find_task
-from rlcli.viewer.gl import open_context
+from rlcli.sim.gl import open_context
 from rlcli.viewer.video import Renderer, free_camera
 from rlcli.viewer.writer import VideoWriter, check_video, gif_stride
 
@@ -58,6 +59,30 @@ def test_the_pole_is_in_the_picture_and_moves():
     assert blue > 100  # the cart
 
 
+@pytest.mark.slow
+def test_the_camera_goes_along_with_the_entity_that_it_follows():
+    drawn = {}
+    for follow in ("robot", None):
+        overrides = ["scene.num_envs=1", f"viewer.follow={follow or 'null'}"]
+        env = make_env(resolve(find_task("quadruped-flat"), overrides=overrides))
+        env.reset(seed=1)
+        model, data = env.world(0)
+        with Renderer(model, env.config.viewer) as renderer:
+            pictures = []
+            for x in (0.0, 8.0):  # the ground's pattern repeats every metre
+                data.qpos[0] = x
+                mujoco.mj_forward(model, data)
+                pictures.append(renderer.draw(model, data).astype(int))
+        drawn[follow] = np.abs(pictures[0] - pictures[1]).mean()
+        assert pictures[0].std() > 20
+    assert drawn["robot"] < 1.0 < drawn[None]
+
+
+def test_what_is_followed_must_be_in_the_scene():
+    with pytest.raises(ConfigError, match=r"there is no entity 'rover' in the scene; entities: robot"):
+        resolve(find_task("cartpole"), overrides=["viewer.follow=rover"])
+
+
 def test_drawing_switched_off_is_a_machine_error(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
     with pytest.raises(MachineError, match="switched off by MUJOCO_GL=disable"):
@@ -69,7 +94,7 @@ def test_no_gl_at_all_says_what_was_tried_and_what_to_install():
         "import sys\nclass Hidden:\n    def find_spec(name, *_):\n"
         "        if name in ('mujoco.egl', 'mujoco.osmesa'): raise ImportError(name)\n"
         "sys.meta_path.insert(0, Hidden)\n"
-        "from rlcli.errors import MachineError\nfrom rlcli.viewer.gl import open_context\n"
+        "from rlcli.errors import MachineError\nfrom rlcli.sim.gl import open_context\n"
         "try: open_context(64, 48)\nexcept MachineError as e: print(e.message, '|', e.hint)"
     )
     env = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")}

@@ -26,6 +26,8 @@ def run(inputs):
             else np.clip(x, -NETWORK["normalize_clip"], NETWORK["normalize_clip"])
         )
     x, outputs = x.astype(np.float64), {}
+    if NETWORK["pictures"]:
+        x = _seen(x)
     if NETWORK["cells"]:
         hidden, cells = [], []
         for layer, (h, c) in enumerate(zip(inputs["h_in"], inputs["c_in"], strict=True)):
@@ -72,6 +74,26 @@ class Episode:
         out = run({"obs": np.concatenate(seen)[None], **self.memory})
         self.memory = {part["input"]: out[part["output"]] for part in METADATA["memory"]}
         return out["action"][0], out["command"][0]
+
+
+def _seen(x):
+    """Pictures through their convolutions, (channels, rows, columns) each; then the columns that are no picture's."""
+    found, kept, end = [], [], 0
+    for number, (start, *shape) in enumerate(NETWORK["pictures"]):
+        stop = start + int(np.prod(shape))
+        pixels, (c, h, w) = x[:, start:stop], shape
+        for layer, (edge, step) in enumerate(NETWORK["windows"]):
+            down, right = (step * np.arange((size - edge) // step + 1) for size in (h, w))
+            window = (np.arange(c)[:, None, None] * h + np.arange(edge)[:, None]) * w + np.arange(edge)
+            index = (down[:, None] * w + right).reshape(-1, 1) + window.reshape(1, -1)
+            pixels = pixels[:, index] @ _W[f"cw{number}_{layer}"].T + _W[f"cb{number}_{layer}"]
+            pixels = _ACTIVATIONS[NETWORK["activation"]](pixels).transpose(0, 2, 1)
+            c, h, w = pixels.shape[1], len(down), len(right)
+            pixels = pixels.reshape(len(x), -1)
+        found.append(pixels)
+        kept.append(x[:, end:start])
+        end = stop
+    return np.concatenate([*found, *kept, x[:, end:]], axis=1)
 
 
 def _sigmoid(x):

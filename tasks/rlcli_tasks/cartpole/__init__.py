@@ -1,8 +1,13 @@
-"""Cartpole, in both workflows: balance a pole on a cart. Numbers and their sources: docs/cartpole.md."""
+"""Cartpole: balance a pole on a cart, in both workflows and from pictures. Numbers: docs/zoo/cartpole.md."""
 
 from rlcli.task import TaskSpec
 
 MANAGED = TaskSpec(package=__name__, summary="Balance a pole on a cart (manager-based, Isaac Lab's numbers).")
+CAMERA = TaskSpec(
+    package=__name__,
+    config="camera.yaml",
+    summary="Balance a pole on a cart from depth pictures alone (manager-based, after Isaac Lab's).",
+)
 DIRECT = TaskSpec(
     package=__name__,
     config="direct.yaml",

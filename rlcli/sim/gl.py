@@ -45,14 +45,23 @@ def has_display() -> bool:
     return True
 
 
-def open_context(width: int, height: int) -> tuple[Any, str]:
+def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[Any, str]:
     """A current OpenGL context and the name of what made it.
+
+    Args:
+        width: of its pictures.
+        height: likewise.
+        in_thread: it is opened, and used, in a thread that is not the main one: a display's GL, which has to be opened
+            there, is then the last to be tried.
 
     Raises:
         MachineError: if nothing works, with what was tried and what to install.
     """
     tried = []
-    for backend in _candidates():
+    candidates = _candidates()
+    if in_thread:
+        candidates.sort(key=lambda backend: backend == "glfw")
+    for backend in candidates:
         try:
             context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
             context.make_current()

@@ -1,0 +1,199 @@
+"""The generated parts of docs/zoo/*.md: what a task is, what came of its trainings, and how they went."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rlcli.config.card import markdown, task_card
+from rlcli.config.load import resolve
+from rlcli.registry import OWN, catalog, find_task
+
+BLOCKS = ("card", "results", "curves")
+
+
+def built_in() -> list[str]:
+    """The built-in tasks whose package is there."""
+    from rlcli.errors import TaskError
+
+    found = []
+    for entry in catalog()[0]:
+        if entry.distribution == OWN:
+            try:
+                find_task(entry.qualified)
+            except TaskError:
+                continue
+            found.append(entry.name)
+    return found
+
+
+def write_all(zoo: Path, entries: Mapping[str, Any]) -> None:
+    """Fill every page that there is, and write the index."""
+    tasks = [name for name in built_in() if name in entries]
+    for name in tasks:
+        file = zoo / f"{name}.md"
+        if not file.is_file():
+            print(f"{file} is not written yet")
+            continue
+        before = file.read_text(encoding="utf-8")
+        after = filled(before, zoo, entries[name])
+        if after != before:
+            file.write_text(after, encoding="utf-8")
+            print(file)
+    (zoo / "index.md").write_text(index(zoo, [entries[name] for name in tasks]), encoding="utf-8")
+    print(zoo / "index.md")
+
+
+def filled(text: str, zoo: Path, entry: Any) -> str:
+    """A page with its generated blocks as they should be."""
+    made = {"card": card(entry.name), "results": results(zoo, entry), "curves": curves(zoo, entry)}
+    for block in BLOCKS:
+        text = re.sub(
+            rf"<!-- {block} -->\n.*?<!-- end {block} -->",
+            lambda _, block=block: f"<!-- {block} -->\n{made[block]}<!-- end {block} -->",
+            text,
+            flags=re.DOTALL,
+        )
+    return text
+
+
+def block(text: str, name: str) -> str | None:
+    """What stands in a block of a page; None where it has no such block."""
+    found = re.search(rf"<!-- {name} -->\n(.*?)<!-- end {name} -->", text, re.DOTALL)
+    return None if found is None else found[1]
+
+
+def card(task: str) -> str:
+    """The MDP card, folded."""
+    source = find_task(task)
+    resolved = resolve(source)
+    file = source.config.with_name(f"{source.config.stem}.layout.json")
+    layout = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+    _, _, text = markdown(task_card(resolved, layout), level=2).partition("\n\n")
+    return f"<details>\n<summary>The MDP, as configured</summary>\n\n{text.rstrip()}\n\n</details>\n"
+
+
+def rows_of(zoo: Path, task: str) -> list[dict[str, Any]]:
+    """The results of a task; empty where none are there."""
+    file = zoo / "results" / f"{task}.json"
+    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else []
+
+
+def results(zoo: Path, entry: Any) -> str:
+    """The bar, and a row of each seed."""
+    where = "one H200" if entry.device == "cuda" else "two CPU cores"
+    held = (
+        f"Tier {entry.tier}: {bars(entry)} over {entry.episodes:,} episodes, trained in {entry.minutes:g} min on"
+        f" {where}; `make learn-{entry.name}` checks it.\n"
+    )
+    rows = rows_of(zoo, entry.name)
+    if not rows:
+        return f"{held}\nNot trained yet.\n"
+    names = list(dict.fromkeys(["success", *entry.bar])) if "success" in rows[0]["evaluation"] else list(entry.bar)
+    lines = [
+        f"| seed | agent | machine | steps | minutes | {' | '.join(names)} | return |",
+        "| ---: | --- | --- | ---: | ---: |" + " ---: |" * (len(names) + 1),
+    ]
+    for row in rows:
+        numbers = [with_interval(row["evaluation"], name) for name in names]
+        trained = f"{row['steps'] / 1e6:.3g} M | {row['minutes']:.3g}"
+        lines.append(
+            f"| {row['seed']} | `{row['agent']}` | {row['machine']} | {trained} | {' | '.join(numbers)} |"
+            f" {row['evaluation']['return']['mean']:.4g} |"
+        )
+    versions = ", ".join(f"{name} {version}" for name, version in rows[0]["versions"].items())
+    commands = list(dict.fromkeys(re.sub(r"--seed[ =]\d+", "--seed N", row["command"]) for row in rows))
+    said = "; ".join(f"`{command}`" for command in commands)
+    return f"{held}\n" + "\n".join(lines) + f"\n\n{said}, with {versions}. Brackets are 95 % intervals.\n"
+
+
+def bars(entry: Any) -> str:
+    """The bar in words."""
+    return ", ".join(
+        f"{name} <= {bound['max']:g}" if isinstance(bound, dict) else f"{name} >= {bound:g}"
+        for name, bound in entry.bar.items()
+    )
+
+
+def with_interval(evaluation: dict[str, Any], name: str) -> str:
+    """A number and the interval behind it."""
+    found = evaluation.get(name)
+    if found is None:
+        values = evaluation.get("values", {})
+        found = values.get(name) or next((v for key, v in values.items() if key.rpartition("/")[2] == name), None)
+    if found is None:
+        return "-"
+    middle = found.get("rate", found.get("mean"))
+    if middle is None or found["low"] is None:
+        return "-"
+    return f"{middle:.4g} ({found['low']:.3g} .. {found['high']:.3g})"
+
+
+def curves(zoo: Path, entry: Any) -> str:
+    """The learning curves, and what the shipped policy looks like."""
+    parts = []
+    if (zoo / "pictures" / f"{entry.name}.jpg").is_file():
+        parts.append(
+            f"![{entry.name}: the shipped policy](pictures/{entry.name}.jpg)\n\nThe shipped policy, over"
+            f" {entry.picture:g} s: `rlcli play {entry.name} --video`.\n"
+        )
+    if (zoo / "curves" / f"{entry.name}.svg").is_file():
+        parts.append(
+            f"![learning curves of {entry.name}](curves/{entry.name}.svg)\n\nThe numbers:"
+            f" [curves/{entry.name}.csv](curves/{entry.name}.csv).\n"
+        )
+    return "\n".join(parts)
+
+
+def index(zoo: Path, found: list[Any]) -> str:
+    """The table of all tasks."""
+    lines = [
+        "# The built-in tasks",
+        "",
+        "Each has a page with its numbers and where they come from, a policy that ships with it (`rlcli play TASK`",
+        "right after the installation), learning curves, and a bar that `make learn-TASK` checks: tier A over three",
+        "seeds within its minutes, tier B a stated level of one seed. `cpu` is two cores, `cuda` one H200. What a task",
+        "is held to stands in [zoo.yaml](zoo.yaml); `python benchmarks/zoo.py pages` writes this table and the",
+        "generated parts of the pages.",
+        "",
+        "| | task | workflow | obs | act | tier | device | minutes | bar | result |",
+        "| --- | --- | --- | ---: | ---: | --- | --- | ---: | --- | --- |",
+    ]
+    shipped = _index_json()
+    for entry in found:
+        known = shipped.get(entry.name, {})
+        rows = rows_of(zoo, entry.name)
+        image = f"![](pictures/{entry.name}.jpg)" if (zoo / "pictures" / f"{entry.name}.jpg").is_file() else ""
+        page = f"[{entry.name}]({entry.name}.md)" if (zoo / f"{entry.name}.md").is_file() else entry.name
+        lines.append(
+            f"| {image} | {page}: {known.get('summary', '')} | {known.get('workflow', '?')} |"
+            f" {known.get('observation_size', '?')} | {known.get('action_size', '?')} | {entry.tier} | {entry.device} |"
+            f" {_minutes(rows, entry)} | {bars(entry)} | {_outcome(rows, entry)} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _minutes(rows: list[dict[str, Any]], entry: Any) -> str:
+    if not rows:
+        return f"of {entry.minutes:g}"
+    return f"{max(row['minutes'] for row in rows):.2g} of {entry.minutes:g}"
+
+
+def _outcome(rows: list[dict[str, Any]], entry: Any) -> str:
+    if not rows:
+        return "not trained yet"
+    found = []
+    for name in entry.bar:
+        texts = [with_interval(row["evaluation"], name).partition(" ")[0] for row in rows]
+        found.append(f"{name} {', '.join(texts)}")
+    return "; ".join(found)
+
+
+def _index_json() -> dict[str, Any]:
+    from rlcli.probe import cached
+
+    own = [entry for entry in catalog()[0] if entry.distribution == OWN]
+    return {name.partition(":")[2]: row.record() for name, row in cached(own).items()}

@@ -1,0 +1,14 @@
+"""Velocity tracking on Unitree's Go1 and G1, whose models the user has. Nothing heavy is imported here."""
+
+from rlcli.task import TaskSpec
+
+GO1 = TaskSpec(
+    package=__name__,
+    config="go1.yaml",
+    summary="Follow velocity commands with a Unitree Go1 (the model is the user's).",
+)
+G1 = TaskSpec(
+    package=__name__,
+    config="g1.yaml",
+    summary="Follow velocity commands with a Unitree G1 (the model is the user's).",
+)

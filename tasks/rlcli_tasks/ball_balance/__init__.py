@@ -1,0 +1,10 @@
+"""Table on three legs: catch a ball and hold it in the middle. Numbers: docs/zoo/ball-balance.md."""
+
+from rlcli.task import TaskSpec
+
+DIRECT = TaskSpec(
+    package=__name__,
+    config="direct.yaml",
+    summary="Catch a ball on a three-legged table and hold it in the middle (direct, OmniIsaacGymEnvs' numbers).",
+    task="rlcli_tasks.ball_balance.task:BallBalanceTask",
+)

@@ -1,0 +1,136 @@
+"""A table on three legs catches a ball and holds it in the middle.
+
+The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, and
+what outlives a step is written in place.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from rlcli.config.schema import StrictModel
+from rlcli.envs.articulation import ArticulationView
+from rlcli.envs.direct import DirectTask
+from rlcli.sim.selection import Selection
+
+LEGS = (0, 1, 2)
+KNEES = tuple(f"knee{leg}" for leg in LEGS)
+JOINTS = tuple(f"{joint}{leg}" for leg in LEGS for joint in ("hip", "knee"))
+
+BALL_POS, BALL_VEL = slice(6, 9), slice(9, 12)
+"""Columns of the observation that rewards and terminations read."""
+
+
+class BallBalanceTask(DirectTask):
+    """Hold the ball in the middle. Observations: docs/zoo/ball-balance.md lists the 24 columns."""
+
+    num_observations = 24
+    num_actions = 3
+    motors = False
+    observation_names = (
+        *(f"{knee}_pos" for knee in KNEES),
+        *(f"{knee}_vel" for knee in KNEES),
+        *("ball_x", "ball_y", "ball_z", "ball_vel_x", "ball_vel_y", "ball_vel_z"),
+        *(f"leg{leg}_force_x" for leg in LEGS),
+        *(f"leg{leg}_torque_{axis}" for axis in "xyz" for leg in LEGS),
+    )
+    observation_units = (
+        *("rad",) * 3,
+        *("rad/s",) * 3,
+        *("m",) * 3,
+        *("m/s",) * 3,
+        *("20 N",) * 3,
+        *("20 N m",) * 9,
+    )
+    action_names = KNEES
+
+    class Params(StrictModel):
+        """The task's own settings."""
+
+        speed: float = Field(20.0, gt=0, description="Rate of a knee's target at action 1 [rad/s].")
+        target_height: float = Field(0.7, description="Height of the point where the ball should rest [m].")
+        fall_height: float = Field(0.15, description="Height of the ball below which the episode fails [m].")
+        start_distance: tuple[float, float] = Field(
+            (0.001, 0.4), description="Start: distance of the ball from the middle, lowest and highest [m]."
+        )
+        start_height: tuple[float, float] = Field((1.0, 2.0), description="Start: height of the ball likewise [m].")
+        start_speed: float = Field(
+            2.0,
+            ge=0,
+            description="Start: highest speed of the ball towards the middle, at the greatest distance [m/s].",
+        )
+        start_drop: float = Field(5.0, ge=0, description="Start: speed of the ball downwards [m/s].")
+
+    params: Params
+
+    def set_up_scene(self, scene) -> None:
+        """Register the view of the tables."""
+        self.tables = scene.add(ArticulationView("robot", name="table_view"))
+
+    def post_reset(self) -> None:
+        """Make what the hooks use: constants, and buffers that keep their place."""
+        self.robot, self.ball = self.env.entities["robot"], self.env.entities["ball"]
+        assert tuple(self.robot.joint_names) == JOINTS
+        params, device = self.params, self.device
+        low, high = self.robot.data.joint_pos_limits.to(device).unbind(dim=1)
+        self.lowest, self.highest = low[1::2].contiguous(), high[1::2].contiguous()
+        self.targets = torch.zeros(self.num_envs, len(JOINTS), device=device)  # of the knees; hips have no motor [rad]
+        self.goal = torch.tensor([0.0, 0.0, params.target_height], device=device)
+        # distance, direction, height, and the share of the highest speed inwards
+        ranges = [params.start_distance, (-math.pi, math.pi), params.start_height, (0.0, 1.0)]
+        self.start_low, self.start_high = torch.tensor(ranges, device=device).unbind(dim=1)
+        self.distance = torch.zeros(self.num_envs, device=device)
+        self.extras["distance"] = self.distance  # of the ball from where it should rest [m]
+
+    def reset(self, selection: Selection) -> None:
+        """The table at rest; the ball falls, and moves towards the middle the faster the further out it is."""
+        params = self.params
+        distance, direction, height, share = selection.uniform(self.start_low, self.start_high, (4,)).unbind(dim=1)
+        nearest, furthest = params.start_distance
+        speed = share * (distance - nearest) * (params.start_speed / max(furthest - nearest, 1e-9))
+        x, y, zero = direction.cos(), direction.sin(), torch.zeros_like(distance)
+        upright = torch.stack([zero + 1.0, zero, zero, zero], dim=1)
+        self.ball.write_root_pose(selection, torch.stack([distance * x, distance * y, height], dim=1), upright)
+        velocity = torch.stack([-speed * x, -speed * y, zero - params.start_drop], dim=1)
+        self.ball.write_root_velocity(selection, velocity, torch.zeros_like(velocity))
+        selection.write(self.targets, 0.0)
+
+    def pre_physics_step(self, actions: Tensor) -> None:
+        """Move the targets of the knees, inside their limits."""
+        knees = self.targets[:, 1::2]
+        knees.add_(actions, alpha=self.params.speed * self.step_dt)
+        knees.copy_(torch.minimum(torch.maximum(knees, self.lowest), self.highest))
+        self.tables.set_joint_position_targets(self.targets)
+
+    def get_observations(self) -> None:
+        """Fill obs_buf."""
+        robot, ball = self.robot.data, self.ball.data
+        # a new episode has had no physics step: what the sensors show is not of its state
+        scale = (self.progress_buf > 0).mul(1.0 / 20.0)
+        readings = robot.sensordata.unflatten(1, (len(LEGS), 6)).transpose(1, 2) * scale[:, None, None]
+        torch.cat(
+            [
+                robot.joint_pos[:, 1::2],
+                robot.joint_vel[:, 1::2],
+                ball.root_pos_w,
+                ball.root_lin_vel_w,
+                readings[:, 0],
+                readings[:, 3:].flatten(1),
+            ],
+            dim=1,
+            out=self.obs_buf,
+        )
+
+    def calculate_metrics(self) -> None:
+        """Near the middle, and slow."""
+        speed = torch.linalg.vector_norm(self.obs_buf[:, BALL_VEL], dim=1)
+        torch.linalg.vector_norm(self.obs_buf[:, BALL_POS] - self.goal, dim=1, out=self.distance)
+        self.rew_buf.copy_(((1.0 + self.distance) * (1.0 + speed)).reciprocal_())
+
+    def is_done(self) -> None:
+        """The ball has fallen off; the framework adds the time-out."""
+        self.reset_buf.copy_(self.obs_buf[:, BALL_POS][:, 2] < self.params.fall_height)

@@ -1,0 +1,10 @@
+"""Crazyflie: rise to a point with four slow motors and hover. Numbers and their sources: docs/zoo/crazyflie.md."""
+
+from rlcli.task import TaskSpec
+
+DIRECT = TaskSpec(
+    package=__name__,
+    config="direct.yaml",
+    summary="Hover at a point with a 28 g quadcopter (direct, OmniIsaacGymEnvs' numbers).",
+    task="rlcli_tasks.crazyflie.task:CrazyflieTask",
+)

@@ -1,0 +1,136 @@
+"""Crazyflie in the direct workflow: rise to a point and stay there, with four motors that follow slowly.
+
+The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, and
+what outlives a step is written in place.
+"""
+
+from __future__ import annotations
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from rlcli.config.schema import StrictModel
+from rlcli.envs.direct import DirectTask
+from rlcli.sim.rotations import axis_x, axis_y, axis_z, length
+from rlcli.sim.selection import Selection
+
+MOTORS = ("m1", "m2", "m3", "m4")
+
+
+class CrazyflieTask(DirectTask):
+    """Hover at the target. Observations: docs/zoo/crazyflie.md lists the 18 columns."""
+
+    num_observations = 18
+    num_actions = 4
+    observation_names = (
+        *("to_target_x", "to_target_y", "to_target_z"),
+        *(f"{axis}_axis_{part}" for axis in "xyz" for part in "xyz"),
+        *("vel_x", "vel_y", "vel_z", "rate_x", "rate_y", "rate_z"),
+    )
+    observation_units = (*("m",) * 3, *("",) * 9, *("m/s",) * 3, *("rad/s",) * 3)
+    action_names = MOTORS
+    motors = False
+
+    class Params(StrictModel):
+        """The task's own settings."""
+
+        thrust_to_weight: float = Field(1.9, gt=1, description="All four motors at full speed, over the weight.")
+        motor_time: float = Field(
+            0.15, gt=0, description="Time in which a motor's speed settles [s]; 4 time constants."
+        )
+        thrust_noise: float = Field(0.01, ge=0, description="Noise of a thrust, over what is asked of it (deviation).")
+        target_period: int = Field(500, gt=0, description="Steps from one target to the next.")
+        target_low: tuple[float, float, float] = Field(
+            (0.0, 0.0, 2.0), description="Targets: lower corner of the box they are drawn from [m]."
+        )
+        target_high: tuple[float, float, float] = Field((0.0, 0.0, 2.0), description="Targets: upper corner [m].")
+        start_offset: float = Field(0.3, ge=0, description="Start: offset from the default position +- [m].")
+        max_distance: float = Field(5.0, gt=0, description="Distance to the target beyond which it fails [m].")
+        height_range: tuple[float, float] = Field((0.5, 5.0), description="Heights outside which it fails [m].")
+        effort_cost: float = Field(0.05, description="Penalty x exp(-sum of squared actions / 2): on low effort.")
+
+    params: Params
+
+    def post_reset(self) -> None:
+        """Make what the hooks use: constants, and buffers that keep their place."""
+        params, n, model = self.params, self.num_envs, self.env.engine.model
+        self.robot, self.goal = self.env.entities["robot"], self.env.entities["target"]
+        weight = float(model.body_mass[self.robot.body_ids].sum()) * -float(model.opt.gravity[2])
+        self.max_thrust = params.thrust_to_weight * weight / len(MOTORS)
+        """Of a motor [N]."""
+        self.follow = min(4.0 * self.step_dt / params.motor_time, 1.0)
+        """Share of the way to the speed asked for that a motor makes in a step."""
+        self.target_low = torch.tensor(params.target_low, device=self.device)
+        self.target_high = torch.tensor(params.target_high, device=self.device)
+        phases = -(-self.max_episode_length // params.target_period)
+        self.targets = torch.zeros(n, phases, 3, device=self.device)
+        """Those of the running episode, in turn. (n, phases, 3) [m]"""
+        self.target = torch.zeros(n, 3, device=self.device)
+        """The present one. (n, 3) [m]"""
+        self.actions = torch.zeros(n, len(MOTORS), device=self.device)
+        self.speeds = torch.zeros(n, len(MOTORS), device=self.device)
+        """Motor speeds, over the highest. (n, 4)"""
+        self.distance = torch.zeros(n, device=self.device)
+        self.extras["distance"] = self.distance  # to the target [m]
+
+    def reset(self, selection: Selection) -> None:
+        """Level and at rest below the target, motors off; the episode's targets are drawn."""
+        offset, phases = self.params.start_offset, self.targets.shape[1]
+        default = selection.peek(self.robot.data.default_root_state)
+        self.robot.write_root_pose(
+            selection, default[:, :3] + selection.uniform(-offset, offset, (3,)), default[:, 3:7]
+        )
+        targets = selection.uniform(self.target_low, self.target_high, (phases, 3))
+        selection.write(self.targets, targets)
+        selection.write(self.target, targets[:, 0])
+        self.goal.write_root_pose(selection, targets[:, 0], selection.read(self.goal.data.default_root_state[:, 3:7]))
+        selection.write(self.actions, 0.0)
+        selection.write(self.speeds, 0.0)
+
+    def pre_physics_step(self, actions: Tensor) -> None:
+        """Thrusts asked for, which motors follow by their speed: its square is the thrust."""
+        phase = (self.progress_buf // self.params.target_period).clamp_(max=self.targets.shape[1] - 1)
+        self.target.copy_(self.targets.gather(1, phase[:, None, None].expand(-1, 1, 3)).squeeze(1))
+        self.env.engine.field("mocap_pos")[:, self.goal.mocap].copy_(self.target)
+        self.actions.copy_(actions)
+        asked = (actions + 1.0).mul_(0.5).clamp_(0.0, 1.0)
+        self.speeds.lerp_(asked.sqrt(), self.follow)
+        noise = self.step_draws("thrust").normal(0.0, self.params.thrust_noise, (len(MOTORS),))
+        thrusts = torch.addcmul(self.speeds.square(), asked, noise).clamp_(0.0, 1.0)
+        self.env.engine.field("ctrl").copy_(thrusts.mul_(self.max_thrust))
+
+    def get_observations(self) -> None:
+        """Fill obs_buf."""
+        data = self.robot.data
+        quat = data.root_quat_w
+        torch.cat(
+            [
+                self.target - data.root_pos_w,
+                axis_x(quat),
+                axis_y(quat),
+                axis_z(quat),
+                data.root_lin_vel_w,
+                data.root_ang_vel_w,
+            ],
+            dim=1,
+            out=self.obs_buf,
+        )
+
+    def calculate_metrics(self) -> None:
+        """Nearness; near the target, uprightness and not to turn; less a little where actions are small."""
+        data = self.robot.data
+        self.distance.copy_(length(self.target - data.root_pos_w))
+        near = 1.0 / (1.0 + self.distance)
+        up = axis_z(data.root_quat_w)[:, 2].clamp_(0.0, 1.0)
+        still = (-data.root_ang_vel_w.square().sum(dim=1)).exp_()
+        low_effort = (-0.5 * self.actions.square().sum(dim=1)).exp_()
+        reward = torch.addcmul(near, near, up.add_(still, alpha=0.01))
+        self.rew_buf.copy_(reward.sub_(low_effort, alpha=self.params.effort_cost))
+
+    def is_done(self) -> None:
+        """Too far, too low, too high or upside down; the framework adds the time-out."""
+        data = self.robot.data
+        low, high = self.params.height_range
+        height, up = data.root_pos_w[:, 2], axis_z(data.root_quat_w)[:, 2]
+        self.reset_buf.copy_((self.distance > self.params.max_distance) | (height < low) | (height > high) | (up < 0.0))

@@ -1,0 +1,11 @@
+"""Hand: a cube turned in the fingers of a hand. Numbers and their sources: docs/zoo/hand-reorient.md."""
+
+from rlcli.task import TaskSpec
+
+DIRECT = TaskSpec(
+    package=__name__,
+    config="direct.yaml",
+    summary="Turn a cube in a four-fingered hand to one orientation after another (direct, OmniIsaacGymEnvs' rewards).",
+    task="rlcli_tasks.hand_reorient.task:HandTask",
+    terms=("rlcli_tasks.hand_reorient.terms",),
+)

@@ -1,0 +1,201 @@
+"""Hand in the direct workflow: fingers turn a cube to one orientation after another.
+
+The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, and
+what outlives a step is written in place.
+"""
+
+from __future__ import annotations
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from rlcli.config.schema import StrictModel
+from rlcli.envs.articulation import ArticulationView
+from rlcli.envs.direct import DirectTask
+from rlcli.sim.rotations import conjugate, length, multiply, random_quaternion, turn_between, unique
+from rlcli.sim.selection import Selection
+
+FINGERS = ("index", "middle", "ring", "thumb")
+JOINTS = tuple(f"{finger}_{joint}" for finger in FINGERS for joint in range(4))
+_QUAT, _XYZ = ("w", "x", "y", "z"), ("x", "y", "z")
+GOAL = slice(45, 53)
+"""Columns of the observation that a new goal changes."""
+
+
+class HandTask(DirectTask):
+    """Turn the cube to the goal, again and again. Observations: docs/zoo/hand-reorient.md lists the 69 columns.
+
+    The critic's states are these and what the ends of the fingers do and feel, 145 columns in all.
+    """
+
+    num_observations = 69
+    num_actions = 16
+    num_states = 145
+    observation_names = (
+        *(f"{joint}_pos" for joint in JOINTS),
+        *(f"{joint}_vel" for joint in JOINTS),
+        *(f"cube_{axis}" for axis in _XYZ),
+        *(f"cube_quat_{axis}" for axis in _QUAT),
+        *(f"cube_vel_{axis}" for axis in _XYZ),
+        *(f"cube_rate_{axis}" for axis in _XYZ),
+        *(f"goal_quat_{axis}" for axis in _QUAT),
+        *(f"turn_quat_{axis}" for axis in _QUAT),
+        *(f"{joint}_action" for joint in JOINTS),
+    )
+    observation_units = (
+        *("half range",) * 16,
+        *("5 rad/s",) * 16,
+        *("m",) * 3,
+        *("",) * 4,
+        *("m/s",) * 3,
+        *("5 rad/s",) * 3,
+        *("",) * 24,
+    )
+    action_names = JOINTS
+    motors = False
+
+    class Params(StrictModel):
+        """The task's own settings."""
+
+        goal_pos: tuple[float, float, float] = Field((-0.01, 0.0, 0.55), description="Where the cube belongs [m].")
+        shown_pos: tuple[float, float, float] = Field((0.12, 0.2, 0.62), description="Where the goal is shown [m].")
+        smoothing: float = Field(
+            0.5, gt=0, le=1, description="Share of the new target in a step; the rest is the last step's target."
+        )
+        success_tolerance: float = Field(0.2, gt=0, description="Angle at which a goal counts as reached [rad].")
+        fall_distance: float = Field(0.24, gt=0, description="Distance from its place at which the cube is lost [m].")
+        distance_weight: float = Field(-10.0, description="Reward on the distance from the cube's place [1/m].")
+        rotation_weight: float = Field(1.0, description="Reward on 1 / (angle to the goal + rotation_eps) [rad].")
+        rotation_eps: float = Field(0.1, gt=0, description="See rotation_weight [rad].")
+        action_weight: float = Field(-0.0002, description="Reward on the sum of squared actions.")
+        goal_bonus: float = Field(250.0, description="Reward of a step that reaches a goal.")
+        fall_reward: float = Field(0.0, description="Reward of the step in which the cube is lost, besides the others.")
+        position_noise: float = Field(0.01, ge=0, description="Start: position of the cube +- [m].")
+        joint_noise: float = Field(
+            0.2, ge=0, le=1, description="Start: share of the way from the default to a position drawn in the range."
+        )
+
+    params: Params
+
+    def set_up_scene(self, scene) -> None:
+        """Register the view of the hands."""
+        self.hands = scene.add(ArticulationView("robot", name="hand_view"))
+
+    def post_reset(self) -> None:
+        """Make what the hooks use: constants, and buffers that keep their place."""
+        self.robot, self.cube, self.shown = (self.env.entities[name] for name in ("robot", "object", "goal"))
+        data, params, n, device = self.robot.data, self.params, self.num_envs, self.device
+        self.low, self.high = (ends.clone() for ends in data.joint_pos_limits.to(device).unbind(dim=1))
+        self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        default, noise = data.default_joint_pos[0], params.joint_noise
+        self.start_low, self.start_high = (torch.lerp(default, end, noise) for end in (self.low, self.high))
+        self.ends = torch.tensor(
+            [self.robot.names["Bodies"].index(f"{finger}_distal") for finger in FINGERS], device=device
+        )
+        self.goal_pos = torch.tensor([params.goal_pos], device=device).repeat(n, 1)
+        self.shown_pos = torch.tensor([params.shown_pos], device=device).repeat(n, 1)
+        self.goal_quat = torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device).repeat(n, 1)
+        self.actions = torch.zeros(n, self.num_actions, device=device)
+        self.targets = torch.zeros(n, self.num_actions, device=device)
+        self.distance = torch.zeros(n, device=device)
+        self.angle = torch.zeros(n, device=device)
+        self.successes = torch.zeros(n, device=device)  # goals reached in the running episode
+        self.episode_metrics["successes"] = self.successes
+        self.extras["angle"] = self.angle  # to the goal [rad]
+
+    def reset(self, selection: Selection) -> None:
+        """Fingers about their default and at rest, the cube above the palm in any orientation, and a goal."""
+        joints = selection.uniform(self.start_low, self.start_high, (self.num_actions,))
+        self.robot.write_joint_positions(selection, joints)
+        noise = self.params.position_noise
+        place = selection.read(self.cube.data.default_root_state[:, :3])
+        place += selection.uniform(-noise, noise, (3,))
+        self.cube.write_root_pose(selection, place, _any_rotation(selection))
+        self._draw_goal(selection)
+        selection.write(self.targets, joints)
+        selection.write(self.actions, 0.0)
+        selection.write(self.successes, 0.0)
+
+    def pre_physics_step(self, actions: Tensor) -> None:
+        """Position targets, smoothed."""
+        self.actions.copy_(actions)
+        wanted = torch.addcmul(self.middle, self.half, actions)
+        self.targets.lerp_(wanted, self.params.smoothing)
+        torch.clamp(self.targets, self.low, self.high, out=self.targets)
+        self.hands.set_joint_position_targets(self.targets)
+
+    def get_observations(self) -> None:
+        """Fill obs_buf."""
+        hand, cube = self.robot.data, self.cube.data
+        torch.cat(
+            [
+                (hand.joint_pos - self.middle) / self.half,
+                hand.joint_vel * 0.2,
+                cube.root_pos_w,
+                unique(cube.root_quat_w),
+                cube.root_lin_vel_w,
+                cube.root_ang_vel_w * 0.2,
+                self._goal(),
+                self.actions,
+            ],
+            dim=1,
+            out=self.obs_buf,
+        )
+
+    def get_states(self) -> None:
+        """Fill states_buf: what the policy sees, then position, orientation, velocity and load of the fingers' ends."""
+        data, ends = self.robot.data, self.ends
+        # a new episode has had no physics step: what the sensors show is not of its state
+        felt = (self.progress_buf > 0).mul(0.1)
+        torch.cat(
+            [
+                self.obs_buf,
+                data.body_pos_w[:, ends].flatten(1),
+                data.body_quat_w[:, ends].flatten(1),
+                data.body_lin_vel_w[:, ends].flatten(1),
+                data.body_ang_vel_w[:, ends].flatten(1) * 0.2,
+                data.sensordata * felt[:, None],
+            ],
+            dim=1,
+            out=self.states_buf,
+        )
+
+    def calculate_metrics(self) -> None:
+        """Closeness in place and in orientation, less effort; a bonus for a goal, which is then drawn anew."""
+        params, cube = self.params, self.cube.data
+        self.distance.copy_(length(cube.root_pos_w - self.goal_pos))
+        self.angle.copy_(turn_between(self.goal_quat, cube.root_quat_w))
+        reached = self.angle <= params.success_tolerance
+        reward = params.rotation_weight / (self.angle + params.rotation_eps)
+        reward.add_(self.distance, alpha=params.distance_weight)
+        reward.add_(self.actions.square().sum(dim=1), alpha=params.action_weight)
+        reward.add_(reached, alpha=params.goal_bonus)
+        reward.add_(self.distance >= params.fall_distance, alpha=params.fall_reward)
+        self.rew_buf.copy_(reward)
+        self.successes.add_(reached)
+        due = self.selection(reached, "goal")
+        if due is not None:
+            self._draw_goal(due)
+            self.obs_buf[:, GOAL] = self._goal()  # the policy acts on the new goal at once
+            if self.num_states:
+                self.states_buf[:, GOAL] = self.obs_buf[:, GOAL]
+
+    def is_done(self) -> None:
+        """The cube is lost; the framework adds the time-out."""
+        self.reset_buf.copy_(self.distance >= self.params.fall_distance)
+
+    def _draw_goal(self, selection: Selection) -> None:
+        quat = _any_rotation(selection)
+        selection.write(self.goal_quat, quat)
+        self.shown.write_root_pose(selection, selection.read(self.shown_pos), quat)
+
+    def _goal(self) -> Tensor:
+        """Orientation of the goal, and the turn from it to the cube. (num_envs, 8)"""
+        turn = multiply(self.cube.data.root_quat_w, conjugate(self.goal_quat))
+        return torch.cat([self.goal_quat, unique(turn)], dim=1)
+
+
+def _any_rotation(selection: Selection) -> Tensor:
+    """A rotation drawn uniformly, w >= 0. (rows, 4)"""
+    return unique(random_quaternion(*selection.uniform(0.0, 1.0, (3,)).unbind(1)))

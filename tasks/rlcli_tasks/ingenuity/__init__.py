@@ -1,0 +1,10 @@
+"""Ingenuity: fly from point to point on Mars with two coaxial rotors. Numbers, sources: docs/zoo/ingenuity.md."""
+
+from rlcli.task import TaskSpec
+
+DIRECT = TaskSpec(
+    package=__name__,
+    config="direct.yaml",
+    summary="Fly from point to point with the Mars helicopter (direct, OmniIsaacGymEnvs' numbers).",
+    task="rlcli_tasks.ingenuity.task:IngenuityTask",
+)

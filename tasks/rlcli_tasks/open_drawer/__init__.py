@@ -1,0 +1,9 @@
+"""Open drawer: an arm pulls a drawer open by its handle. Numbers and their sources: docs/zoo/open-drawer.md."""
+
+from rlcli.task import TaskSpec
+
+DIRECT = TaskSpec(
+    package=__name__,
+    summary="Pull a drawer open by its handle (direct, OmniIsaacGymEnvs' numbers).",
+    task="rlcli_tasks.open_drawer.task:DrawerTask",
+)

@@ -1,0 +1,10 @@
+"""Quadcopter: fly to a point and hover, with tilting rotors. Numbers and their sources: docs/zoo/quadcopter.md."""
+
+from rlcli.task import TaskSpec
+
+DIRECT = TaskSpec(
+    package=__name__,
+    config="direct.yaml",
+    summary="Hover at a point with four tilting rotors (direct, OmniIsaacGymEnvs' numbers).",
+    task="rlcli_tasks.quadcopter.task:QuadcopterTask",
+)

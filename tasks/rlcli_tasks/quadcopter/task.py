@@ -1,0 +1,118 @@
+"""Quadcopter in the direct workflow: fly to a point and stay there, with four thrusts and eight rotor tilts.
+
+The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, and
+what outlives a step is written in place.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from rlcli.config.schema import StrictModel
+from rlcli.envs.direct import DirectTask
+from rlcli.sim.rotations import length
+from rlcli.sim.selection import Selection
+
+ROTORS = ("fl", "bl", "br", "fr")
+JOINTS = tuple(f"{joint}_{rotor}" for rotor in ROTORS for joint in ("pitch", "roll"))
+THRUSTS = tuple(f"thrust_{rotor}" for rotor in ROTORS)
+
+
+class QuadcopterTask(DirectTask):
+    """Hover at the target. Observations: docs/zoo/quadcopter.md lists the 21 columns."""
+
+    num_observations = 21
+    num_actions = 12
+    observation_names = (
+        *("to_target_x", "to_target_y", "to_target_z", "quat_w", "quat_x", "quat_y", "quat_z"),
+        *("vel_x", "vel_y", "vel_z", "rate_x", "rate_y", "rate_z"),
+        *(f"{joint}_pos" for joint in JOINTS),
+    )
+    observation_units = (*("3 m",) * 3, *("",) * 4, *("2 m/s",) * 3, *("pi rad/s",) * 3, *("rad",) * 8)
+    action_names = (*JOINTS, *THRUSTS)
+    motors = False
+
+    class Params(StrictModel):
+        """The task's own settings."""
+
+        tilt_speed: float = Field(25.132741, gt=0, description="Speed of a tilt's target at action 1, 8 pi [rad/s].")
+        thrust_speed: float = Field(100.0, gt=0, description="Change of a thrust at action 1 [N/s].")
+        max_thrust: float = Field(2.0, gt=0, description="Largest thrust of a rotor, either way [N].")
+        max_distance: float = Field(3.0, gt=0, description="Distance to the target beyond which it fails [m].")
+        min_height: float = Field(0.3, description="Height below which it fails [m].")
+        start_low: tuple[float, float, float] = Field(
+            (-1.5, -1.5, -0.2), description="Start: least offset from the default position [m]."
+        )
+        start_high: tuple[float, float, float] = Field((1.5, 1.5, 1.5), description="Start: greatest offset [m].")
+        joint_pos_noise: float = Field(0.2, ge=0, description="Start: tilts +-, inside their limits [rad].")
+
+    params: Params
+
+    def post_reset(self) -> None:
+        """Make what the hooks use: constants, and buffers that keep their place."""
+        params, n = self.params, self.num_envs
+        self.robot, self.goal = self.env.entities["robot"], self.env.entities["target"]
+        self.low, self.high = self.robot.data.joint_pos_limits.to(self.device).unbind(dim=1)
+        noise = params.joint_pos_noise
+        self.tilt_low, self.tilt_high = self.low.clamp(min=-noise), self.high.clamp(max=noise)
+        self.start_low = torch.tensor(params.start_low, device=self.device)
+        self.start_high = torch.tensor(params.start_high, device=self.device)
+        self.tilts = torch.zeros(n, len(JOINTS), device=self.device)
+        """What the servos hold. (n, 8) [rad]"""
+        self.thrusts = torch.zeros(n, len(THRUSTS), device=self.device)
+        """(n, 4) [N]"""
+        self.distance = torch.zeros(n, device=self.device)
+        self.extras["distance"] = self.distance  # to the target [m]
+
+    def reset(self, selection: Selection) -> None:
+        """Somewhere about the target, level and at rest, with tilted rotors and no thrust."""
+        default = selection.peek(self.robot.data.default_root_state)
+        position = default[:, :3] + selection.uniform(self.start_low, self.start_high, (3,))
+        tilts = selection.uniform(self.tilt_low, self.tilt_high, (len(JOINTS),))
+        self.robot.write_root_pose(selection, position, default[:, 3:7])
+        self.robot.write_joint_positions(selection, tilts)
+        selection.write(self.tilts, tilts)
+        selection.write(self.thrusts, 0.0)
+
+    def pre_physics_step(self, actions: Tensor) -> None:
+        """Actions are speeds: of the tilts that the servos hold, and of the thrusts."""
+        params, dt = self.params, self.step_dt
+        tilts, thrusts = actions.split([len(JOINTS), len(THRUSTS)], dim=1)
+        torch.clamp(self.tilts.add_(tilts, alpha=dt * params.tilt_speed), self.low, self.high, out=self.tilts)
+        self.thrusts.add_(thrusts, alpha=dt * params.thrust_speed).clamp_(-params.max_thrust, params.max_thrust)
+        self.env.engine.field("ctrl").copy_(torch.cat([self.tilts, self.thrusts], dim=1))
+
+    def get_observations(self) -> None:
+        """Fill obs_buf."""
+        data = self.robot.data
+        torch.cat(
+            [
+                (self.goal.data.root_pos_w - data.root_pos_w).div_(3.0),
+                data.root_quat_w,
+                data.root_lin_vel_w * 0.5,
+                data.root_ang_vel_w / math.pi,
+                data.joint_pos,
+            ],
+            dim=1,
+            out=self.obs_buf,
+        )
+
+    def calculate_metrics(self) -> None:
+        """Nearness; and near the target, uprightness and not to spin."""
+        data = self.robot.data
+        self.distance.copy_(length(self.goal.data.root_pos_w - data.root_pos_w))
+        _, x, y, _ = data.root_quat_w.unbind(dim=1)
+        tilt = 2.0 * torch.addcmul(x * x, y, y)  # 1 - cos of the angle between up and the vertical
+        spin = data.root_ang_vel_w[:, 2].square()
+        near = 1.0 / (1.0 + 3.0 * self.distance.square())
+        posture = 1.0 / (1.0 + 10.0 * tilt.square()) + 1.0 / (1.0 + 0.001 * spin) - spin / 400.0
+        torch.clamp(near + near * posture, min=0.0, out=self.rew_buf)
+
+    def is_done(self) -> None:
+        """Too far or too low; the framework adds the time-out."""
+        low = self.robot.data.root_pos_w[:, 2] < self.params.min_height
+        self.reset_buf.copy_((self.distance > self.params.max_distance) | low)

@@ -1,0 +1,113 @@
+"""Bundles from strangers: refused as checkpoints are, in one sentence; nothing is executed, changed or used up."""
+
+import json
+import pickle
+import shutil
+
+import pytest
+import safetensors.torch
+import torch
+from bad_checkpoints import PLAYED, Bomb, Case, forged, named, setting
+from fault_sizes import amount, chosen
+from saved_states import rehash
+from test_bad_checkpoints import command, limited, look
+
+from rlcli.cli.app import main
+from rlcli.errors import CheckpointError
+from rlcli.registry import find_task
+from rlcli.rl.checkpoint import open_checkpoint
+
+HELD = ("manifest.json", "policy.json", "policy.safetensors")
+
+
+@pytest.fixture
+def gift(tmp_path, monkeypatch):
+    """A good bundle, whose policy normalises."""
+    monkeypatch.chdir(tmp_path)
+    folder = shutil.copytree(find_task("cartpole").policy, tmp_path / "a" / "b" / "gift")
+    spec = json.loads((folder / "policy.json").read_text())
+    (folder / "policy.json").write_text(json.dumps({**spec, "normalize": True}))
+    weights = safetensors.torch.load((folder / "policy.safetensors").read_bytes())
+    for name, value in (("mean", 0.0), ("var", 1.0)):
+        weights[f"normalizer.{name}"] = torch.full((4,), value, dtype=torch.float64)
+    weights["normalizer.count"] = torch.tensor(100.0, dtype=torch.float64)
+    (folder / "policy.safetensors").write_bytes(safetensors.torch.save(weights))
+    rehash(folder, "policy.json", "policy.safetensors")
+    return folder
+
+
+def test_the_bundle_that_is_damaged_below_is_a_good_one(gift, capfd):
+    for reader in ("play", "eval", "export"):
+        assert main(command(reader, gift)) == 0
+    capfd.readouterr()
+
+
+def own():
+    """Damages of what only a bundle says."""
+    for name, *change in (
+        ("bundle 2", "bundle", 2), ("bundle true", "bundle", True), ("bundle text", "bundle", "1"),
+        ("no task", "task", None), ("task text", "task", "cartpole"), ("task ..", "task", "name", ".."),
+        ("task a/b", "task", "name", "a/b"), ("task list", "task", "name", ["cartpole"]),
+        ("task escape", "task", "name", "a\x1b[2J"), ("distribution 3", "task", "distribution", 3),
+        ("agent list", "agent", ["x"]), ("agent escape", "agent", "a\x1b[2J"), ("agent long", "agent", "a" * 10**6),
+        ("layout text", "layout", "x"), ("layout list", "layout", []), ("no columns", "layout", {}),
+        ("columns text", "layout", "observations", "x"),
+    ):  # fmt: skip
+        *path, value = change
+
+        def damage(folder, path=path, value=value):
+            file = folder / "manifest.json"
+            document = json.loads(file.read_text())
+            setting(*path, to=value)(document)
+            file.write_text(json.dumps(document))
+
+        yield Case(name, damage, PLAYED)
+
+
+def applies(case):
+    """Whether a damage is one of what a bundle has: its folder is not named after a step."""
+    return case.run == "ppo" and "play" in case.readers and case.name != "step 7"
+
+
+CASES = [case for case in named() if applies(case)]
+
+
+@pytest.mark.parametrize("case", [*chosen(CASES, 40), *own()], ids=lambda case: case.name)
+def test_it_is_refused_in_one_sentence_and_stays_as_it_was(case, gift, capfd):
+    case.damage(gift)
+    before = look(gift)
+    for reader in sorted({"play", "export"} & set(case.readers)):
+        arguments = command(reader, gift)
+        code = limited(arguments) if case.bomb else main(arguments)
+        out, err = capfd.readouterr()
+        assert code == 5, f"{case.name}, {reader}: exit {code}\n{err}"
+        assert "Traceback" not in err
+        assert "\x1b[2J" not in err
+        errors = [line for line in err.splitlines() if line.startswith("error:") and not line.startswith("error:   ")]
+        assert len(errors) == 1, err
+        assert "gift" in errors[0]
+        assert len(errors[0]) < 1000, "a message is no copy of the file"
+        assert (out, look(gift)) == ("", before)
+        assert not (gift.parents[2] / "executed").exists()
+
+
+@pytest.mark.parametrize("case", list(forged(amount(10, 200))), ids=lambda case: case.name)
+def test_with_hashes_that_agree_it_is_refused_or_a_policy_like_any_other(case, gift):
+    if not (gift / case.name.split()[1]).is_file():
+        assert case.name.split()[1] not in HELD  # it is of a file that a bundle does not have
+        return
+    case.damage(gift)
+    try:
+        policy = open_checkpoint(gift).policy()
+    except CheckpointError:
+        return
+    assert all(bool(value.isfinite().all()) for value in policy.state_dict().values())
+
+
+def test_pickles_beside_the_policy_are_not_read(gift, capfd):
+    for name in ("policy.pkl", "policy.pt", "trainer.safetensors"):
+        (gift / name).write_bytes(pickle.dumps(Bomb()))
+    assert main(command("play", gift)) == 0
+    assert main(command("export", gift)) == 0
+    capfd.readouterr()
+    assert not (gift.parents[2] / "executed").exists()
