@@ -220,11 +220,12 @@ def test_a_time_limit_ends_training_and_the_policy_of_that_moment_is_judged(cli)
 
 
 @pytest.mark.slow
-def test_settings_that_cannot_be_trained_end_the_sweep_with_what_is_wrong(cli):
-    words = ("--param", "agent.num_minibatches=7,11,13", "--trials", 8, "--max-iterations", 1)
+def test_settings_that_no_trial_survives_end_the_sweep_with_what_is_wrong(cli):
+    words = ("--param", "agent.learning_rate=1e30,1e31,1e32", "--trials", 8, "--max-iterations", 3)
     result = cli("sweep", "cartpole", *SMALL, *words)
-    assert result.code != 0
-    assert "minibatch" in result.err
+    assert result.code == 6, result.err
+    assert "the first 3 trials failed" in result.err
+    assert len(list(Path("runs/cartpole/sweep-sweep").glob("trial-*"))) == 3
 
 
 def postgres_programs():
