@@ -56,28 +56,17 @@ def begun(
     from rlcli.rl.environment import environment_record, file_digest
     from rlcli.rl.job import threads
     from rlcli.rl.loggers import check_loggers
-<<<<<<< HEAD
-    from rlcli.rl.run import create_run
-=======
-    from rlcli.rl.run import find_checkpoint
->>>>>>> t-study
 
     loggers = check_loggers(logger)
     _require_drawing(video_every)
     initial = None
     if init_from is not None:
-<<<<<<< HEAD
         from rlcli.rl.choice import choose
 
         choice = choose(init_from, runs, resolved.source, any_task=True, tell=console.warn)
         initial = choice.folder
         console.info(f"weights of {initial} ({choice.why})")
-    record |= {
-=======
-        _, initial, why = find_checkpoint(init_from, runs, tell=console.warn)
-        console.info(f"weights of {initial} ({why})")
     return record | {
->>>>>>> t-study
         "task": resolved.source.record() | {"file": resolved.source.config.name},
         "agent": resolved.agent_name,
         "loggers": loggers,
