@@ -414,7 +414,7 @@ def test_a_checkpoint_carries_times_and_history(tmp_path):
         (contact(), "feet: missing key 'bodies'", None),
         (contact(bodies="torso", hisotry=2), "feet.hisotry: unknown key", "did you mean 'history'"),
         ({"bodies": "torso"}, "feet: missing key 'kind'", "contact"),
-        ({"kind": "contct", "bodies": "torso"}, "feet.kind: expected 'contact' or 'rays', found 'contct'", "'contact'"),
+        ({"kind": "contct", "bodies": "torso"}, "feet.kind: expected 'contact' or 'rays' or 'camera'", "'contact'"),
         (rays(pattern={"size": [1, 1], "resolution": 0}), "pattern.resolution: expected a number > 0", None),
         (rays(pattern=[[0, 0, 0]]), "feet.pattern.0: a direction must not be zero", None),
         (rays(pattern=[]), "feet.pattern: ", None),
@@ -424,7 +424,7 @@ def test_a_checkpoint_carries_times_and_history(tmp_path):
         (rays(pattern=[[0, 1, -1]], lookup=True, alignment="yaw"), "feet: lookup is for rays straight down", None),
         (rays(**DOWN), "feet: lookup is for rays straight down", None),
         (rays(**DOWN, alignment="yaw", sees="all"), "feet: lookup is for rays that see", None),
-        (rays(**DOWN, alignment="yaw"), "feet.lookup: there is no table of heights to look in: the scene has no terrain",
+        (rays(**DOWN, alignment="yaw"), "feet.lookup: there is no table of heights to look in: the scene has no terra",
          "lookup: false"),
     ],
 )  # fmt: skip
