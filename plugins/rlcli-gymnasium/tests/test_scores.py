@@ -62,6 +62,17 @@ def test_the_table_has_medians_and_says_what_is_reached():
     assert not entry["reached"]
 
 
+def test_scores_are_put_between_the_marks_of_a_page_and_nowhere_else(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("above\n<!-- scores -->\nold\n<!-- end scores -->\nbelow\n")
+    gym_scores.put(page, "new")
+    assert page.read_text() == "above\n<!-- scores -->\nnew\n<!-- end scores -->\nbelow\n"
+    page.write_text("no marks\n")
+    with pytest.raises(SystemExit):
+        gym_scores.put(page, "new")
+    assert page.read_text() == "no marks\n"
+
+
 @pytest.mark.slow
 def test_one_command_trains_evaluates_and_writes_the_scores(tmp_path):
     output = tmp_path / "scores.json"
