@@ -22,6 +22,7 @@ COMMANDS = {
     "show": "show",
     "validate": "validate",
     "train": "train",
+    "sweep": "sweep",
     "play": "play",
     "eval": "eval",
     "stress": "stress",

@@ -26,11 +26,36 @@ def created(
     video_every: int | None,
 ) -> Job:
     """A new run, its folder written before anything heavy is imported."""
-    from rlcli.config.dump import given, to_data, to_yaml
-    from rlcli.rl.environment import environment_record, file_digest
-    from rlcli.rl.job import Job, threads
-    from rlcli.rl.loggers import check_loggers
+    from rlcli.config.dump import to_data, to_yaml
+    from rlcli.rl.job import Job
     from rlcli.rl.run import create_run
+
+    record = begun(resolved, runs, record, logger, init_from, video_every)
+    run = create_run(runs, resolved.source.name, name, to_yaml(to_data(resolved)), record)
+    console.info(f"run {run.folder}")
+    initial = record["init_from"]
+    return Job(
+        run,
+        resolved,
+        record["loggers"],
+        init_from=Path(initial) if initial else None,
+        video_every=record["video_every"],
+    )
+
+
+def begun(
+    resolved: Resolved,
+    runs: Path,
+    record: dict[str, Any],
+    logger: list[str] | None,
+    init_from: str | None,
+    video_every: int | None,
+) -> dict[str, Any]:
+    """What a new run's run.json says besides its seed and device."""
+    from rlcli.config.dump import given
+    from rlcli.rl.environment import environment_record, file_digest
+    from rlcli.rl.job import threads
+    from rlcli.rl.loggers import check_loggers
 
     loggers = check_loggers(logger)
     _require_drawing(video_every)
@@ -41,7 +66,7 @@ def created(
         choice = choose(init_from, runs, resolved.source, any_task=True, tell=console.warn)
         initial = choice.folder
         console.info(f"weights of {initial} ({choice.why})")
-    record |= {
+    return record | {
         "task": resolved.source.record() | {"file": resolved.source.config.name},
         "agent": resolved.agent_name,
         "loggers": loggers,
@@ -51,9 +76,6 @@ def created(
         "given": given(resolved),
         **environment_record(resolved, *threads(resolved)),
     }
-    run = create_run(runs, resolved.source.name, name, to_yaml(to_data(resolved)), record)
-    console.info(f"run {run.folder}")
-    return Job(run, resolved, loggers, init_from=initial, video_every=video_every or 0)
 
 
 def resumed(
@@ -70,7 +92,7 @@ def resumed(
     from rlcli.rl.job import Job
     from rlcli.rl.load import resolve_run
     from rlcli.rl.loggers import check_loggers
-    from rlcli.rl.run import require_own
+    from rlcli.rl.run import WAITING, require_own
 
     run, folder, why = _where_to_begin(reference, runs, None if named is None else named.name)
     if run.record.get("state") == "finished" and not budget and folder is not None:
@@ -94,7 +116,9 @@ def resumed(
     except BaseException:
         run.unlock()
         raise
-    if folder is None:
+    if run.record.get("state") == WAITING:
+        console.info(f"run {run.folder}")
+    elif folder is None:
         console.info(f"{run.folder} ({why}) ended before its first checkpoint: it begins again")
     else:
         console.info(f"resuming {folder} ({why})")

@@ -6,6 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -44,6 +45,12 @@ def command(
         int | None,
         typer.Option("--seed", min=-1, max=MAX_SEED, help="Seed of everything random; -1 draws one; default 42."),
     ] = None,
+    seeds: Annotated[
+        str | None, typer.Option("--seeds", help="Several seeds, a run each, in one study folder: 0..4 or 1,5,9.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", min=1, help="With --seeds: trainings at a time; default 1.")
+    ] = None,
     num_envs: NumEnvs = None,
     max_iterations: Annotated[int | None, typer.Option("--max-iterations", help="Iterations to train for.")] = None,
     max_steps: Annotated[int | None, typer.Option("--max-steps", help="Environment steps to train for.")] = None,
@@ -78,6 +85,7 @@ def command(
     headless: Headless = True,
 ) -> None:
     """Train a policy."""
+    from rlcli.cli.children import on_leash
     from rlcli.cli.jobs import agree, created, fitting_device, process_device, require_parallel, resumed
     from rlcli.config.load import resolve
     from rlcli.errors import Stopped, UsageError
@@ -87,14 +95,17 @@ def command(
     from rlcli.rl.trust import named_task
 
     console.quiet, console.verbose = quiet, verbose
+    on_leash()
     # libgomp's threads spin while they wait; on a busy machine that makes an update ten times slower
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     console.follows = not distributed.leads()
     runs, budget = runs_dir or default_runs_dir(), _budget(max_iterations, max_steps)
+    several = _several(seeds, jobs, seed, gpus, resume, runs)
     wanted, device = device, process_device(device, gpus)
     fixed = {
         "--agent": agent,
         "--seed": seed,
+        "--seeds": seeds,
         "--num-envs": num_envs,
         "--config": config,
         "--init-from": init_from,
@@ -122,6 +133,10 @@ def command(
     if gpus is not None and gpus > 1 and not distributed.launched():
         raise typer.Exit(distributed.launch(gpus, sys.argv[1:]))
 
+    if several is not None:
+        _train_several(several, jobs or 1, stop, resolved, device, wanted, runs, name, logger, init_from, video_every)
+        return
+
     def begin() -> Job | None:
         if resolved is None:
             assert resume is not None
@@ -138,6 +153,51 @@ def command(
             raise Stopped("stopped at once", exit_code=stop.exit_code) from None
         finally:
             distributed.leave()
+
+
+def _several(
+    seeds: str | None, jobs: int | None, seed: int | None, gpus: int | None, resume: str | None, runs: Path
+) -> list[int] | Path | None:
+    """The seeds of a new study, or the folder of one that goes on; None for a single training."""
+    from rlcli.errors import UsageError
+    from rlcli.rl import distributed
+    from rlcli.rl.run import STUDY
+    from rlcli.rl.study import read_seeds
+
+    study = None
+    if resume is not None:
+        study = next((place for place in (Path(resume), runs / resume) if (place / STUDY).is_file()), None)
+    if seeds is None and study is None:
+        if jobs is not None:
+            raise UsageError("--jobs is of several trainings", hint="--seeds 0..4 --jobs 2")
+        return None
+    if seed is not None or gpus is not None or distributed.launched():
+        other = "--seed" if seed is not None else "--gpus"
+        raise UsageError(f"--seeds and {other} contradict each other", hint=f"leave out {other}")
+    return study if seeds is None else read_seeds(seeds)
+
+
+def _train_several(
+    several: list[int] | Path,
+    jobs: int,
+    stop: StopRequest,
+    resolved: Any,
+    device: str,
+    wanted: str,
+    runs: Path,
+    name: str | None,
+    logger: list[str] | None,
+    init_from: str | None,
+    video_every: int | None,
+) -> None:
+    from rlcli.cli.seeds import create, train_all
+
+    if isinstance(several, Path):
+        train_all(several, None if wanted == "auto" else device, jobs, stop)
+        return
+    how = {"logger": logger, "init_from": init_from, "video_every": video_every}
+    folder = create(resolved, runs, name, {"device": device}, several, **how)
+    train_all(folder, device, jobs, stop)
 
 
 def _budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:

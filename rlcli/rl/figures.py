@@ -106,6 +106,38 @@ def picture(panels: Sequence[Panel], x_label: str, kind: str, *, title: str = ""
         return _bytes(figure, kind)
 
 
+def scatter(
+    columns: Sequence[tuple[str, Sequence[Any], bool]], values: Sequence[float], label: str, *, title: str
+) -> bytes:
+    """What trials reached over each thing that they varied in, as SVG.
+
+    Args:
+        columns: name, value of each trial, and whether the axis is logarithmic; what is no number has a place each.
+        values: what the trials reached.
+        label: of it.
+        title: of the picture.
+    """
+    wide = min(3, len(columns))
+    rows = -(-len(columns) // wide)
+    with _drawing({}):
+        figure = _figure((_WIDTH * wide * 0.75, _HEIGHT * rows * 0.85))
+        for place, (name, given, log) in enumerate(columns):
+            axes = figure.add_subplot(rows, wide, place + 1)
+            numbers = all(type(value) in (int, float) for value in given)
+            words = sorted({str(value) for value in given})
+            x = given if numbers else [words.index(str(value)) for value in given]
+            axes.scatter(x, values, s=18.0, color=COLORS[0], alpha=0.8, linewidths=0.0)
+            if log:
+                axes.set_xscale("log")
+            if not numbers:
+                axes.set_xticks(range(len(words)), [_text(word, 16) for word in words])
+            axes.set_xlabel(_text(name))
+            if place % wide == 0:
+                axes.set_ylabel(_text(label))
+        figure.suptitle(_text(title))
+        return _bytes(figure, ".svg")
+
+
 def panel_svg(panel: Panel, x_label: str, name: str) -> str:
     """One panel as an SVG element for a page, whose text and rules take the page's colours; without a legend.
 

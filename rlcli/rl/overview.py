@@ -14,7 +14,7 @@ from typing import Any
 
 from rlcli.errors import CheckpointError
 from rlcli.rl.reading import read_tail
-from rlcli.rl.run import CONFIG, RECORD, Run, is_locked, open_run
+from rlcli.rl.run import CONFIG, RECORD, STUDY, WAITING, Run, is_locked, open_run
 
 ENDED = {"finished", "stopped", "diverged", "failed"}
 """States that a run says of itself when it ends; one that says `running` and is not locked was interrupted."""
@@ -38,7 +38,7 @@ class Overview:
     folder: Path
     task: str
     state: str
-    """running, finished, stopped, interrupted, diverged, failed, or broken."""
+    """running, waiting, finished, stopped, interrupted, diverged, failed, or broken."""
     reason: str | None = None
     """Why it is not in order, where that is known."""
     resumable: bool = False
@@ -136,7 +136,7 @@ def state_of(run: Run) -> tuple[str, str | None]:
     reason = why if isinstance(why, str) and said in ("diverged", "failed") else None
     if is_locked(run.folder) or (said == "running" and _age(run.record.get("started")) < _BEGINNING_S):
         return "running", None
-    if said in ENDED:
+    if said in ENDED or said == WAITING:
         return said, reason
     if said == "running":
         return "interrupted", "its process ended without a word: a kill, or the machine"
@@ -173,7 +173,11 @@ def _is_new(folder: Path) -> bool:
 def _folders(runs_dir: Path) -> Iterator[Path]:
     """What stands in a run's place: the folders of the folders, those with a dot left out."""
     for task in _subfolders(runs_dir):
-        yield from _subfolders(task)
+        for folder in _subfolders(task):
+            if (folder / STUDY).is_file():
+                yield from _subfolders(folder)
+            else:
+                yield folder
 
 
 def _subfolders(folder: Path) -> list[Path]:

@@ -21,6 +21,10 @@ from rlcli.rl.reading import JSON_LIMIT, parse_json, read_file, refuse_links
 
 CONFIG = "config.yaml"
 RECORD = "run.json"
+STUDY = "study.json"
+"""What a folder holds whose folders are runs of one study: the seeds of a training, or the trials of a sweep."""
+WAITING = "waiting"
+"""State of a run of a study whose turn has not come."""
 LOCK = ".lock"
 MAX_SEED = 2**62
 _TASK = re.compile(r"(?!\.{1,2}$)[^/\\:]{1,255}")
@@ -93,21 +97,47 @@ def create_run(runs_dir: Path, task: str, name: str | None, config: str, record:
         UsageError: for a name that cannot be part of a folder's.
         MachineError: if the folder cannot be made or written.
     """
-    if name is not None and not _NAME.fullmatch(name):
-        raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint="letters, digits, - and _")
+    return begin_run(new_folder(runs_dir, task, name), config, record)
+
+
+def new_folder(runs_dir: Path, task: str, name: str | None) -> Path:
+    """A folder for a run or a study of runs, with the time in its name.
+
+    Raises:
+        UsageError: for a name that cannot be part of a folder's.
+        MachineError: if the folder cannot be made.
+    """
+    require_name(name)
     parent = runs_dir / task
-    now = datetime.now(UTC)
-    stem = now.strftime("%Y-%m-%d_%H-%M-%S") + (f"-{name}" if name else "")
+    stem = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S") + (f"-{name}" if name else "")
     try:
         parent.mkdir(parents=True, exist_ok=True)
-        folder = _fresh_folder(parent, stem)
+        return _fresh_folder(parent, stem)
     except OSError as error:
         raise disk_error(parent, error) from error
+
+
+def require_name(name: str | None) -> None:
+    """A name can be part of a folder's.
+
+    Raises:
+        UsageError: if it cannot.
+    """
+    if name is not None and not _NAME.fullmatch(name):
+        raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint="letters, digits, - and _")
+
+
+def begin_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
+    """Write what a run is to do into its empty folder, and lock it.
+
+    Raises:
+        MachineError: if it cannot be written; the folder is gone then.
+    """
     run = Run(folder)
     try:
         run.checkpoints.mkdir()
         write_atomic(run.config, config)
-        run.update(started=now.isoformat(timespec="microseconds"), state="running", **record)
+        run.update(**{"started": datetime.now(UTC).isoformat(timespec="microseconds"), "state": "running", **record})
         run.lock()
     except (OSError, MachineError) as error:
         shutil.rmtree(folder, ignore_errors=True)
@@ -221,7 +251,9 @@ def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[R
 def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
     """Runs under a folder, oldest first; what is not a run is passed over."""
     runs = []
-    for file in runs_dir.glob(f"*/*/{RECORD}"):
+    for file in (*runs_dir.glob(f"*/*/{RECORD}"), *runs_dir.glob(f"*/*/*/{RECORD}")):
+        if not _stands_right(file, runs_dir):
+            continue
         try:
             run = open_run(file.parent)
         except CheckpointError:
@@ -229,6 +261,12 @@ def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
         if task is None or run.record["task"].get("name") == task:
             runs.append(run)
     return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name))
+
+
+def _stands_right(file: Path, runs_dir: Path) -> bool:
+    """Whether a run lies in a task's folder, or in a study that does."""
+    deep = len(file.relative_to(runs_dir).parts) == 4
+    return not deep or (file.parent.parent / STUDY).is_file()
 
 
 def find_checkpoint(
@@ -389,6 +427,12 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
     ):
         if os.path.isfile(candidate / RECORD):
             return open_run(candidate), "as named"
+        if os.path.isfile(candidate / STUDY):
+            inside = sorted(file.parent.name for file in candidate.glob(f"*/{RECORD}"))
+            raise CheckpointError(
+                f"{candidate} is a study of several runs",
+                hint=f"name one: {listing(str(candidate / n) for n in inside)}",
+            )
     matches = [run for run in list_runs(runs_dir, None) if run.folder.name == reference]
     if len(matches) == 1:
         return matches[0], "as named"

@@ -7,7 +7,16 @@ from pathlib import Path
 
 import torch
 
-from rlcli.errors import ConfigError, DependencyError, DeviceError, RlcliError, TaskError, UsageError, did_you_mean
+from rlcli.errors import (
+    ConfigError,
+    DependencyError,
+    DeviceError,
+    MachineError,
+    RlcliError,
+    TaskError,
+    UsageError,
+    did_you_mean,
+)
 from rlcli.registry import find_task
 from rlcli.testing import lives, portability, values
 from rlcli.testing.subject import Finding, NotRunError, Subject
@@ -134,7 +143,7 @@ def _build(subject: Subject) -> Iterator[Finding]:
             yield Finding(
                 check, "error", where, problem.message, problem.hint or "mend it; `rlcli validate --deep` agrees"
             )
-    except (TaskError, DependencyError, DeviceError):
+    except (TaskError, DependencyError, DeviceError, MachineError):
         raise
     except Exception as error:
         yield _stopped("names", subject, error, [])
@@ -143,7 +152,7 @@ def _build(subject: Subject) -> Iterator[Finding]:
 def _run(name: str, subject: Subject, before: list[Finding]) -> Iterator[Finding]:
     try:
         yield from CHECKS[name](subject)
-    except NotRunError:
+    except (NotRunError, MachineError):
         raise
     except Exception as error:
         yield _stopped(name, subject, error, before)

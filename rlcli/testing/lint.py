@@ -24,7 +24,7 @@ from torch import Tensor
 from rlcli.config.schema import AgentConfig
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import ConfigError, RlcliError, UsageError, did_you_mean
+from rlcli.errors import ConfigError, MachineError, RlcliError, UsageError, did_you_mean
 from rlcli.registry import find_task
 from rlcli.testing.dummies import DUMMIES, Life, live
 from rlcli.testing.subject import Subject, observed
@@ -517,7 +517,7 @@ def lint_task(
 def _judge(name: str, evidence: Evidence) -> Iterator[Remark]:
     try:
         yield from RULES[name](evidence)
-    except ConfigError:
+    except (ConfigError, MachineError):
         raise
     except Exception as error:
         said = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"

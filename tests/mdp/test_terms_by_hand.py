@@ -71,6 +71,8 @@ def test_the_numbers_tell_environments_apart(row):
 
 FORCES = {"body_lin_acc_l2", "body_incoming_wrench"}
 """Terms of forces on bodies: worked out on a pendulum, below."""
+PICTURES = {"image"}
+"""Terms of cameras: worked out in test_pictures.py."""
 EPISODES = {"velocity_tracked_on_average"}
 """Terms of a whole episode: worked out in tests/managers/test_commands_and_curriculum.py."""
 
@@ -78,7 +80,7 @@ EPISODES = {"velocity_tracked_on_average"}
 def test_every_term_of_the_library_is_worked_out_by_hand():
     tabled = {"observations": OBSERVATIONS, "rewards": REWARDS, "terminations": TERMINATIONS, "success": SUCCESS}
     for section, rows in tabled.items():
-        named = {name_of(row) for row in rows} | FORCES | EPISODES
+        named = {name_of(row) for row in rows} | FORCES | PICTURES | EPISODES
         terms = {signature.attribute for signature in builtin_terms(section).values()}
         assert terms, section
         assert terms <= named, terms - named

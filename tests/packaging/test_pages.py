@@ -96,7 +96,9 @@ def test_the_scenes_of_the_page_build_and_run(number, tmp_path):
     entities, sensors = part["scene"]["entities"], part["scene"].get("sensors", {})
     assert list(env.entities) == list(entities)
     assert list(env.sensors) == list(sensors)
-    assert [sensor.names[0] for sensor in env.sensors.values()] == ["leg_fl", "ray_0", "ray_0"][: len(sensors)]
+    names = ["leg_fl", "ray_0", "ray_0", "eye", "above"]
+    assert [sensor.names[0] for sensor in env.sensors.values()] == names[: len(sensors)]
+    env.close()
     assert (env.terrain is None) == ("terrain" not in part["scene"])
 
 

@@ -418,6 +418,11 @@ def test_a_checkpoint_carries_times_and_history(tmp_path):
         (rays(pattern=[[0, 0, -1]], body="leg_.*"), "feet.body: 'leg_.*' is several bodies", "name one"),
         (rays(pattern=[[0, 0, -1]], body="head"), "feet.body: no body matches 'head'", "torso"),
         (rays(pattern=[[0, 0, -1]], sees=[6]), "feet.sees", None),
+        (rays(pattern=[[0, 1, -1]], lookup=True, alignment="yaw"), "feet: lookup is for rays straight down", None),
+        (rays(pattern=[[0, 0, -1]], lookup=True), "feet: lookup is for rays straight down", None),
+        (rays(pattern=[[0, 0, -1]], lookup=True, alignment="yaw", sees="all"), "feet: lookup is for rays that see", None),
+        (rays(pattern=[[0, 0, -1]], lookup=True, alignment="yaw"), "feet.lookup: there is no table of heights to look in: "
+         "the scene has no terrain", "lookup: false"),
     ],
 )  # fmt: skip
 def test_a_sensor_that_does_not_fit_is_refused_with_its_place(tmp_path, sensor, message, hint):

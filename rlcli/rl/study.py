@@ -1,0 +1,116 @@
+"""Studies: one configuration trained with several seeds, in one folder; light, for whoever starts the trainings."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rlcli.errors import CheckpointError, MachineError, UsageError
+from rlcli.rl.files import disk_error, to_json, write_atomic
+from rlcli.rl.reading import parse_json, read_file
+from rlcli.rl.run import MAX_SEED, STUDY, WAITING, begin_run, new_folder, require_inside
+
+_MOST_SEEDS = 1000
+_LIMIT = 1024 * 1024
+_PART = re.compile(r"([0-9]{1,19})(?:\.\.([0-9]{1,19}))?")
+
+
+def read_seeds(text: str) -> list[int]:
+    """`0..4` (both included), `1,5,9`, or both.
+
+    Raises:
+        UsageError: for anything else, an empty range, a seed twice, or too many.
+    """
+    seeds: list[int] = []
+    for part in text.split(","):
+        found = _PART.fullmatch(part.strip())
+        if found is None:
+            raise UsageError(f"--seeds '{text}': '{part.strip()}' is no seed", hint="as in --seeds 0..4 or 1,5,9")
+        first, last = int(found[1]), int(found[2] or found[1])
+        if last < first:
+            raise UsageError(f"--seeds '{text}': {part.strip()} is empty", hint=f"{last}..{first}")
+        if last > MAX_SEED or last - first >= _MOST_SEEDS or len(seeds) > _MOST_SEEDS:
+            raise UsageError(f"--seeds '{text}': at most {_MOST_SEEDS} seeds, each up to {MAX_SEED}")
+        seeds += range(first, last + 1)
+    twice = sorted({seed for seed in seeds if seeds.count(seed) > 1})
+    if twice:
+        raise UsageError(f"--seeds '{text}' names {twice[0]} twice")
+    return seeds
+
+
+def create_study(
+    runs_dir: Path, task: str, name: str | None, config: str, record: Mapping[str, Any], seeds: Sequence[int]
+) -> Path:
+    """A folder with a run for every seed, all of them waiting.
+
+    Raises:
+        UsageError: for a name that cannot be part of a folder's.
+        MachineError: if it cannot be written.
+    """
+    folder = new_folder(runs_dir, task, name)
+    try:
+        names = [f"seed-{seed}" for seed in seeds]
+        about = {"kind": "seeds", "task": task, "seeds": list(seeds), "runs": names, "device": record["device"]}
+        write_atomic(folder / STUDY, to_json(about))
+        for seed, run_name in zip(seeds, names, strict=True):
+            (folder / run_name).mkdir()
+            begin_run(folder / run_name, config, {**record, "seed": seed, "state": WAITING}).unlock()
+    except OSError as error:
+        raise disk_error(folder, error) from error
+    return folder
+
+
+def read_study(folder: Path, kind: str = "seeds") -> dict[str, Any]:
+    """What a study says of itself, checked.
+
+    Raises:
+        CheckpointError: if it is not one of this kind, or damaged.
+    """
+    file = folder / STUDY
+    try:
+        require_inside(folder, file)
+        about = parse_json(read_file(file, _LIMIT), file)
+    except FileNotFoundError:
+        raise CheckpointError(f"{folder} is not a study: it has no {STUDY}") from None
+    except OSError as error:
+        raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
+    if (
+        not isinstance(about, dict)
+        or about.get("kind") not in ("seeds", "sweep")
+        or not isinstance(about.get("task"), str)
+    ):
+        raise CheckpointError(f"{file} is corrupt: it does not say what it is of")
+    if about["kind"] != kind:
+        raise CheckpointError(f"{folder} is a study of {about['kind']}, not of {kind}")
+    return about
+
+
+def runs_of(folder: Path, about: Mapping[str, Any]) -> list[Path]:
+    """The folders of a study's runs.
+
+    Raises:
+        CheckpointError: if it names what cannot be one of them.
+    """
+    names = about.get("runs")
+    right = isinstance(names, list) and 0 < len(names) <= _MOST_SEEDS
+    if not right or not all(isinstance(name, str) and re.fullmatch(r"seed-[0-9]{1,19}", name) for name in names or []):
+        raise CheckpointError(f"{folder / STUDY} is corrupt: its runs are malformed")
+    assert names is not None
+    return [folder / name for name in names]
+
+
+def write_summary(folder: Path, name: str, content: bytes | str) -> Path:
+    """A file of a study.
+
+    Raises:
+        MachineError: if it cannot be written.
+    """
+    try:
+        write_atomic(folder / name, content)
+    except OSError as error:
+        raise disk_error(folder / name, error) from error
+    except MachineError:
+        raise
+    return folder / name
