@@ -47,7 +47,8 @@ rewards: {way: {func: way, weight: 100.0}}
 terminations: {time_out: {func: time_out, time_out: true}}
 agents:
   ppo: {trainer: ppo, algorithm: ppo, max_iterations: 2, num_steps: 10, num_minibatches: 2, num_epochs: 2,
-        cnn: {channels: [4, 6], kernels: [4, 2], strides: [2, 1], motion: 5.0}, actor: {hidden: [8]}, critic: {hidden: [9]}}
+        cnn: {channels: [4, 6], kernels: [4, 2], strides: [2, 1], motion: 5.0},
+        actor: {hidden: [8]}, critic: {hidden: [9]}}
 """
 TERMS = '''
 def way(env):
