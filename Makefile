@@ -10,7 +10,7 @@ SEED ?= 1
 # Tests run beside each other: threads of theirs that wait must not keep a core busy.
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: demo test test-all test-faults test-faults-long check bench zoo-pages setup clean
+.PHONY: docs demo test test-all test-faults test-faults-long check bench zoo-pages setup clean
 
 # The installation is repeated when what is installed changes.
 $(VENV)/.demo: pyproject.toml constraints.txt
@@ -61,6 +61,10 @@ learn-%: $(VENV)/.demo
 # The generated parts of docs/zoo.
 zoo-pages: $(VENV)/.demo
 	$(BIN)/python benchmarks/zoo.py pages
+
+docs: $(VENV)/.dev
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
+	@echo "docs/_build/html/index.html"
 
 bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/env_step.py

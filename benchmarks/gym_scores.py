@@ -1,8 +1,8 @@
 """Scores of PPO after a million steps of Gymnasium's tasks, beside rl-zoo3's: `python benchmarks/gym_scores.py -j 4`.
 
 Trains the agent `ppo-1m` of each task with each seed, `-j` at a time, evaluates 100 episodes of each final policy
-without exploration noise, and prints a table of ours and theirs; `--output FILE` has it as JSON. It needs the plugin
-`plugins/rlcli-gymnasium`. What is finished in `--runs-dir` is not trained again.
+without exploration noise, and prints a table of ours and theirs; `--output FILE` has it as JSON, `--page FILE` puts it
+into a page. It needs the plugin `plugins/rlcli-gymnasium`. What is finished in `--runs-dir` is not trained again.
 
 rl-zoo3 publishes v3 tasks. What they count differently from v5 is computed by a second evaluation, of the same policy:
 v3 pays `healthy_reward` in the step that fails too, so an episode that fails is worth so much more; mujoco-py, which
@@ -122,20 +122,32 @@ def tabulate(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return table
 
 
-def show(table: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:
-    """Print both, as Markdown."""
-    print(
-        "| task | ours, counted as v3: median (lowest .. highest seed) | rl-zoo3 | as v5 |\n| --- | --- | --- | --- |"
-    )
+def markdown(table: list[dict[str, Any]], rows: list[dict[str, Any]]) -> str:
+    """Both as tables."""
+    lines = [
+        "| task | ours, as v3: median (lowest .. highest seed) | rl-zoo3 | ours, as v5 |",
+        "| --- | ---: | ---: | ---: |",
+    ]
     for entry in table:
         v3, v5, theirs = entry["v3"], entry["v5"], entry["rl_zoo3"]
         ours = f"{v3['median']:.0f} ({v3['low']:.0f} .. {v3['high']:.0f})"
-        print(f"| `{entry['task']}` | {ours} | {theirs['mean']:.0f} | {v5['median']:.0f} |")
-    print("\n| task | seed | v3: mean, 95 % interval | v5: mean, 95 % interval | failed | length |")
-    print("| --- | --- | --- | --- | --- | --- |")
+        lines.append(f"| `{entry['task']}` | {ours} | {theirs['mean']:.0f} | {v5['median']:.0f} |")
+    lines += ["", "| task | seed | as v3: mean, 95 % interval | as v5: mean, 95 % interval | failed | steps |"]
+    lines += ["| --- | ---: | ---: | ---: | ---: | ---: |"]
     for row in rows:
         counts = (f"{row[c]['mean']:.0f}, {row[c]['low']:.0f} to {row[c]['high']:.0f}" for c in ("v3", "v5"))
-        print(f"| `{row['task']}` | {row['seed']} | {' | '.join(counts)} | {row['failed']:.2f} | {row['length']:.0f} |")
+        numbers = f"{row['failed']:.0%} | {row['length']:.0f}"
+        lines.append(f"| `{row['task']}` | {row['seed']} | {' | '.join(counts)} | {numbers} |")
+    return "\n".join(lines)
+
+
+def put(page: Path, text: str) -> None:
+    """Write between the marks of a page."""
+    before, begin, rest = page.read_text().partition("<!-- scores -->\n")
+    _, end, after = rest.partition("<!-- end scores -->")
+    if not (begin and end):
+        raise SystemExit(f"{page}: no <!-- scores --> and <!-- end scores -->")
+    page.write_text(f"{before}{begin}{text}\n{end}{after}")
 
 
 def main() -> None:
@@ -150,6 +162,7 @@ def main() -> None:
     parser.add_argument("--runs-dir", type=Path, default=Path("runs/gym_scores"))
     parser.add_argument("--label", default="", help="Added to the names of the runs: for trials with overrides.")
     parser.add_argument("--output", type=Path, help="JSON file to write.")
+    parser.add_argument("--page", type=Path, help="Markdown file to write the tables into, as docs/zoo/peers.md.")
     parser.add_argument("overrides", nargs="*", help="agent.gamma=0.98 and the like, for every training.")
     options = parser.parse_intermixed_args()
     todo = [(task, seed) for seed in options.seeds for task in options.tasks]
@@ -157,7 +170,10 @@ def main() -> None:
         rows = list(pool.map(lambda job: one(*job, options), todo))
     rows.sort(key=lambda row: (list(THEIRS).index(row["task"]), row["seed"]))
     table = tabulate(rows)
-    show(table, rows)
+    text = markdown(table, rows)
+    print(text)
+    if options.page:
+        put(options.page, text)
     if options.output:
         document = {"machine": describe(), "agent": AGENT, "steps": options.steps, "episodes": options.episodes}
         options.output.write_text(json.dumps({**document, "tasks": table, "runs": rows}, indent=1) + "\n")

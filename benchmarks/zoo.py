@@ -2,7 +2,9 @@
 
     python benchmarks/zoo.py learn TASK            train the default agent here, evaluate, compare with the bar
     python benchmarks/zoo.py collect TASK RUN ...  finished runs, from this or another machine, become results and
-                                                   curves; --ship also puts the best policy into the package
+                                                   curves; --ship also puts the best policy into the package, and draws
+    python benchmarks/zoo.py collect --all FOLDER  the same of every task with runs below a folder, and the pages;
+                                                   documents of `rlcli eval --json` that lie there are taken
     python benchmarks/zoo.py picture TASK          a strip of pictures of the shipped policy
     python benchmarks/zoo.py pages                 fill the generated parts of docs/zoo/*.md, and write its index
 
@@ -47,6 +49,7 @@ class Entry:
     bar: dict[str, Any]
     agent: str | None = None
     episodes: int = 1000
+    envs: int = 200
     picture: float = 4.0
     seeds: tuple[int, ...] = field(default=())
 
@@ -91,23 +94,35 @@ def value_of(evaluation: dict[str, Any], name: str) -> float | None:
 # --- learn ---
 
 
-def learn(task: str, device: str | None, seed: int, runs: Path, episodes: int | None) -> int:
+def learn(task: str, overrides: list[str], device: str | None, seed: int, runs: Path) -> int:
     """Train, evaluate, judge; the exit status."""
     entry = entries()[task]
     device = device or entry.device
     agent = ["--agent", entry.agent] if entry.agent else []
     begin = time.monotonic()
     trained = _rlcli(
-        "train", task, *agent, "--device", device, "--seed", str(seed), "--runs-dir", str(runs), "--logger", "none"
+        "train",
+        task,
+        *overrides,
+        *agent,
+        "--device",
+        device,
+        "--seed",
+        str(seed),
+        "--runs-dir",
+        str(runs),
+        "--logger",
+        "none",
     )
     minutes = (time.monotonic() - begin) / 60
     run = Path(trained["run"])
-    evaluation = _rlcli("eval", "--checkpoint", str(run), "--episodes", str(episodes or entry.episodes))
+    evaluation = _evaluate(run, entry)
     missed = entry.missed(evaluation)
     if minutes > entry.minutes and device == entry.device:
         missed.append(f"it took {minutes:.1f} minutes, more than {entry.minutes:g}")
     line = {
         "task": task,
+        "overrides": overrides,
         "seed": seed,
         "device": device,
         "minutes": round(minutes, 2),
@@ -142,22 +157,37 @@ def _gpu(run: Path) -> str:
 # --- collect ---
 
 
-def collect(task: str, runs: list[Path], hardware: str | None, ship: bool) -> None:
+def collect_all(folder: Path, hardware: str | None, ship: bool) -> None:
+    """Every run below a folder, task by task; with `ship` the pictures, and the pages at the end."""
+    from rlcli.errors import RlcliError
+
+    found: dict[str, list[Path]] = {}
+    for file in sorted(folder.rglob("run.json")):
+        found.setdefault(json.loads(file.read_text(encoding="utf-8"))["task"]["name"], []).append(file.parent)
+    for task, runs in found.items():
+        if task not in entries():
+            continue
+        try:
+            collect(task, runs, hardware, ship, _documents(folder))
+        except (RlcliError, OSError, subprocess.CalledProcessError) as error:
+            print(f"{task}: not collected: {error}", file=sys.stderr)
+    zoo_pages.write_all(ZOO, entries())
+
+
+def collect(task: str, runs: list[Path], hardware: str | None, ship: bool, known: dict[str, Any]) -> None:
     """Results and curves of finished runs, and, if asked for, the best policy as the one that is shipped."""
     from rlcli.rl.curves import read_history
-    from rlcli.rl.run import find_checkpoint, open_run
+    from rlcli.rl.run import find_checkpoint
 
-    entry, rows, histories, found = entries()[task], [], [], []
-    for folder in runs:
-        run = open_run(folder)
-        if run.record["task"]["name"] != task:
-            sys.exit(f"{folder} is a run of {run.record['task']['name']}")
-        _, checkpoint, _ = find_checkpoint(str(folder), folder.parent)
-        evaluation = _evaluated(run, checkpoint, entry.episodes)
-        rows.append(_row(run, checkpoint, evaluation, hardware))
-        histories.append(read_history(run))
-        found.append((rows[-1], checkpoint))
-    rows.sort(key=lambda row: row["seed"])
+    entry, found = entries()[task], []
+    for run in _of_one_agent(entry, runs):
+        _, checkpoint, _ = find_checkpoint(str(run.folder), run.folder.parent)
+        evaluation = _evaluated(run, checkpoint, entry, known)
+        found.append((run, checkpoint, evaluation, _row(run, checkpoint, evaluation, hardware)))
+    if not found:
+        return
+    histories = [read_history(run) for run, *_ in found]
+    rows = sorted((row for *_, row in found), key=lambda row: row["seed"])
     for folder, name, text in (
         ("results", f"{task}.json", json.dumps(rows, indent=1) + "\n"),
         ("curves", f"{task}.csv", zoo_curves.table(histories)),
@@ -165,22 +195,67 @@ def collect(task: str, runs: list[Path], hardware: str | None, ship: bool) -> No
     ):
         (ZOO / folder).mkdir(exist_ok=True)
         (ZOO / folder / name).write_text(text, encoding="utf-8")
-        print(ZOO / folder / name)
+    for row in rows:
+        missed = "; ".join(entry.missed(row["evaluation"])) or "within its bar"
+        print(f"{task}, seed {row['seed']}: {missed}; {row['minutes']:g} min")
     if ship:
-        best = max(found, key=lambda pair: _goodness(entry, pair[0]["evaluation"]))
-        target = find_task(task).root / "policies" / task
-        _rlcli("export", "--format", "bundle", "--checkpoint", str(best[1]), "--output", str(target))
-        print(f"{target} (seed {best[0]['seed']})")
+        run, checkpoint, evaluation, row = max(found, key=lambda one: _goodness(entry, one[2]))
+        _ship(task, run, checkpoint, evaluation)
+        print(f"{task}: seed {row['seed']} is shipped")
+        subprocess.run([sys.executable, __file__, "picture", task], check=True)
 
 
-def _evaluated(run: Any, checkpoint: Path, episodes: int) -> dict[str, Any]:
-    """The evaluation that the run keeps, or a new one where it is of too few episodes."""
+def _ship(task: str, run: Any, checkpoint: Path, evaluation: dict[str, Any]) -> None:
+    from rlcli.rl.bundle import write_bundle
+    from rlcli.rl.checkpoint import open_checkpoint
+
+    write_bundle(open_checkpoint(checkpoint), find_task(task).root / "policies" / task, run, evaluation)
+
+
+def _of_one_agent(entry: Entry, folders: list[Path]) -> list[Any]:
+    """The newest run of each seed, of the agent that the task is held to its bar with."""
+    from rlcli.config.load import resolve
+    from rlcli.rl.run import open_run
+
+    wanted = entry.agent or resolve(find_task(entry.name), device=entry.device).agent_name
+    runs: dict[int, Any] = {}
+    for run in sorted((open_run(folder) for folder in folders), key=lambda run: run.record["started"]):
+        if run.record["task"]["name"] != entry.name or run.record["agent"] != wanted:
+            print(f"{run.folder.name} is left out: it is of {run.record['task']['name']}, {run.record['agent']}")
+            continue
+        runs[run.record["seed"]] = run
+    return [runs[seed] for seed in sorted(runs)]
+
+
+def _documents(folder: Path) -> dict[str, Any]:
+    """What `rlcli eval --json` printed into files of this folder, by RUN/STEP of the checkpoint."""
+    found = {}
+    for file in folder.rglob("*.json"):
+        try:
+            said = json.loads(file.read_text(encoding="utf-8"))
+        except ValueError:
+            continue
+        if isinstance(said, dict) and said.get("command") == "eval" and isinstance(said.get("checkpoint"), str):
+            run, _, step = Path(said["checkpoint"]).parts[-3:]
+            found[f"{run}/{step}"] = said
+    return found
+
+
+def _evaluate(policy: Path, entry: Entry) -> dict[str, Any]:
+    """A new evaluation, in many environments: the few that `play:` has would take longer."""
+    several = ("--num-envs", str(min(entry.episodes, entry.envs)))
+    return _rlcli("eval", "--checkpoint", str(policy), "--episodes", str(entry.episodes), *several)
+
+
+def _evaluated(run: Any, checkpoint: Path, entry: Entry, known: dict[str, Any]) -> dict[str, Any]:
+    """An evaluation that is there, in the run or in `known`, or a new one where it is of too few episodes."""
     from rlcli.rl.evaluations import read_evaluation
 
-    kept = read_evaluation(run, checkpoint.name)
-    if kept is not None and kept["episodes"] >= episodes and "values" in kept:
-        return kept
-    return _rlcli("eval", "--checkpoint", str(checkpoint), "--episodes", str(episodes))
+    there = [read_evaluation(run, checkpoint.name), known.get(f"{run.folder.name}/{checkpoint.name}")]
+    for said in there:
+        if said is not None and said["episodes"] >= entry.episodes and "values" in said and not said["stochastic"]:
+            return said
+    return _evaluate(checkpoint, entry)
 
 
 def _row(run: Any, checkpoint: Path, evaluation: dict[str, Any], hardware: str | None) -> dict[str, Any]:
@@ -288,22 +363,28 @@ def main() -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     learning = commands.add_parser("learn")
     learning.add_argument("task", choices=entries())
+    learning.add_argument("overrides", nargs="*", metavar="key.path=value")
     learning.add_argument("--device", default=None)
     learning.add_argument("--seed", type=int, default=1)
     learning.add_argument("--runs-dir", type=Path, default=Path("runs"))
-    learning.add_argument("--episodes", type=int, default=None)
     collecting = commands.add_parser("collect")
-    collecting.add_argument("task", choices=entries())
-    collecting.add_argument("runs", nargs="+", type=Path)
+    collecting.add_argument("--all", type=Path, default=None, metavar="FOLDER")
+    collecting.add_argument("task", nargs="?", choices=entries())
+    collecting.add_argument("runs", nargs="*", type=Path)
     collecting.add_argument("--machine", default=None, help="what it was trained on, if the run does not say it well")
     collecting.add_argument("--ship", action="store_true")
     commands.add_parser("picture").add_argument("task", choices=entries())
     commands.add_parser("pages")
     given = parser.parse_args()
     if given.command == "learn":
-        return learn(given.task, given.device or None, given.seed, given.runs_dir, given.episodes)
+        return learn(given.task, given.overrides, given.device or None, given.seed, given.runs_dir)
     if given.command == "collect":
-        collect(given.task, given.runs, given.machine, given.ship)
+        if (given.all is None) == (given.task is None):
+            parser.error("collect TASK RUN ..., or collect --all FOLDER")
+        if given.all is not None:
+            collect_all(given.all, given.machine, given.ship)
+        else:
+            collect(given.task, given.runs, given.machine, given.ship, {})
     elif given.command == "picture":
         picture(given.task)
     else:

@@ -612,6 +612,21 @@ class RaySensorConfig(StrictModel):
     """Range [m]; what lies farther is missed."""
     sees: Literal["ground", "all"] | Annotated[list[Annotated[int, Field(ge=0, le=5)]], Field(min_length=1)] = "ground"
     """ground: the plane or the terrain; all: every geom but those of the body; or a list of geom groups."""
+    lookup: bool = False
+    """Rays straight down find the ground in the table of the terrain's heights instead of among geoms: the same to
+    rounding, and much faster on a GPU. For a terrain without boxes, and alignment yaw or world."""
+
+    @model_validator(mode="after")
+    def _straight_down(self) -> RaySensorConfig:
+        if not self.lookup:
+            return self
+        pattern = self.pattern
+        directions = [pattern.direction] if isinstance(pattern, GridPatternConfig) else pattern
+        if any(x or y or z >= 0.0 for x, y, z in directions) or self.alignment == "base":
+            raise ValueError("lookup is for rays straight down: directions [0, 0, -1], alignment yaw or world")
+        if self.sees != "ground":
+            raise ValueError("lookup is for rays that see the ground alone: sees: ground")
+        return self
 
 
 class CameraSensorConfig(StrictModel):

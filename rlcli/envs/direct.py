@@ -72,7 +72,8 @@ class DirectTask:
         self.progress_buf = torch.zeros(n, dtype=torch.int64, device=self.device)
         """Steps of the running episode. (num_envs,) int64"""
         self.extras: dict[str, Any] = {}
-        """Numbers and tensors to log, by name: `Task/<name>` in the metrics is their mean, once an iteration."""
+        """Numbers and tensors to log, by name. `Task/<name>` in the metrics is their mean, once an iteration; `rlcli
+        eval` gives means over episodes of means over their steps, of tensors with a row for each environment."""
         self.episode_metrics: dict[str, Tensor] = {}
         """Numbers of the running episodes, by name, (num_envs,) each: `Metrics/<name>` is their mean over the episodes
         that end, as they were in the last step. Fill it in `post_reset`; write to the tensors in place."""

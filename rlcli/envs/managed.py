@@ -148,7 +148,7 @@ class ManagedEnv(VecEnv):
 
     def _judge(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         terminated, truncated = self.termination_manager.compute(diverged)
-        reward = self.reward_manager.compute(terminated, diverged)
+        reward = self.reward_manager.compute(diverged, terminated)
         self._require_finite(reward, "the reward")
         self.reward_manager.add_up()
         if diverged is not None:

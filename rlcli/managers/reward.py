@@ -53,8 +53,10 @@ class RewardManager:
             if _moves(weight) or weight != 0.0:
                 check_shape(term, first_value(term), (num_envs,), "rewards")
 
-    def compute(self, terminated: Tensor, diverged: Tensor | None = None) -> Tensor:
+    def compute(self, diverged: Tensor | None = None, terminated: Tensor | None = None) -> Tensor:
         """This step's reward; `add_up` takes it into the episode's sums. (num_envs,)
+
+        Where it `terminated`, terms with `while_alive` pay nothing.
 
         On a CPU a term that is not finite where the simulation diverged pays nothing there.
 
@@ -65,7 +67,7 @@ class RewardManager:
             torch.mul(call(), factor, out=row)
         for row, weight in self._moved:
             row.mul_(weight * self._dt)
-        if self._while_alive is not None:
+        if self._while_alive is not None and terminated is not None:
             self._values.masked_fill_(self._while_alive & terminated, 0.0)
         if diverged is not None and not self._fused:
             self._values.masked_fill_(diverged & ~self._values.isfinite(), 0.0)

@@ -343,7 +343,10 @@ class DifferentialInverseKinematics(_JointAction):
     dq = J^T (J J^T + damping^2 I)^-1 e, with J the body's geometric Jacobian and e the error of its pose in the root's
     frame, once a step. `mode` position takes 3 columns, pose 7 (position, quaternion w x y z), or 6 if `relative`
     (position, axis times angle): relative ones are x scale and added to where the body is. The pose is that of a point
-    `offset_pos`, `offset_quat` in the body's frame. Isaac Lab: DifferentialInverseKinematicsAction (ik_method dls).
+    `offset_pos`, `offset_quat` in the body's frame. Joints to spare go `posture` of the way to their default pose in a
+    step, as far as the body stays where dq has it: dq + (I - J^T (J J^T + damping^2 I)^-1 J) posture (default - q).
+    Without, an arm of seven joints wanders into its limits. Isaac Lab: DifferentialInverseKinematicsAction (ik_method
+    dls); mjlab: posture_weight.
     """
 
     actuator = "position"
@@ -360,13 +363,14 @@ class DifferentialInverseKinematics(_JointAction):
         relative: bool = False,
         scale: float = 1.0,
         damping: float = 0.01,
+        posture: float = 0.0,
         offset_pos: tuple[float, float, float] = (0.0, 0.0, 0.0),
         offset_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
         clip: Range | dict[str, Range] | None = None,
     ) -> None:
         super().__init__(env, entity, joints, scale, clip)
         self._body = one_column(bodies, len(entity.body_ids), "bodies")
-        self._mode, self._relative, self._damping = mode, relative, damping
+        self._mode, self._relative, self._damping, self._posture = mode, relative, damping, posture
         self._point = torch.tensor(offset_pos, device=env.device)
         self._turn = torch.tensor(offset_quat, device=env.device)
         columns = [entity.joint_names.index(name) for name in self.elements]
@@ -383,8 +387,13 @@ class DifferentialInverseKinematics(_JointAction):
         error = self._error(action * self._scale, position, quat)
         jacobian = self._jacobian(position)[:, : error.shape[1]]
         square = jacobian @ jacobian.mT + self._damping**2 * torch.eye(error.shape[1], device=error.device)
-        step = jacobian.mT @ torch.linalg.solve_ex(square, error[:, :, None])[0]
-        torch.add(data.joint_pos[:, self._joints], step[:, :, 0], out=self.command)
+        joints, wanted = data.joint_pos[:, self._joints], error[:, :, None]
+        if not self._posture:
+            step = jacobian.mT @ torch.linalg.solve_ex(square, wanted)[0]
+        else:
+            rest = (self._posture * (data.default_joint_pos[:, self._joints] - joints))[:, :, None]
+            step = rest + jacobian.mT @ torch.linalg.solve_ex(square, wanted - jacobian @ rest)[0]
+        torch.add(joints, step[:, :, 0], out=self.command)
 
     def _error(self, asked: Tensor, position: Tensor, quat: Tensor) -> Tensor:
         """What is left to the asked pose, world frame: position, and axis times angle. (num_envs, 3 or 6)"""

@@ -147,6 +147,10 @@ class OigeEnv(DirectEnv):
             flat.update(value if isinstance(value, dict) else {name: value})
         return flat
 
+    def _metrics_of(self, ended: Selection) -> dict[str, Tensor]:
+        """Tasks of OmniIsaacGymEnvs have no numbers of an episode but what they log in `extras`."""
+        return {}
+
     def _act(self, action: Tensor) -> None:
         if self.pushed:  # a force acts for one step
             self.engine.field("xfrc_applied").zero_()

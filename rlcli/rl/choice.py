@@ -100,8 +100,7 @@ def choose(
         UsageError: if it is of another task than the one given.
     """
     name = None if named is None or any_task else named.name
-    unnamed = reference is None and named is not None and named.policy is not None
-    if reference == SHIPPED or (unnamed and not list_runs(runs_dir, name)):
+    if reference == SHIPPED or (reference is None and _only_shipped(named, runs_dir)):
         return _shipped(named)
     if reference is not None and is_bundle(Path(reference)):
         found = open_bundle(Path(reference))
@@ -110,6 +109,13 @@ def choose(
         return Choice(found.folder, "as named", None, found)
     run, folder, why = find_checkpoint(reference or "latest", runs_dir, name, tell=tell)
     return Choice(folder, why, run, None)
+
+
+def _only_shipped(named: TaskSource | None, runs_dir: Path) -> bool:
+    """Whether a task has a policy that is shipped, and no run: not even one that is damaged, which is to be told."""
+    if named is None or named.policy is None:
+        return False
+    return not list_runs(runs_dir, named.name) and not any((runs_dir / named.name).glob("*/run.json"))
 
 
 def _shipped(named: TaskSource | None) -> Choice:

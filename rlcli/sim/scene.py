@@ -81,6 +81,8 @@ class RayMount:
     config: RaySensorConfig
     body: str
     groups: tuple[int, ...] | None
+    ground: Ground | None = None
+    """What heights are looked up in, instead of casting rays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -438,7 +440,12 @@ class Scene:
         groups = tuple(config.sees) if isinstance(config.sees, list) else None
         if config.sees == "ground":
             groups = (self._group_of_ground((*path, "sees")),)
-        return RayMount(config, bodies[0], groups)
+        if not config.lookup:
+            return RayMount(config, bodies[0], groups)
+        if self.ground is None or self.ground.blocks:
+            lacks = "the scene has no terrain" if self.ground is None else "the terrain has boxes"
+            raise SceneProblem((*path, "lookup"), f"there is no table of heights to look in: {lacks}", "lookup: false")
+        return RayMount(config, bodies[0], groups, self.ground)
 
     def _camera_sensor(self, name: str, config: CameraSensorConfig) -> CameraMount:
         path = ("scene", "sensors", name)

@@ -12,6 +12,7 @@ from torch import Tensor
 from rlcli.config.schema import GridPatternConfig, RaySensorConfig
 from rlcli.sim.camera import CameraSensor, make_cameras
 from rlcli.sim.entity import Entity, SimData, as_index
+from rlcli.sim.heights import HeightTable
 from rlcli.sim.rotations import rotate
 from rlcli.sim.scene import CameraMount, ContactSlots, RayMount
 from rlcli.sim.selection import Columns, Selection
@@ -125,6 +126,7 @@ class RaySensor:
         self._engine = engine = sim.engine
         self._body = engine.model.body(mount.body).id
         self._groups = mount.groups
+        self._table = None if mount.ground is None else HeightTable(mount.ground, engine.device)
         self._root = entity.root_qpos if self._body == entity.root_body else None
         starts, directions = (values.to(engine.device) for values in _pattern(config))
         self._starts, self._directions = starts, directions
@@ -206,7 +208,10 @@ class RaySensor:
         position = position + _turned(axes, self._offset)[:, 0]
         points = position[:, None] + _turned(axes, self._starts)
         directions = _turned(axes, self._directions)
-        found = self._engine.rays(points, directions, groups=self._groups, exclude=self._body, selection=selection)
+        if self._table is not None:
+            found = self._table.depth(points)
+        else:
+            found = self._engine.rays(points, directions, groups=self._groups, exclude=self._body, selection=selection)
         reach = self._config.max_distance
         missed = (found < 0.0) | (found > reach)
         distance = found.masked_fill_(missed, reach)

@@ -204,10 +204,10 @@ def test_stochastic_actions_differ_from_deterministic_ones(cli, trained):
 
 
 @pytest.mark.parametrize("command", ["play", "eval"])
-def test_without_a_run_the_hint_says_how_to_make_one(cli, command):
-    done = cli(command, "cartpole")
+def test_without_a_run_and_a_shipped_policy_the_hint_says_how_to_make_one(cli, coin, command):
+    done = cli(command, coin)
     assert done.code == 5
-    assert "rlcli train cartpole" in done.err
+    assert "rlcli train coin" in done.err
 
 
 @pytest.mark.parametrize("command", ["play", "eval"])

@@ -132,3 +132,10 @@ def test_a_policy_for_a_task_that_was_not_installed_asks_for_its_folder(cli, coi
     done = cli("play", "--checkpoint", "gift", *NUMBERS)
     assert (done.code, "name the task's folder" in done.err) == (5, True), done.err
     assert cli("play", coin, "--checkpoint", "gift", *NUMBERS).code == 0
+
+
+def test_a_run_that_is_damaged_is_told_of_and_not_passed_over(cli, only_run):
+    cli("train", "cartpole", *SMALL, "--max-iterations", 1)
+    (only_run() / "run.json").write_text("{")
+    done = cli("play", "cartpole", *NUMBERS)
+    assert (done.code, "there is no run of cartpole" in done.err) == (5, True), done.err

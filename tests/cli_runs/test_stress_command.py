@@ -181,7 +181,7 @@ def test_a_run_a_checkpoint_or_a_task_is_stressed(cli, only_run):
         (("cartpole", "--sweep", "gravity=1:2", "-o", "nowhere/x.png"), 10, "no folder"),
         (("cartpole", "--sweep", "gravity=1:2:200", "--sweep", "push=0:1:200"), 2, "40,000 variants"),
         (("cartpol", "--sweep", "gravity=1:2"), 4, "did you mean 'cartpole"),
-        (("cartpole", "--sweep", "gravity=1:2"), 5, "rlcli train cartpole"),
+        (("cartpole", "--checkpoint", "latest", "--sweep", "gravity=1:2"), 5, "rlcli train cartpole"),
         (("latest", "--sweep", "gravity=1:2"), 5, "no run"),
         (("ant-direct", "--policy", "lqr", "--sweep", "gravity=1:2"), 2, "no LQR of ant-direct"),
     ],

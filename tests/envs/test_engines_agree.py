@@ -11,8 +11,13 @@ SHORT = {  # episodes end and begin within the run, by time
     "cartpole": ("episode_length_s=0.25",),
     "cartpole-direct": ("episode_length_s=0.25",),
     "ant-direct": ("episode_length_s=0.2",),
+    "quadcopter": ("episode_length_s=0.2",),
+    "crazyflie": ("episode_length_s=0.2", "params.target_period=7", "params.target_low=[-1,-1,1]"),
+    "ingenuity": ("episode_length_s=0.2", "params.target_period=7"),
+    "humanoid": ("episode_length_s=0.2",),
 }
-TOLERANCE = {"cartpole": 2e-5, "cartpole-direct": 2e-5, "ant-direct": 2e-3}
+TOLERANCE = {"cartpole": 2e-5, "cartpole-direct": 2e-5, "ant-direct": 2e-3, "quadcopter": 2e-4, "crazyflie": 2e-5,
+             "ingenuity": 2e-5, "humanoid": 2e-3}  # fmt: skip
 """float32 rounding, grown over the steps of one episode; contacts make it grow faster."""
 
 

@@ -160,7 +160,7 @@ def test_unknown_formats_and_wrong_suffixes_are_usage_errors(copied, tmp_path, m
         ([], 2, "a TASK, or --checkpoint"),
         (["--checkpoint", "latest"], 5, "there is no run in"),
         (["--checkpoint", "nothing"], 5, "no run 'nothing'"),
-        (["cartpole"], 5, "rlcli train cartpole"),
+        (["cartpole", "--checkpoint", "latest"], 5, "rlcli train cartpole"),
         (["cartpol"], 4, "did you mean 'cartpole'"),
     ],
 )

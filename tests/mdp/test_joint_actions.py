@@ -210,6 +210,25 @@ def test_inverse_kinematics_moves_relative_to_where_the_body_is(tmp_path):
     assert torch.allclose(moved[:, [0, 2, 4]], torch.tensor([0.01, 0.005, 0.0]).expand(3, 3), atol=2e-4)
 
 
+def test_inverse_kinematics_brings_spare_joints_home_and_leaves_the_body(tmp_path):
+    """Three joints move the hand in a plane where its position needs two: one is to spare."""
+    term = {"func": "differential_inverse_kinematics", "joints": ["slide", "shoulder", "elbow"], "bodies": ["hand"],
+            "mode": "position", "damping": 1.0e-3}  # fmt: skip
+    target = torch.tensor([[0.45, 0.0, 0.25]] * 3)
+    homes = []
+    for posture in (0.0, 0.05):
+        env = arm(tmp_path, {**term, "posture": posture}, episode_length_s=20.0)
+        env.reset()
+        for _ in range(300):
+            env.step(target)
+        robot = env.entities["robot"]
+        hand = robot.data.body_pos_w[:, robot.names["Bodies"].index("hand")] - robot.data.root_pos_w
+        assert (hand - target).norm(dim=1).max() < 5e-3
+        away = robot.data.joint_pos[:, :3] - robot.data.default_joint_pos[:, :3]
+        homes.append(away.norm(dim=1))
+    assert bool((homes[1] < homes[0] - 1e-3).all())
+
+
 def test_inverse_kinematics_needs_one_body(tmp_path):
     term = {"func": "differential_inverse_kinematics", "bodies": ["hand", "lower"]}
     with pytest.raises(ConfigError, match="2 elements"):

@@ -8,6 +8,7 @@ from worlds import CRITTER_TASK, actions, build, critter, edited, life, run, sam
 
 from rlcli.config.schema import TerrainGeneratorConfig
 from rlcli.errors import ConfigError
+from rlcli.sim.heights import HeightTable
 from rlcli.sim.terrain import make_ground
 
 torch.set_num_threads(1)
@@ -363,6 +364,54 @@ def test_sensors_know_the_terrain_as_the_ground(tmp_path):
         env.step(torch.zeros(4, 4))
     weight = env.sensors["torso"].force[..., 2].sum(dim=1)
     assert ((weight > 10.0) & (weight < 150.0)).all(), weight
+
+
+@ENGINES
+def test_heights_that_are_looked_up_are_those_that_rays_find(tmp_path, engine):
+    grid = {"size": [1.6, 1.0], "resolution": 0.1}
+    scan = {"kind": "rays", "pattern": grid, "alignment": "yaw", "offset": [0.1, 0.0, 5.0], "max_distance": 9.0}
+    grounds = {"rubble": {"kind": "noise", "height": [0.1, 0.3], "spacing": 0.1}, "hill": {"kind": "slope"}}
+    uneven = generator(
+        rows=3, columns=4, sub_terrains={**grounds, "stairs": {"kind": "stairs"}, "w": {"kind": "waves"}}
+    )
+    env = on_terrain(tmp_path, uneven, 12, f"sim.engine={engine}",
+                     scene={"sensors": {"cast": scan, "table": {**scan, "lookup": True}}})  # fmt: skip
+    env.reset()
+    draw = torch.Generator().manual_seed(1)
+    # four about their patches, four at the edge between field and border, four at that of the border, and beyond
+    place = env.origins + torch.rand(12, 3, generator=draw) * torch.tensor([2.0, 2.0, 0.5])
+    place[4:8, 0], place[8:, 0] = 5.9, 8.0
+    turns = torch.nn.functional.normalize(torch.randn(12, 4, generator=draw), dim=1)
+    env.entities["robot"].write_root_pose(env._everyone(), place, turns)
+    env.sim.moved(env._everyone())
+    env.sim.settle()
+    cast, table = (env.sensors[name] for name in ("cast", "table"))
+    for sensor in (cast, table):
+        sensor.update(0.02)
+    assert torch.equal(cast.missed, table.missed)
+    assert 0 < int(table.missed.sum()) < table.missed.numel() / 3
+    torch.testing.assert_close(cast.distance, table.distance, atol=2e-4, rtol=0)
+    torch.testing.assert_close(cast.hits, table.hits, atol=2e-4, rtol=0)
+    assert table.distance[:4].std() > 0.02
+    one = env._select(torch.arange(12) == 3)
+    env.entities["robot"].write_root_pose(one, env.origins[3:4] + 0.2, torch.tensor([[1.0, 0.0, 0.0, 0.0]]))
+    before = table.distance.clone()
+    env.sim.moved(one)
+    table.moved(one)
+    assert ((table.distance != before).any(dim=1) == (torch.arange(12) == 3)).all()
+
+
+def test_what_lies_under_the_ground_finds_none_in_the_table():
+    table = HeightTable(ground(sub_terrains={"flat": {"kind": "flat"}}), torch.device("cpu"))
+    found = table.depth(torch.tensor([[0.3, 0.2, 1.5], [0.3, 0.2, -0.1], [7.9, 0.0, 2.0], [8.1, 0.0, 2.0]]))
+    assert found.tolist() == [1.5, -1.0, 2.0, -1.0]
+
+
+def test_boxes_are_in_no_table_of_heights(tmp_path):
+    down = {"kind": "rays", "pattern": [[0.0, 0.0, -1.0]], "alignment": "world", "lookup": True}
+    stairs = generator(sub_terrains={"it": {"kind": "stairs", "boxes": True}})
+    with pytest.raises(ConfigError, match=r"scene.sensors.scan.lookup: there is no table .*: the terrain has boxes"):
+        on_terrain(tmp_path, stairs, 1, scene={"sensors": {"scan": down}})
 
 
 def test_a_height_field_from_a_file(tmp_path):

@@ -106,20 +106,22 @@ def test_what_touches_what(env):
     links = [f"{f}_{part}" for f in FINGERS for part in ("proximal", "medial", "distal")]
     links.remove("thumb_proximal")
     ends = [f"{f}_distal" for f in FINGERS]
-    expected = {frozenset(["cube", other]) for other in [*links, "palm"]}
-    expected |= {frozenset([end, "palm"]) for end in ends} | {frozenset([a, b]) for a in ends for b in ends if a != b}
+    palm = [f"bar_{number}" for number in (1, 2, 3, 4)]
+    expected = {frozenset(["cube", other]) for other in [*links, *palm]}
+    expected |= {frozenset([end, bar]) for end in ends for bar in palm}
+    expected |= {frozenset([a, b]) for a in ends for b in ends if a != b}
     assert touching == expected
 
 
 def test_a_hand_that_stays_as_it_starts_holds_the_cube():
-    """The fingers keep their start pose for two seconds: nearly all cubes stay, and come to rest."""
+    """The fingers keep their start pose for two seconds: three cubes of four stay, and come to rest."""
     env = build("hand-reorient", 32)
     env.reset()
     still = (env.task.targets - env.task.middle) / env.task.half
     lost = torch.zeros(32, dtype=torch.bool)
     for _ in range(60):
         lost |= env.step(still).terminated
-    assert int(lost.sum()) <= 5
+    assert int(lost.sum()) <= 8
     speed = env.entities["object"].data.root_lin_vel_w[~lost].norm(dim=1)
     assert float(speed.median()) < 0.005
 
@@ -228,7 +230,7 @@ def test_the_reward_is_the_documented_sum(env):
     assert float(judge(env)[0]) == pytest.approx(-10 * 0.05 + 1 / (1.0 + 0.1) - 0.0002 * 16 * 0.25, abs=1e-5)
 
 
-@pytest.mark.parametrize(("angle", "bonus"), [(0.19, 250.0), (0.21, 0.0)])
+@pytest.mark.parametrize(("angle", "bonus"), [(0.39, 250.0), (0.41, 0.0)])
 def test_a_goal_within_the_tolerance_pays_and_counts(env, angle, bonus):
     put(env, quat=about(1, angle), goal=LEVEL)
     env.task.actions.zero_()
@@ -301,10 +303,10 @@ def test_start_states_stay_inside_their_ranges():
     assert not env.task.successes.any()
 
 
-def test_success_is_a_goal_reached_and_a_cube_that_was_never_lost():
+def test_success_is_five_goals_and_a_cube_that_was_never_lost():
     env = build("hand-reorient", N, "episode_length_s=0.2")
     env.reset()
-    env.task.successes.copy_(torch.tensor([0.0, 1.0, 0.0, 2.0]))
+    env.task.successes.copy_(torch.tensor([0.0, 5.0, 4.0, 9.0]))
     ended = {}
     for step in range(6):
         for row in range(N):  # in the air above the palm, but the last one: that is lost in the end

@@ -12,6 +12,8 @@ from rlcli_gymnasium.base import float32_sum
 from test_parity import TASKS, ours
 
 from rlcli.adapters.gymnasium import action_space
+from rlcli.config.load import resolve
+from rlcli.registry import find_task
 from rlcli.testing import check_task
 
 torch.set_num_threads(1)
@@ -132,6 +134,15 @@ def test_the_agents_train(task, agent, tmp_path):
         rlcli(tmp_path, "eval", task, "--episodes", "2", "--num-envs", "2", "--json", "episode_length_s=1")
     )
     assert report["episodes"] >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["gym-ant", "gym-half-cheetah", "gym-hopper", "gym-swimmer", "gym-walker2d"])
+def test_the_agents_for_a_million_steps_train_for_a_million_steps(task, tmp_path):
+    agent = resolve(find_task(task), agent="ppo-1m")
+    steps = agent.agent.max_iterations * agent.agent.num_steps * agent.task.scene.num_envs
+    assert 0.99e6 < steps <= 1e6
+    rlcli(tmp_path, "train", task, "--agent", "ppo-1m", "--max-iterations", "1", "--quiet", "agent.num_epochs=1")
 
 
 @pytest.mark.slow

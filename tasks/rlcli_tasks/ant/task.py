@@ -1,4 +1,4 @@
-"""Ant in the direct workflow: a four-legged walker runs towards a far target. docs/ant.md lists its 60 columns."""
+"""Ant in the direct workflow: four legs run towards a far target. docs/zoo/ant-direct.md lists its 60 columns."""
 
 from __future__ import annotations
 

@@ -1,12 +1,5 @@
-"""Biped velocity: the humanoid walks and turns as fast as it is told. Numbers and sources: docs/zoo/biped-velocity.md.
-
-Its YAML lies beside the humanoid's model, which it shares.
-"""
+"""Biped velocity: the humanoid walks and turns as it is told. Numbers and sources: docs/zoo/biped-velocity.md."""
 
 from rlcli.task import TaskSpec
 
-MANAGED = TaskSpec(
-    package="rlcli_tasks.humanoid",
-    config="velocity.yaml",
-    summary="Walk and turn with a human figure as commanded (manager-based).",
-)
+MANAGED = TaskSpec(package=__name__, summary="Walk and turn with a human figure as commanded (manager-based).")

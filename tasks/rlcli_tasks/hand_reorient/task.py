@@ -63,7 +63,7 @@ class HandTask(DirectTask):
         smoothing: float = Field(
             0.5, gt=0, le=1, description="Share of the new target in a step; the rest is the last step's target."
         )
-        success_tolerance: float = Field(0.2, gt=0, description="Angle at which a goal counts as reached [rad].")
+        success_tolerance: float = Field(0.4, gt=0, description="Angle at which a goal counts as reached [rad].")
         fall_distance: float = Field(0.24, gt=0, description="Distance from its place at which the cube is lost [m].")
         distance_weight: float = Field(-10.0, description="Reward on the distance from the cube's place [1/m].")
         rotation_weight: float = Field(1.0, description="Reward on 1 / (angle to the goal + rotation_eps) [rad].")

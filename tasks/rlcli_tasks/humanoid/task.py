@@ -50,10 +50,17 @@ class HumanoidTask(LocomotionTask):
             ge=0,
             description="Penalty on a joint at its limit, from 0 at 98% of its half range, by the same share.",
         )
-        joint_pos_noise: float = Field(0.2, ge=0, description="Start: joint positions +-, inside the limits [rad].")
+        joint_pos_noise: float = Field(
+            0.2, ge=0, description="Start: joint positions +-, inside the limits; legs not inwards [rad]."
+        )
         joint_vel_noise: float = Field(0.1, ge=0, description="Start: joint velocities +- [rad/s].")
 
     params: Params
+
+    def post_reset(self) -> None:
+        """Legs start side by side or apart: drawn inwards, a fifth of all starts would have them inside each other."""
+        super().post_reset()
+        self.start_high[[JOINTS.index("hip_roll_l"), JOINTS.index("hip_roll_r")]] = 0.0
 
     def efforts(self) -> tuple[float, ...]:
         """Each motor's own."""

@@ -47,17 +47,18 @@ class DrawerTask(DirectTask):
     class Params(StrictModel):
         """The task's own settings."""
 
-        action_scale: float = Field(7.5, gt=0, description="Speed of a joint's target at action 1 [rad/s].")
+        action_scale: float = Field(2.5, gt=0, description="Speed of a joint's target at action 1 [rad/s].")
         finger_speed: float = Field(0.1, gt=0, description="Of the fingers' targets, as a share of that [m/rad].")
         velocity_scale: float = Field(0.1, gt=0, description="Factor on observed joint velocities.")
         start_noise: float = Field(0.125, ge=0, description="Start: joints +- about their default [rad, m].")
         start_opening: float = Field(0.01, ge=0, description="Start: the drawer is up to this far open [m].")
         distance_weight: float = Field(2.0, description="Reward on nearness to the handle, which is at most 2.")
         rotation_weight: float = Field(0.5, description="Reward on the attitude of the gripper, at most 1.")
-        around_weight: float = Field(10.0, description="Reward on a finger above and one below the handle, 0.5.")
+        around_weight: float = Field(10.0, description="Reward on fingers above and below the handle and at it, 0.5.")
         finger_weight: float = Field(100.0, description="Reward on how near to its height these are [1/m].")
         close_weight: float = Field(10.0, description="Reward on fingers closed at the handle [1/m].")
         open_weight: float = Field(7.5, description="Reward on the drawer's opening, half as much again if held [1/m].")
+        reach: float = Field(0.05, gt=0, description="From how far on fingers count as about the handle [m].")
         action_cost: float = Field(0.01, ge=0, description="Penalty on squared actions.")
 
     params: Params
@@ -135,7 +136,7 @@ class DrawerTask(DirectTask):
         height = self.cabinet.data.site_pos_w[:, self.handle, 2]
         above = arm.body_pos_w[:, self.left, 2] - height
         below = height - arm.body_pos_w[:, self.right, 2]
-        around = ((above > 0.0) & (below > 0.0)).float()
+        around = ((above > 0.0) & (below > 0.0) & (distance <= params.reach)).float()
         fingers = around * (2.0 * FULLY_OPEN - above - below)
         closed = (distance <= 0.03) * (FULLY_OPEN - arm.joint_pos[:, FINGERS]).sum(dim=1)
         around.mul_(0.5)

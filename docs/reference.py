@@ -1,0 +1,218 @@
+"""The pages that are written from the code: configuration, terms, command line, Python."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+PUBLIC = Path(__file__).parent / "public-names.txt"
+"""What others may rely on, a name a line; tests/docs compares it with the code."""
+MODULES = (
+    "rlcli.task",
+    "rlcli.trainers",
+    "rlcli.errors",
+    "rlcli.gym",
+    "rlcli.random",
+    "rlcli.registry",
+    "rlcli.config.load",
+    "rlcli.config.schema",
+    "rlcli.config.card",
+    "rlcli.envs.vec_env",
+    "rlcli.envs.direct",
+    "rlcli.envs.articulation",
+    "rlcli.envs.step",
+    "rlcli.sim.selection",
+    "rlcli.sim.rotations",
+    "rlcli.rl.trainer",
+    "rlcli.rl.policy",
+    "rlcli.rl.statistics",
+    "rlcli.rl.optimizers",
+    "rlcli.rl.rng",
+    "rlcli.adapters.gymnasium",
+    "rlcli.adapters.sb3",
+    "rlcli.adapters.rsl_rl",
+    "rlcli.testing",
+)
+"""Modules whose public names are the Python interface."""
+TERMS = (
+    "observations",
+    "actions",
+    "rewards",
+    "terminations",
+    "events",
+    "commands",
+    "curriculum",
+    "success",
+    "randomization",
+)
+
+
+def public_names(module_name: str) -> list[str]:
+    """What a module defines, or says it offers, without an underscore."""
+    module = importlib.import_module(module_name)
+    offered = getattr(module, "__all__", None)
+    if offered is not None:
+        return sorted(offered)
+    found = []
+    for name, value in vars(module).items():
+        own = getattr(value, "__module__", None) == module_name
+        if not name.startswith("_") and own and (inspect.isclass(value) or inspect.isfunction(value)):
+            found.append(name)
+    return sorted(found)
+
+
+def write(folder: Path) -> None:
+    """All of the pages."""
+    folder.mkdir(exist_ok=True)
+    pages = {
+        "index": _index,
+        "configuration": _configuration,
+        "terms": _terms,
+        "command-line": _command_line,
+        "python": _python,
+    }
+    for name, page in pages.items():
+        text = "\n".join(page()) + "\n"
+        file = folder / f"{name}.md"
+        if not file.is_file() or file.read_text(encoding="utf-8") != text:
+            file.write_text(text, encoding="utf-8")
+
+
+def _index() -> Iterator[str]:
+    yield "# Reference\n"
+    yield "Written from the code of this version.\n"
+    yield "```{toctree}\n:maxdepth: 1\n\nconfiguration\nterms\ncommand-line\npython\n```"
+
+
+def _configuration() -> Iterator[str]:
+    from rlcli.config.schema import TaskConfig
+
+    schema = TaskConfig.model_json_schema()
+    yield "# Configuration\n"
+    yield "Every key of a `task.yaml`, with its type, default and range; for an editor: `rlcli show TASK --schema`.\n"
+    yield from _model("Task", schema, schema)
+    for name, model in sorted(schema.get("$defs", {}).items()):
+        if "properties" in model:
+            yield from _model(name, model, schema)
+
+
+def _model(name: str, model: dict[str, Any], schema: dict[str, Any]) -> Iterator[str]:
+    yield f"## {name}\n"
+    if model.get("description"):
+        yield _one_line(model["description"]) + "\n"
+    if not model.get("properties"):
+        return
+    yield "| key | type | default | |\n| --- | --- | --- | --- |"
+    for key, field in model["properties"].items():
+        default = "required" if key in model.get("required", ()) else f"`{_cell(repr(field.get('default')))}`"
+        bounds = [f"{sign} {field[word]}" for word, sign in _BOUNDS if word in field]
+        said = " ".join([_one_line(field.get("description", "")), f"({', '.join(bounds)})" if bounds else ""]).strip()
+        yield f"| `{key}` | {_cell(_type(field))} | {default} | {_cell(said)} |"
+    yield ""
+
+
+_BOUNDS = (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("exclusiveMaximum", "<"))
+
+
+def _type(field: dict[str, Any]) -> str:
+    if "$ref" in field:
+        return field["$ref"].rsplit("/", 1)[-1]
+    for several in ("anyOf", "oneOf", "allOf"):
+        if several in field:
+            return " or ".join(dict.fromkeys(_type(each) for each in field[several]))
+    if "enum" in field:
+        return ", ".join(map(str, field["enum"]))
+    if field.get("type") == "array":
+        items = field.get("items") or field.get("prefixItems")
+        if isinstance(items, list):
+            return "[" + ", ".join(_type(item) for item in items) + "]"
+        return f"list of {_type(items)}" if isinstance(items, dict) else "list"
+    if field.get("type") == "object":
+        inner = field.get("additionalProperties")
+        return f"mapping to {_type(inner)}" if isinstance(inner, dict) and inner else "mapping"
+    return str(field.get("type", "any"))
+
+
+def _terms() -> Iterator[str]:
+    yield "# Terms\n"
+    yield "What `func:` may name in each section of a task. A term's keyword parameters are its YAML keys.\n"
+    for section in TERMS:
+        module = importlib.import_module(f"rlcli.mdp.{section}")
+        yield f"## {section.capitalize()}\n"
+        for name, value in vars(module).items():
+            if name.startswith("_") or getattr(value, "__module__", "") != module.__name__:
+                continue
+            if inspect.isclass(value) or inspect.isfunction(value):
+                yield from _term(name, value)
+
+
+def _term(name: str, value: Any) -> Iterator[str]:
+    from rlcli.config.terms import snake_case
+
+    yield f"### {snake_case(name) if inspect.isclass(value) else name}\n"
+    parameters = [
+        f"`{parameter.name}`" + ("" if parameter.default is parameter.empty else f" = `{parameter.default!r}`")
+        for parameter in inspect.signature(value).parameters.values()
+        if parameter.kind is parameter.KEYWORD_ONLY
+    ]
+    yield inspect.cleandoc(value.__doc__ or "").replace("\n\n", "\n\n") + "\n"
+    if parameters:
+        yield "Keys: " + ", ".join(parameters) + "\n"
+
+
+def _command_line() -> Iterator[str]:
+    import typer
+
+    from rlcli.cli.app import build
+
+    command = typer.main.get_command(build())
+    yield "# Command line\n"
+    yield "Data goes to stdout, messages to stderr; `--json` prints one document. [Exit codes](../exit-codes.md).\n"
+    yield from _commands(command, "rlcli")
+
+
+def _commands(command: Any, path: str) -> Iterator[str]:
+    for name, inner in sorted(getattr(command, "commands", {}).items()):
+        yield f"## {path} {name}\n"
+        yield inspect.cleandoc(inner.help or "") + "\n"
+        if hasattr(inner, "commands"):
+            yield from _commands(inner, f"{path} {name}")
+            continue
+        yield "| | |\n| --- | --- |"
+        for parameter in inner.params:
+            if getattr(parameter, "hidden", False) or parameter.name == "help":
+                continue
+            names = ", ".join(f"`{option}`" for option in parameter.opts) if parameter.opts[0].startswith("-") else None
+            shown = names or f"`{(parameter.metavar or parameter.name).upper()}`"
+            yield f"| {shown} | {_cell(_one_line(getattr(parameter, 'help', None) or ''))} |"
+        yield ""
+
+
+def _python() -> Iterator[str]:
+    yield "# Python\n"
+    yield "What plugins and scripts may rely on. Before 1.0 a minor version may change one: see the changelog.\n"
+    for module_name in MODULES:
+        yield f"## {module_name}\n"
+        yield "```{eval-rst}"
+        yield f".. automodule:: {module_name}\n   :no-index:\n"
+        for name in public_names(module_name):
+            value = getattr(importlib.import_module(module_name), name)
+            kind = "autoclass" if inspect.isclass(value) else "autofunction" if callable(value) else "py:data"
+            yield f".. {kind}:: {module_name}.{name}"
+            yield "   :no-index:\n" if kind != "autoclass" else "   :members:\n   :no-index:\n"
+        yield "```\n"
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("<", "&lt;")
+
+
+if __name__ == "__main__":
+    PUBLIC.write_text("".join(f"{m}.{n}\n" for m in MODULES for n in public_names(m)), encoding="utf-8")
