@@ -44,6 +44,7 @@ class ActorCritic(nn.Module):
         self.memory = Lstm(obs_size, cells) if cells else None
         self.vision, obs_size = _eyes(vision, obs_size, config.actor, config.init)
         self.actor = _mlp(cells[-1] if cells else obs_size, config.actor, action_size, config.init, gain=0.01)
+        self.teller = nn.Linear(config.actor.hidden[-1], critic_obs_size) if config.tell_coef else None
         if config.std == "log":
             self.log_std = nn.Parameter(torch.full((action_size,), math.log(config.init_std)))
         else:
@@ -59,7 +60,11 @@ class ActorCritic(nn.Module):
 
     def mean(self, obs: Tensor) -> Tensor:
         """The mean action. (n, d) -> (n, a)"""
-        return self.actor(obs if self.vision is None else self.vision(obs))
+        return self.actor[-1](self.hidden(obs))
+
+    def hidden(self, obs: Tensor) -> Tensor:
+        """The actor's last hidden layer. (n, d) -> (n, h)"""
+        return self.actor[:-1](obs if self.vision is None else self.vision(obs))
 
     def value(self, critic_obs: Tensor) -> Tensor:
         """(..., c) -> (...)"""

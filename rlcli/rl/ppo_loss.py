@@ -55,7 +55,8 @@ def judge(
         old_std: deviation of the policy that `batch.mean` is of. (a,)
     """
     value_loss = _value_loss(networks.value(critic_obs), batch, config)
-    std, mean = networks.std, networks.mean(obs)
+    hidden = networks.hidden(obs)
+    std, mean = networks.std, networks.actor[-1](hidden)
 
     log_ratio = log_prob((batch.action - mean) / std, std) - batch.log_prob
     ratio = log_ratio.exp()
@@ -63,6 +64,8 @@ def judge(
     surrogate = -torch.min(advantage * ratio, advantage * clipped).mean()
     entropy = (std.log() + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
     loss = surrogate + config.value_coef * value_loss - config.entropy_coef * entropy
+    if networks.teller is not None:
+        loss = loss + config.tell_coef * (networks.teller(hidden) - _standard(critic_obs)).square().mean()
     if config.bounds_coef:
         bounds = (mean.abs() - config.bounds_margin).clamp(min=0.0).square().sum(dim=-1).mean()
         loss = loss + config.bounds_coef * bounds
@@ -104,6 +107,12 @@ class Parts(NamedTuple):
 def log_prob(noise: Tensor, std: Tensor) -> Tensor:
     """Log-density of `mean + std * noise`. (n, a), (a,) -> (n,)"""
     return -(0.5 * noise.square() + std.log() + 0.5 * math.log(2.0 * math.pi)).sum(dim=-1)
+
+
+def _standard(values: Tensor) -> Tensor:
+    """Each column less its mean, by its deviation, within +-3. (n, d)"""
+    deviation, mean = torch.std_mean(values, dim=0)
+    return ((values - mean) / (deviation + 1e-6)).clamp(-3.0, 3.0)
 
 
 def _value_loss(value: Tensor, batch: Samples, config: PpoConfig) -> Tensor:

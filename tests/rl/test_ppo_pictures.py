@@ -47,7 +47,8 @@ rewards: {way: {func: way, weight: 100.0}}
 terminations: {time_out: {func: time_out, time_out: true}}
 agents:
   ppo: {trainer: ppo, algorithm: ppo, max_iterations: 2, num_steps: 10, num_minibatches: 2, num_epochs: 2,
-        cnn: {channels: [4, 6], kernels: [4, 2], strides: [2, 1], motion: 5.0}, actor: {hidden: [8]}, critic: {hidden: [9]}}
+        cnn: {channels: [4, 6], kernels: [4, 2], strides: [2, 1], motion: 5.0},
+        actor: {hidden: [8]}, critic: {hidden: [9]}}
 """
 TERMS = '''
 def way(env):
@@ -186,20 +187,34 @@ def test_a_critic_of_pictures_and_states_sees_both(trainer_of):
     trainer.iterate()
 
 
-@pytest.mark.parametrize("critic", ["", STATE])
-def test_a_state_loads_back_bit_for_bit(trainer_of, critic):
+@pytest.mark.parametrize(("critic", "tell"), [("", 0.0), (STATE, 0.0), (STATE, 0.5)])
+def test_a_state_loads_back_bit_for_bit(trainer_of, critic, tell):
     text = YAML.replace("\nevents", critic) if critic else YAML
-    trainer = trainer_of("agent.normalize_observations=true", text=text)
+    trainer = trainer_of("agent.normalize_observations=true", f"agent.tell_coef={tell}", text=text)
     trainer.iterate()
     state = trainer.state()
     trainer.iterate()
     after = trainer.state()
-    other = trainer_of("agent.normalize_observations=true", seed=98, env_seed=99)
+    other = trainer_of("agent.normalize_observations=true", f"agent.tell_coef={tell}", seed=98, env_seed=99)
     other.load(state)
     other.iterate()
     for part, tensors in after.tensors.items():
         for name, value in tensors.items():
             assert torch.equal(value.nan_to_num(), other.state().tensors[part][name].nan_to_num()), (part, name)
+
+
+@pytest.mark.slow
+def test_an_actor_that_is_to_tell_what_the_critic_sees_learns_where_the_cart_stands(trainer_of):
+    trainer = trainer_of(
+        "agent.tell_coef=1.0", "agent.learning_rate=2e-3", "agent.num_epochs=5", text=YAML.replace("\nevents", STATE)
+    )
+    for _ in range(30):
+        trainer.iterate()
+    networks, obs = trainer.networks, trainer._obs
+    with torch.no_grad():
+        told = networks.teller(networks.hidden(obs["policy"]))[:, 0]
+    assert torch.corrcoef(torch.stack([told, obs["critic"][:, 0]]))[0, 1] > 0.9
+    assert not any("teller" in name for name in trainer.state().tensors["policy"])
 
 
 @pytest.mark.slow
