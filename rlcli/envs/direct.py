@@ -133,14 +133,6 @@ class DirectTask:
         lives = self.env.engine.lives
         return IdSelection(ids, self.env.seed, episodes[ids], stream(f"direct.{name}"), device, lives)
 
-    def step_draws(self, name: str = "step") -> Selection:
-        """Random numbers of this step for all environments: `step_draws().normal(0, 1, (k,))` is (num_envs, k).
-
-        They depend on the seed, the environment, the number of steps since the start and `name`, and on nothing else.
-        A GPU records them.
-        """
-        return self.env.everyone_now().stream(stream(f"direct.{name}"))
-
     def selection(self, mask: Tensor, name: str) -> Selection | None:
         """The environments where `mask` (num_envs,) holds, to draw for in the middle of an episode; None for nobody.
 

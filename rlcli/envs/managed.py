@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from rlcli.config.schema import ObservationConfig
@@ -63,6 +64,7 @@ class ManagedEnv(VecEnv):
 
     def _build(self) -> None:
         # in this order: a term's first value may use what stands before it
+        self._everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         n, device, live = self.num_envs, self.device, self._binder.live
         self.command_manager = CommandManager(self._commands, n, self.step_dt, device, live)
         self.action_manager = ActionManager(self._actions, n, device)
@@ -79,7 +81,7 @@ class ManagedEnv(VecEnv):
             n,
             self.step_dt,
             device,
-            self.everyone_now,
+            self._everyone_now,
             live,
             self._watch(),
         )
@@ -200,6 +202,15 @@ class ManagedEnv(VecEnv):
         running = (self.episode_length_buf > 0).long()  # no time has passed for those just reset
         self.command_manager.compute(self._now, running)
         self.event_manager.interval(self._now, running, self._written)
+
+    def _everyone_now(self) -> Selection:
+        everyone = self._now(self._everywhere)
+        assert everyone is not None
+        return everyone
+
+    def _now(self, mask: Tensor) -> Selection | None:
+        """A selection that draws from the step's own counter."""
+        return self.engine.select(mask, self.seed, self._steps.expand(self.num_envs).contiguous())
 
     def _written(self, selection: Selection) -> None:
         self.sim.moved(selection)

@@ -190,12 +190,6 @@ class VecEnv(ABC):
         self.seconds["step"] += time.perf_counter() - start
         return StepResult(obs, reward, terminated, truncated, final_obs, episodes)
 
-    def everyone_now(self) -> Selection:
-        """All environments, drawing by the number of steps since the start instead of by their episodes."""
-        everyone = self._now(self._everywhere)
-        assert everyone is not None
-        return everyone
-
     def succeeding(self) -> Tensor | None:
         """Where the success condition holds as things are; None for a task without one. (num_envs,) bool"""
         return None if self._success is None else self._success()
@@ -564,12 +558,8 @@ class VecEnv(ABC):
     def _select(self, mask: Tensor) -> Selection | None:
         return self.engine.select(mask, self.seed, self.episode_index)
 
-    def _now(self, mask: Tensor) -> Selection | None:
-        """A selection that draws from the step's own counter."""
-        return self.engine.select(mask, self.seed, self._steps.expand(self.num_envs).contiguous())
-
     def _everyone(self) -> Selection:
-        everyone = self._select(self._everywhere)
+        everyone = self._select(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
         assert everyone is not None
         return everyone
 
@@ -676,7 +666,6 @@ class VecEnv(ABC):
         self._aside = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._any_aside = False
         self._ids = torch.arange(self.num_envs, device=self.device)
-        self._everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         self._steps: Tensor = torch.zeros((), dtype=torch.int64, device=self.device)
 
 

@@ -34,7 +34,7 @@ def test_no_hook_of_a_step_waits_for_the_device(task):
     env.step(action)
     if task == "crazyflie":  # a GPU draws by itself, a CPU in numpy
         noise = torch.zeros(4, 4)
-        env.task.step_draws = lambda name: SimpleNamespace(normal=lambda mean, std, shape: noise)
+        env.task.selection = lambda mask, name: SimpleNamespace(normal=lambda mean, std, shape: noise)
     with Operations() as step:
         env.task.pre_physics_step(action)
         env.task.get_observations()

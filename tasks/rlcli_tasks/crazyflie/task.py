@@ -68,6 +68,7 @@ class CrazyflieTask(DirectTask):
         """Those of the running episode, in turn. (n, phases, 3) [m]"""
         self.target = torch.zeros(n, 3, device=self.device)
         """The present one. (n, 3) [m]"""
+        self.everywhere = torch.ones(n, dtype=torch.bool, device=self.device)
         self.actions = torch.zeros(n, len(MOTORS), device=self.device)
         self.speeds = torch.zeros(n, len(MOTORS), device=self.device)
         """Motor speeds, over the highest. (n, 4)"""
@@ -96,7 +97,9 @@ class CrazyflieTask(DirectTask):
         self.actions.copy_(actions)
         asked = (actions + 1.0).mul_(0.5).clamp_(0.0, 1.0)
         self.speeds.lerp_(asked.sqrt(), self.follow)
-        noise = self.step_draws("thrust").normal(0.0, self.params.thrust_noise, (len(MOTORS),))
+        everyone = self.selection(self.everywhere, "thrust")
+        assert everyone is not None
+        noise = everyone.normal(0.0, self.params.thrust_noise, (len(MOTORS),))
         thrusts = torch.addcmul(self.speeds.square(), asked, noise).clamp_(0.0, 1.0)
         self.env.engine.field("ctrl").copy_(thrusts.mul_(self.max_thrust))
 
