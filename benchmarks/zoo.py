@@ -94,23 +94,35 @@ def value_of(evaluation: dict[str, Any], name: str) -> float | None:
 # --- learn ---
 
 
-def learn(task: str, device: str | None, seed: int, runs: Path, episodes: int | None) -> int:
+def learn(task: str, overrides: list[str], device: str | None, seed: int, runs: Path) -> int:
     """Train, evaluate, judge; the exit status."""
     entry = entries()[task]
     device = device or entry.device
     agent = ["--agent", entry.agent] if entry.agent else []
     begin = time.monotonic()
     trained = _rlcli(
-        "train", task, *agent, "--device", device, "--seed", str(seed), "--runs-dir", str(runs), "--logger", "none"
+        "train",
+        task,
+        *overrides,
+        *agent,
+        "--device",
+        device,
+        "--seed",
+        str(seed),
+        "--runs-dir",
+        str(runs),
+        "--logger",
+        "none",
     )
     minutes = (time.monotonic() - begin) / 60
     run = Path(trained["run"])
-    evaluation = _evaluate(run, entry, episodes)
+    evaluation = _evaluate(run, entry)
     missed = entry.missed(evaluation)
     if minutes > entry.minutes and device == entry.device:
         missed.append(f"it took {minutes:.1f} minutes, more than {entry.minutes:g}")
     line = {
         "task": task,
+        "overrides": overrides,
         "seed": seed,
         "device": device,
         "minutes": round(minutes, 2),
@@ -229,11 +241,10 @@ def _documents(folder: Path) -> dict[str, Any]:
     return found
 
 
-def _evaluate(policy: Path, entry: Entry, episodes: int | None = None) -> dict[str, Any]:
+def _evaluate(policy: Path, entry: Entry) -> dict[str, Any]:
     """A new evaluation, in many environments: the few that `play:` has would take longer."""
-    episodes = episodes or entry.episodes
-    several = ("--num-envs", str(min(episodes, entry.envs)))
-    return _rlcli("eval", "--checkpoint", str(policy), "--episodes", str(episodes), *several)
+    several = ("--num-envs", str(min(entry.episodes, entry.envs)))
+    return _rlcli("eval", "--checkpoint", str(policy), "--episodes", str(entry.episodes), *several)
 
 
 def _evaluated(run: Any, checkpoint: Path, entry: Entry, known: dict[str, Any]) -> dict[str, Any]:
@@ -352,10 +363,10 @@ def main() -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     learning = commands.add_parser("learn")
     learning.add_argument("task", choices=entries())
+    learning.add_argument("overrides", nargs="*", metavar="key.path=value")
     learning.add_argument("--device", default=None)
     learning.add_argument("--seed", type=int, default=1)
     learning.add_argument("--runs-dir", type=Path, default=Path("runs"))
-    learning.add_argument("--episodes", type=int, default=None)
     collecting = commands.add_parser("collect")
     collecting.add_argument("--all", type=Path, default=None, metavar="FOLDER")
     collecting.add_argument("task", nargs="?", choices=entries())
@@ -366,7 +377,7 @@ def main() -> int:
     commands.add_parser("pages")
     given = parser.parse_args()
     if given.command == "learn":
-        return learn(given.task, given.device or None, given.seed, given.runs_dir, given.episodes)
+        return learn(given.task, given.overrides, given.device or None, given.seed, given.runs_dir)
     if given.command == "collect":
         if (given.all is None) == (given.task is None):
             parser.error("collect TASK RUN ..., or collect --all FOLDER")

@@ -143,9 +143,9 @@ def command(
             _Worker(search, base, goal, jobs, stop).run()
     finally:
         search.let_go()
-    _report(search, base)
-    if stop.signal is not None:
+    if stop.signal is not None and len(search.ended()) < trials:
         raise Stopped("stopped on request", exit_code=stop.exit_code, hint="the same command again goes on")
+    _report(search)
 
 
 @dataclass(slots=True)
@@ -370,7 +370,7 @@ def _trained(rows: Sequence[Mapping[str, Any]], step: _Step) -> float:
     return step.trained_s
 
 
-def _report(search: Search, base: _Base | None) -> None:
+def _report(search: Search) -> None:
     """The trials and the best one, as a table and as a document."""
     from rlcli.rl.search import PRESET
 
@@ -455,4 +455,4 @@ def _show(words: Sequence[str], runs: Path, storage: str | None, plot: bool) -> 
         drawn += [(p.key, [search.values(trial)[p.key] for trial in done], p.log) for p in search.parameters]
         picture = scatter(drawn, [trial.value for trial in done], search.settings["objective"], title=folder.name)
         console.data(str(write_summary(folder, PICTURE, picture)))
-    _report(search, None)
+    _report(search)

@@ -367,17 +367,46 @@ def _direct(task: TaskConfig, source: TaskSource | None) -> Iterable[Table]:
 
 
 def _hooks(file: Path, class_name: str) -> list[tuple[str, str, str]]:
+    docstrings = _docstrings(file, class_name)
+    found = [("Task", class_name, docstrings.get("", ""))]
+    found += [(decides, name, docstrings.get(name, "")) for name, decides in _HOOKS.items()]
+    return [(decides, name, first_paragraph(text)) for decides, name, text in found if text]
+
+
+def _docstrings(file: Path, class_name: str, depth: int = 8) -> dict[str, str]:
+    """Method -> docstring, of a class and of the bases that a task has in files of its own; "" is the class itself."""
     tree = ast.parse(file.read_bytes())
     node = next((n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == class_name), None)
-    if node is None:
-        return []
-    found = [("Task", class_name, first_paragraph(ast.get_docstring(node) or ""))]
-    functions = {inner.name: inner for inner in node.body if isinstance(inner, ast.FunctionDef)}
-    for name, decides in _HOOKS.items():
-        docstring = ast.get_docstring(functions[name]) if name in functions else None
-        if docstring:
-            found.append((decides, name, first_paragraph(docstring)))
-    return [row for row in found if row[2]]
+    if node is None or not depth:
+        return {}
+    found: dict[str, str] = {}
+    for base in reversed([base.id for base in node.bases if isinstance(base, ast.Name)]):
+        where = _defined_in(tree, file, base)
+        if where is not None:
+            found |= _docstrings(*where, depth - 1)
+    functions = [inner for inner in node.body if isinstance(inner, ast.FunctionDef)]
+    found |= {inner.name: text for inner in functions if (text := ast.get_docstring(inner))}
+    found[""] = ast.get_docstring(node) or ""
+    return found
+
+
+def _defined_in(tree: ast.Module, file: Path, name: str) -> tuple[Path, str] | None:
+    """File and name of a class that a file defines or imports; None for rlcli's own, and for what is not found."""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef) and node.name == name:
+            return file, name
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        real = next((alias.name for alias in node.names if (alias.asname or alias.name) == name), None)
+        parts = (node.module or "").split(".")
+        if real is None or parts[0] == "rlcli":
+            continue
+        roots = file.parents[node.level - 1 : node.level] if node.level else file.parents
+        for root in roots:
+            for candidate in (root.joinpath(*parts).with_suffix(".py"), root.joinpath(*parts, "__init__.py")):
+                if candidate.is_file():
+                    return candidate, real
+    return None
 
 
 def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -620,8 +620,8 @@ class RaySensorConfig(StrictModel):
     def _straight_down(self) -> RaySensorConfig:
         if not self.lookup:
             return self
-        grid = isinstance(self.pattern, GridPatternConfig)
-        directions = [self.pattern.direction] if grid else self.pattern  # type: ignore[union-attr]
+        pattern = self.pattern
+        directions = [pattern.direction] if isinstance(pattern, GridPatternConfig) else pattern
         if any(x or y or z >= 0.0 for x, y, z in directions) or self.alignment == "base":
             raise ValueError("lookup is for rays straight down: directions [0, 0, -1], alignment yaw or world")
         if self.sees != "ground":

@@ -42,6 +42,9 @@ class CnnConfig(StrictModel):
     """Edge of each layer's square window [pixels]."""
     strides: Annotated[tuple[Count, ...], Field(min_length=1)] = (4, 2)
     """How far each layer's window moves [pixels]."""
+    motion: Positive | None = None
+    """The steps of a history before the newest become what has changed since them, times this: velocities are learned
+    much sooner; null: they stay pictures."""
 
     @model_validator(mode="after")
     def _layers(self) -> CnnConfig:

@@ -46,14 +46,14 @@ def vision_spec(env: VecEnv, config: PpoConfig, groups: tuple[str, ...]) -> Visi
     for term in (term for group in groups for term in env.layout.observations[group]):
         if len(term.shape) == 3:
             channels, *edges = term.shape
-            pictures.append({"start": start, "shape": [term.history * channels, *edges]})
+            pictures.append({"start": start, "shape": [term.history * channels, *edges], "steps": term.history})
         start += term.size
     if not pictures:
         return None
     cnn = config.cnn
     layers = {name: list(getattr(cnn, name)) for name in ("channels", "kernels", "strides")}
     try:
-        return VisionSpec.model_validate({"pictures": pictures, **layers})
+        return VisionSpec.model_validate({"pictures": pictures, "motion": cnn.motion, **layers})
     except ValidationError as error:
         message = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
         raise _problem(env, "cnn", message, "smaller kernels or strides, fewer layers, or larger pictures") from None

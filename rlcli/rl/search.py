@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import platform
+import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,6 +28,7 @@ _SETTINGS = "rlcli"
 """Attribute of an Optuna study: what all of its processes agree on."""
 _PLACE = "place"
 """Attribute of a trial: the machine and the folder of who works on it; only there its run can go on."""
+_TRIES = 5
 _ENDED = ("COMPLETE", "PRUNED", "FAIL")
 
 
@@ -285,6 +287,10 @@ def _database(url: str) -> Any:
     except ImportError:
         raise DependencyError("a shared storage needs SQLAlchemy", hint='pip install "rlcli[sweep]"') from None
     try:
+        for _ in range(_TRIES):
+            with contextlib.suppress(sqlalchemy.exc.IntegrityError, sqlalchemy.exc.ProgrammingError):
+                return RDBStorage(url, engine_kwargs={"pool_pre_ping": True})
+            time.sleep(1.0)  # another machine makes the same tables at this moment
         return RDBStorage(url, engine_kwargs={"pool_pre_ping": True})
     except ModuleNotFoundError as error:
         raise DependencyError(f"--storage needs the driver {error.name}", hint=f"pip install {error.name}") from None

@@ -6,7 +6,7 @@ import math
 from typing import Annotated
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 from torch import Tensor, nn
 
 _Size = Annotated[int, Field(ge=1, le=4096)]
@@ -21,6 +21,8 @@ class PictureSpec(BaseModel):
     """Its first column."""
     shape: tuple[_Size, _Size, _Size]
     """Channels (with a history those of the oldest step first), rows, columns."""
+    steps: Annotated[int, Field(ge=1, le=4096)] = 1
+    """Of a history: its channels are those of so many pictures."""
 
     @property
     def stop(self) -> int:
@@ -41,6 +43,8 @@ class VisionSpec(BaseModel):
     """Edge of each layer's square window [pixels]."""
     strides: list[_Size]
     """How far each layer's window moves [pixels]."""
+    motion: PositiveFloat | None = None
+    """The steps of a history before the newest become what has changed since them, times this; null: they stay."""
 
     @model_validator(mode="after")
     def _fits(self) -> VisionSpec:
@@ -50,6 +54,8 @@ class VisionSpec(BaseModel):
         for picture in self.pictures:
             if picture.start < end:
                 raise ValueError("pictures overlap, or are not in the order of their columns")
+            if picture.shape[0] % picture.steps:
+                raise ValueError(f"{picture.shape[0]} channels are not those of {picture.steps} steps")
             end = picture.stop
             self.sizes(picture)
         return self
@@ -110,11 +116,20 @@ class Vision(nn.Module):
         found, kept, end = [], [], 0
         for picture, layers in zip(self.spec.pictures, self.pictures, strict=True):
             pixels = obs[:, picture.start : picture.stop].unflatten(1, picture.shape)
+            if self.spec.motion is not None and picture.steps > 1:
+                pixels = moved(pixels, picture.steps, self.spec.motion)
             found.append(layers(pixels).flatten(1))
             kept.append(obs[:, end : picture.start])
             end = picture.stop
         kept.append(obs[:, end:])
         return torch.cat([*found, *(part.to(found[0].dtype) for part in kept if part.shape[1])], dim=1)
+
+
+def moved(pixels: Tensor, steps: int, factor: float) -> Tensor:
+    """Of each step but the newest, what has changed since. (n, steps x c, h, w), the oldest first, likewise back"""
+    frames = pixels.unflatten(1, (steps, -1))
+    now = frames[:, -1:]
+    return torch.cat([factor * (now - frames[:, :-1]), now], dim=1).flatten(1, 2)
 
 
 class WideConv(nn.Conv2d):

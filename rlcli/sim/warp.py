@@ -81,6 +81,10 @@ _BOUNDS = ("geom_aabb", "geom_rbound")
 """Those that it derives from the sizes of geoms."""
 
 
+_HOLDS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
+"""Equality constraints that hold bodies together."""
+
+
 _Groups = wp.types.vector(length=mujoco.mjNGROUP, dtype=float)
 
 
@@ -145,6 +149,7 @@ class WarpEngine:
             for kind, stage in zip(model.sensor_type, model.sensor_needstage, strict=True)
             if int(stage) < int(mujoco.mjtStage.mjSTAGE_ACC)
         )
+        self._holds_bodies = bool(np.isin(model.eq_type, _HOLDS).any())
         self._expanded: dict[str, Tensor] = {}
         self._graphs: dict[tuple[int, bool], Any] = {}
         self._rays: dict[tuple[int, int], tuple[wp.array, wp.array, wp.array]] = {}
@@ -213,6 +218,7 @@ class WarpEngine:
             self._graphs.clear()
             if self._stages(name):
                 with self._launching():
+                    self._catch_up()
                     mjw.forward(self._model, self._data)  # a field asked for late is that of the state
                 for other, values in kept.items():
                     self._fields[other].copy_(values)
@@ -440,6 +446,7 @@ class WarpEngine:
 
     def _advance(self, nstep: int, derive: bool) -> None:
         for _ in range(nstep):
+            self._catch_up()
             mjw.step(self._model, self._data)
         if derive and self._external_forces:
             mjw.rne_postconstraint(self._model, self._data)
@@ -447,6 +454,16 @@ class WarpEngine:
             self._guard()
         if derive and not self._late:
             self._derive()
+
+    def _catch_up(self) -> None:
+        """Compute the velocities of bodies before constraints are made of them.
+
+        MuJoCo Warp 4.0 makes connect and weld constraints first, of the velocities that the last pass left: those of
+        the step before, or of the episode before.
+        """
+        if self._holds_bodies:
+            mjw.fwd_kinematics(self._model, self._data)
+            mjw.com_vel(self._model, self._data)
 
     def _guard(self) -> None:
         """Put worlds that have left all bounds back, before anything is derived from where they are."""
@@ -476,6 +493,7 @@ class WarpEngine:
                 mjw.sensor_pos(m, d)
                 mjw.sensor_vel(m, d)
         elif _VELOCITY in self._derived:
+            self._catch_up()
             mjw.fwd_position(m, d, factorize=False)
             for name, kept in self._overwritten.items():
                 wp.copy(kept, getattr(d, name))
@@ -515,6 +533,7 @@ class WarpEngine:
             return
         before = self._before_forward()
         with self._launching():
+            self._catch_up()
             mjw.forward(self._model, self._data)
         for name, old in before.items():
             now = self.field(name)

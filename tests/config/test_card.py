@@ -128,6 +128,25 @@ def test_a_direct_task_has_its_parameters_and_the_words_of_its_hooks():
     assert dict(content.facts)["Observations are clipped to"] == "±5"
 
 
+def test_hooks_that_a_direct_task_inherits_have_their_words_too(tmp_path):
+    source = find_task("cartpole-direct")
+    for name in ("direct.yaml", "cartpole.xml"):
+        (tmp_path / name.replace("direct", "task")).write_text((source.root / name).read_text())
+    (tmp_path / "base.py").write_text(
+        'raise SystemExit("run")\nfrom rlcli.envs.direct import DirectTask\n\n'
+        'class Other(DirectTask):\n    """Not said."""\n    def reset(self, selection):\n        """From below."""\n'
+        '    def is_done(self):\n        """Replaced."""\n'
+    )
+    (tmp_path / "task.py").write_text(
+        'from .base import Other as Base\n\nclass Task(Base):\n    """Balance."""\n'
+        '    def is_done(self):\n        """Never."""\n\n    class Params:\n'
+        "        reset_dist: float = 1.0\n        max_effort: float = 1.0\n        pole_vel_weight: float = 1.0\n"
+    )
+    words = rows(built(tmp_path), "In the task's words")
+    assert {row["Hook"]: row["What"] for row in words.values()} == {
+        "Task": "Balance.", "reset": "From below.", "is_done": "Never."}  # fmt: skip
+
+
 def test_nothing_of_a_tasks_code_runs_for_its_card(tmp_path):
     source = find_task("cartpole")
     (tmp_path / "task.yaml").write_text(source.config.read_text().replace("func: is_alive", "func: mine"))

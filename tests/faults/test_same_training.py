@@ -1,7 +1,9 @@
 """Two trainings with one seed: the same metrics, weights, optimisers, replay rows and environments, bit for bit."""
 
+import json
 import random
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,9 @@ from fault_sizes import amount, chosen
 from same_bits import TASKS, other_work, place_of
 from worlds import write
 
+import rlcli_tasks
 from rlcli.cli.app import main
+from rlcli.config import strict_yaml
 from rlcli.config.load import resolve
 from rlcli.envs.vec_env import make_env
 from rlcli.registry import find_task, load_object
@@ -24,8 +28,19 @@ KINDS = {
     "td3": f"trainer: sb3, algorithm: td3, {OFF_POLICY}",
     "ddpg": f"trainer: sb3, algorithm: ddpg, {OFF_POLICY}",
 }
-BUILT_IN = [("cartpole", "sb3-ppo"), ("cartpole", "ppo"), ("cartpole-direct", "sb3-ppo"), ("cartpole-direct", "ppo"),
-            ("ant-direct", "sb3-ppo")]  # fmt: skip
+
+
+def built_in():
+    """Every built-in task with each of its agents whose trainer is built in too."""
+    names = json.loads(Path(rlcli_tasks.__file__).with_name("index.json").read_text())
+    for name in names:
+        agents = strict_yaml.load(find_task(name).config.read_bytes()).data["agents"]
+        for agent, settings in agents.items():
+            if agent != "default" and settings["trainer"] in ("ppo", "sb3"):
+                yield name, agent
+
+
+BUILT_IN = sorted(built_in())
 CLOCK = "Perf/"
 
 
@@ -99,7 +114,7 @@ def test_several_torch_threads_give_the_same_every_time(kind, threads, tmp_path)
         del kept
 
 
-@pytest.mark.parametrize(("task", "agent"), chosen(BUILT_IN, 1))
+@pytest.mark.parametrize(("task", "agent"), chosen(BUILT_IN, 2))
 def test_the_agents_of_built_in_tasks_train_the_same_twice(task, agent):
     resolved = resolve(find_task(task), agent=agent, overrides=["scene.num_envs=32", "episode_length_s=0.4"])
     first = train(resolved, iterations=3)

@@ -200,7 +200,8 @@ def test_the_page_on_lint_lists_every_rule():
 def test_links_between_pages_lead_somewhere():
     for page in [*DOCS.rglob("*.md"), README]:
         for target in re.findall(r"\]\(([^)#:]+\.md)\)", page.read_text(encoding="utf-8")):
-            assert (page.parent / target).is_file(), f"{page.name}: {target}"
+            written = target.startswith("reference/")  # by the build of the pages
+            assert written or (page.parent / target).is_file(), f"{page.name}: {target}"
 
 
 def test_every_page_is_linked_from_the_index_or_the_readme():

@@ -47,7 +47,7 @@ rewards: {way: {func: way, weight: 100.0}}
 terminations: {time_out: {func: time_out, time_out: true}}
 agents:
   ppo: {trainer: ppo, algorithm: ppo, max_iterations: 2, num_steps: 10, num_minibatches: 2, num_epochs: 2,
-        cnn: {channels: [4, 6], kernels: [4, 2], strides: [2, 1]}, actor: {hidden: [8]}, critic: {hidden: [9]}}
+        cnn: {channels: [4, 6], kernels: [4, 2], strides: [2, 1], motion: 5.0}, actor: {hidden: [8]}, critic: {hidden: [9]}}
 """
 TERMS = '''
 def way(env):
@@ -111,6 +111,17 @@ def test_pictures_are_cut_out_of_the_columns_and_the_others_follow(wide):
     torch.testing.assert_close(seen, torch.cat([first, second, others], dim=1))
 
 
+def test_with_motion_older_steps_become_what_has_changed_since():
+    spec = VisionSpec(
+        pictures=[{"start": 0, "shape": [6, 2, 3], "steps": 3}], channels=[5], kernels=[2], strides=[1], motion=4.0
+    )
+    vision, obs = Vision(spec, nn.Identity), torch.randn(4, 36)
+    plain = Vision(spec.model_copy(update={"motion": None}), nn.Identity)
+    plain.load_state_dict(vision.state_dict())
+    first, second, now = obs.view(4, 3, 12).unbind(1)
+    torch.testing.assert_close(vision(obs), plain(torch.cat([4.0 * (now - first), 4.0 * (now - second), now], dim=1)))
+
+
 def test_the_layout_says_where_the_picture_lies_and_the_policy_too(trainer_of):
     trainer = trainer_of()
     (action, image, time) = trainer.env.layout.observations["policy"]
@@ -119,6 +130,7 @@ def test_the_layout_says_where_the_picture_lies_and_the_policy_too(trainer_of):
     assert trainer.spec.kind == "gaussian-cnn"
     (picture,) = trainer.spec.vision.pictures
     assert (picture.start, picture.shape) == (1, (2, 8, 16))  # behind one column; two steps are two channels
+    assert (picture.steps, trainer.spec.vision.motion) == (2, 5.0)
     record = trainer.env.layout.record()["observations"]["policy"]
     assert [term.get("shape") for term in record] == [None, [1, 8, 16], None]
 
@@ -238,6 +250,8 @@ GOOD = {
         {"pictures": [{"start": 8, "shape": [1, 4, 4]}]},  # beyond the observation
         {"pictures": [{"start": 0, "shape": [1, 3, 3]}, {"start": 4, "shape": [1, 3, 3]}]},  # overlapping
         {"pictures": []},
+        {"pictures": [{"start": 2, "shape": [3, 2, 2], "steps": 2}]},  # half a step
+        {"motion": 0.0},
         {"kernels": [5]},
         {"strides": [0]},
         {"channels": [2, 2]},

@@ -229,6 +229,9 @@ def pose(env, position, quat, pan=0.0):
         sensor.update(env.step_dt)
 
 
+DOWN = {"pattern": [[0.0, 0.0, -1.0]], "lookup": True}
+
+
 def rays(**settings):
     return {"kind": "rays", **settings}
 
@@ -411,7 +414,7 @@ def test_a_checkpoint_carries_times_and_history(tmp_path):
         (contact(), "feet: missing key 'bodies'", None),
         (contact(bodies="torso", hisotry=2), "feet.hisotry: unknown key", "did you mean 'history'"),
         ({"bodies": "torso"}, "feet: missing key 'kind'", "contact"),
-        ({"kind": "contct", "bodies": "torso"}, "feet.kind: expected 'contact' or 'rays', found 'contct'", "'contact'"),
+        ({"kind": "contct", "bodies": "torso"}, "feet.kind: expected 'contact' or 'rays' or 'camera'", "'contact'"),
         (rays(pattern={"size": [1, 1], "resolution": 0}), "pattern.resolution: expected a number > 0", None),
         (rays(pattern=[[0, 0, 0]]), "feet.pattern.0: a direction must not be zero", None),
         (rays(pattern=[]), "feet.pattern: ", None),
@@ -419,10 +422,10 @@ def test_a_checkpoint_carries_times_and_history(tmp_path):
         (rays(pattern=[[0, 0, -1]], body="head"), "feet.body: no body matches 'head'", "torso"),
         (rays(pattern=[[0, 0, -1]], sees=[6]), "feet.sees", None),
         (rays(pattern=[[0, 1, -1]], lookup=True, alignment="yaw"), "feet: lookup is for rays straight down", None),
-        (rays(pattern=[[0, 0, -1]], lookup=True), "feet: lookup is for rays straight down", None),
-        (rays(pattern=[[0, 0, -1]], lookup=True, alignment="yaw", sees="all"), "feet: lookup is for rays that see", None),
-        (rays(pattern=[[0, 0, -1]], lookup=True, alignment="yaw"), "feet.lookup: there is no table of heights to look in: "
-         "the scene has no terrain", "lookup: false"),
+        (rays(**DOWN), "feet: lookup is for rays straight down", None),
+        (rays(**DOWN, alignment="yaw", sees="all"), "feet: lookup is for rays that see", None),
+        (rays(**DOWN, alignment="yaw"), "feet.lookup: there is no table of heights to look in: the scene has no terra",
+         "lookup: false"),
     ],
 )  # fmt: skip
 def test_a_sensor_that_does_not_fit_is_refused_with_its_place(tmp_path, sensor, message, hint):

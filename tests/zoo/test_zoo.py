@@ -162,7 +162,7 @@ def test_learning_is_judged_and_logged_and_becomes_results_curves_and_a_policy(t
     copy = tmp_path / "repository"
     for part in ("benchmarks", "docs/zoo", "tasks"):
         shutil.copytree(REPOSITORY / part, copy / part, ignore=shutil.ignore_patterns("__pycache__"))
-    for folder in ("results", "curves"):
+    for folder in ("results", "curves", "pictures"):
         shutil.rmtree(copy / "docs" / "zoo" / folder)
     shutil.rmtree(copy / "tasks" / "rlcli_tasks" / "cartpole" / "policies")
 
@@ -173,8 +173,10 @@ def test_learning_is_judged_and_logged_and_becomes_results_curves_and_a_policy(t
 
     held = copy / "docs" / "zoo" / "zoo.yaml"
     text = held.read_text()
-    held.write_text(text.replace("minutes: 1, bar: {success: 0.95}", "minutes: 9, bar: {success: 2.0}"))
-    learned = run("learn", "cartpole", "--seed", "5", "--episodes", "16", "--runs-dir", "runs")
+    short, before = "minutes: 90, episodes: 16, ", "minutes: 1, bar: {success: 0.95}"
+    assert before in text
+    held.write_text(text.replace(before, short + "bar: {success: 2.0}", 1))
+    learned = run("learn", "cartpole", "agent.max_iterations=5", "--seed", "5", "--runs-dir", "runs")
     assert learned.returncode == 9, learned.stderr
     assert "below 2" in learned.stderr
     (line,) = (tmp_path / "runs" / "learn.jsonl").read_text().splitlines()
@@ -183,14 +185,22 @@ def test_learning_is_judged_and_logged_and_becomes_results_curves_and_a_policy(t
     assert logged["minutes"] > 0
     assert "mujoco" in logged["machine"]
     folder = next((tmp_path / "runs" / "cartpole").iterdir())
-    held.write_text(text)
-    collected = run("collect", "cartpole", str(folder), "--ship")
+    held.write_text(text.replace(before, short + "bar: {success: 0.0}", 1))
+    said = subprocess.run(
+        [sys.executable, "-m", "rlcli", "eval", "--checkpoint", str(folder), "--episodes", "16", "--num-envs", "16",
+         "--json"], cwd=tmp_path, capture_output=True, text=True, timeout=280,
+    )  # fmt: skip
+    shutil.rmtree(folder / "evaluations")  # as of another machine, where only the document was kept
+    (tmp_path / "runs" / "cartpole.eval.json").write_text(said.stdout)
+    collected = run("collect", "--all", "runs", "--ship")
     assert collected.returncode == 0, collected.stderr
+    assert "cartpole, seed 5: within its bar" in collected.stdout
+    assert (copy / "docs" / "zoo" / "pictures" / "cartpole.jpg").stat().st_size < 80_000
     (row,) = json.loads((copy / "docs" / "zoo" / "results" / "cartpole.json").read_text())
-    assert (row["seed"], row["agent"], row["evaluation"]["episodes"]) == (5, "sb3-ppo", 1000)
+    assert (row["seed"], row["agent"], row["evaluation"]["episodes"]) == (5, "sb3-ppo", 16)
+    assert row["evaluation"]["return"] == json.loads(said.stdout)["return"]
     shipped = copy / "tasks" / "rlcli_tasks" / "cartpole" / "policies" / "cartpole"
     assert open_bundle(shipped).manifest["evaluation"]["return"] == row["evaluation"]["return"]
-    assert run("pages").returncode == 0
     page = (copy / "docs" / "zoo" / "cartpole.md").read_text()
     assert "| 5 | `sb3-ppo` |" in page
     assert "curves/cartpole.svg" in page

@@ -234,7 +234,7 @@ def test_a_new_episode_forgets_the_motors_and_the_action(env):
 
 @pytest.mark.parametrize(
     ("offset", "velocity", "succeeds"),
-    [((0.05, 0, 0), (0, 0, 0), True), ((0, 0.15, 0), (0, 0, 0), False), ((0, 0, 0), (0, 0, 0.6), False)],
+    [((0.1, 0, 0), (0, 0, 0), True), ((0, 0.2, 0), (0, 0, 0), False), ((0, 0, 0), (0, 0, 0.6), False)],
 )
 def test_hovering_at_the_target_to_the_end_is_a_success(offset, velocity, succeeds):
     env = build("crazyflie", 2, "episode_length_s=1.0")

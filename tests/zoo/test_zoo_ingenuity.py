@@ -194,7 +194,7 @@ def test_whoever_starts_at_the_lowest_point_can_rise_from_it(env):
 
 @pytest.mark.parametrize(
     ("offset", "velocity", "succeeds"),
-    [((0.1, 0, 0), (0, 0, 0), True), ((0, 0.25, 0), (0, 0, 0), False), ((0, 0, 0), (0, 0, 0.6), False)],
+    [((0.1, 0, 0), (0, 0, 0), True), ((0, 0.35, 0), (0, 0, 0), False), ((0, 0, 0), (0, 0, 0.6), False)],
 )
 def test_hovering_at_the_target_to_the_end_is_a_success(offset, velocity, succeeds):
     env = build("ingenuity", 2, "episode_length_s=1.0")

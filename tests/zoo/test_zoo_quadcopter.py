@@ -211,7 +211,7 @@ def test_an_episode_starts_without_thrust_and_with_the_tilts_it_is_drawn(env):
 
 @pytest.mark.parametrize(
     ("offset", "velocity", "succeeds"),
-    [((0.1, 0, 0), (0, 0, 0), True), ((0, 0, 0.3), (0, 0, 0), False), ((0, 0, 0), (0.8, 0, 0), False)],
+    [((0.05, 0, 0), (0, 0, 0), True), ((0, 0, 0.15), (0, 0, 0), False), ((0, 0, 0), (0.8, 0, 0), False)],
 )
 def test_hovering_at_the_target_to_the_end_is_a_success(offset, velocity, succeeds):
     env = build("quadcopter", 2, "episode_length_s=1.0")

@@ -12,9 +12,8 @@ from rlcli.sim.rotations import turn_between
 
 torch.set_num_threads(1)
 
-HOME = (0.0, -0.569, 0.0, -2.81, 0.0, 3.037, 0.741)
 READY = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
-"""A pose in which the hand points straight down and its x axis forwards."""
+"""The default pose: the hand points straight down, its x axis forwards."""
 ARM = slice(0, 7)
 
 
@@ -102,10 +101,10 @@ def test_no_command_turns_a_joint_faster_than_its_motor_can(arm, joint, fastest)
 
 def test_gravity_does_not_pull_the_arm_down(arm):
     model, data = arm
-    data.qpos[ARM], data.ctrl[ARM] = HOME, HOME
+    data.qpos[ARM], data.ctrl[ARM] = READY, READY
     for _ in range(120):
         mujoco.mj_step(model, data)
-    assert np.abs(data.qpos[ARM] - HOME).max() < 1e-4
+    assert np.abs(data.qpos[ARM] - READY).max() < 1e-4
 
 
 def test_the_gripper_meets_the_ground_and_the_links_pass_through_each_other(arm):
@@ -198,7 +197,7 @@ def test_penalties_grow_after_4500_steps(env):
 def test_arms_start_at_half_to_one_and_a_half_of_their_pose():
     env = build("reach", 256)
     env.reset()
-    joints, home = env.entities["robot"].data.joint_pos[:, ARM], torch.tensor(HOME)
+    joints, home = env.entities["robot"].data.joint_pos[:, ARM], torch.tensor(READY)
     low, high = env.entities["robot"].data.joint_pos_limits[ARM].unbind(1)
     ends = torch.stack([0.5 * home, 1.5 * home])
     assert bool((joints >= torch.maximum(ends.amin(0), low) - 1e-5).all())
@@ -216,7 +215,7 @@ def test_an_action_moves_the_joints_half_a_radian_about_their_pose(env):
     for _ in range(60):
         env.step(action)
     reached = env.entities["robot"].data.joint_pos[:, ARM]
-    wanted = torch.tensor(HOME) + 0.5 * action
+    wanted = torch.tensor(READY) + 0.5 * action
     torch.testing.assert_close(reached, wanted, atol=0.01, rtol=0)
 
 

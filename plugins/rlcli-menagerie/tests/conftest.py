@@ -18,8 +18,8 @@ LEG = """
 
 def go1(driven: bool) -> str:
     """A four-legged robot, with the position actuators that Menagerie's file has or without any, as mjlab's."""
-    places = {"FR": (0.19, -0.047, -0.08), "FL": (0.19, 0.047, 0.08), "RR": (-0.19, -0.047, -0.08), "RL": (-0.19, 0.047, 0.08)}  # fmt: skip
-    legs = "".join(LEG.format(n=name, x=x, y=y, side=side) for name, (x, y, side) in places.items())
+    places = {"FR": (1, -1), "FL": (1, 1), "RR": (-1, -1), "RL": (-1, 1)}
+    legs = "".join(LEG.format(n=n, x=0.19 * x, y=0.047 * y, side=0.08 * y) for n, (x, y) in places.items())
     joints = [f"{name}_{part}_joint" for name in places for part in ("hip", "thigh", "calf")]
     drives = "".join(f'<position name="{j[:-6]}" joint="{j}" kp="100" forcerange="-23 23"/>' for j in joints)
     actuators = f"<actuator>{drives}</actuator>" if driven else ""

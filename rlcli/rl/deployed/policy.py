@@ -79,9 +79,13 @@ class Episode:
 def _seen(x):
     """Pictures through their convolutions, (channels, rows, columns) each; then the columns that are no picture's."""
     found, kept, end = [], [], 0
-    for number, (start, *shape) in enumerate(NETWORK["pictures"]):
+    for number, (start, steps, *shape) in enumerate(NETWORK["pictures"]):
         stop = start + int(np.prod(shape))
         pixels, (c, h, w) = x[:, start:stop], shape
+        if NETWORK["motion"] is not None and steps > 1:
+            frames = pixels.reshape(len(x), steps, -1)
+            changed = NETWORK["motion"] * (frames[:, -1:] - frames[:, :-1])
+            pixels = np.concatenate([changed, frames[:, -1:]], axis=1).reshape(len(x), -1)
         for layer, (edge, step) in enumerate(NETWORK["windows"]):
             down, right = (step * np.arange((size - edge) // step + 1) for size in (h, w))
             window = (np.arange(c)[:, None, None] * h + np.arange(edge)[:, None]) * w + np.arange(edge)
