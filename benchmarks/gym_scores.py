@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 from machine import describe
 
-AGENT = "ppo-1m"
+AGENT, STEPS = "ppo-1m", 1_000_000
 
 
 class Score(NamedTuple):
@@ -75,7 +75,9 @@ def train(task: str, seed: int, options: argparse.Namespace) -> Path:
     if run is None:
         begin = time.perf_counter()
         where = ["--runs-dir", str(options.runs_dir), "--name", name, "--device", "cpu", "--quiet"]
-        how = ["--agent", AGENT, "--seed", str(seed), "--max-steps", str(options.steps)]
+        how = ["--agent", AGENT, "--seed", str(seed)]
+        if options.steps is not None:
+            how += ["--max-steps", str(options.steps)]
         rlcli("train", task, *how, *where, f"sim.engine_threads={options.threads}", *options.overrides,
               threads=options.threads)  # fmt: skip
         run = finished(options.runs_dir, task, name)
@@ -157,7 +159,7 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("-j", "--jobs", type=int, default=1, help="Trainings at a time.")
     parser.add_argument("--threads", type=int, default=1, help="Physics threads of each.")
-    parser.add_argument("--steps", type=int, default=1_000_000)
+    parser.add_argument("--steps", type=int, help="Of each training; else the agent's own, just under 1 M.")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--runs-dir", type=Path, default=Path("runs/gym_scores"))
     parser.add_argument("--label", default="", help="Added to the names of the runs: for trials with overrides.")
@@ -175,7 +177,12 @@ def main() -> None:
     if options.page:
         put(options.page, text)
     if options.output:
-        document = {"machine": describe(), "agent": AGENT, "steps": options.steps, "episodes": options.episodes}
+        document = {
+            "machine": describe(),
+            "agent": AGENT,
+            "steps": options.steps or STEPS,
+            "episodes": options.episodes,
+        }
         options.output.write_text(json.dumps({**document, "tasks": table, "runs": rows}, indent=1) + "\n")
 
 
