@@ -340,6 +340,9 @@ SUCCESS = [
     (u.velocity_tracked, {**VELOCITY, "linear_tolerance": 9.0, "angular_tolerance": 0.5}, lambda s:
      abs(s.velocity[2] - s.ang[2]) < 0.5),
     (u.body_at_goal, {**POSE, "tolerance": 0.5}, lambda s: norm(s.fore - s.goal) < 0.5),
+    (u.body_at_goal, {**POSE, "tolerance": 9.0, "angle_tolerance": 1.5}, lambda s:
+     angle_of(product(inverse(s.fore_quat), s.goal_quat)) < 1.5),
+    (u.body_at_goal, {**POSE, "tolerance": 0.5, "angle_tolerance": 3.2}, lambda s: norm(s.fore - s.goal) < 0.5),
     (u.site_at_goal, {**GRIP, "command": "pose", "tolerance": 0.5}, lambda s: norm(s.grip - s.goal) < 0.5),
     (u.object_at_goal, {**ARM, **THING, "command": "pose", "tolerance": 0.5}, lambda s: norm(s.thing - s.goal) < 0.5),
 ]  # fmt: skip

@@ -73,7 +73,7 @@ def test_a_closed_gripper_carries_the_cube_up_and_does_not_let_it_creep(env):
     cube = np.array([0.5, 0.0, 0.024])
     data.qpos[CUBE] = [*cube, 1.0, 0.0, 0.0, 0.0]
     data.qpos[ARM], data.qpos[FINGERS] = (0.0, -0.3, 0.0, -2.4, 0.0, 2.1, 0.785), 0.04
-    above = reach_for(model, data, cube + [0.0, 0.0, 0.12])
+    above = reach_for(model, data, cube + np.array([0.0, 0.0, 0.12]))
     data.qpos[ARM] = data.ctrl[ARM] = above
     grasp = reach_for(model, data, cube)
     move(model, data, grasp, 0.04, 1.5)

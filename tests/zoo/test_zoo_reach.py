@@ -130,7 +130,7 @@ def test_commands_lie_in_their_box_and_point_the_hand_down(task):
         values = command[:, column]
         assert low <= float(values.min()) < low + 0.03
         assert high - 0.03 < float(values.max()) <= high
-    w, x, y, z = command[:, 3:].unbind(1)
+    _, x, y, _ = command[:, 3:].unbind(1)
     down = 1.0 - 2.0 * (x * x + y * y)
     torch.testing.assert_close(down, torch.full_like(down, -1.0))
 
