@@ -74,7 +74,7 @@ def test_the_policy_sees_three_pictures_alone_and_the_critic_the_state(env):
     assert obs["critic"].shape == (3, 4)
     frames = obs["policy"].unflatten(1, (3, HIGH, WIDE))
     assert torch.equal(frames[:, 0], frames[:, 2])  # an episode's first picture stands for those before it
-    assert 6.5 < float(frames.max()) < 7.2  # metres
+    assert 1.95 < float(frames.max()) < 2.16  # 7 m are 2.1
     assert float((frames == 0.0).float().mean()) > 0.8  # what is empty is 0
     frames = env.step(torch.full((3, 1), 1.0)).obs["policy"].unflatten(1, (3, HIGH, WIDE))
     assert torch.equal(frames[:, 0], frames[:, 1])
@@ -112,4 +112,4 @@ def test_final_pictures_are_of_the_state_that_ended_the_episode(env):
     last = step.final_obs["policy"].unflatten(1, (3, HIGH, WIDE))[over[0], 2].clone()
     y, angle = step.final_obs["critic"][over[0], :2].tolist()
     assert y > 3.0
-    torch.testing.assert_close(last, show(env, [y] * 3, [angle] * 3)[0], rtol=0.0, atol=1e-3)
+    torch.testing.assert_close(last / 0.3, show(env, [y] * 3, [angle] * 3)[0], rtol=0.0, atol=1e-3)
