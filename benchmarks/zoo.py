@@ -5,6 +5,7 @@
                                                    curves; --ship also puts the best policy into the package, and draws
     python benchmarks/zoo.py collect --all FOLDER  the same of every task with runs below a folder, and the pages;
                                                    documents of `rlcli eval --json` that lie there are taken
+    python benchmarks/zoo.py adopt TASK OTHER      ship the policy of the task's other form, judged in this one
     python benchmarks/zoo.py picture TASK          a strip of pictures of the shipped policy
     python benchmarks/zoo.py pages                 fill the generated parts of docs/zoo/*.md, and write its index
 
@@ -17,8 +18,10 @@ import argparse
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -212,18 +215,58 @@ def _ship(task: str, run: Any, checkpoint: Path, evaluation: dict[str, Any]) -> 
     write_bundle(open_checkpoint(checkpoint), find_task(task).root / "policies" / task, run, evaluation)
 
 
+def _results(task: str) -> list[dict[str, Any]]:
+    return list(json.loads((ZOO / "results" / f"{task}.json").read_text(encoding="utf-8")))
+
+
+def adopt(task: str, other: str) -> None:
+    """The policy that the task's other form ships, judged in this one: both forms step alike, column by column."""
+    from rlcli.config.load import resolve
+    from rlcli.envs.deployment import describe
+    from rlcli.envs.vec_env import make_env
+    from rlcli.rl.bundle import write_bundle
+    from rlcli.rl.checkpoint import open_checkpoint
+    from rlcli.rl.files import to_json
+
+    entry, source = entries()[task], find_task(task)
+    given = open_checkpoint(find_task(other).root / "policies" / other)
+    env = make_env(resolve(source, overrides=["scene.num_envs=1"]), seed=0)
+    layout, theirs = env.layout.record(), given.manifest["layout"]
+    moved = [[action["elements"] for action in each["actions"]] for each in (layout, theirs)]
+    if env.layout.size() != given.policy().spec.observation_size or moved[0] != moved[1]:
+        raise SystemExit(f"{task} and {other} do not observe and act alike")
+    with tempfile.TemporaryDirectory() as place:
+        copy = Path(place) / "policy"
+        shutil.copytree(given.folder, copy)
+        about = {"task": {**given.manifest["task"], "name": task}, "layout": layout, "deployment": describe(env)}
+        (copy / "manifest.json").write_text(to_json({**given.manifest, **about}), encoding="utf-8")
+        env.close()
+        evaluation = _evaluate(copy, entry)
+        write_bundle(open_checkpoint(copy), source.root / "policies" / task, None, evaluation)
+    (row,) = [row for row in _results(other) if row["seed"] == given.manifest["seed"]]
+    judged = {name: evaluation[name] for name in row["evaluation"] if evaluation.get(name) is not None}
+    values = {"values": evaluation["values"]} if evaluation.get("values") else {}
+    command = f"{row['command']} (the other form)"
+    rows = [{**row, "command": command, "evaluation": {**judged, **values}}]
+    (ZOO / "results" / f"{task}.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    missed = "; ".join(entry.missed(evaluation)) or "within its bar"
+    print(f"{task}, the policy of {other}: {missed}")
+    subprocess.run([sys.executable, __file__, "picture", task], check=True)
+
+
 def _of_one_agent(entry: Entry, folders: list[Path]) -> list[Any]:
-    """The newest run of each seed, of the agent that the task is held to its bar with."""
+    """The newest run of each seed, of the agent that the task is held to its bar with; without one, of any agent."""
     from rlcli.config.load import resolve
     from rlcli.rl.run import open_run
 
     wanted = entry.agent or resolve(find_task(entry.name), device=entry.device).agent_name
-    runs: dict[int, Any] = {}
-    for run in sorted((open_run(folder) for folder in folders), key=lambda run: run.record["started"]):
-        if run.record["task"]["name"] != entry.name or run.record["agent"] != wanted:
+    opened = sorted((open_run(folder) for folder in folders), key=lambda run: run.record["started"])
+    of_task = [run for run in opened if run.record["task"]["name"] == entry.name]
+    chosen = [run for run in of_task if run.record["agent"] == wanted] or of_task
+    for run in opened:
+        if run not in chosen:
             print(f"{run.folder.name} is left out: it is of {run.record['task']['name']}, {run.record['agent']}")
-            continue
-        runs[run.record["seed"]] = run
+    runs = {run.record["seed"]: run for run in chosen}
     return [runs[seed] for seed in sorted(runs)]
 
 
@@ -373,6 +416,9 @@ def main() -> int:
     collecting.add_argument("runs", nargs="*", type=Path)
     collecting.add_argument("--machine", default=None, help="what it was trained on, if the run does not say it well")
     collecting.add_argument("--ship", action="store_true")
+    adopting = commands.add_parser("adopt")
+    adopting.add_argument("task", choices=entries())
+    adopting.add_argument("other", choices=entries())
     commands.add_parser("picture").add_argument("task", choices=entries())
     commands.add_parser("pages")
     given = parser.parse_args()
@@ -385,6 +431,8 @@ def main() -> int:
             collect_all(given.all, given.machine, given.ship)
         else:
             collect(given.task, given.runs, given.machine, given.ship, {})
+    elif given.command == "adopt":
+        adopt(given.task, given.other)
     elif given.command == "picture":
         picture(given.task)
     else:
