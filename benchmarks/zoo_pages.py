@@ -179,7 +179,9 @@ def index(zoo: Path, found: list[Any]) -> str:
 def _minutes(rows: list[dict[str, Any]], entry: Any) -> str:
     if not rows:
         return f"of {entry.minutes:g}"
-    return f"{max(row['minutes'] for row in rows):.2g} of {entry.minutes:g}"
+    taken = f"{max(row['minutes'] for row in rows):.2g}"
+    elsewhere = sorted({row["device"] for row in rows} - {entry.device})
+    return f"{taken} on {elsewhere[0]}; of {entry.minutes:g}" if elsewhere else f"{taken} of {entry.minutes:g}"
 
 
 def _outcome(rows: list[dict[str, Any]], entry: Any) -> str:
