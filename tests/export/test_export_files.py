@@ -153,7 +153,7 @@ SCHEMA = {
     },
     "observations": [
         {"name": str, "size": int, "elements": list, "unit": str, "scale": (list, type(None)),
-         "clip": (list, type(None)), "columns": list, "history": int, "modifiers": list}
+         "clip": (list, type(None)), "columns": list, "history": int, "modifiers": list, "shape": (list, type(None))}
     ],
     "memory": list,
     "actions": [

@@ -209,9 +209,9 @@ def test_formulas_of_actions_write_the_controls_that_the_environment_writes(live
 
 def test_every_observation_term_that_mjdata_can_tell_has_a_formula():
     ours = set(builtin_terms("observations"))
-    without = {  # contacts, rays and memories of the environment's own
+    without = {  # contacts, rays, pictures and memories of the environment's own
         "height_scan", "foot_air_time", "foot_contact", "foot_contact_forces", "fingers_contact_force_b",
-        "body_incoming_wrench", "rel_ee_drawer_distance", "object_to_goal_distance", "goal_quat_diff",
+        "body_incoming_wrench", "rel_ee_drawer_distance", "object_to_goal_distance", "goal_quat_diff", "image",
     }  # fmt: skip
     known = set(formulas._OBSERVATIONS)
     assert {name for name in ours if name not in known} <= without | aliases(ours, known)

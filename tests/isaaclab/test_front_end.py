@@ -60,6 +60,7 @@ def test_the_configuration_equals_that_of_cartpole(package):
         "func": "joint_pos_target_l2",
         "weight": -1.0,
         "target": 0.0,
+        "while_alive": False,
         "asset_cfg": {
             "name": "robot",
             "joint_names": ["cart_to_pole"],

@@ -171,6 +171,7 @@ EVENT_TERMS = {
 ELSEWHERE = {
     "contacts", "success_reward",  # of one hand's own sensors and assets
     "reset_joints_within_limits_range", "randomize_object_pose",  # ranges a joint, lists of assets
+    "image",  # of a camera, which needs OpenGL: tests/mdp/test_pictures.py
     "randomize_fixed_tendon_parameters",  # no robot here has tendons
 }  # fmt: skip
 """On the page, with parameters of another shape."""
