@@ -249,6 +249,8 @@ def adopt(task: str, other: str) -> None:
     command = f"{row['command']} (the other form)"
     rows = [{**row, "command": command, "evaluation": {**judged, **values}}]
     (ZOO / "results" / f"{task}.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    for kind in ("csv", "svg"):
+        shutil.copy(ZOO / "curves" / f"{other}.{kind}", ZOO / "curves" / f"{task}.{kind}")
     missed = "; ".join(entry.missed(evaluation)) or "within its bar"
     print(f"{task}, the policy of {other}: {missed}")
     subprocess.run([sys.executable, __file__, "picture", task], check=True)

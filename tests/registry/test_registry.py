@@ -32,7 +32,7 @@ def test_an_unknown_task_is_answered_with_the_nearest_and_the_list(plugins, spec
     said = failure("cartpol")
     assert "no task 'cartpol'" in said
     assert "did you mean 'cartpole'" in said
-    assert "cartpole, cartpole-direct, walk" in said
+    assert "installed: ant, ant-direct, ball" in said
     assert "robots 1.0" in said
     assert "did you mean 'robots:walk'" in failure("robots:wlk")
     assert "overrides come after the task" in failure("sim.dt=1")
