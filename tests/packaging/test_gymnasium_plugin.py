@@ -47,13 +47,16 @@ def test_the_wheel_has_the_task_files_and_no_model(wheels):
 
 
 def test_the_plugins_own_tests_pass_against_the_wheels(site, tmp_path):
-    shutil.copytree(PLUGIN / "tests", tmp_path / "tests", ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(PLUGIN / "pyproject.toml", tmp_path)
-    place = python(site, tmp_path, "-c", "import rlcli, rlcli_gymnasium as g; print(rlcli.__file__, g.__file__)")
-    assert place.count(str(site)) == 2
-    output = python(site, tmp_path, "-m", "pytest", "-p", "no:cacheprovider", "-m", "not slow", "tests")
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(REPOSITORY / "benchmarks", tmp_path / "benchmarks", ignore=ignored)  # its scores are tested too
+    place = tmp_path / "plugins" / PLUGIN.name
+    shutil.copytree(PLUGIN / "tests", place / "tests", ignore=ignored)
+    shutil.copy(PLUGIN / "pyproject.toml", place)
+    used = python(site, place, "-c", "import rlcli, rlcli_gymnasium as g; print(rlcli.__file__, g.__file__)")
+    assert used.count(str(site)) == 2
+    output = python(site, place, "-m", "pytest", "-p", "no:cacheprovider", "-m", "not slow", "tests")
     assert "passed" in output
-    rows = json.loads(python(site, tmp_path, "-m", "rlcli", "list-tasks", "--json"))["tasks"]
+    rows = json.loads(python(site, place, "-m", "rlcli", "list-tasks", "--json"))["tasks"]
     assert len([row for row in rows if row["distribution"] == "rlcli-gymnasium"]) == 11
 
 
