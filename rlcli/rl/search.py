@@ -287,11 +287,12 @@ def _database(url: str) -> Any:
     except ImportError:
         raise DependencyError("a shared storage needs SQLAlchemy", hint='pip install "rlcli[sweep]"') from None
     try:
+        closed_after_use = {"poolclass": sqlalchemy.pool.NullPool}  # a trial lasts longer than a connection
         for _ in range(_TRIES):
             with contextlib.suppress(sqlalchemy.exc.IntegrityError, sqlalchemy.exc.ProgrammingError):
-                return RDBStorage(url, engine_kwargs={"pool_pre_ping": True})
+                return RDBStorage(url, engine_kwargs=closed_after_use)
             time.sleep(1.0)  # another machine makes the same tables at this moment
-        return RDBStorage(url, engine_kwargs={"pool_pre_ping": True})
+        return RDBStorage(url, engine_kwargs=closed_after_use)
     except ModuleNotFoundError as error:
         raise DependencyError(f"--storage needs the driver {error.name}", hint=f"pip install {error.name}") from None
     except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError) as error:
