@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.config.card_text import columns_text, modifier_text, noise_text, number, span, text_of, when_text
+from rlcli.config.classes import lineage
 from rlcli.config.load import Resolved
 from rlcli.config.schema import (
     ObservationConfig,
@@ -373,40 +374,14 @@ def _hooks(file: Path, class_name: str) -> list[tuple[str, str, str]]:
     return [(decides, name, first_paragraph(text)) for decides, name, text in found if text]
 
 
-def _docstrings(file: Path, class_name: str, depth: int = 8) -> dict[str, str]:
+def _docstrings(file: Path, class_name: str) -> dict[str, str]:
     """Method -> docstring, of a class and of the bases that a task has in files of its own; "" is the class itself."""
-    tree = ast.parse(file.read_bytes())
-    node = next((n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == class_name), None)
-    if node is None or not depth:
-        return {}
     found: dict[str, str] = {}
-    for base in reversed([base.id for base in node.bases if isinstance(base, ast.Name)]):
-        where = _defined_in(tree, file, base)
-        if where is not None:
-            found |= _docstrings(*where, depth - 1)
-    functions = [inner for inner in node.body if isinstance(inner, ast.FunctionDef)]
-    found |= {inner.name: text for inner in functions if (text := ast.get_docstring(inner))}
-    found[""] = ast.get_docstring(node) or ""
+    for source in reversed(lineage(file, class_name)):
+        functions = [inner for inner in source.node.body if isinstance(inner, ast.FunctionDef)]
+        found |= {inner.name: text for inner in functions if (text := ast.get_docstring(inner))}
+        found[""] = ast.get_docstring(source.node) or ""
     return found
-
-
-def _defined_in(tree: ast.Module, file: Path, name: str) -> tuple[Path, str] | None:
-    """File and name of a class that a file defines or imports; None for rlcli's own, and for what is not found."""
-    for node in tree.body:
-        if isinstance(node, ast.ClassDef) and node.name == name:
-            return file, name
-        if not isinstance(node, ast.ImportFrom):
-            continue
-        real = next((alias.name for alias in node.names if (alias.asname or alias.name) == name), None)
-        parts = (node.module or "").split(".")
-        if real is None or parts[0] == "rlcli":
-            continue
-        roots = file.parents[node.level - 1 : node.level] if node.level else file.parents
-        for root in roots:
-            for candidate in (root.joinpath(*parts).with_suffix(".py"), root.joinpath(*parts, "__init__.py")):
-                if candidate.is_file():
-                    return candidate, real
-    return None
 
 
 def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

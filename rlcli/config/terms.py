@@ -19,6 +19,7 @@ from typing import Any, Literal, Union
 
 from pydantic import ConfigDict, Field, create_model
 
+from rlcli.config.classes import nested_lineage, parse
 from rlcli.config.schema import (
     ActionConfig,
     CommandConfig,
@@ -139,7 +140,7 @@ def read_terms(file: Path) -> dict[str, Signature]:
     Raises:
         SyntaxError: if the file is not Python.
     """
-    tree = _tree(file)
+    tree = parse(file)
     classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
     terms: dict[str, Signature] = {}
     for node in tree.body:
@@ -175,24 +176,23 @@ def signature_of(term: Any, name: str) -> Signature:
 
 
 def read_params(file: Path, class_name: str) -> type[StrictModel] | None:
-    """The `Params` model nested in a direct task's class, rebuilt from its source; None if there is none.
+    """The `Params` model of a direct task's class, its own or inherited, rebuilt from its source; None without one.
 
     Raises:
-        SyntaxError: if the file is not Python.
+        SyntaxError: if a file is not Python.
         SignatureError: if a field is not one that YAML can express.
     """
-    tree = _tree(file)
-    task = next((n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == class_name), None)
-    params = next((n for n in task.body if isinstance(n, ast.ClassDef) and n.name == "Params"), None) if task else None
-    if params is None:
+    params = nested_lineage(file, class_name, "Params")
+    if not params:
         return None
     fields: dict[str, Any] = {}
-    for node in params.body:
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            try:
-                fields[node.target.id] = (annotation_type(node.annotation), _field_default(node.value))
-            except SignatureError as error:
-                raise SignatureError(f"line {node.lineno}: '{node.target.id}': {error}") from None
+    for source in reversed(params):  # its own come last and win
+        for node in source.node.body:
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                try:
+                    fields[node.target.id] = (annotation_type(node.annotation), _field_default(node.value))
+                except SignatureError as error:
+                    raise SignatureError(f"line {node.lineno}: '{node.target.id}': {error}") from None
     return _model("Params", StrictModel, fields)
 
 
@@ -247,18 +247,6 @@ def annotation_type(node: ast.expr) -> Any:
         f"annotation '{ast.unparse(node)}' is not one that YAML can express; use float, int, bool, str, Literal, tuple,"
         f" list, dict[str, X], X | None, Range, {', '.join(NAMED)} or {' / '.join(SELECTORS)}"
     )
-
-
-def _tree(file: Path) -> ast.Module:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return ast.parse(file.read_bytes(), filename=str(file))
-    except SyntaxError as error:
-        error.filename = str(file)  # absent where there is a null byte
-        raise
-    except (ValueError, RecursionError, MemoryError) as error:
-        raise SyntaxError(str(error) or "nested too deeply", (str(file), 1, 1, None)) from None
 
 
 def _model(name: str, base: type[StrictModel], fields: dict[str, Any]) -> type[Any]:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Callable
@@ -53,20 +54,24 @@ def try_trainer(name: str) -> Details:
 
 
 def main(arguments: list[str]) -> None:
-    """`GROUP FILE NAME...`: append a line of JSON to FILE for each name: its details, or why it is broken.
-
-    `--index DISTRIBUTION` prints the index of a distribution.
-    """
-    if len(arguments) == 2 and arguments[0] == "--index":
-        names = [entry.qualified for entry in catalog()[0] if entry.distribution == arguments[1]]
+    """Append a line of JSON to a file for each name, or print the index of a distribution."""
+    parser = argparse.ArgumentParser(prog="python -m rlcli.envs.describe", description=__doc__)
+    parser.add_argument("--index", metavar="DISTRIBUTION", help="print the index.json of this distribution, no more")
+    parser.add_argument("group", nargs="?", choices=(TASKS, TRAINERS))
+    parser.add_argument("file", nargs="?")
+    parser.add_argument("names", nargs="*")
+    options = parser.parse_args(arguments)
+    if options.index:
+        names = [entry.qualified for entry in catalog()[0] if entry.distribution == options.index]
         index = {name.partition(":")[2]: describe(name).record() for name in names}
         sys.stdout.write(json.dumps(index, indent=1) + "\n")
         return
-    group, file, *names = arguments
+    if options.file is None:
+        parser.error("the following arguments are required: group, file")
     with malformed_metadata_ignored():
-        for name in names:
-            details = _details(name, describe if group == TASKS else try_trainer)
-            with open(file, "ab") as rows:
+        for name in options.names:
+            details = _details(name, describe if options.group == TASKS else try_trainer)
+            with open(options.file, "ab") as rows:
                 rows.write(json.dumps(details.record()).encode() + b"\n")
 
 

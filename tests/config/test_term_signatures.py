@@ -235,6 +235,44 @@ def test_params_of_a_direct_task_are_filled_in(task):
     assert read_params(source.task_file, "Other") is None
 
 
+HEIR = """
+from .common import Hovering as Base
+class Heir(Base):
+    class Params(Base.Params):
+        gain: float = 3.0
+        own: int = 1
+class Plain(Heir): ...
+class Stranger(Missing):
+    class Params(Missing.Params):
+        own: int = 2
+class Round(Round):
+    class Params(Round.Params):
+        own: int = 4
+"""
+
+
+def test_params_are_inherited_in_a_file_and_from_its_neighbours(tmp_path):
+    (tmp_path / "common.py").write_text(
+        "class Hovering:\n    class Params(StrictModel):\n        gain: float = 1.0\n        height: float = 2.0\n"
+    )
+    file = tmp_path / "task.py"
+    file.write_text(HEIR)
+    for name in ("Heir", "Plain"):
+        assert read_params(file, name)().model_dump() == {"gain": 3.0, "height": 2.0, "own": 1}
+    assert read_params(file, "Base")().model_dump() == {"gain": 1.0, "height": 2.0}
+    assert read_params(file, "Stranger")().model_dump() == {"own": 2}
+    assert read_params(file, "Round")().model_dump() == {"own": 4}
+
+
+def test_files_whose_classes_inherit_in_a_circle_are_read_to_an_end(tmp_path):
+    for name, other in (("a", "b"), ("b", "a")):
+        bases = ", ".join(f"T{i}.Params" for i in range(40))
+        imports = ", ".join(f"T{i}" for i in range(40))
+        body = "".join(f"class T{i}(T{(i + 1) % 40}.Q, {bases}): ...\n" for i in range(40, 80))
+        (tmp_path / f"{name}.py").write_text(f"from .{other} import {imports}\n{body}class Task(T40): ...\n")
+    assert read_params(tmp_path / "a.py", "Task") is None
+
+
 @pytest.mark.parametrize(
     ("source", "said"),
     [
