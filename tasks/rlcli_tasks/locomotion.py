@@ -9,8 +9,10 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
+from rlcli.config.schema import StrictModel
 from rlcli.envs.articulation import ArticulationView
 from rlcli.envs.direct import DirectTask
 from rlcli.sim.rotations import atan2
@@ -49,9 +51,19 @@ def observation_units(joints: int, feet: int, *, rate: str, joint_rate: str, for
 class LocomotionTask(DirectTask):
     """Run towards the target.
 
-    A robot says what its joints are, how much torque they get and what is scaled how. Its `Params` have the fields
-    that the hooks read here; they stand in its own file, where a YAML is checked against them.
+    A robot says what its joints are, how much torque they get and what is scaled how. Its `Params` add
+    `termination_height`, `death_reward`, `alive_weight`, `action_cost`, `energy_cost`, `limit_cost` and
+    `joint_pos_noise`, whose values are a robot's own.
     """
+
+    class Params(StrictModel):
+        """What every walker is asked."""
+
+        target: tuple[float, float] = Field((1000.0, 0.0), description="Where to run, x and y [m].")
+        progress_weight: float = Field(1.0, description="Reward on the speed towards the target [s/m].")
+        up_weight: float = Field(0.1, description="Reward where the torso is upright to within acos(0.93).")
+        heading_weight: float = Field(0.5, description="Reward where the torso faces the target, to within acos(0.8).")
+        joint_vel_noise: float = Field(0.1, ge=0, description="Start: joint velocities +- [rad/s].")
 
     joints: ClassVar[tuple[str, ...]]
     """In the order of observations and actions, which is the model's."""

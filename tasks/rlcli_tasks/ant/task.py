@@ -5,7 +5,6 @@ from __future__ import annotations
 from pydantic import Field
 from torch import Tensor
 
-from rlcli.config.schema import StrictModel
 from rlcli_tasks.locomotion import LocomotionTask, observation_names, observation_units
 
 LEGS = ("fl", "bl", "br", "fr")
@@ -23,24 +22,19 @@ class AntTask(LocomotionTask):
     observation_units = observation_units(8, 4, rate="rad/s", joint_rate="5 rad/s", force="10")
     action_names = JOINTS
 
-    class Params(StrictModel):
+    class Params(LocomotionTask.Params):
         """The task's own settings."""
 
         effort: float = Field(7.5, gt=0, description="Torque at action 1 [N m].")
-        target: tuple[float, float] = Field((1000.0, 0.0), description="Where to run, x and y [m].")
         termination_height: float = Field(0.31, description="Torso height below which the episode fails [m].")
         death_reward: float = Field(-2.0, description="Reward of the step that fails, in place of all others.")
         alive_weight: float = Field(0.5, description="Reward a step.")
-        progress_weight: float = Field(1.0, description="Reward on the speed towards the target [s/m].")
-        up_weight: float = Field(0.1, description="Reward where the torso is upright to within acos(0.93).")
-        heading_weight: float = Field(0.5, description="Reward where the torso faces the target, to within acos(0.8).")
         action_cost: float = Field(0.005, ge=0, description="Penalty on squared actions.")
         energy_cost: float = Field(0.05, ge=0, description="Penalty on |action x joint velocity / (5 rad/s)|.")
         limit_cost: float = Field(
             0.1, ge=0, description="Penalty on each joint within 1% of its half range of a limit."
         )
         joint_pos_noise: float = Field(0.2, ge=0, description="Start: joint positions +-, inside the limits [rad].")
-        joint_vel_noise: float = Field(0.1, ge=0, description="Start: joint velocities +- [rad/s].")
 
     params: Params
 

@@ -1,8 +1,4 @@
-"""Crazyflie in the direct workflow: rise to a point and stay there, with four motors that follow slowly.
-
-The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, and
-what outlives a step is written in place.
-"""
+"""Crazyflie in the direct workflow: rise to a point and stay there, with four motors that follow slowly."""
 
 from __future__ import annotations
 
@@ -10,15 +6,14 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from rlcli.config.schema import StrictModel
-from rlcli.envs.direct import DirectTask
 from rlcli.sim.rotations import axis_x, axis_y, axis_z, length
 from rlcli.sim.selection import Selection
+from rlcli_tasks.flight import FlightTask
 
 MOTORS = ("m1", "m2", "m3", "m4")
 
 
-class CrazyflieTask(DirectTask):
+class CrazyflieTask(FlightTask):
     """Hover at the target. Observations: docs/zoo/crazyflie.md lists the 18 columns."""
 
     num_observations = 18
@@ -32,7 +27,7 @@ class CrazyflieTask(DirectTask):
     action_names = MOTORS
     motors = False
 
-    class Params(StrictModel):
+    class Params(FlightTask.Params):
         """The task's own settings."""
 
         thrust_to_weight: float = Field(1.9, gt=1, description="All four motors at full speed, over the weight.")
@@ -40,13 +35,10 @@ class CrazyflieTask(DirectTask):
             0.15, gt=0, description="Time in which a motor's speed settles [s]; 4 time constants."
         )
         thrust_noise: float = Field(0.01, ge=0, description="Noise of a thrust, over what is asked of it (deviation).")
-        target_period: int = Field(500, gt=0, description="Steps from one target to the next.")
         target_low: tuple[float, float, float] = Field(
             (0.0, 0.0, 2.0), description="Targets: lower corner of the box they are drawn from [m]."
         )
         target_high: tuple[float, float, float] = Field((0.0, 0.0, 2.0), description="Targets: upper corner [m].")
-        start_offset: float = Field(0.3, ge=0, description="Start: offset from the default position +- [m].")
-        max_distance: float = Field(5.0, gt=0, description="Distance to the target beyond which it fails [m].")
         height_range: tuple[float, float] = Field((0.5, 5.0), description="Heights outside which it fails [m].")
         effort_cost: float = Field(0.05, description="Penalty x exp(-sum of squared actions / 2): on low effort.")
 
@@ -54,46 +46,27 @@ class CrazyflieTask(DirectTask):
 
     def post_reset(self) -> None:
         """Make what the hooks use: constants, and buffers that keep their place."""
+        super().post_reset()
         params, n, model = self.params, self.num_envs, self.env.engine.model
-        self.robot, self.goal = self.env.entities["robot"], self.env.entities["target"]
         weight = float(model.body_mass[self.robot.body_ids].sum()) * -float(model.opt.gravity[2])
         self.max_thrust = params.thrust_to_weight * weight / len(MOTORS)
         """Of a motor [N]."""
         self.follow = min(4.0 * self.step_dt / params.motor_time, 1.0)
         """Share of the way to the speed asked for that a motor makes in a step."""
-        self.target_low = torch.tensor(params.target_low, device=self.device)
-        self.target_high = torch.tensor(params.target_high, device=self.device)
-        phases = -(-self.max_episode_length // params.target_period)
-        self.targets = torch.zeros(n, phases, 3, device=self.device)
-        """Those of the running episode, in turn. (n, phases, 3) [m]"""
-        self.target = torch.zeros(n, 3, device=self.device)
-        """The present one. (n, 3) [m]"""
         self.everywhere = torch.ones(n, dtype=torch.bool, device=self.device)
         self.actions = torch.zeros(n, len(MOTORS), device=self.device)
         self.speeds = torch.zeros(n, len(MOTORS), device=self.device)
         """Motor speeds, over the highest. (n, 4)"""
-        self.distance = torch.zeros(n, device=self.device)
-        self.extras["distance"] = self.distance  # to the target [m]
 
     def reset(self, selection: Selection) -> None:
-        """Level and at rest below the target, motors off; the episode's targets are drawn."""
-        offset, phases = self.params.start_offset, self.targets.shape[1]
-        default = selection.peek(self.robot.data.default_root_state)
-        self.robot.write_root_pose(
-            selection, default[:, :3] + selection.uniform(-offset, offset, (3,)), default[:, 3:7]
-        )
-        targets = selection.uniform(self.target_low, self.target_high, (phases, 3))
-        selection.write(self.targets, targets)
-        selection.write(self.target, targets[:, 0])
-        self.goal.write_root_pose(selection, targets[:, 0], selection.read(self.goal.data.default_root_state[:, 3:7]))
+        """Level and at rest below the target, motors off."""
+        super().reset(selection)
         selection.write(self.actions, 0.0)
         selection.write(self.speeds, 0.0)
 
     def pre_physics_step(self, actions: Tensor) -> None:
         """Thrusts asked for, which motors follow by their speed: its square is the thrust."""
-        phase = (self.progress_buf // self.params.target_period).clamp_(max=self.targets.shape[1] - 1)
-        self.target.copy_(self.targets.gather(1, phase[:, None, None].expand(-1, 1, 3)).squeeze(1))
-        self.env.engine.field("mocap_pos")[:, self.goal.mocap].copy_(self.target)
+        self.move_target()
         self.actions.copy_(actions)
         asked = (actions + 1.0).mul_(0.5).clamp_(0.0, 1.0)
         self.speeds.lerp_(asked.sqrt(), self.follow)

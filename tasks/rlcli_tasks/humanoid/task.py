@@ -5,7 +5,6 @@ from __future__ import annotations
 from pydantic import Field
 from torch import Tensor
 
-from rlcli.config.schema import StrictModel
 from rlcli_tasks.locomotion import LocomotionTask, observation_names, observation_units
 
 LEG = {"hip_roll": 45.0, "hip_yaw": 45.0, "hip_pitch": 135.0, "knee": 90.0, "ankle_pitch": 22.5, "ankle_roll": 22.5}
@@ -30,17 +29,13 @@ class HumanoidTask(LocomotionTask):
     observation_units = observation_units(21, 2, rate="4 rad/s", joint_rate="10 rad/s", force="100")
     action_names = JOINTS
 
-    class Params(StrictModel):
+    class Params(LocomotionTask.Params):
         """The task's own settings."""
 
         power: float = Field(1.0, gt=0, description="Factor on the motors' torques.")
-        target: tuple[float, float] = Field((1000.0, 0.0), description="Where to run, x and y [m].")
         termination_height: float = Field(0.8, description="Torso height below which the episode fails [m].")
         death_reward: float = Field(-1.0, description="Reward of the step that fails, in place of all others.")
         alive_weight: float = Field(2.0, description="Reward a step.")
-        progress_weight: float = Field(1.0, description="Reward on the speed towards the target [s/m].")
-        up_weight: float = Field(0.1, description="Reward where the torso is upright to within acos(0.93).")
-        heading_weight: float = Field(0.5, description="Reward where the torso faces the target, to within acos(0.8).")
         action_cost: float = Field(0.01, ge=0, description="Penalty on squared actions.")
         energy_cost: float = Field(
             0.05, ge=0, description="Penalty on |action x joint velocity / (10 rad/s)| x the motor's share of 135 N m."
@@ -53,7 +48,6 @@ class HumanoidTask(LocomotionTask):
         joint_pos_noise: float = Field(
             0.2, ge=0, description="Start: joint positions +-, inside the limits; legs not inwards [rad]."
         )
-        joint_vel_noise: float = Field(0.1, ge=0, description="Start: joint velocities +- [rad/s].")
 
     params: Params
 

@@ -1,8 +1,4 @@
-"""Ingenuity in the direct workflow: fly from point to point on Mars, with two rotors that push along and sideways.
-
-The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, and
-what outlives a step is written in place.
-"""
+"""Ingenuity in the direct workflow: fly from point to point on Mars, with two rotors that push along and sideways."""
 
 from __future__ import annotations
 
@@ -12,15 +8,13 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from rlcli.config.schema import StrictModel
-from rlcli.envs.direct import DirectTask
 from rlcli.sim.rotations import length
-from rlcli.sim.selection import Selection
+from rlcli_tasks.flight import FlightTask
 
 ROTORS = ("lower", "upper")
 
 
-class IngenuityTask(DirectTask):
+class IngenuityTask(FlightTask):
     """Hover at the target, which jumps. Observations: docs/zoo/ingenuity.md lists the 13 columns."""
 
     num_observations = 13
@@ -33,12 +27,11 @@ class IngenuityTask(DirectTask):
     action_names = tuple(f"{rotor}_{part}" for rotor in ROTORS for part in ("x", "y", "thrust"))
     motors = False
 
-    class Params(StrictModel):
+    class Params(FlightTask.Params):
         """The task's own settings."""
 
         max_thrust: float = Field(20.0, gt=0, description="Largest thrust of a rotor, either way [N].")
         lateral: float = Field(0.2, ge=0, description="Largest share of the thrust along each of x and y.")
-        target_period: int = Field(500, gt=0, description="Steps from one target to the next.")
         target_low: tuple[float, float, float] = Field(
             (-1.0, -1.0, 1.0), description="Targets: lower corner of the box they are drawn from [m]."
         )
@@ -51,37 +44,13 @@ class IngenuityTask(DirectTask):
 
     def post_reset(self) -> None:
         """Make what the hooks use: constants, and buffers that keep their place."""
-        params, n = self.params, self.num_envs
-        self.robot, self.goal = self.env.entities["robot"], self.env.entities["target"]
-        self.target_low = torch.tensor(params.target_low, device=self.device)
-        self.target_high = torch.tensor(params.target_high, device=self.device)
-        phases = -(-self.max_episode_length // params.target_period)
-        self.targets = torch.zeros(n, phases, 3, device=self.device)
-        """Those of the running episode, in turn. (n, phases, 3) [m]"""
-        self.target = torch.zeros(n, 3, device=self.device)
-        """The present one. (n, 3) [m]"""
-        self.forces = torch.zeros(n, len(ROTORS), 3, device=self.device)
+        super().post_reset()
+        self.forces = torch.zeros(self.num_envs, len(ROTORS), 3, device=self.device)
         """Of each rotor, in its own frame. (n, 2, 3) [N]"""
-        self.distance = torch.zeros(n, device=self.device)
-        self.extras["distance"] = self.distance  # to the target [m]
-
-    def reset(self, selection: Selection) -> None:
-        """Level and at rest; the episode's targets are drawn."""
-        offset, phases = self.params.start_offset, self.targets.shape[1]
-        default = selection.peek(self.robot.data.default_root_state)
-        self.robot.write_root_pose(
-            selection, default[:, :3] + selection.uniform(-offset, offset, (3,)), default[:, 3:7]
-        )
-        targets = selection.uniform(self.target_low, self.target_high, (phases, 3))
-        selection.write(self.targets, targets)
-        selection.write(self.target, targets[:, 0])
-        self.goal.write_root_pose(selection, targets[:, 0], selection.read(self.goal.data.default_root_state[:, 3:7]))
 
     def pre_physics_step(self, actions: Tensor) -> None:
         """Of each rotor: two sideways shares of its thrust, and the thrust."""
-        phase = (self.progress_buf // self.params.target_period).clamp_(max=self.targets.shape[1] - 1)
-        self.target.copy_(self.targets.gather(1, phase[:, None, None].expand(-1, 1, 3)).squeeze(1))
-        self.env.engine.field("mocap_pos")[:, self.goal.mocap].copy_(self.target)
+        self.move_target()
         asked = actions.view(-1, len(ROTORS), 3).clamp(-1.0, 1.0)
         thrust = asked[..., 2:] * self.params.max_thrust
         torch.mul(asked[..., :2], thrust * self.params.lateral, out=self.forces[..., :2])
