@@ -30,7 +30,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, RlcliError
 from rlcli.managers.termination import DIVERGED
 from rlcli.rl.dump import MOST_SUBSTEPS, Ending, Kind, Scene, Trace, put, read_dump, trace
-from rlcli.rl.files import to_json, write_atomic
+from rlcli.rl.files import to_json
 from rlcli.rl.reading import parse_json, read_file
 from rlcli.sim.batch import BatchEngine
 from rlcli.sim.guard import Divergence
@@ -232,8 +232,8 @@ class Keeper:
                 kept = (entry.ending, case.steps)
                 content = self._scene.encode([case.traced], case.constants, case.common_step, kept)
                 put(self._folder / entry.name, content)
-            if self._folder.is_dir():
-                write_atomic(self._folder / _RETURNS, to_json({"step": batch.step, "returns": batch.returns}))
+            if batch.returns:  # what the next episodes are compared with, also where none was kept yet
+                put(self._folder / _RETURNS, to_json({"step": batch.step, "returns": batch.returns}).encode())
         except (RlcliError, OSError) as error:
             self._failed = str(error)
 
