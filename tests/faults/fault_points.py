@@ -4,6 +4,7 @@ A point is a call and what it is called with; the fault happens the n-th time th
 error of the machine, every time from then on.
 """
 
+import atexit
 import errno
 import os
 import pkgutil
@@ -80,7 +81,10 @@ def plant(
         elif kind == "sleep":
             time.sleep(seconds)
         elif kind == "limit":
-            resource.setrlimit(resource.RLIMIT_FSIZE, (int(code), int(code)))
+            soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (int(code), hard))
+            # what counts covered lines writes its file after the program has ended
+            atexit.register(resource.setrlimit, resource.RLIMIT_FSIZE, (soft, hard))
         elif kind == "clock":
             real, shift = time.time, float(code)
             time.time = lambda: real() + shift
