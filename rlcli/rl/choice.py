@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,7 +116,10 @@ def _only_shipped(named: TaskSource | None, runs_dir: Path) -> bool:
     """Whether a task has a policy that is shipped, and no run: not even one that is damaged, which is to be told."""
     if named is None or named.policy is None:
         return False
-    return not list_runs(runs_dir, named.name) and not any((runs_dir / named.name).glob("*/run.json"))
+    if list_runs(runs_dir, named.name):
+        return False
+    records = (run / "run.json" for run in (runs_dir / named.name).glob("*"))
+    return not any(os.path.lexists(record) for record in records)  # also a link that leads nowhere
 
 
 def _shipped(named: TaskSource | None) -> Choice:

@@ -330,7 +330,8 @@ def require_inside(folder: Path, file: Path) -> None:
     Raises:
         OSError: if a link leads elsewhere.
     """
-    if not file.resolve().is_relative_to(folder.resolve()):
+    real = Path(os.path.realpath(file))  # where resolve() would raise something else for a link to itself
+    if not real.is_relative_to(os.path.realpath(folder)):
         raise OSError(errno.ELOOP, "it is a link that leads elsewhere", str(file))
 
 
