@@ -9,7 +9,6 @@ from pathlib import Path
 
 from rlcli.errors import DeviceError
 
-
 _GROUPS, _OWN_GROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
