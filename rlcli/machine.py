@@ -70,6 +70,22 @@ def memory(report: Path = Path("/proc/meminfo")) -> int:
         return 8 * 2**30
 
 
+def resident(report: Path = Path("/proc/self/statm")) -> int | None:
+    """Bytes of memory that this process holds now; None where the system does not say."""
+    try:
+        return int(report.read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError, AttributeError):
+        return None
+
+
+def wait_calmly() -> None:
+    """Threads of OpenMP spin briefly while they wait, unless somebody said how long; before torch is imported.
+
+    On a busy machine libgomp's long spinning makes an update ten times slower.
+    """
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+
+
 def _quota(group: Path) -> float | None:
     try:
         if (group / "cpu.max").is_file():

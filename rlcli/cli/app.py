@@ -23,6 +23,7 @@ COMMANDS = {
     "validate": "validate",
     "train": "train",
     "sweep": "sweep",
+    "bench": "bench",
     "play": "play",
     "eval": "eval",
     "stress": "stress",
@@ -90,7 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
     console.owns_process = arguments is None
     arguments = sys.argv[1:] if arguments is None else arguments
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
-    console.quiet = console.verbose = False  # what an earlier command of this process was told
+    console.quiet = console.verbose = console.told = False  # what an earlier command of this process was told
     with console.stdout_kept(), malformed_metadata_ignored():
         code = _run(_with_values(arguments))
     try:
