@@ -17,7 +17,7 @@ import pytest
 
 from rlcli.config.load import resolve
 from rlcli.registry import find_task
-from rlcli.rl import bench
+from rlcli.rl import bench, job
 from rlcli.rl.bench import Bench, Pace
 
 HASTE = Pace(block_s=0.0, blocks=3, rounds=1, longest_s=100.0)
@@ -25,9 +25,11 @@ HASTE = Pace(block_s=0.0, blocks=3, rounds=1, longest_s=100.0)
 
 @pytest.fixture
 def hasty(monkeypatch):
-    """Few sizes, a call each: what is measured matters here, not how well."""
+    """Few sizes on one core, a call each: what is measured matters here, not how well."""
     monkeypatch.setattr(bench, "QUICK", HASTE)
     monkeypatch.setattr(bench, "SIZES", (4, 8))
+    for module in (bench, job):
+        monkeypatch.setattr(module, "available_cores", lambda: 1)
 
 
 def test_every_row_that_learns_alike_has_as_many_samples_and_minibatches(coin, cli, hasty):
@@ -47,6 +49,14 @@ def test_every_row_that_learns_alike_has_as_many_samples_and_minibatches(coin, c
     assert best["scene.num_envs"] * best["agent.n_steps"] == 256
     assert best["agent.num_minibatches"] == 2
     assert found["machine"]["cores"] >= 1
+
+
+def test_threads_are_tried_up_to_the_cores(coin, cli, hasty, monkeypatch):
+    monkeypatch.setattr(bench, "available_cores", lambda: 3)
+    found = cli("bench", coin, "--quick", "--json").json
+    tried = {(row["engine_threads"], row["torch_threads"]) for row in found["training"]}
+    assert {engine for engine, _ in tried} == {update for _, update in tried} == {1, 2, 3}
+    assert {row["engine_threads"] for row in found["environment"] if row["num_envs"] == 32} == {2, 3}
 
 
 def test_a_preset_trains(coin, cli, hasty, only_run):
