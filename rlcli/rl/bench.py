@@ -247,8 +247,6 @@ class Bench:
 
     def _train_all(self) -> None:
         best = self._add_trained(self.present)
-        if best.seconds is None:
-            return
         for key, most in (("torch_threads", min(16, available_cores())), ("engine_threads", available_cores())):
             others = [count for count in _powers(most) if count != getattr(best.setting, key)]
             best = _soonest([best, *(self._add_trained(_with(best.setting, **{key: count})) for count in others)])
@@ -277,7 +275,7 @@ class Bench:
     def _train(self, setting: Setting) -> Trained:
         self._tell(f"training: {_said(setting)}")
         alike = setting.minibatches == self.present.minibatches
-        reason = self._too_large(setting.num_envs)
+        reason = None if setting == self.present else self._too_large(setting.num_envs)
         if reason is not None:
             return Trained(setting, alike, left_out=reason)
         try:
