@@ -1,16 +1,7 @@
 """`rlcli bench`: what it measures, what it recommends, and the preset that a training takes."""
 
-import fcntl
 import json
-import os
-import pty
-import re
-import select
 import signal
-import struct
-import sys
-import termios
-import time
 from pathlib import Path
 
 import pytest
@@ -168,39 +159,3 @@ def test_ctrl_c_shows_what_was_measured(coin, start, words):
         assert found["environment"][0]["num_envs"] == 16
     else:
         assert out.splitlines()[1].split()[0] == "16"
-
-
-@pytest.mark.slow
-def test_a_terminal_of_forty_columns_loses_nothing(coin):
-    """On a pseudo-terminal: no line is wider, and every number has its name."""
-    child, terminal = pty.fork()
-    if child == 0:
-        os.environ["COLUMNS"], os.environ["TERM"] = "40", "xterm"
-        words = ["bench", coin, "--quick"]
-        program = f"from rlcli.rl import bench; bench.SIZES = (4, 8)\nfrom rlcli.cli.app import main\nmain({words!r})"
-        os.execv(sys.executable, [sys.executable, "-c", program])
-    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 40, 0, 0))
-    said, end = b"", time.monotonic() + 300
-    while time.monotonic() < end:
-        if select.select([terminal], [], [], 1.0)[0]:
-            try:
-                part = os.read(terminal, 65536)
-            except OSError:
-                break
-            if not part:
-                break
-            said += part
-    _, status = os.waitpid(child, 0)
-    os.close(terminal)
-    assert os.waitstatus_to_exitcode(status) == 0
-    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", said.decode())
-    lines = [line.rstrip() for line in re.split(r"[\r\n]+", text)]
-    tables = lines[lines.index("environment, random actions") :]
-    block = "\n".join(tables)
-    rows = [line for line in tables if line.startswith("ENVS ")]
-    assert "…" not in block
-    assert len(rows) >= 7
-    for name in ("THREADS", "STEPS/S", "PHYSICS", "MINIBATCHES", "UPDATE", "N_STEPS"):
-        assert name in block
-    sentences = [line for line in tables if "an iteration" in line and "training" not in line]
-    assert max(len(line) for line in tables if line not in sentences and "learns alike" not in line) <= 40
