@@ -9,14 +9,22 @@ from pathlib import Path
 
 from rlcli.errors import DeviceError
 
+_GROUPS, _OWN_GROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
-def available_cores() -> int:
-    """Cores this process may use; processes that a launcher started together share them."""
+
+def available_cores(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> int:
+    """Cores this process may use: its affinity, and no more than its control group grants it whole.
+
+    Processes that a launcher started together share them.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota = core_quota(groups, own)
+    if quota is not None:  # a thread more is stopped for the rest of every period, and the others wait for it
+        cores = min(cores, int(quota))
     return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
-def core_quota(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> float | None:
+def core_quota(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> float | None:
     """Cores' worth of time that a container's control group grants this process; None where there is no limit."""
     try:
         places = [line.split(":", 2) for line in own.read_text(encoding="utf-8").splitlines()]
@@ -26,11 +34,10 @@ def core_quota(groups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/se
     for _, controllers, place in (parts for parts in places if len(parts) == 3):
         if controllers and "cpu" not in controllers.split(","):
             continue
-        root = (
-            groups / controllers if controllers else groups
-        )  # version 1 has a folder a controller, version 2 has none
-        folder = root / place.strip("/")
-        quotas += [_quota(each) for each in (folder, *folder.parents) if each.is_relative_to(root)]
+        # version 1 has a folder a controller, which may be mounted under either name; version 2 has none
+        for root in (groups / controllers, groups / "cpu") if controllers else (groups,):
+            folder = root / place.strip("/")
+            quotas += [_quota(each) for each in (folder, *folder.parents) if each.is_relative_to(root)]
     return min((quota for quota in quotas if quota is not None), default=None)
 
 
@@ -61,6 +68,22 @@ def memory(report: Path = Path("/proc/meminfo")) -> int:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     except (AttributeError, OSError, ValueError):
         return 8 * 2**30
+
+
+def resident(report: Path = Path("/proc/self/statm")) -> int | None:
+    """Bytes of memory that this process holds now; None where the system does not say."""
+    try:
+        return int(report.read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError, AttributeError):
+        return None
+
+
+def wait_calmly() -> None:
+    """Threads of OpenMP spin briefly while they wait, unless somebody said how long; before torch is imported.
+
+    On a busy machine libgomp's long spinning makes an update ten times slower.
+    """
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 
 def _quota(group: Path) -> float | None:

@@ -20,7 +20,6 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
-from rlcli.config import oige
 from rlcli.errors import DependencyError, MissingModelError, TaskError, did_you_mean, listing
 from rlcli.task import API_VERSION, TaskSpec
 
@@ -185,6 +184,8 @@ def find_task(name: str) -> TaskSource:
     if place.endswith(".py") or (attribute and os.sep not in attribute and "/" in place and Path(place).is_dir()):
         return python_task(name)
     if name in (".", "..") or any(mark in name for mark in ("/", os.sep)):
+        from rlcli.config import oige
+
         path = Path(name)
         if path.suffix == ".yaml" and path.is_file() and oige.is_oige_file(path):
             return folder_task(path.parent, path.name)
@@ -350,6 +351,8 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
     if not config.is_file():
         found = listing(sorted(p.name for p in root.iterdir())) if root.is_dir() else "no such folder"
         raise TaskError(f"'{folder}' is not a task: it has no {file} ({found})")
+    from rlcli.config import oige
+
     name = oige.task_name(config)
     if name is not None:
         return _oige_task(config.parent, config, name)
@@ -369,6 +372,8 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
 
 def _oige_config(root: Path) -> Path | None:
     """The one YAML of a folder, or of its `cfg/task`, that has OmniIsaacGymEnvs' form; None if there is none."""
+    from rlcli.config import oige
+
     files = sorted(root.glob("*.yaml")) or sorted(root.glob("cfg/task/*.yaml"))
     found = [file for file in files if oige.is_oige_file(file)]
     if len(found) > 1:
@@ -378,6 +383,8 @@ def _oige_config(root: Path) -> Path | None:
 
 
 def _oige_task(root: Path, config: Path, name: str) -> TaskSource:
+    from rlcli.config import oige
+
     file: Path | None
     try:
         file, class_name = oige.find_class(oige.home(config), name)

@@ -23,6 +23,7 @@ COMMANDS = {
     "validate": "validate",
     "train": "train",
     "sweep": "sweep",
+    "bench": "bench",
     "play": "play",
     "eval": "eval",
     "stress": "stress",
@@ -52,16 +53,7 @@ _SETTINGS = {
     "token_normalize_func": lambda name: name.replace("_", "-"),
 }
 
-app = typer.Typer(
-    context_settings=_SETTINGS,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    help="Train, play, evaluate and export robot-control policies in MuJoCo.",
-)
 
-
-@app.callback(invoke_without_command=True)
 def _root(
     version: bool = typer.Option(False, "--version", help="Print the version and exit.", is_eager=True),
 ) -> None:
@@ -73,16 +65,22 @@ def _root(
 
 
 @functools.cache
-def build() -> typer.Typer:
-    """The app with every command registered; command modules import nothing heavy."""
-    registered = {command.name for command in app.registered_commands}
+def build(only: str | None = None) -> typer.Typer:
+    """The app with every command registered, or with one; command modules import nothing heavy."""
+    app = typer.Typer(
+        context_settings=_SETTINGS,
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        help="Train, play, evaluate and export robot-control policies in MuJoCo.",
+    )
+    app.callback(invoke_without_command=True)(_root)
     for name, module in COMMANDS.items():
-        if name in registered:
-            continue
-        command = importlib.import_module(f"rlcli.cli.{module}").command
-        app.command(name, context_settings=_SETTINGS)(command)
+        if only in (None, name):
+            command = importlib.import_module(f"rlcli.cli.{module}").command
+            app.command(name, context_settings=_SETTINGS)(command)
     for name, module in GROUPS.items():
-        if name not in {group.name for group in app.registered_groups}:
+        if only in (None, name):
             group = importlib.import_module(f"rlcli.cli.{module}").app
             app.add_typer(group, name=name, context_settings=_SETTINGS)
     return app
@@ -93,7 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
     console.owns_process = arguments is None
     arguments = sys.argv[1:] if arguments is None else arguments
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
-    console.quiet = console.verbose = False  # what an earlier command of this process was told
+    console.quiet = console.verbose = console.told = False  # what an earlier command of this process was told
     with console.stdout_kept(), malformed_metadata_ignored():
         code = _run(_with_values(arguments))
     try:
@@ -115,9 +113,15 @@ def _with_values(arguments: list[str]) -> list[str]:
     return filled
 
 
+def _named(arguments: list[str]) -> str | None:
+    """The command that is asked for, if there is such a one."""
+    word = next((word for word in arguments if not word.startswith("-")), "").replace("_", "-")
+    return word if word in COMMANDS or word in GROUPS else None
+
+
 def _run(arguments: list[str]) -> int:
     try:
-        result = build()(arguments, prog_name="rlcli", standalone_mode=False)
+        result = build(_named(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
         if result == _INTERRUPTED:  # how typer hands on Ctrl-C
             raise KeyboardInterrupt
         return result if isinstance(result, int) else 0

@@ -33,6 +33,9 @@ class Console:
     owns_process: bool = False
     """Whether the process was started for the command and ends with it."""
 
+    told: bool = False
+    """Whether the command has said its document: what ends it after that, such as Ctrl-C, brings no second one."""
+
     out: Any = None
     """Where the JSON document goes; None is stdout."""
 
@@ -57,6 +60,7 @@ class Console:
     def document(self, command: str, **content: Any) -> None:
         """The result, as JSON; left out without --json."""
         if self.json and not self.follows:
+            self.told = True
             _write(
                 self.out or sys.stdout,
                 json.dumps({"schema": SCHEMA_VERSION, "command": command, **content}, indent=2, default=str),
@@ -82,7 +86,7 @@ class Console:
         """Why the command failed."""
         if self.follows and kind not in _OWN:
             return
-        if self.json and not self.follows:
+        if self.json and not self.follows and not self.told:
             error = {"kind": kind, "exit_code": code, "message": message, "hint": hint, "problems": problems}
             with contextlib.suppress(OSError):  # stdout may be what failed
                 _write(self.out or sys.stdout, json.dumps({"schema": SCHEMA_VERSION, "error": error}, indent=2))

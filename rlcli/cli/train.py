@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -89,6 +88,7 @@ def command(
     from rlcli.cli.jobs import agree, created, fitting_device, process_device, require_parallel, resumed
     from rlcli.config.load import resolve
     from rlcli.errors import Stopped, UsageError
+    from rlcli.machine import wait_calmly
     from rlcli.rl import distributed
     from rlcli.rl.run import default_runs_dir
     from rlcli.rl.stop import StopRequest
@@ -96,8 +96,7 @@ def command(
 
     console.quiet, console.verbose = quiet, verbose
     on_leash()
-    # libgomp's threads spin while they wait; on a busy machine that makes an update ten times slower
-    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    wait_calmly()
     console.follows = not distributed.leads()
     runs, budget = runs_dir or default_runs_dir(), _budget(max_iterations, max_steps)
     several = _several(seeds, jobs, seed, gpus, resume, runs)

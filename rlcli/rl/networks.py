@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from rlcli.rl.optimizers import Adam
 from rlcli.rl.policy import ACTIVATIONS, Lstm, Normalizer
 from rlcli.rl.ppo_config import NetworkConfig, PpoConfig
 from rlcli.rl.vision import Vision, VisionSpec
@@ -144,10 +145,10 @@ def flatten(module: nn.Module) -> tuple[nn.Parameter, Tensor, dict[str, slice]]:
     return vector, gradient, places
 
 
-def adam(vector: nn.Parameter, learning_rate: Tensor, eps: float) -> torch.optim.Adam:
+def adam(vector: nn.Parameter, learning_rate: Tensor, eps: float) -> Adam:
     """Adam with its state in place, so that a captured step finds it and nothing is made while capturing."""
     on_gpu = vector.is_cuda
-    optimizer = torch.optim.Adam([vector], lr=learning_rate, eps=eps, fused=True, capturable=on_gpu)
+    optimizer = Adam([vector], lr=learning_rate, eps=eps, fused=True, capturable=on_gpu)
     optimizer.step()  # of a gradient of zero: it moves nothing
     optimizer.state[vector]["step"].zero_()
     return optimizer

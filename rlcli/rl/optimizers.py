@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 
 import torch
@@ -13,6 +14,18 @@ _SLOTS = {
     "RMSprop": {"step", "square_avg"},
     "SGD": {"momentum_buffer"},
 }
+
+
+class Adam(torch.optim.Adam):
+    """torch's Adam, number for number; but the first of torch's own imports torch's compiler, which takes as long as
+    torch itself, to keep it out of four methods and to break its graphs around the step. Nobody compiles these.
+    """
+
+    step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))
+    zero_grad = inspect.unwrap(torch.optim.Adam.zero_grad)
+    state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
+    load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
+    add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
 
 
 def below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

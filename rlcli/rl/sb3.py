@@ -17,7 +17,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DivergedError
 from rlcli.random import derive
 from rlcli.rl.finite import LEARNER_HINT, GradientWatch, moments, require_finite
-from rlcli.rl.optimizers import below, load_optimizer, optimizer_tensors
+from rlcli.rl.optimizers import Adam, below, load_optimizer, optimizer_tensors
 from rlcli.rl.policy import ACTIVATIONS, Normalizer, Policy, PolicySpec
 from rlcli.rl.rng import load_rng_state, rng_state
 from rlcli.rl.sb3_algorithms import FastA2C, FastDDPG, FastPPO, FastSAC, FastTD3
@@ -358,6 +358,8 @@ def _make(env: VecEnv, config: Sb3Config, seed: int, device: str) -> Any:
         "activation_fn": ACTIVATIONS[config.policy.activation],
         "optimizer_kwargs": None if isinstance(config, A2cConfig) else adam,
     }
+    if not isinstance(config, A2cConfig):
+        networks["optimizer_class"] = Adam
     if isinstance(config, OffPolicyConfig):
         return _make_off_policy(config, common, {**networks, "net_arch": list(config.policy.hidden)})
     assert isinstance(config, OnPolicyConfig)

@@ -5,7 +5,7 @@ import json
 import pytest
 from broken_plugins import BROKEN, FILES, SPEC
 
-from rlcli.machine import core_quota
+from rlcli.machine import available_cores, core_quota
 
 
 def checks(done):
@@ -80,6 +80,11 @@ def test_a_runs_folder_and_graphics_that_cannot_work_are_broken(cli, tmp_path):
             {"cpu,cpuacct/x/cpu.cfs_quota_us": "-1\n", "cpu,cpuacct/x/cpu.cfs_period_us": "100000\n"},
             None,
         ),
+        (
+            "3:cpuacct,cpu:/x\n",
+            {"cpu/cpu.cfs_quota_us": "300000\n", "cpu/cpu.cfs_period_us": "100000\n"},
+            3.0,
+        ),
         ("nonsense\n", {}, None),
     ],
 )
@@ -94,3 +99,20 @@ def test_the_quota_of_a_container_is_the_smallest_on_the_way_up(tmp_path, own, f
 
 def test_without_control_groups_there_is_no_quota(tmp_path):
     assert core_quota(tmp_path / "none", tmp_path / "none") is None
+
+
+@pytest.mark.parametrize(("granted", "cores"), [("50000", 1), ("100000", 1), ("190000", 1), ("100000000000", None)])
+def test_the_cores_of_a_process_are_those_that_its_control_group_grants_whole(tmp_path, monkeypatch, granted, cores):
+    monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
+    (tmp_path / "own").write_text("0::/\n")
+    (tmp_path / "cpu.max").write_text(f"{granted} 100000\n")
+    unlimited = available_cores(tmp_path, tmp_path / "none")
+    assert available_cores(tmp_path, tmp_path / "own") == (cores or unlimited)
+
+
+def test_processes_started_together_share_what_the_control_group_grants(tmp_path, monkeypatch):
+    have = available_cores(tmp_path, tmp_path / "none")
+    (tmp_path / "own").write_text("0::/\n")
+    (tmp_path / "cpu.max").write_text(f"{have}00000 100000\n")
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    assert available_cores(tmp_path, tmp_path / "own") == max(1, have // 2)

@@ -1,0 +1,48 @@
+"""The optimiser that leaves torch's compiler unread."""
+
+import torch
+
+from rlcli.rl.optimizers import Adam, load_optimizer, optimizer_tensors
+
+
+def trained(kind, steps, **settings):
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(torch.nn.Linear(5, 7), torch.nn.Tanh(), torch.nn.Linear(7, 2))
+    inputs = torch.randn(16, 5)
+    optimizer = kind(network.parameters(), lr=1e-2, **settings)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        network(inputs).square().mean().backward()
+        optimizer.step()
+    return network, optimizer
+
+
+def test_adam_gives_the_bits_of_torchs():
+    for settings in ({}, {"fused": True, "eps": 1e-5}, {"weight_decay": 0.1}):
+        (own, _), (theirs, _) = (trained(kind, 6, **settings) for kind in (Adam, torch.optim.Adam))
+        for mine, other in zip(own.parameters(), theirs.parameters(), strict=True):
+            assert torch.equal(mine, other)
+
+
+def test_a_step_leaves_no_graph_behind():
+    network, _ = trained(Adam, 2)
+    assert all(parameter.is_leaf and parameter.grad_fn is None for parameter in network.parameters())
+
+
+def test_hooks_see_every_step():
+    _, optimizer = trained(Adam, 1)
+    seen = []
+    optimizer.register_step_pre_hook(lambda *_: seen.append("before"))
+    optimizer.register_step_post_hook(lambda *_: seen.append("after"))
+    optimizer.step()
+    assert seen == ["before", "after"]
+
+
+def test_states_pass_between_it_and_torchs():
+    _, own = trained(Adam, 3)
+    _, theirs = trained(torch.optim.Adam, 1)
+    saved = optimizer_tensors(own, "o.")
+    load_optimizer(theirs, saved, "o.")
+    back = optimizer_tensors(theirs, "o.")
+    assert saved.keys() == back.keys()
+    assert all(torch.equal(saved[name], back[name]) for name in saved)
