@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import CHOOSE, Debug, Json, Quiet, RunsDir
+from rlcli.cli.options import CHOOSE, Debug, Json, Quiet, RunsDir, Verbose
 
 if TYPE_CHECKING:
     from rlcli.registry import TaskSource
@@ -37,12 +37,12 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """List or show how kept episodes ended."""
     from rlcli.errors import UsageError, did_you_mean
 
-    console.quiet = quiet
     if sort not in _SORTS:
         raise UsageError(
             f"--sort {sort}: there is no such order", hint=did_you_mean(sort, _SORTS) or f"orders: {', '.join(_SORTS)}"

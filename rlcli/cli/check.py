@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Agent, Debug, Json, Overrides
+from rlcli.cli.options import Agent, Debug, Json, Overrides, Quiet, Verbose
 
 if TYPE_CHECKING:
     from rlcli.testing import Finding
@@ -23,6 +23,8 @@ def command(
     ] = False,
     agent: Agent = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Check that a task keeps its contract."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Debug, Json, Quiet, RunsDir
+from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 
 if TYPE_CHECKING:
     from rlcli.rl.compare import Difference, Section
@@ -30,6 +30,7 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Tell where two runs first differ."""
@@ -37,7 +38,6 @@ def command(
     from rlcli.rl.compare import SECTIONS, compare
     from rlcli.rl.run import default_runs_dir
 
-    console.quiet = quiet
     for name in only or []:
         if name not in SECTIONS:
             raise UsageError(f"no --only '{name}'", hint=did_you_mean(name, SECTIONS) or ", ".join(SECTIONS))

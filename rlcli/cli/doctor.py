@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Debug, Json, RunsDir
+from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 from rlcli.probe import TIMEOUT_S
 
 
@@ -18,6 +18,8 @@ def command(
     ] = TIMEOUT_S,
     runs_dir: RunsDir = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Look at this machine, this installation and every plugin; for bug reports."""

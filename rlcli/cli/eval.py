@@ -23,6 +23,7 @@ from rlcli.cli.options import (
     RecordMode,
     RunsDir,
     Seed,
+    Verbose,
     draw_seed,
 )
 
@@ -78,13 +79,13 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
     headless: Headless = True,
 ) -> None:
     """Evaluate a policy."""
     from rlcli.cli.session import check_record, open_session
 
-    console.quiet = quiet
     limits, ceilings = read_limits(fail_under or []), read_limits(fail_over or [], "--fail-over")
     if compare:
         from rlcli.cli.compare import compare as compared

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import CheckpointRef, Debug, Json, Quiet, RunsDir
+from rlcli.cli.options import CheckpointRef, Debug, Json, Quiet, RunsDir, Verbose
 
 if TYPE_CHECKING:
     from rlcli.rl.choice import Choice
@@ -42,6 +42,7 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Export a trained policy."""
@@ -50,7 +51,6 @@ def command(
     from rlcli.rl.export import BUNDLE, FORMATS, check_target, export
     from rlcli.rl.run import default_runs_dir, require_own
 
-    console.quiet = quiet
     if task is None and checkpoint is None:
         raise UsageError("export what?", hint="a TASK, or --checkpoint RUN|latest")
     check_target(format_, output)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Agent, Debug, Json, RunsDir
+from rlcli.cli.options import Agent, Debug, Json, Quiet, RunsDir, Verbose
 
 if TYPE_CHECKING:
     from rlcli.config.imported import Imported
@@ -29,6 +29,8 @@ def oige(
     ] = None,
     output: Output = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Import a task's YAML of OmniIsaacGymEnvs; its class goes on as it is."""
@@ -46,6 +48,8 @@ def isaaclab(
         list[str] | None, typer.Option("--model", help="ENTITY=FILE.xml: the MJCF of a robot or object; repeatable.")
     ] = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Import the env.yaml and agent.yaml that Isaac Lab writes into a run."""
@@ -82,6 +86,8 @@ def sb3(
     runs_dir: RunsDir = None,
     name: RunName = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Import the policy of a PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3 as a run; nothing is unpickled."""
@@ -104,6 +110,8 @@ def rsl_rl(
     runs_dir: RunsDir = None,
     name: RunName = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Import the policy of a checkpoint of RSL-RL as a run; nothing is unpickled."""

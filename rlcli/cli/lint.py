@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Agent, Debug, Json, Overrides
+from rlcli.cli.options import Agent, Debug, Json, Overrides, Quiet, Verbose
 
 if TYPE_CHECKING:
     from rlcli.testing import Remark
@@ -24,6 +24,8 @@ def command(
     ignore: Annotated[list[str] | None, typer.Option("--ignore", help="Leave this rule out; repeatable.")] = None,
     agent: Agent = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Look for what will get in the way of learning: rewards, resets, observations, actions, time step, discount."""

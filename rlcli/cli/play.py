@@ -22,6 +22,7 @@ from rlcli.cli.options import (
     RecordMode,
     RunsDir,
     Seed,
+    Verbose,
     draw_seed,
 )
 
@@ -45,13 +46,13 @@ def command(
         ),
     ] = None,
     viewer: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--viewer",
             help="auto, native (a window), web (the browser) or none (numbers). auto: a window if there is a display,"
             " else the browser if a terminal asks, else numbers.",
         ),
-    ] = "auto",
+    ] = None,
     port: Annotated[
         int | None,
         typer.Option("--port", min=0, max=65535, help="Of --viewer web, on this machine alone; 0: any. Else 8080."),
@@ -79,6 +80,7 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
     headless: Headless = False,
 ) -> None:
@@ -87,7 +89,6 @@ def command(
     from rlcli.cli.viewing import choose_viewers, read_commands, require_viewer, show
     from rlcli.errors import UsageError
 
-    console.quiet = quiet
     require_viewer(viewer, port, drawn=video is not None or record is not None)
     commands = read_commands(asked or [])
     if video is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Debug, Json, Quiet, RunsDir
+from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 
 if TYPE_CHECKING:
     from rlcli.rl.curves import Curve
@@ -44,6 +44,7 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Draw learning curves; of several seeds their interquartile mean and its 95 % interval."""
@@ -51,7 +52,6 @@ def command(
     from rlcli.rl.figures import FORMATS, check_drawing
     from rlcli.rl.run import default_runs_dir
 
-    console.quiet = quiet
     axes = ("steps", "iterations", "time")
     if x not in axes:
         raise UsageError(f"no --x '{x}'", hint=did_you_mean(x, axes) or f"axes: {', '.join(axes)}")

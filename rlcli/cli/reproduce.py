@@ -34,7 +34,6 @@ def command(
     from rlcli.rl.load import resolve_run
     from rlcli.rl.run import default_runs_dir, find_run
 
-    console.quiet, console.verbose = quiet, verbose
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as in training
     runs = runs_dir or default_runs_dir()
     original, why = find_run(reference, runs)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Agent, ConfigFile, Debug, Json, NumEnvs, Overrides, flags
+from rlcli.cli.options import Agent, ConfigFile, Debug, Json, NumEnvs, Overrides, Quiet, Verbose, flags
 
 
 def command(
@@ -21,6 +21,8 @@ def command(
     num_envs: NumEnvs = None,
     config: ConfigFile = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Print a task's resolved configuration."""

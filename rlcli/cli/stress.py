@@ -19,6 +19,7 @@ from rlcli.cli.options import (
     Quiet,
     RunsDir,
     Seed,
+    Verbose,
     draw_seed,
 )
 
@@ -72,6 +73,7 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Evaluate a policy in variants of its task."""
@@ -81,7 +83,6 @@ def command(
     from rlcli.rl.heat_map import check_picture, draw, heat_map
     from rlcli.rl.sweeps import grid, read_sweeps
 
-    console.quiet = quiet
     words = overrides or []
     if subject is not None and "=" in subject:
         words, subject = [subject, *words], None

@@ -96,7 +96,6 @@ def command(
     from rlcli.rl.space import HINT, read_objective, read_parameters
     from rlcli.rl.stop import StopRequest
 
-    console.quiet, console.verbose = quiet, verbose
     runs = runs_dir or default_runs_dir()
     if task == "show":
         check_optuna()

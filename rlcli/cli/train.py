@@ -94,7 +94,6 @@ def command(
     from rlcli.rl.stop import StopRequest
     from rlcli.rl.trust import named_task
 
-    console.quiet, console.verbose = quiet, verbose
     on_leash()
     # libgomp's threads spin while they wait; on a busy machine that makes an update ten times slower
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Agent, ConfigFile, Debug, Json, Overrides, tell_notes
+from rlcli.cli.options import Agent, ConfigFile, Debug, Json, Overrides, Quiet, Verbose, tell_notes
 from rlcli.errors import TaskError
 from rlcli.registry import TaskSource, find_task, folder_task, task_of_file
 
@@ -21,6 +21,8 @@ def command(
     agent: Agent = None,
     config: ConfigFile = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Check a task's configuration."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Debug, Json, Quiet, RunsDir
+from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 
 if TYPE_CHECKING:
     from rlcli.rl.overview import Overview
@@ -23,13 +23,13 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Follow a training from another terminal; Ctrl-C leaves it alone. --json says how it stands and ends."""
     from rlcli.errors import Stopped
     from rlcli.rl.run import default_runs_dir, find_run
 
-    console.quiet = quiet
     run, why = find_run(reference, runs_dir or default_runs_dir())
     if json:
         _document(run)
