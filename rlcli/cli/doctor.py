@@ -31,7 +31,9 @@ def command(
     for check in checks:
         if check.hint:
             console.data(f"{check.state}: {check.name}: {check.hint}")
-    broken = [check for check in checks if check.state == "broken"]
-    console.document("doctor", healthy=not broken, checks=[asdict(check) for check in checks])
+    broken, warnings = ([check.name for check in checks if check.state == state] for state in ("broken", "warning"))
+    verdict = [f"{word}: {', '.join(names)}" for word, names in (("broken", broken), ("warnings", warnings)) if names]
+    console.data("; ".join(verdict) or "all good")
+    console.document("doctor", healthy=not broken, all_good=not verdict, checks=[asdict(check) for check in checks])
     if broken:
         raise typer.Exit(9)

@@ -28,7 +28,7 @@ def command(
     """Check a task's configuration."""
     from rlcli.config.load import check_all, resolve
 
-    source = _source(target)
+    source = task_source(target)
     given = overrides or []
     unchecked = [] if agent else check_all(source, config_file=config, overrides=given)
     resolved = resolve(source, agent=agent, config_file=config, overrides=given)
@@ -55,7 +55,8 @@ def command(
     )
 
 
-def _source(target: str) -> TaskSource:
+def task_source(target: str) -> TaskSource:
+    """A task by its name, its folder, or any YAML file that describes one."""
     file = Path(target)
     if file.suffix not in (".yaml", ".yml"):
         return find_task(target)
