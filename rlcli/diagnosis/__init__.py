@@ -7,10 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from rlcli.diagnosis.check import Check
-from rlcli.diagnosis.installation import broken_metadata, entries, installation
-from rlcli.diagnosis.machine import machine
-from rlcli.diagnosis.outside import outside
-from rlcli.diagnosis.settings import settings
+from rlcli.diagnosis.installation import entry_checks, installation_checks, metadata_checks
+from rlcli.diagnosis.machine import machine_checks
+from rlcli.diagnosis.outside import outside_checks
+from rlcli.diagnosis.settings import settings_checks
 from rlcli.probe import TIMEOUT_S
 from rlcli.registry import TASKS, TRAINERS
 
@@ -29,10 +29,16 @@ def examine(runs_dir: Path, timeout_s: float = TIMEOUT_S) -> list[Check]:
     stop = threading.Event()
     with ThreadPoolExecutor(2) as pool:
         try:
-            tasks = pool.submit(entries, TASKS, timeout_s, stop)
-            asked = pool.submit(outside, timeout_s)
-            checks = [*installation(), *machine(runs_dir), *settings()]
-            return [*checks, *asked.result(), *broken_metadata(), *tasks.result(), *entries(TRAINERS, timeout_s, stop)]
+            tasks = pool.submit(entry_checks, TASKS, timeout_s, stop)
+            asked = pool.submit(outside_checks, timeout_s)
+            checks = [*installation_checks(), *machine_checks(runs_dir), *settings_checks()]
+            return [
+                *checks,
+                *asked.result(),
+                *metadata_checks(),
+                *tasks.result(),
+                *entry_checks(TRAINERS, timeout_s, stop),
+            ]
         except BaseException:  # Ctrl-C
             stop.set()
             raise

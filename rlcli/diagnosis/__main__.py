@@ -13,7 +13,7 @@ from typing import Any
 from rlcli.diagnosis.installation import version
 from rlcli.errors import MachineError, RlcliError
 from rlcli.registry import malformed_metadata_ignored
-from rlcli.sim.gl import has_display
+from rlcli.sim.gl import has_display, open_context
 
 _WORLD = """
 <mujoco>
@@ -21,6 +21,7 @@ _WORLD = """
   <worldbody><body pos="0 0 1"><freejoint/><geom size="1" rgba="0.9 0.3 0.1 1"/></body></worldbody>
 </mujoco>
 """
+_PIXELS = 64
 
 
 def _compute() -> dict[str, Any]:
@@ -98,19 +99,29 @@ def _warp() -> dict[str, Any] | None:
 
 
 def _drawn(backend: str) -> dict[str, Any]:
-    """Draw a picture offscreen, as a video is."""
+    """Draw a picture offscreen, as videos are drawn; without what is not drawing, which takes seconds to import."""
     if backend == "glfw" and not has_display():
         raise MachineError("there is no display")
     os.environ["MUJOCO_GL"] = backend
     import mujoco
-
-    from rlcli.config.schema import ViewerConfig
-    from rlcli.viewer.video import Renderer
+    import numpy as np
 
     model = mujoco.MjModel.from_xml_string(_WORLD)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    picture = Renderer(model, ViewerConfig(width=64, height=64, lookat=(0.0, 0.0, 1.0))).draw(model, data)
+    context, _ = open_context(_PIXELS, _PIXELS)
+    scene, camera = mujoco.MjvScene(model, maxgeom=10), mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    everything = int(mujoco.mjtCatBit.mjCAT_ALL)
+    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, everything, scene)
+    canvas = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, canvas)
+    place = mujoco.MjrRect(0, 0, _PIXELS, _PIXELS)
+    mujoco.mjr_render(place, scene, canvas)
+    picture = np.zeros((_PIXELS, _PIXELS, 3), np.uint8)
+    mujoco.mjr_readPixels(picture, None, place, canvas)
+    canvas.free()
+    context.free()
     if int(picture.max()) - int(picture.min()) < 16:
         raise MachineError("it draws, but the picture is empty")
     return {"backend": backend, "brightest": int(picture.max())}

@@ -22,7 +22,7 @@ _REQUIREMENT = re.compile(r"\s*([\w.-]+)(?:\[[^]]*\])?\s*([^;]*)(?:;(.*))?")
 _BOUND = re.compile(r"\s*(==|>=|<=|!=|<|>)\s*([\d.]+)(\.\*)?\s*")
 
 
-def installation() -> list[Check]:
+def installation_checks() -> list[Check]:
     """Python, rlcli, what it requires, MuJoCo's packages, and the extras."""
     place = f"{platform.python_implementation()} {platform.python_version()} at {sys.executable}"
     return [
@@ -34,14 +34,14 @@ def installation() -> list[Check]:
     ]
 
 
-def broken_metadata() -> list[Check]:
+def metadata_checks() -> list[Check]:
     """Distributions whose metadata nobody can read."""
     bad = unreadable_distributions()
     hint = "install that package again, or remove the folder; it stops others than rlcli too"
     return [Check(f"metadata of {each.distribution}", "broken", each.reason, hint) for each in bad]
 
 
-def entries(group: str, timeout_s: float, stop: threading.Event) -> list[Check]:
+def entry_checks(group: str, timeout_s: float, stop: threading.Event) -> list[Check]:
     """Every task, or every trainer, loaded in another process."""
     kind = "task" if group == TASKS else "trainer"
     found, _ = catalog(group)
@@ -127,7 +127,7 @@ def _copies(name: str) -> dict[str, str]:
         place = Path(str(getattr(distribution, "_path", "?"))).parent
         try:
             found.setdefault(str(place.resolve()), str(distribution.version))
-        except Exception:  # malformed: `broken_metadata` says it
+        except Exception:  # malformed: `metadata_checks` says it
             continue
     return found
 

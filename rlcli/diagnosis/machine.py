@@ -16,7 +16,7 @@ LOW_MEMORY_BYTES = 1e9
 """torch and MuJoCo alone take about half of it."""
 
 
-def machine(runs_dir: Path) -> list[Check]:
+def machine_checks(runs_dir: Path) -> list[Check]:
     """Cores, memory, the runs folder, and how text is written."""
     return [_cores(), memory_check(memory(), memory_limit()), _runs_folder(runs_dir), _text()]
 

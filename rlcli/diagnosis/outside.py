@@ -33,7 +33,7 @@ Answer = tuple[dict[str, Any] | None, str]
 """What a process answered; or None and why there is no answer."""
 
 
-def outside(timeout_s: float) -> list[Check]:
+def outside_checks(timeout_s: float) -> list[Check]:
     """torch, MuJoCo, graphics and GPUs."""
     backends = ["cgl", "glfw"] if sys.platform == "darwin" else ["egl", "osmesa", "glfw"]
     with ThreadPoolExecutor(available_cores()) as pool:

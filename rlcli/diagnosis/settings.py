@@ -18,7 +18,7 @@ VARIABLES = (
 """Environment variables that are shown."""
 
 
-def settings() -> list[Check]:
+def settings_checks() -> list[Check]:
     """The user's settings file and the variables of the environment."""
     return [_file(), _variables()]
 
