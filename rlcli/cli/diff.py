@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import runs_and_tasks, words
 from rlcli.cli.console import console
 from rlcli.cli.options import Agent, Debug, Json, Quiet, RunsDir, Verbose
 
@@ -29,6 +30,7 @@ def command(
     words: Annotated[
         list[str],
         typer.Argument(
+            autocompletion=runs_and_tasks,
             metavar="A [KEY.PATH=VALUE]... [B [KEY.PATH=VALUE]...]",
             help="Each a run (RUN, RUN@step:N, RUN@best, a checkpoint, latest), or a task (a name, a folder, a YAML"
             " file) with the overrides after it. One task with overrides is compared with itself without them.",
@@ -36,7 +38,11 @@ def command(
     ],
     only: Annotated[
         list[str] | None,
-        typer.Option("--only", help="Of runs: configuration, environment, metrics, weights or policy; repeatable."),
+        typer.Option(
+            "--only",
+            autocompletion=words("configuration", "environment", "metrics", "weights", "policy"),
+            help="Of runs: configuration, environment, metrics, weights or policy; repeatable.",
+        ),
     ] = None,
     agent: Agent = None,
     runs_dir: RunsDir = None,

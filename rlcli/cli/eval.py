@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import tasks, words
 from rlcli.cli.console import SCHEMA_VERSION, console
 from rlcli.cli.options import (
     CheckpointRef,
@@ -37,7 +38,8 @@ def command(
     task: Annotated[
         str | None,
         typer.Argument(
-            help="A task: its newest run is evaluated, else the policy it ships. Not needed with --checkpoint."
+            autocompletion=tasks,
+            help="A task: its newest run is evaluated, else the policy it ships. Not needed with --checkpoint.",
         ),
     ] = None,
     overrides: Overrides = None,
@@ -50,7 +52,12 @@ def command(
         ),
     ] = False,
     checkpoint: CheckpointRef = None,
-    policy: Annotated[str, typer.Option("--policy", help="trained, zero, random or lqr.")] = "trained",
+    policy: Annotated[
+        str,
+        typer.Option(
+            "--policy", autocompletion=words("trained", "zero", "random", "lqr"), help="trained, zero, random or lqr."
+        ),
+    ] = "trained",
     episodes: Annotated[
         int, typer.Option("--episodes", min=1, help="Episodes to run, each environment's first ones.")
     ] = 200,

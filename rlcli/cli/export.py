@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import tasks, words
 from rlcli.cli.console import console
 from rlcli.cli.options import CheckpointRef, Debug, Json, Quiet, RunsDir, Verbose
 
@@ -18,14 +19,17 @@ def command(
     task: Annotated[
         str | None,
         typer.Argument(
-            help="A task: its newest run is exported, else the policy it ships. Not needed with --checkpoint."
+            autocompletion=tasks,
+            help="A task: its newest run is exported, else the policy it ships. Not needed with --checkpoint.",
         ),
     ] = None,
     checkpoint: CheckpointRef = None,
     format_: Annotated[
         str,
         typer.Option(
-            "--format", help="onnx, torch (a torch.export program), numpy, or bundle (a folder for rlcli itself)."
+            "--format",
+            autocompletion=words("onnx", "torch", "numpy", "bundle"),
+            help="onnx, torch (a torch.export program), numpy, or bundle (a folder for rlcli itself).",
         ),
     ] = "onnx",
     output: Annotated[

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rlcli.cli.completion import tasks
 from rlcli.cli.console import console
 from rlcli.cli.options import Agent, Debug, Json, Overrides, Quiet, Verbose
 
@@ -14,7 +15,10 @@ if TYPE_CHECKING:
 
 
 def command(
-    task: Annotated[str, typer.Argument(help="A task's name, distribution:name, or a folder with a task.yaml.")],
+    task: Annotated[
+        str,
+        typer.Argument(autocompletion=tasks, help="A task's name, distribution:name, or a folder with a task.yaml."),
+    ],
     overrides: Overrides = None,
     seconds: Annotated[
         float | None,

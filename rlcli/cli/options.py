@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import agents, checkpoints, words
 from rlcli.cli.console import console
 
 CHOOSE = "auto"
@@ -41,25 +42,33 @@ ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", help="YAML merged over the task; `agent:` in it addresses the chosen agent."),
 ]
-Agent = Annotated[str | None, typer.Option("--agent", help="Which of the task's agents.")]
+Agent = Annotated[str | None, typer.Option("--agent", autocompletion=agents, help="Which of the task's agents.")]
 NumEnvs = Annotated[int | None, typer.Option("--num-envs", help="Short for scene.num_envs=N.")]
 MAX_SEED = 2**62
 Seed = Annotated[
     int,
     typer.Option("--seed", min=-1, max=MAX_SEED, help="Seed of everything random; -1 draws one and records it."),
 ]
-Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
+Device = Annotated[
+    str, typer.Option("--device", autocompletion=words("auto", "cpu", "cuda"), help="auto, cpu, cuda or cuda:N.")
+]
 RunsDir = Annotated[Path | None, typer.Option("--runs-dir", help="Runs folder; else RLCLI_RUNS_DIR, settings, runs/.")]
 Record = Annotated[
     Path | None, typer.Option("--record", help="Write the episodes, states and actions, to FILE; `replay` steps them.")
 ]
 RecordMode = Annotated[
-    str, typer.Option("--record-mode", help="Which episodes: all, succeeded, failed, or separate (a file each).")
+    str,
+    typer.Option(
+        "--record-mode",
+        autocompletion=words("all", "succeeded", "failed", "separate"),
+        help="Which episodes: all, succeeded, failed, or separate (a file each).",
+    ),
 ]
 CheckpointRef = Annotated[
     str | None,
     typer.Option(
         "--checkpoint",
+        autocompletion=checkpoints,
         help="RUN, RUN@best, RUN@step:N, a checkpoint folder, a bundle, latest, or shipped (the task's own policy).",
     ),
 ]

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import tasks, words
 from rlcli.cli.console import console
 from rlcli.cli.options import (
     CHOOSE,
@@ -33,12 +34,18 @@ def command(
     task: Annotated[
         str | None,
         typer.Argument(
-            help="A task: its newest run is played, else the policy it ships. Not needed with --checkpoint."
+            autocompletion=tasks,
+            help="A task: its newest run is played, else the policy it ships. Not needed with --checkpoint.",
         ),
     ] = None,
     overrides: Overrides = None,
     checkpoint: CheckpointRef = None,
-    policy: Annotated[str, typer.Option("--policy", help="trained, zero, random or lqr.")] = "trained",
+    policy: Annotated[
+        str,
+        typer.Option(
+            "--policy", autocompletion=words("trained", "zero", "random", "lqr"), help="trained, zero, random or lqr."
+        ),
+    ] = "trained",
     video: Annotated[
         Path | None,
         typer.Option(
@@ -49,6 +56,7 @@ def command(
         str | None,
         typer.Option(
             "--viewer",
+            autocompletion=words("auto", "native", "web", "none"),
             help="auto, native (a window), web (the browser) or none (numbers). auto: a window if there is a display,"
             " else the browser if a terminal asks, else numbers.",
         ),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import runs_and_tasks
 from rlcli.cli.console import console
 from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 
@@ -22,7 +23,11 @@ _MOST_PANELS = 60
 def command(
     runs: Annotated[
         list[str],
-        typer.Argument(metavar="RUN", help="Runs by folder or name, latest, or a task: all of its runs."),
+        typer.Argument(
+            autocompletion=runs_and_tasks,
+            metavar="RUN",
+            help="Runs by folder or name, latest, or a task: all of its runs.",
+        ),
     ],
     output: Annotated[
         Path | None,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import checkpoints
 from rlcli.cli.console import console
 from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 from rlcli.cli.plot import require_folder
@@ -26,7 +27,12 @@ _LARGEST = 24 * 2**20
 
 
 def command(
-    run: Annotated[str, typer.Argument(metavar="RUN", help="RUN, RUN@best, RUN@step:N, a checkpoint, or latest.")],
+    run: Annotated[
+        str,
+        typer.Argument(
+            autocompletion=checkpoints, metavar="RUN", help="RUN, RUN@best, RUN@step:N, a checkpoint, or latest."
+        ),
+    ],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="FILE.html; by default report.html in the run.")
     ] = None,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rlcli.cli.completion import tasks
 from rlcli.cli.console import console
 from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 
@@ -21,7 +22,9 @@ _LONGEST = 60
 
 
 def command(
-    task: Annotated[str | None, typer.Argument(help="Only runs of this task: its name, or its folder.")] = None,
+    task: Annotated[
+        str | None, typer.Argument(autocompletion=tasks, help="Only runs of this task: its name, or its folder.")
+    ] = None,
     limit: Annotated[int | None, typer.Option("--limit", min=1, help="Only the N newest.")] = None,
     runs_dir: RunsDir = None,
     json: Json = False,

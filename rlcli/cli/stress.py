@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import runs_and_tasks
 from rlcli.cli.console import console
 from rlcli.cli.options import (
     CheckpointRef,
@@ -36,7 +37,11 @@ _MOST = 10_000
 def command(
     subject: Annotated[
         str | None,
-        typer.Argument(metavar="RUN|TASK", help="A run, RUN@best, RUN@step:N or latest; or a task: its newest run."),
+        typer.Argument(
+            autocompletion=runs_and_tasks,
+            metavar="RUN|TASK",
+            help="A run, RUN@best, RUN@step:N or latest; or a task: its newest run.",
+        ),
     ] = None,
     overrides: Overrides = None,
     sweep: Annotated[

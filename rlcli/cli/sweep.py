@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import tasks
 from rlcli.cli.console import console
 from rlcli.cli.options import (
     MAX_SEED,
@@ -45,7 +46,9 @@ PICTURE = "sweep.svg"
 
 
 def command(
-    task: Annotated[str | None, typer.Argument(help="A task; or `show`, and a sweep's folder or name.")] = None,
+    task: Annotated[
+        str | None, typer.Argument(autocompletion=tasks, help="A task; or `show`, and a sweep's folder or name.")
+    ] = None,
     overrides: Overrides = None,
     param: Annotated[
         list[str] | None,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import checkpoints, runs, tasks, words
 from rlcli.cli.console import console
 from rlcli.cli.options import (
     MAX_SEED,
@@ -37,7 +38,8 @@ if TYPE_CHECKING:
 
 def command(
     task: Annotated[
-        str | None, typer.Argument(help="A task's name, distribution:name, or a folder with a task.yaml.")
+        str | None,
+        typer.Argument(autocompletion=tasks, help="A task's name, distribution:name, or a folder with a task.yaml."),
     ] = None,
     overrides: Overrides = None,
     agent: Agent = None,
@@ -59,7 +61,12 @@ def command(
         int | None, typer.Option("--gpus", min=1, help="Processes on this machine, a GPU each; num_envs is of each.")
     ] = None,
     logger: Annotated[
-        list[str] | None, typer.Option("--logger", help="tensorboard, wandb, mlflow, trackio or none; repeatable.")
+        list[str] | None,
+        typer.Option(
+            "--logger",
+            autocompletion=words("tensorboard", "wandb", "mlflow", "trackio", "none"),
+            help="tensorboard, wandb, mlflow, trackio or none; repeatable.",
+        ),
     ] = None,
     video_every: Annotated[
         int | None,
@@ -71,10 +78,14 @@ def command(
     ] = None,
     config: ConfigFile = None,
     resume: Annotated[
-        str | None, typer.Option("--resume", help="Go on with a run: RUN, RUN@step:N or latest. Needs no TASK.")
+        str | None,
+        typer.Option(
+            "--resume", autocompletion=runs, help="Go on with a run: RUN, RUN@step:N or latest. Needs no TASK."
+        ),
     ] = None,
     init_from: Annotated[
-        str | None, typer.Option("--init-from", help="Start a new run from a checkpoint's weights.")
+        str | None,
+        typer.Option("--init-from", autocompletion=checkpoints, help="Start a new run from a checkpoint's weights."),
     ] = None,
     runs_dir: RunsDir = None,
     name: Annotated[str | None, typer.Option("--name", help="Part of the run folder's name.")] = None,

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from rlcli.cli.completion import tasks
 from rlcli.cli.console import console
 from rlcli.cli.options import Agent, ConfigFile, Debug, Json, Overrides, Quiet, Verbose, tell_notes
 from rlcli.errors import TaskError
@@ -15,7 +16,10 @@ from rlcli.registry import TaskSource, find_task, folder_task, task_of_file
 
 
 def command(
-    target: Annotated[str, typer.Argument(metavar="FILE|TASK", help="A task.yaml, its folder, or a task's name.")],
+    target: Annotated[
+        str,
+        typer.Argument(autocompletion=tasks, metavar="FILE|TASK", help="A task.yaml, its folder, or a task's name."),
+    ],
     overrides: Overrides = None,
     deep: Annotated[bool, typer.Option("--deep", help="Also compile the model and resolve every name in it.")] = False,
     agent: Agent = None,

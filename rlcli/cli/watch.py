@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import runs
 from rlcli.cli.console import console
 from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 
@@ -19,7 +20,9 @@ _EVERY_S = 0.5
 
 
 def command(
-    reference: Annotated[str, typer.Argument(metavar="RUN", help="A run's folder or name, or latest.")] = "latest",
+    reference: Annotated[
+        str, typer.Argument(autocompletion=runs, metavar="RUN", help="A run's folder or name, or latest.")
+    ] = "latest",
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,

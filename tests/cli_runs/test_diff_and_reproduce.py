@@ -116,8 +116,9 @@ def test_a_run_is_compared_with_a_task_by_configuration_and_files(cli, run, coin
     assert sections(result)["files"] == []
     same = cli("diff", coin, *SMALL[:3], "agent.max_iterations=3", run, "--json")
     assert (same.code, sections(same)["configuration"]) == (0, [])
-    Path("coin/model.xml").write_text(Path("coin/model.xml").read_text().replace('mass="1"', 'mass="2"'))
-    changed = cli("diff", coin, *SMALL[:3], "agent.max_iterations=3", run, "--json")
+    model = Path(shutil.copytree(coin, "other")) / "model.xml"  # not of the task that this process's runs share
+    model.write_text(model.read_text().replace('mass="1"', 'mass="2"'))
+    changed = cli("diff", "./other", *SMALL[:3], "agent.max_iterations=3", run, "--json")
     assert (changed.code, [d["where"] for d in sections(changed)["files"]]) == (9, ["model.xml"])
     assert cli("diff", run, "sim.dt=0.1", coin).code == 2, "a run has no overrides"
 
