@@ -33,7 +33,7 @@ def oige(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Import a task's YAML of OmniIsaacGymEnvs; its class goes on as it is."""
+    """Import a task's YAML of OmniIsaacGymEnvs. Its class goes on as it is."""
     from rlcli.config.oige_import import convert
 
     _tell("oige", convert([task] if train is None else [task, train], output))
@@ -52,7 +52,7 @@ def isaaclab(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Import the env.yaml and agent.yaml that Isaac Lab writes into a run."""
+    """Import the settings of an Isaac Lab run. These are its env.yaml and agent.yaml."""
     from rlcli.errors import UsageError
     from rlcli.isaaclab.importer import convert
 
@@ -90,7 +90,7 @@ def sb3(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Import the policy of a PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3 as a run; nothing is unpickled."""
+    """Import a policy of Stable-Baselines3 as a run. PPO, A2C, SAC, TD3 or DDPG; nothing is unpickled."""
     _check_policy(activation, action_bound)
     resolved = _resolved(task, agent)
     from rlcli.rl.foreign import read_sb3
@@ -114,7 +114,7 @@ def rsl_rl(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Import the policy of a checkpoint of RSL-RL as a run; nothing is unpickled."""
+    """Import a policy of RSL-RL as a run. Nothing is unpickled."""
     _check_policy(activation, action_bound)
     resolved = _resolved(task, agent)
     from rlcli.rl.foreign import read_rsl_rl

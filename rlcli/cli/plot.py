@@ -52,7 +52,7 @@ def command(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Draw learning curves; of several seeds their interquartile mean and its 95 % interval."""
+    """Draw learning curves. Of several seeds their interquartile mean and its 95 % interval."""
     from rlcli.errors import UsageError, did_you_mean
     from rlcli.rl.figures import FORMATS, check_drawing
     from rlcli.rl.run import default_runs_dir

@@ -92,7 +92,7 @@ def command(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Search settings that learn best; `sweep show` tells how far it is."""
+    """Search settings that learn best. `sweep show` tells how far it is."""
     from rlcli.errors import Stopped, UsageError, did_you_mean
     from rlcli.rl.run import default_runs_dir, require_name
     from rlcli.rl.search import check_optuna, open_search

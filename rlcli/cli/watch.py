@@ -29,7 +29,7 @@ def command(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Follow a training from another terminal; Ctrl-C leaves it alone. --json says how it stands and ends."""
+    """Follow a training from another terminal. Ctrl-C leaves it alone. --json says how it stands and ends."""
     from rlcli.errors import Stopped
     from rlcli.rl.run import default_runs_dir, find_run
 
