@@ -51,7 +51,7 @@ def command(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Tell where two runs first differ, or two configurations: physics, MDP, agent, cosmetic."""
+    """Tell where two runs or configurations differ. Of each key: physics, MDP, agent or cosmetic."""
     from rlcli.errors import CheckpointError, UsageError, did_you_mean
     from rlcli.rl.compare import SECTIONS
     from rlcli.rl.run import default_runs_dir

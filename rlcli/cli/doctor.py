@@ -22,7 +22,7 @@ def command(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Look at this machine, this installation and every plugin; for bug reports."""
+    """Tell what works here and how to mend the rest. Every part and plugin is looked at; for bug reports."""
     from rlcli.diagnosis import examine
     from rlcli.rl.run import default_runs_dir
 

@@ -25,7 +25,7 @@ def command(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Write the package of a new task: model, configuration, code, tests."""
+    """Write the package of a new task. It has: model, configuration, code, tests."""
     from rlcli.scaffold import create
 
     folder, files = create(name, flavour, output)

@@ -46,7 +46,7 @@ def command(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Write a run's page: task, curves, evaluation, video, configuration, machine."""
+    """Write a run's page. On it: task, curves, evaluation, video, configuration, machine."""
     from rlcli.errors import UsageError
     from rlcli.rl.run import default_runs_dir, require_own
 
