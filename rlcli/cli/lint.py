@@ -32,7 +32,7 @@ def command(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Look for what will get in the way of learning. Among it: rewards, resets, observations, actions, time step, discount."""
+    """Look for what will get in the way of learning. Rewards, resets, observations, actions, time step, discount."""
     from rlcli.rl.trust import named_task
 
     named_task(task)  # what is not there is said before anything heavy is imported
