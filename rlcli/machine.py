@@ -5,11 +5,14 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 from rlcli.errors import DeviceError
 
 _GROUPS, _OWN_GROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+_NO_LIMIT = 1 << 60
+"""Version 1 says with a number like this that there is none."""
 
 
 def available_cores(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> int:
@@ -26,19 +29,35 @@ def available_cores(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> int:
 
 def core_quota(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> float | None:
     """Cores' worth of time that a container's control group grants this process; None where there is no limit."""
+    quotas = [_quota(folder) for folder in _control_groups("cpu", groups, own)]
+    return min((quota for quota in quotas if quota is not None), default=None)
+
+
+def memory_limit(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> int | None:
+    """Bytes that a container's control group grants; None where there is no limit."""
+    limits = []
+    for folder in _control_groups("memory", groups, own):
+        for name in ("memory.max", "memory.limit_in_bytes"):
+            try:
+                limits.append(int((folder / name).read_text(encoding="utf-8")))
+            except (OSError, ValueError):  # not there, or `max`
+                continue
+    return min((limit for limit in limits if limit < _NO_LIMIT), default=None)
+
+
+def _control_groups(controller: str, groups: Path, own: Path) -> Iterator[Path]:
+    """The folders of this process's control groups, from its own up."""
     try:
         places = [line.split(":", 2) for line in own.read_text(encoding="utf-8").splitlines()]
     except (OSError, ValueError):
-        return None
-    quotas = []
+        return
     for _, controllers, place in (parts for parts in places if len(parts) == 3):
-        if controllers and "cpu" not in controllers.split(","):
+        if controllers and controller not in controllers.split(","):
             continue
         # version 1 has a folder a controller, which may be mounted under either name; version 2 has none
-        for root in (groups / controllers, groups / "cpu") if controllers else (groups,):
+        for root in (groups / controllers, groups / controller) if controllers else (groups,):
             folder = root / place.strip("/")
-            quotas += [_quota(each) for each in (folder, *folder.parents) if each.is_relative_to(root)]
-    return min((quota for quota in quotas if quota is not None), default=None)
+            yield from (each for each in (folder, *folder.parents) if each.is_relative_to(root))
 
 
 def read_plain(file: Path, most: int) -> bytes:

@@ -81,21 +81,27 @@ def _known(entry: Entry, own: dict[str, Any]) -> Details | None:
 
 
 def probe(
-    entries: Iterable[Entry], timeout_s: float = TIMEOUT_S, group: str = TASKS, stop: threading.Event | None = None
+    entries: Iterable[Entry],
+    timeout_s: float = TIMEOUT_S,
+    group: str = TASKS,
+    stop: threading.Event | None = None,
+    without: Iterable[str] = (),
 ) -> dict[str, Details]:
     """Load every task in a process other than this one, and remember what it says. A broken one is a row with a reason.
 
     The tasks of a distribution share a process; who ends it, or takes longer than `timeout_s`, is alone to blame, and
-    the others go on in a new one. Several distributions are loaded at a time. `stop` ends it early.
+    the others go on in a new one. Several distributions are loaded at a time. `stop` ends it early. `without` names
+    variables of the environment that the processes are not to see.
     """
     entries = list(entries)
     owners: dict[str, list[Entry]] = {}
     for entry in entries:
         owners.setdefault(entry.distribution, []).append(entry)
     stop = stop or threading.Event()
+    env = {name: value for name, value in os.environ.items() if name not in without}
     with ThreadPoolExecutor(max(1, min(len(owners), available_cores()))) as pool:
         try:  # around the start as well: the first process may run before the last thread does
-            rows = pool.map(lambda owned: _probe_distribution(owned, timeout_s, group, stop), owners.values())
+            rows = pool.map(lambda owned: _probe_distribution(owned, timeout_s, group, stop, env), owners.values())
             found = {name: row for part in rows for name, row in part.items()}
         except BaseException:  # Ctrl-C
             stop.set()
@@ -119,17 +125,19 @@ def _remember(known: dict[str, Any]) -> None:
 
 
 def _probe_distribution(
-    entries: list[Entry], timeout_s: float, group: str, stop: threading.Event
+    entries: list[Entry], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str]
 ) -> dict[str, Details]:
     found: dict[str, Details] = {}
     while left := [entry.qualified for entry in entries if entry.qualified not in found]:
         if stop.is_set():
             break
-        found.update(_probe_names(left, timeout_s, group, stop))
+        found.update(_probe_names(left, timeout_s, group, stop, env))
     return found
 
 
-def _probe_names(names: list[str], timeout_s: float, group: str, stop: threading.Event) -> dict[str, Details]:
+def _probe_names(
+    names: list[str], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str]
+) -> dict[str, Details]:
     """What one process says of the first of these, and of as many more as it comes to."""
     with tempfile.TemporaryDirectory(prefix="rlcli-probe-", ignore_cleanup_errors=True) as folder:
         file, said = Path(folder) / "rows", Path(folder) / "stderr"
@@ -139,6 +147,7 @@ def _probe_names(names: list[str], timeout_s: float, group: str, stop: threading
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=stderr,
+                env=env,
                 start_new_session=True,
             )
         try:

@@ -20,6 +20,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
+from rlcli.config.settings import setting, settings_file
 from rlcli.errors import DependencyError, MissingModelError, TaskError, did_you_mean, listing
 from rlcli.task import API_VERSION, TaskSpec
 
@@ -102,7 +103,7 @@ class TaskSource:
 def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], list[Broken]]:
     """Every entry of a group, sorted by name then distribution, and the distributions that could not be read.
 
-    Those that RLCLI_PLUGINS leaves out are only there if `hidden`.
+    Those that RLCLI_PLUGINS or the user's settings leave out are only there if `hidden`.
     """
     entries: dict[tuple[str, str], Entry] = {}
     broken: dict[str, Broken] = {}
@@ -142,12 +143,17 @@ def unreadable_distributions() -> list[Broken]:
 
 
 def unknown_wanted() -> list[str]:
-    """Names in RLCLI_PLUGINS that are no installed distribution with tasks or trainers."""
+    """Names of plugins to use, of the variable or the user's settings, that have no tasks or trainers here."""
     wanted = _wanted()
     if not wanted:
         return []
     installed = {_normal(entry.distribution) for group in (TASKS, TRAINERS) for entry in catalog(group, hidden=True)[0]}
     return sorted(wanted - installed - {OWN})
+
+
+def plugins_chosen_by() -> str:
+    """What says which plugins to use: the variable, or the user's settings."""
+    return "RLCLI_PLUGINS" if os.environ.get("RLCLI_PLUGINS", "").strip() else f"plugins in {settings_file()}"
 
 
 @contextlib.contextmanager
@@ -417,10 +423,10 @@ def find_entry(group: str, name: str, *, what: str) -> Entry:
         choices = " or ".join(e.qualified for e in matches)
         raise TaskError(f"{what} '{name}' is offered by {owners}", hint=f"name one: {choices}")
     if any(name in (e.name, e.qualified) for e in catalog(group, hidden=True)[0]):
-        setting = f"RLCLI_PLUGINS={os.environ.get('RLCLI_PLUGINS')}"
-        raise TaskError(
-            f"{what} '{name}' is installed, but {setting} leaves its plugin out", hint="unset RLCLI_PLUGINS"
-        )
+        value = os.environ.get("RLCLI_PLUGINS", "").strip()
+        said = f"RLCLI_PLUGINS={value}" if value else plugins_chosen_by()
+        remedy = "unset RLCLI_PLUGINS" if value else "name its distribution there, or remove that key"
+        raise TaskError(f"{what} '{name}' is installed, but {said} leaves its plugin out", hint=remedy)
     names = list(dict.fromkeys(e.name for e in entries))
     installed = listing(sorted({f"{e.distribution} {e.version}" for e in entries}))
     near = did_you_mean(name, [*names, *(e.qualified for e in entries)] if ":" in name else names)
@@ -696,11 +702,12 @@ def _defines(file: Path, name: str) -> bool:
 
 
 def _wanted() -> set[str] | None:
-    """Distributions that RLCLI_PLUGINS allows (`none` leaves the built-ins), or None for all."""
-    value = os.environ.get("RLCLI_PLUGINS")
-    if value is None or not value.strip():
+    """Distributions that RLCLI_PLUGINS or the user's settings allow (`none` leaves the built-ins), or None for all."""
+    value = os.environ.get("RLCLI_PLUGINS", "").strip()
+    names = value.split(",") if value else setting("plugins")
+    if names is None:
         return None
-    return {"rlcli", *(_normal(name.strip()) for name in value.split(",") if name.strip().lower() != "none")}
+    return {"rlcli", *(_normal(name.strip()) for name in names if name.strip().lower() != "none")}
 
 
 def _normal(distribution: str) -> str:

@@ -17,13 +17,16 @@ if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_I
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_state(tmp_path_factory):
-    """Tasks that the tests use are noted in a folder of the tests."""
-    before = os.environ.get("RLCLI_STATE_DIR")
-    os.environ["RLCLI_STATE_DIR"] = str(tmp_path_factory.mktemp("state"))
+    """Tasks that the tests use are noted in a folder of the tests, and nobody's preferences are followed."""
+    own = {"RLCLI_STATE_DIR": str(tmp_path_factory.mktemp("state")), "RLCLI_SETTINGS": "none"}
+    before = {name: os.environ.get(name) for name in own}
+    os.environ.update(own)
     yield
-    del os.environ["RLCLI_STATE_DIR"]
-    if before is not None:
-        os.environ["RLCLI_STATE_DIR"] = before
+    for name, value in before.items():
+        if value is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = value
 
 
 @pytest.fixture(autouse=True)

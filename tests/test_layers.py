@@ -30,7 +30,7 @@ LIGHT = [
     "config",
     "registry",
     "probe",
-    "diagnosis.py",
+    "diagnosis",
     "scaffold.py",
     "cli",
     "rl/trainer.py",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import os
 import re
 import sys
 import traceback
@@ -14,6 +15,7 @@ from typer._click.exceptions import ClickException, NoArgsIsHelpError, UsageErro
 
 from rlcli.cli.console import console, discard
 from rlcli.cli.options import CHOOSE
+from rlcli.config.settings import applied, read_settings, settings_file
 from rlcli.errors import ConfigError, RlcliError
 from rlcli.registry import malformed_metadata_ignored
 
@@ -47,6 +49,9 @@ GROUPS = {"import": "import_"}
 """Command that has commands of its own -> module of `rlcli.cli` with their `app`."""
 
 _INTERRUPTED = 130
+_ASKING = frozenset(("-h", "--help", "--version", "--install-completion", "--show-completion"))
+_COMPLETING = "_RLCLI_COMPLETE"
+"""Set by a shell that asks how a line may go on."""
 
 _SETTINGS = {
     "help_option_names": ["-h", "--help"],
@@ -91,7 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
     console.owns_process = arguments is None
     arguments = sys.argv[1:] if arguments is None else arguments
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
-    console.quiet = console.verbose = console.told = False  # what an earlier command of this process was told
+    console.told = False  # what an earlier command of this process was told
     with console.stdout_kept(), malformed_metadata_ignored():
         code = _run(_with_values(arguments))
     try:
@@ -121,7 +126,8 @@ def _named(arguments: list[str]) -> str | None:
 
 def _run(arguments: list[str]) -> int:
     try:
-        result = build(_named(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
+        with applied(_preferences(arguments)):
+            result = build(_named(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
         if result == _INTERRUPTED:  # how typer hands on Ctrl-C
             raise KeyboardInterrupt
         return result if isinstance(result, int) else 0
@@ -146,6 +152,23 @@ def _run(arguments: list[str]) -> int:
         said = f"this is a bug in rlcli: {type(error).__name__}: {error}"
         console.error("bug", 1, said, "please report it with the lines above", [])
         return 1
+
+
+def _preferences(arguments: list[str]) -> dict[str, Any]:
+    """The user's settings; what is asked for help, or to find out what is wrong, works without them too."""
+    try:
+        settings = read_settings()
+    except ConfigError:
+        looking = arguments[:1] in ([], ["doctor"]) or _ASKING.intersection(arguments)
+        if not looking and _COMPLETING not in os.environ:
+            raise
+        settings = {}
+    told = settings.get("verbosity")
+    console.quiet = told == "quiet"  # unless a flag says otherwise
+    console.verbose = told == "verbose" or not {"-v", "--verbose"}.isdisjoint(arguments)
+    if settings:
+        console.detail(f"settings: {settings_file()}")
+    return settings
 
 
 def _report(error: RlcliError) -> int:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import runs
 from rlcli.cli.console import console
-from rlcli.cli.options import CHOOSE, Debug, Json, Quiet, RunsDir
+from rlcli.cli.options import CHOOSE, Debug, Json, Quiet, RunsDir, Verbose
 
 if TYPE_CHECKING:
     from rlcli.registry import TaskSource
@@ -24,7 +25,7 @@ _MANY = 12
 
 
 def command(
-    run: Annotated[str, typer.Argument(help="A run: its folder, its name, or latest.")],
+    run: Annotated[str, typer.Argument(autocompletion=runs, help="A run: its folder, its name, or latest.")],
     case: Annotated[int | None, typer.Argument(help="Show this case, by its number in the list.", min=0)] = None,
     sort: Annotated[str, typer.Option("--sort", help="Order of the list: when, return, length or kind.")] = "when",
     steps: Annotated[int, typer.Option("--steps", min=1, help="How many last steps of a case to show.")] = 8,
@@ -37,12 +38,12 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """List or show how kept episodes ended."""
     from rlcli.errors import UsageError, did_you_mean
 
-    console.quiet = quiet
     if sort not in _SORTS:
         raise UsageError(
             f"--sort {sort}: there is no such order", hint=did_you_mean(sort, _SORTS) or f"orders: {', '.join(_SORTS)}"

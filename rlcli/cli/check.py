@@ -7,15 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rlcli.cli.completion import tasks
 from rlcli.cli.console import console
-from rlcli.cli.options import Agent, Debug, Json, Overrides
+from rlcli.cli.options import Agent, Debug, Json, Overrides, Quiet, Verbose
 
 if TYPE_CHECKING:
     from rlcli.testing import Finding
 
 
 def command(
-    task: Annotated[str, typer.Argument(help="A task's name, distribution:name, or a folder with a task.yaml.")],
+    task: Annotated[
+        str,
+        typer.Argument(autocompletion=tasks, help="A task's name, distribution:name, or a folder with a task.yaml."),
+    ],
     overrides: Overrides = None,
     only: Annotated[list[str] | None, typer.Option("--only", help="Run only this check; repeatable.")] = None,
     record: Annotated[
@@ -23,6 +27,8 @@ def command(
     ] = False,
     agent: Agent = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Check that a task keeps its contract."""

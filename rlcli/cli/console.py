@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from rlcli.config.settings import setting
+
 SCHEMA_VERSION = 1
 _OWN = ("bug", "device", "diverged")
 """Kinds of errors that one process of several may have alone."""
@@ -99,7 +101,7 @@ class Console:
         """A table on stdout: plain columns, or what fits on a terminal."""
         if self.json:
             return
-        if sys.stdout is not None and sys.stdout.isatty():
+        if drawable(sys.stdout):
             from rlcli.cli.tables import draw_table
 
             draw_table([*map(plain, columns)], [[*map(plain, row)] for row in rows], title and plain(title))
@@ -115,7 +117,7 @@ class Console:
         `drawn` has `rows`, `columns`, `cells` and `share(number)`, the place of a number on the scale from 0 to 1.
         """
         rows = [[name, *(f"{x:.2f}" for x in cells)] for name, cells in zip(drawn.rows, drawn.cells, strict=True)]
-        if self.json or sys.stdout is None or not sys.stdout.isatty():
+        if self.json or not drawable(sys.stdout):
             self.data(title)
             self.table([corner, *drawn.columns], rows)
             return
@@ -133,6 +135,26 @@ def _shade(share: float) -> str:
 
 
 console = Console()
+
+
+def is_terminal(stream: Any) -> bool:
+    """Whether a stream is a terminal that knows how to move its cursor."""
+    return stream is not None and stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
+
+
+def drawable(stream: Any) -> bool:
+    """Whether tables with styles belong on a stream: a terminal, or one that colours are forced on."""
+    return stream is not None and (stream.isatty() or colors() == "always")
+
+
+def colors() -> str:
+    """never, always or auto (on a terminal): as NO_COLOR or else FORCE_COLOR say if they are not empty, or settings."""
+    if os.environ.get("NO_COLOR"):
+        return "never"
+    if os.environ.get("FORCE_COLOR"):
+        return "always"
+    return str(setting("color") or "auto")
+
 
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 """What a terminal would obey, what turns the direction of text, and halves of characters; not tab and newline."""

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Debug, Json, RunsDir
+from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 from rlcli.probe import TIMEOUT_S
 
 
@@ -18,9 +18,11 @@ def command(
     ] = TIMEOUT_S,
     runs_dir: RunsDir = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Look at this machine, this installation and every plugin; for bug reports."""
+    """Tell what works here and how to mend the rest. Every part and plugin is looked at; for bug reports."""
     from rlcli.diagnosis import examine
     from rlcli.rl.run import default_runs_dir
 
@@ -29,7 +31,9 @@ def command(
     for check in checks:
         if check.hint:
             console.data(f"{check.state}: {check.name}: {check.hint}")
-    broken = [check for check in checks if check.state == "broken"]
-    console.document("doctor", healthy=not broken, checks=[asdict(check) for check in checks])
+    broken, warnings = ([check.name for check in checks if check.state == state] for state in ("broken", "warning"))
+    verdict = [f"{word}: {', '.join(names)}" for word, names in (("broken", broken), ("warnings", warnings)) if names]
+    console.data("; ".join(verdict) or "all good")
+    console.document("doctor", healthy=not broken, all_good=not verdict, checks=[asdict(check) for check in checks])
     if broken:
         raise typer.Exit(9)

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import tasks, words
 from rlcli.cli.console import SCHEMA_VERSION, console
 from rlcli.cli.options import (
     CheckpointRef,
@@ -23,6 +24,7 @@ from rlcli.cli.options import (
     RecordMode,
     RunsDir,
     Seed,
+    Verbose,
     draw_seed,
 )
 
@@ -36,7 +38,8 @@ def command(
     task: Annotated[
         str | None,
         typer.Argument(
-            help="A task: its newest run is evaluated, else the policy it ships. Not needed with --checkpoint."
+            autocompletion=tasks,
+            help="A task: its newest run is evaluated, else the policy it ships. Not needed with --checkpoint.",
         ),
     ] = None,
     overrides: Overrides = None,
@@ -49,7 +52,12 @@ def command(
         ),
     ] = False,
     checkpoint: CheckpointRef = None,
-    policy: Annotated[str, typer.Option("--policy", help="trained, zero, random or lqr.")] = "trained",
+    policy: Annotated[
+        str,
+        typer.Option(
+            "--policy", autocompletion=words("trained", "zero", "random", "lqr"), help="trained, zero, random or lqr."
+        ),
+    ] = "trained",
     episodes: Annotated[
         int, typer.Option("--episodes", min=1, help="Episodes to run, each environment's first ones.")
     ] = 200,
@@ -78,13 +86,13 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
     headless: Headless = True,
 ) -> None:
     """Evaluate a policy."""
     from rlcli.cli.session import check_record, open_session
 
-    console.quiet = quiet
     limits, ceilings = read_limits(fail_under or []), read_limits(fail_over or [], "--fail-over")
     if compare:
         from rlcli.cli.compare import compare as compared

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import tasks, words
 from rlcli.cli.console import console
-from rlcli.cli.options import CheckpointRef, Debug, Json, Quiet, RunsDir
+from rlcli.cli.options import CheckpointRef, Debug, Json, Quiet, RunsDir, Verbose
 
 if TYPE_CHECKING:
     from rlcli.rl.choice import Choice
@@ -18,14 +19,17 @@ def command(
     task: Annotated[
         str | None,
         typer.Argument(
-            help="A task: its newest run is exported, else the policy it ships. Not needed with --checkpoint."
+            autocompletion=tasks,
+            help="A task: its newest run is exported, else the policy it ships. Not needed with --checkpoint.",
         ),
     ] = None,
     checkpoint: CheckpointRef = None,
     format_: Annotated[
         str,
         typer.Option(
-            "--format", help="onnx, torch (a torch.export program), numpy, or bundle (a folder for rlcli itself)."
+            "--format",
+            autocompletion=words("onnx", "torch", "numpy", "bundle"),
+            help="onnx, torch (a torch.export program), numpy, or bundle (a folder for rlcli itself).",
         ),
     ] = "onnx",
     output: Annotated[
@@ -42,6 +46,7 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Export a trained policy."""
@@ -50,7 +55,6 @@ def command(
     from rlcli.rl.export import BUNDLE, FORMATS, check_target, export
     from rlcli.rl.run import default_runs_dir, require_own
 
-    console.quiet = quiet
     if task is None and checkpoint is None:
         raise UsageError("export what?", hint="a TASK, or --checkpoint RUN|latest")
     check_target(format_, output)

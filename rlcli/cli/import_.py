@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Agent, Debug, Json, RunsDir
+from rlcli.cli.options import Agent, Debug, Json, Quiet, RunsDir, Verbose
 
 if TYPE_CHECKING:
     from rlcli.config.imported import Imported
@@ -29,9 +29,11 @@ def oige(
     ] = None,
     output: Output = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Import a task's YAML of OmniIsaacGymEnvs; its class goes on as it is."""
+    """Import a task's YAML of OmniIsaacGymEnvs. Its class goes on as it is."""
     from rlcli.config.oige_import import convert
 
     _tell("oige", convert([task] if train is None else [task, train], output))
@@ -46,9 +48,11 @@ def isaaclab(
         list[str] | None, typer.Option("--model", help="ENTITY=FILE.xml: the MJCF of a robot or object; repeatable.")
     ] = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Import the env.yaml and agent.yaml that Isaac Lab writes into a run."""
+    """Import the settings of an Isaac Lab run. These are its env.yaml and agent.yaml."""
     from rlcli.errors import UsageError
     from rlcli.isaaclab.importer import convert
 
@@ -82,9 +86,11 @@ def sb3(
     runs_dir: RunsDir = None,
     name: RunName = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Import the policy of a PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3 as a run; nothing is unpickled."""
+    """Import a policy of Stable-Baselines3 as a run. PPO, A2C, SAC, TD3 or DDPG; nothing is unpickled."""
     _check_policy(activation, action_bound)
     resolved = _resolved(task, agent)
     from rlcli.rl.foreign import read_sb3
@@ -104,9 +110,11 @@ def rsl_rl(
     runs_dir: RunsDir = None,
     name: RunName = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Import the policy of a checkpoint of RSL-RL as a run; nothing is unpickled."""
+    """Import a policy of RSL-RL as a run. Nothing is unpickled."""
     _check_policy(activation, action_bound)
     resolved = _resolved(task, agent)
     from rlcli.rl.foreign import read_rsl_rl

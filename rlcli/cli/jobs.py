@@ -53,11 +53,12 @@ def begun(
 ) -> dict[str, Any]:
     """What a new run's run.json says besides its seed and device."""
     from rlcli.config.dump import given
+    from rlcli.config.settings import setting
     from rlcli.rl.environment import environment_record, file_digest
     from rlcli.rl.job import threads
     from rlcli.rl.loggers import check_loggers
 
-    loggers = check_loggers(logger)
+    loggers = check_loggers(logger or setting("loggers"))
     _require_drawing(video_every)
     initial = None
     if init_from is not None:

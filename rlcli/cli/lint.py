@@ -6,15 +6,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rlcli.cli.completion import tasks
 from rlcli.cli.console import console
-from rlcli.cli.options import Agent, Debug, Json, Overrides
+from rlcli.cli.options import Agent, Debug, Json, Overrides, Quiet, Verbose
 
 if TYPE_CHECKING:
     from rlcli.testing import Remark
 
 
 def command(
-    task: Annotated[str, typer.Argument(help="A task's name, distribution:name, or a folder with a task.yaml.")],
+    task: Annotated[
+        str,
+        typer.Argument(autocompletion=tasks, help="A task's name, distribution:name, or a folder with a task.yaml."),
+    ],
     overrides: Overrides = None,
     seconds: Annotated[
         float | None,
@@ -24,9 +28,11 @@ def command(
     ignore: Annotated[list[str] | None, typer.Option("--ignore", help="Leave this rule out; repeatable.")] = None,
     agent: Agent = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Look for what will get in the way of learning: rewards, resets, observations, actions, time step, discount."""
+    """Look for what will get in the way of learning. Rewards, resets, observations, actions, time step, discount."""
     from rlcli.rl.trust import named_task
 
     named_task(task)  # what is not there is said before anything heavy is imported

@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Debug, Json
+from rlcli.cli.options import Debug, Json, Quiet, Verbose
 from rlcli.probe import TIMEOUT_S, Details, cached, probe
-from rlcli.registry import OWN, catalog, unknown_wanted
+from rlcli.registry import OWN, catalog, plugins_chosen_by, unknown_wanted
 
 
 def command(
@@ -22,6 +22,8 @@ def command(
         float, typer.Option("--probe-timeout", help="Seconds that --probe gives each task.")
     ] = TIMEOUT_S,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """List installed tasks."""
@@ -56,7 +58,7 @@ def command(
     for bad in broken:
         console.warn(f"{bad.distribution}: {bad.reason}; its tasks are not listed")
     for name in unknown_wanted():
-        console.warn(f"RLCLI_PLUGINS names '{name}', which is no installed distribution with tasks or trainers")
+        console.warn(f"{plugins_chosen_by()} names '{name}', which is no installed distribution with tasks or trainers")
     console.document(
         "list-tasks",
         tasks=[

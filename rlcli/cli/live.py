@@ -8,8 +8,8 @@ import time
 from types import TracebackType
 from typing import Any
 
-from rlcli.cli.console import console, plain
-from rlcli.cli.tables import flow
+from rlcli.cli.console import console, is_terminal, plain
+from rlcli.cli.tables import flow, screen
 from rlcli.rl.progress import PARTS, Progress
 
 LINE_EVERY_S = 5.0
@@ -29,11 +29,10 @@ class TrainingView:
         self._last: Progress | None = None
 
     def __enter__(self) -> TrainingView:
-        if sys.stderr.isatty() and not console.quiet:
-            from rich.console import Console as Rich
+        if is_terminal(sys.stderr) and not console.quiet:
             from rich.live import Live
 
-            self._live = Live(console=Rich(stderr=True), refresh_per_second=8, transient=False)
+            self._live = Live(console=screen(sys.stderr), refresh_per_second=8, transient=False)
             self._live.__enter__()
         return self
 

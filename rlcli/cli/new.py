@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import Debug, Json
+from rlcli.cli.options import Debug, Json, Quiet, Verbose
 
 
 def command(
@@ -21,9 +21,11 @@ def command(
         typer.Option("--output", "-o", help="Folder to write; a new one named after the task if left out."),
     ] = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Write the package of a new task: model, configuration, code, tests."""
+    """Write the package of a new task. It has: model, configuration, code, tests."""
     from rlcli.scaffold import create
 
     folder, files = create(name, flavour, output)

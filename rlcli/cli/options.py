@@ -8,6 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import agents, checkpoints, words
+from rlcli.cli.console import console
+
 CHOOSE = "auto"
 """Stands for a value that an option may leave out (`--video`)."""
 
@@ -17,31 +20,55 @@ Overrides = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Tracebacks of errors.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Errors and results only.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")]
+
+
+def _less(given: bool) -> bool:
+    if given:
+        console.quiet, console.verbose = True, False
+    return given
+
+
+def _more(given: bool) -> bool:
+    if given:
+        console.quiet, console.verbose = False, True
+    return given
+
+
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", callback=_less, help="Errors and results only.")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", "-v", callback=_more, help="Say more; of -q and -v the last holds.")
+]
 ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", help="YAML merged over the task; `agent:` in it addresses the chosen agent."),
 ]
-Agent = Annotated[str | None, typer.Option("--agent", help="Which of the task's agents.")]
+Agent = Annotated[str | None, typer.Option("--agent", autocompletion=agents, help="Which of the task's agents.")]
 NumEnvs = Annotated[int | None, typer.Option("--num-envs", help="Short for scene.num_envs=N.")]
 MAX_SEED = 2**62
 Seed = Annotated[
     int,
     typer.Option("--seed", min=-1, max=MAX_SEED, help="Seed of everything random; -1 draws one and records it."),
 ]
-Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
-RunsDir = Annotated[Path | None, typer.Option("--runs-dir", help="Runs folder; else RLCLI_RUNS_DIR, else runs/.")]
+Device = Annotated[
+    str, typer.Option("--device", autocompletion=words("auto", "cpu", "cuda"), help="auto, cpu, cuda or cuda:N.")
+]
+RunsDir = Annotated[Path | None, typer.Option("--runs-dir", help="Runs folder; else RLCLI_RUNS_DIR, settings, runs/.")]
 Record = Annotated[
     Path | None, typer.Option("--record", help="Write the episodes, states and actions, to FILE; `replay` steps them.")
 ]
 RecordMode = Annotated[
-    str, typer.Option("--record-mode", help="Which episodes: all, succeeded, failed, or separate (a file each).")
+    str,
+    typer.Option(
+        "--record-mode",
+        autocompletion=words("all", "succeeded", "failed", "separate"),
+        help="Which episodes: all, succeeded, failed, or separate (a file each).",
+    ),
 ]
 CheckpointRef = Annotated[
     str | None,
     typer.Option(
         "--checkpoint",
+        autocompletion=checkpoints,
         help="RUN, RUN@best, RUN@step:N, a checkpoint folder, a bundle, latest, or shipped (the task's own policy).",
     ),
 ]
@@ -55,7 +82,6 @@ def flags(**values: Any) -> Mapping[str, Any]:
 
 def tell_notes(resolved: Any) -> None:
     """Say what became of the keys of a task in another tool's form; -v says it of each."""
-    from rlcli.cli.console import console
     from rlcli.config.notes import summary
 
     for line in summary(resolved.notes):

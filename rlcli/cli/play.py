@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import tasks, words
 from rlcli.cli.console import console
 from rlcli.cli.options import (
     CHOOSE,
@@ -22,6 +23,7 @@ from rlcli.cli.options import (
     RecordMode,
     RunsDir,
     Seed,
+    Verbose,
     draw_seed,
 )
 
@@ -32,12 +34,18 @@ def command(
     task: Annotated[
         str | None,
         typer.Argument(
-            help="A task: its newest run is played, else the policy it ships. Not needed with --checkpoint."
+            autocompletion=tasks,
+            help="A task: its newest run is played, else the policy it ships. Not needed with --checkpoint.",
         ),
     ] = None,
     overrides: Overrides = None,
     checkpoint: CheckpointRef = None,
-    policy: Annotated[str, typer.Option("--policy", help="trained, zero, random or lqr.")] = "trained",
+    policy: Annotated[
+        str,
+        typer.Option(
+            "--policy", autocompletion=words("trained", "zero", "random", "lqr"), help="trained, zero, random or lqr."
+        ),
+    ] = "trained",
     video: Annotated[
         Path | None,
         typer.Option(
@@ -45,13 +53,14 @@ def command(
         ),
     ] = None,
     viewer: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--viewer",
+            autocompletion=words("auto", "native", "web", "none"),
             help="auto, native (a window), web (the browser) or none (numbers). auto: a window if there is a display,"
             " else the browser if a terminal asks, else numbers.",
         ),
-    ] = "auto",
+    ] = None,
     port: Annotated[
         int | None,
         typer.Option("--port", min=0, max=65535, help="Of --viewer web, on this machine alone; 0: any. Else 8080."),
@@ -79,6 +88,7 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
     headless: Headless = False,
 ) -> None:
@@ -87,7 +97,6 @@ def command(
     from rlcli.cli.viewing import choose_viewers, read_commands, require_viewer, show
     from rlcli.errors import UsageError
 
-    console.quiet = quiet
     require_viewer(viewer, port, drawn=video is not None or record is not None)
     commands = read_commands(asked or [])
     if video is not None:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import runs_and_tasks
 from rlcli.cli.console import console
-from rlcli.cli.options import Debug, Json, Quiet, RunsDir
+from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 
 if TYPE_CHECKING:
     from rlcli.rl.curves import Curve
@@ -22,7 +23,11 @@ _MOST_PANELS = 60
 def command(
     runs: Annotated[
         list[str],
-        typer.Argument(metavar="RUN", help="Runs by folder or name, latest, or a task: all of its runs."),
+        typer.Argument(
+            autocompletion=runs_and_tasks,
+            metavar="RUN",
+            help="Runs by folder or name, latest, or a task: all of its runs.",
+        ),
     ],
     output: Annotated[
         Path | None,
@@ -44,14 +49,14 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Draw learning curves; of several seeds their interquartile mean and its 95 % interval."""
+    """Draw learning curves. Of several seeds their interquartile mean and its 95 % interval."""
     from rlcli.errors import UsageError, did_you_mean
     from rlcli.rl.figures import FORMATS, check_drawing
     from rlcli.rl.run import default_runs_dir
 
-    console.quiet = quiet
     axes = ("steps", "iterations", "time")
     if x not in axes:
         raise UsageError(f"no --x '{x}'", hint=did_you_mean(x, axes) or f"axes: {', '.join(axes)}")

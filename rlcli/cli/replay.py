@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from rlcli.cli.console import console
-from rlcli.cli.options import CHOOSE, Debug, Json, Quiet
+from rlcli.cli.options import CHOOSE, Debug, Json, Quiet, Verbose
 
 
 def command(
@@ -30,12 +30,12 @@ def command(
     ] = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Replay a recording or a dump."""
     from rlcli.errors import UsageError
 
-    console.quiet = quiet
     if video is not None:
         from rlcli.viewer.writer import check_video
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import checkpoints
 from rlcli.cli.console import console
-from rlcli.cli.options import Debug, Json, Quiet, RunsDir
+from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 from rlcli.cli.plot import require_folder
 
 if TYPE_CHECKING:
@@ -26,7 +27,12 @@ _LARGEST = 24 * 2**20
 
 
 def command(
-    run: Annotated[str, typer.Argument(metavar="RUN", help="RUN, RUN@best, RUN@step:N, a checkpoint, or latest.")],
+    run: Annotated[
+        str,
+        typer.Argument(
+            autocompletion=checkpoints, metavar="RUN", help="RUN, RUN@best, RUN@step:N, a checkpoint, or latest."
+        ),
+    ],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="FILE.html; by default report.html in the run.")
     ] = None,
@@ -37,13 +43,13 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Write a run's page: task, curves, evaluation, video, configuration, machine."""
+    """Write a run's page. On it: task, curves, evaluation, video, configuration, machine."""
     from rlcli.errors import UsageError
     from rlcli.rl.run import default_runs_dir, require_own
 
-    console.quiet = quiet
     if output is not None and output.suffix not in (".html", ".htm"):
         raise UsageError(f"'{output}' is not a page", hint="name it *.html")
     require_folder(output)

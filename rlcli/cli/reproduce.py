@@ -6,12 +6,15 @@ from typing import Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import runs
 from rlcli.cli.console import console
 from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 
 
 def command(
-    reference: Annotated[str, typer.Argument(metavar="RUN", help="A run's folder or name, or latest.")],
+    reference: Annotated[
+        str, typer.Argument(autocompletion=runs, metavar="RUN", help="A run's folder or name, or latest.")
+    ],
     iterations: Annotated[
         int | None, typer.Option("--iterations", min=1, help="Train and compare only the first N iterations.")
     ] = None,
@@ -33,7 +36,6 @@ def command(
     from rlcli.rl.load import resolve_run
     from rlcli.rl.run import default_runs_dir, find_run
 
-    console.quiet, console.verbose = quiet, verbose
     wait_calmly()  # as in training
     runs = runs_dir or default_runs_dir()
     original, why = find_run(reference, runs)

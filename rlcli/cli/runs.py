@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rlcli.cli.completion import tasks
 from rlcli.cli.console import console
-from rlcli.cli.options import Debug, Json, Quiet, RunsDir
+from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 
 if TYPE_CHECKING:
     from rlcli.rl.overview import Overview
@@ -21,11 +22,14 @@ _LONGEST = 60
 
 
 def command(
-    task: Annotated[str | None, typer.Argument(help="Only runs of this task: its name, or its folder.")] = None,
+    task: Annotated[
+        str | None, typer.Argument(autocompletion=tasks, help="Only runs of this task: its name, or its folder.")
+    ] = None,
     limit: Annotated[int | None, typer.Option("--limit", min=1, help="Only the N newest.")] = None,
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """List runs: their state, progress and score."""
@@ -33,7 +37,6 @@ def command(
     from rlcli.rl.overview import overviews
     from rlcli.rl.run import default_runs_dir
 
-    console.quiet = quiet
     place = runs_dir or default_runs_dir()
     found = overviews(place)
     wanted = None if task is None else Path(task).resolve().name if "/" in task else task.rpartition(":")[2]

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlcli.cli.console import console
-from rlcli.cli.tables import flow
+from rlcli.cli.console import console, is_terminal
+from rlcli.cli.tables import flow, screen
 
 if TYPE_CHECKING:
     from rlcli.cli.children import Child
@@ -186,11 +186,10 @@ class _View:
         self._last = time.monotonic()
 
     def __enter__(self) -> _View:
-        if sys.stderr.isatty() and not console.quiet:
-            from rich.console import Console as Rich
+        if is_terminal(sys.stderr) and not console.quiet:
             from rich.live import Live
 
-            self._live = Live(console=Rich(stderr=True), auto_refresh=False, transient=True)
+            self._live = Live(console=screen(sys.stderr), auto_refresh=False, transient=True)
             self._live.__enter__()
         return self
 
@@ -205,19 +204,20 @@ class _View:
         self._last = now
         from rlcli.rl.overview import overview
 
-        lines = [_line(overview(run)) for run in self._runs]
+        seeds = [_told(overview(run)) for run in self._runs]
         if self._live is None:
-            console.info("; ".join(lines))
+            console.info("; ".join(map(" ".join, seeds)))
             return
         from rich.text import Text
 
-        text = "\n".join(flow([self._title], self._live.console.width) + lines)
-        self._live.update(Text(text, no_wrap=True, overflow="ellipsis"), refresh=True)
+        width = self._live.console.width
+        lines = [self._title, *(line for said in seeds for line in flow(said, width))]
+        self._live.update(Text("\n".join(lines)), refresh=True)
 
 
-def _line(one: Any) -> str:
+def _told(one: Any) -> list[str]:
     said = [f"seed {one.seed}", one.state]
     if one.iterations:
         said.append(f"{one.iteration or 0}/{one.iterations}")
     said += [f"{word} {one.last[word]:.4g}" for word in _TOLD if word in one.last]
-    return " ".join(said)
+    return said

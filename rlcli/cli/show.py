@@ -7,12 +7,16 @@ from typing import Annotated
 
 import typer
 
+from rlcli.cli.completion import tasks
 from rlcli.cli.console import console
-from rlcli.cli.options import Agent, ConfigFile, Debug, Json, NumEnvs, Overrides, flags
+from rlcli.cli.options import Agent, ConfigFile, Debug, Json, NumEnvs, Overrides, Quiet, Verbose, flags
 
 
 def command(
-    task: Annotated[str, typer.Argument(help="A task's name, distribution:name, or a folder with a task.yaml.")],
+    task: Annotated[
+        str,
+        typer.Argument(autocompletion=tasks, help="A task's name, distribution:name, or a folder with a task.yaml."),
+    ],
     overrides: Overrides = None,
     origin: Annotated[bool, typer.Option("--origin", help="Say where each value comes from.")] = False,
     schema: Annotated[bool, typer.Option("--schema", help="The JSON Schema of this task's YAML instead.")] = False,
@@ -21,6 +25,8 @@ def command(
     num_envs: NumEnvs = None,
     config: ConfigFile = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Print a task's resolved configuration."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import runs_and_tasks
 from rlcli.cli.console import console
 from rlcli.cli.options import (
     CheckpointRef,
@@ -19,6 +20,7 @@ from rlcli.cli.options import (
     Quiet,
     RunsDir,
     Seed,
+    Verbose,
     draw_seed,
 )
 
@@ -35,7 +37,11 @@ _MOST = 10_000
 def command(
     subject: Annotated[
         str | None,
-        typer.Argument(metavar="RUN|TASK", help="A run, RUN@best, RUN@step:N or latest; or a task: its newest run."),
+        typer.Argument(
+            autocompletion=runs_and_tasks,
+            metavar="RUN|TASK",
+            help="A run, RUN@best, RUN@step:N or latest; or a task: its newest run.",
+        ),
     ] = None,
     overrides: Overrides = None,
     sweep: Annotated[
@@ -72,6 +78,7 @@ def command(
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Evaluate a policy in variants of its task."""
@@ -81,7 +88,6 @@ def command(
     from rlcli.rl.heat_map import check_picture, draw, heat_map
     from rlcli.rl.sweeps import grid, read_sweeps
 
-    console.quiet = quiet
     words = overrides or []
     if subject is not None and "=" in subject:
         words, subject = [subject, *words], None

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import tasks
 from rlcli.cli.console import console
 from rlcli.cli.options import (
     MAX_SEED,
@@ -45,7 +46,9 @@ PICTURE = "sweep.svg"
 
 
 def command(
-    task: Annotated[str | None, typer.Argument(help="A task; or `show`, and a sweep's folder or name.")] = None,
+    task: Annotated[
+        str | None, typer.Argument(autocompletion=tasks, help="A task; or `show`, and a sweep's folder or name.")
+    ] = None,
     overrides: Overrides = None,
     param: Annotated[
         list[str] | None,
@@ -89,14 +92,13 @@ def command(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Search settings that learn best; `sweep show` tells how far it is."""
+    """Search settings that learn best. `sweep show` tells how far it is."""
     from rlcli.errors import Stopped, UsageError, did_you_mean
     from rlcli.rl.run import default_runs_dir, require_name
     from rlcli.rl.search import check_optuna, open_search
     from rlcli.rl.space import HINT, read_objective, read_parameters
     from rlcli.rl.stop import StopRequest
 
-    console.quiet, console.verbose = quiet, verbose
     runs = runs_dir or default_runs_dir()
     if task == "show":
         check_optuna()

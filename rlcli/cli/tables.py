@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from typing import Any
+
+from rlcli.cli.console import colors
 
 _GAP = 2
 _SHORT = 30
 """Longer cells are sentences, which may be broken; shorter ones are read at a glance and stay whole."""
 _NARROWEST = 24
 """Of a column of sentences."""
+_ANY_WIDTH = 10_000
 
 
 def flow(parts: Sequence[str], width: int, indent: int = 0) -> list[str]:
@@ -31,20 +35,20 @@ def draw_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str
     from rich.table import Table
     from rich.text import Text
 
-    screen = _screen()
+    page = screen(sys.stdout)
     least = [max(map(_least, cells)) for cells in zip(columns, *rows, strict=True)]
-    if sum(least) + _GAP * (len(columns) - 1) > screen.width:
+    if sum(least) + _GAP * (len(columns) - 1) > page.width:
         if title:
-            screen.print(Text(title, "bold"))
+            page.print(Text(title, "bold"))
         for row in rows:
-            screen.print(Text("\n").join(_block(columns, row, screen.width)))
+            page.print(Text("\n").join(_block(columns, row, page.width)))
         return
     table = Table(title=title and Text(title), title_justify="left", box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
     for name, narrowest in zip(columns, least, strict=True):
         table.add_column(Text(name), header_style="bold", min_width=narrowest)
     for row in rows:
         table.add_row(*map(Text, row))
-    screen.print(table)
+    page.print(table)
 
 
 def draw_map(
@@ -54,11 +58,11 @@ def draw_map(
     from rich.table import Table
     from rich.text import Text
 
-    screen = _screen()
+    page = screen(sys.stdout)
     first = max((len(row[0]) for row in rows), default=0)
     each = max(len(text) for texts in [columns, *(row[1:] for row in rows)] for text in texts) + 2
-    fit = max(1, (screen.width - first) // (each + 1))
-    screen.print(Text("\n".join(flow(heading, screen.width)), "bold"))
+    fit = max(1, (page.width - first) // (each + 1))
+    page.print(Text("\n".join(flow(heading, page.width)), "bold"))
     for begin in range(0, len(columns), fit):
         part = slice(begin, begin + fit)
         table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
@@ -68,7 +72,7 @@ def draw_map(
         for row, shades in zip(rows, styles, strict=True):
             cells = zip(row[1:][part], shades[part], strict=True)
             table.add_row(Text(row[0]), *(Text(text.center(each), shade) for text, shade in cells))
-        screen.print(table)
+        page.print(table)
 
 
 def _block(columns: Sequence[str], row: Sequence[str], width: int) -> list[Any]:
@@ -84,7 +88,11 @@ def _least(cell: str) -> int:
     return len(cell) if len(cell) <= _SHORT else max(_NARROWEST, *map(len, cell.split()))
 
 
-def _screen() -> Any:
+def screen(stream: Any) -> Any:
+    """What draws on a stream, in colours or without; a pipe has no width that anything must fit."""
     from rich.console import Console
 
-    return Console(file=sys.stdout, highlight=False)
+    chosen, width = colors(), None if stream.isatty() or os.environ.get("COLUMNS") else _ANY_WIDTH
+    if chosen == "never":
+        return Console(file=stream, highlight=False, width=width, color_system=None)
+    return Console(file=stream, highlight=False, width=width, force_terminal=True if chosen == "always" else None)

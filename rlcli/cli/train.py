@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import checkpoints, runs, tasks, words
 from rlcli.cli.console import console
 from rlcli.cli.options import (
     MAX_SEED,
@@ -36,7 +37,8 @@ if TYPE_CHECKING:
 
 def command(
     task: Annotated[
-        str | None, typer.Argument(help="A task's name, distribution:name, or a folder with a task.yaml.")
+        str | None,
+        typer.Argument(autocompletion=tasks, help="A task's name, distribution:name, or a folder with a task.yaml."),
     ] = None,
     overrides: Overrides = None,
     agent: Agent = None,
@@ -58,7 +60,12 @@ def command(
         int | None, typer.Option("--gpus", min=1, help="Processes on this machine, a GPU each; num_envs is of each.")
     ] = None,
     logger: Annotated[
-        list[str] | None, typer.Option("--logger", help="tensorboard, wandb, mlflow, trackio or none; repeatable.")
+        list[str] | None,
+        typer.Option(
+            "--logger",
+            autocompletion=words("tensorboard", "wandb", "mlflow", "trackio", "none"),
+            help="tensorboard, wandb, mlflow, trackio or none; repeatable.",
+        ),
     ] = None,
     video_every: Annotated[
         int | None,
@@ -70,10 +77,14 @@ def command(
     ] = None,
     config: ConfigFile = None,
     resume: Annotated[
-        str | None, typer.Option("--resume", help="Go on with a run: RUN, RUN@step:N or latest. Needs no TASK.")
+        str | None,
+        typer.Option(
+            "--resume", autocompletion=runs, help="Go on with a run: RUN, RUN@step:N or latest. Needs no TASK."
+        ),
     ] = None,
     init_from: Annotated[
-        str | None, typer.Option("--init-from", help="Start a new run from a checkpoint's weights.")
+        str | None,
+        typer.Option("--init-from", autocompletion=checkpoints, help="Start a new run from a checkpoint's weights."),
     ] = None,
     runs_dir: RunsDir = None,
     name: Annotated[str | None, typer.Option("--name", help="Part of the run folder's name.")] = None,
@@ -94,7 +105,6 @@ def command(
     from rlcli.rl.stop import StopRequest
     from rlcli.rl.trust import named_task
 
-    console.quiet, console.verbose = quiet, verbose
     on_leash()
     wait_calmly()
     console.follows = not distributed.leads()

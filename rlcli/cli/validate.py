@@ -8,25 +8,31 @@ from typing import Annotated
 
 import typer
 
+from rlcli.cli.completion import tasks
 from rlcli.cli.console import console
-from rlcli.cli.options import Agent, ConfigFile, Debug, Json, Overrides, tell_notes
+from rlcli.cli.options import Agent, ConfigFile, Debug, Json, Overrides, Quiet, Verbose, tell_notes
 from rlcli.errors import TaskError
 from rlcli.registry import TaskSource, find_task, folder_task, task_of_file
 
 
 def command(
-    target: Annotated[str, typer.Argument(metavar="FILE|TASK", help="A task.yaml, its folder, or a task's name.")],
+    target: Annotated[
+        str,
+        typer.Argument(autocompletion=tasks, metavar="FILE|TASK", help="A task.yaml, its folder, or a task's name."),
+    ],
     overrides: Overrides = None,
     deep: Annotated[bool, typer.Option("--deep", help="Also compile the model and resolve every name in it.")] = False,
     agent: Agent = None,
     config: ConfigFile = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
     """Check a task's configuration."""
     from rlcli.config.load import check_all, resolve
 
-    source = _source(target)
+    source = task_source(target)
     given = overrides or []
     unchecked = [] if agent else check_all(source, config_file=config, overrides=given)
     resolved = resolve(source, agent=agent, config_file=config, overrides=given)
@@ -53,7 +59,8 @@ def command(
     )
 
 
-def _source(target: str) -> TaskSource:
+def task_source(target: str) -> TaskSource:
+    """A task by its name, its folder, or any YAML file that describes one."""
     file = Path(target)
     if file.suffix not in (".yaml", ".yml"):
         return find_task(target)

@@ -14,7 +14,7 @@ Choice = tuple[str, str]
 """A viewer, and why it."""
 
 
-def require_viewer(viewer: str, port: int | None, *, drawn: bool) -> None:
+def require_viewer(viewer: str | None, port: int | None, *, drawn: bool) -> None:
     """Refuse flags that contradict each other.
 
     Raises:
@@ -22,7 +22,7 @@ def require_viewer(viewer: str, port: int | None, *, drawn: bool) -> None:
     """
     from rlcli.errors import UsageError, did_you_mean
 
-    if viewer not in VIEWERS:
+    if viewer is not None and viewer not in VIEWERS:
         near = did_you_mean(viewer, VIEWERS)
         raise UsageError(f"no viewer '{viewer}'", hint=near or f"viewers: {', '.join(VIEWERS)}")
     if drawn and viewer in ("native", "web"):
@@ -50,12 +50,14 @@ def read_commands(asked: Sequence[str]) -> dict[str, float]:
     return values
 
 
-def choose_viewers(viewer: str, port: int | None, *, headless: bool) -> list[Choice]:
-    """The viewers to try, in this order; the last one always works or says why it does not.
+def choose_viewers(viewer: str | None, port: int | None, *, headless: bool) -> list[Choice]:
+    """The viewers to try, in this order; the last one always works or says why it does not. None: the user's settings
+    may say which.
 
     Raises:
         MachineError: if a window is wanted, and there is no display.
     """
+    from rlcli.config.settings import setting
     from rlcli.errors import MachineError
     from rlcli.sim.gl import has_display
 
@@ -64,14 +66,17 @@ def choose_viewers(viewer: str, port: int | None, *, headless: bool) -> list[Cho
             "there is no display for a window",
             hint="--viewer web shows it in the browser, --video FILE.mp4 draws offscreen, --viewer none prints numbers",
         )
-    if viewer != "auto":
-        return [(viewer, "as asked")]
+    if viewer not in (None, "auto"):
+        return [(str(viewer), "as asked")]
     if headless:
         return [("none", "nothing is to be opened")]
     if port is not None:
         return [("web", "--port is given")]
     if console.json:
         return [("none", "with --json nothing is opened unasked")]
+    preferred = setting("viewer") if viewer is None else None
+    if preferred in ("web", "none") or (preferred == "native" and has_display()):
+        return [(preferred, "as your settings say")]
     watched = all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stdout))
     display = "no display" if not has_display() else "no window"
     after: list[Choice] = [("none", f"{display}, and no terminal asks; --viewer web shows it in the browser")]

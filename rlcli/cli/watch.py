@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlcli.cli.completion import runs
 from rlcli.cli.console import console
-from rlcli.cli.options import Debug, Json, Quiet, RunsDir
+from rlcli.cli.options import Debug, Json, Quiet, RunsDir, Verbose
 
 if TYPE_CHECKING:
     from rlcli.rl.overview import Overview
@@ -19,17 +20,19 @@ _EVERY_S = 0.5
 
 
 def command(
-    reference: Annotated[str, typer.Argument(metavar="RUN", help="A run's folder or name, or latest.")] = "latest",
+    reference: Annotated[
+        str, typer.Argument(autocompletion=runs, metavar="RUN", help="A run's folder or name, or latest.")
+    ] = "latest",
     runs_dir: RunsDir = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Follow a training from another terminal; Ctrl-C leaves it alone. --json says how it stands and ends."""
+    """Follow a training from another terminal. Ctrl-C leaves it alone. --json says how it stands and ends."""
     from rlcli.errors import Stopped
     from rlcli.rl.run import default_runs_dir, find_run
 
-    console.quiet = quiet
     run, why = find_run(reference, runs_dir or default_runs_dir())
     if json:
         _document(run)

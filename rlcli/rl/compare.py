@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
-from rlcli.config import strict_yaml
 from rlcli.config.messages import dotted
 from rlcli.errors import CheckpointError
+from rlcli.rl.configurations import Difference, Section, Values, as_text, compare_values, leaves
 from rlcli.rl.environment import differences
 from rlcli.rl.run import Run
 
@@ -29,27 +28,6 @@ _ROWS = 4096
 """Of a replay buffer that are compared at a time."""
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """One place where two runs differ; None stands for what one of them does not have."""
-
-    where: str
-    left: Any
-    right: Any
-    left_from: str | None = None
-    """Where the value was written."""
-    right_from: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Section:
-    """What comparing one part of two runs gave; `compared` says in words how much there was."""
-
-    name: str
-    compared: str
-    differences: list[Difference] = field(default_factory=list)
-
-
 def compare(left: Run, right: Run, *, sections: Iterable[str] = SECTIONS, until: int | None = None) -> list[Section]:
     """Compare two runs. Of metrics and weights the first difference is told, of the others each.
 
@@ -64,7 +42,7 @@ def compare(left: Run, right: Run, *, sections: Iterable[str] = SECTIONS, until:
         CheckpointError: if a file that is needed cannot be read.
     """
     parts: dict[str, Callable[[], Section]] = {
-        "configuration": lambda: _configurations(left, right),
+        "configuration": lambda: compare_values(Values.of_run(left), Values.of_run(right)),
         "environment": lambda: _environments(left, right),
         "metrics": lambda: _metrics(left, right, until),
         "weights": lambda: _weights(left, right, until),
@@ -75,8 +53,9 @@ def compare(left: Run, right: Run, *, sections: Iterable[str] = SECTIONS, until:
 
 
 def first_difference(sections: Iterable[Section]) -> tuple[str, Difference] | None:
-    """The first section with a difference, and that difference."""
-    return next(((section.name, section.differences[0]) for section in sections if section.differences), None)
+    """The first difference that is not cosmetic, and its section."""
+    found = ((section.name, each) for section in sections for each in section.differences)
+    return next(((name, each) for name, each in found if each.category != "cosmetic"), None)
 
 
 def reached(run: Run) -> int:
@@ -84,48 +63,10 @@ def reached(run: Run) -> int:
     return max((row["iteration"] for row in _rows(run, None)), default=0)
 
 
-def _configurations(left: Run, right: Run) -> Section:
-    one, other = _configuration(left), _configuration(right)
-    absent = (None, None)
-    found = []
-    for name in dict.fromkeys([*one, *other]):
-        (value, place), (twin, there) = one.get(name, absent), other.get(name, absent)
-        if (name in one) != (name in other) or _text(value) != _text(twin):
-            found.append(Difference(name, value, twin, place, there))
-    return Section("configuration", f"{len(one.keys() | other.keys())} keys", found)
-
-
-def _configuration(run: Run) -> dict[str, tuple[Any, str | None]]:
-    """Key -> (value, where it was written), the seed included."""
-    try:
-        with run.config.open("rb") as file:
-            document = strict_yaml.load(file.read(strict_yaml.MAX_BYTES + 1))
-    except OSError as error:
-        raise CheckpointError(f"{run.config} cannot be read: {error.strerror}") from None
-    except strict_yaml.YamlError as error:
-        raise CheckpointError(f"{run.config}:{error.line}:{error.column} is corrupt: {error.message}") from None
-    given = run.record.get("given")
-    given = given if isinstance(given, dict) else {}
-    values: dict[str, tuple[Any, str | None]] = {"seed": (run.record["seed"], "run.json")}
-    for path, value in _leaves(document.data, ()):
-        name = dotted(path)
-        line, column = document.marks.get(path, (0, 0))
-        values[name] = (value, str(given.get(name) or f"{run.config.name}:{line}:{column}"))
-    return values
-
-
-def _leaves(value: Any, path: strict_yaml.Path) -> Iterator[tuple[strict_yaml.Path, Any]]:
-    if isinstance(value, dict) and value:
-        for key, item in value.items():
-            yield from _leaves(item, (*path, key))
-    else:
-        yield path, value
-
-
 def _environments(left: Run, right: Run) -> Section:
     rows = differences(left.record, right.record)
     resumed, again = left.record.get("resumed"), right.record.get("resumed")
-    if _text(resumed) != _text(again):
+    if as_text(resumed) != as_text(again):
         rows.append(("resumed", resumed, again))
     whole = all("sources" in run.record and "cpu" in run.record for run in (left, right))
     words = "versions, sources, processor, threads" if whole else "what both have recorded"
@@ -143,7 +84,7 @@ def _metrics(left: Run, right: Run, until: int | None) -> Section:
             assert longer is not None
             return _first("metrics", f"{count} iterations", Difference(f"iteration {longer['iteration']}", *ends))
         for name in ("iteration", *sorted((row.keys() | twin.keys()) - {"iteration"})):
-            if not name.startswith(_CLOCK) and _text(row.get(name)) != _text(twin.get(name)):
+            if not name.startswith(_CLOCK) and as_text(row.get(name)) != as_text(twin.get(name)):
                 where = f"iteration {row['iteration']}: {name}"
                 return _first("metrics", f"{count} iterations", Difference(where, row.get(name), twin.get(name)))
         count += 1
@@ -257,9 +198,9 @@ def _logs(one: Checkpoint, other: Checkpoint) -> Difference | None:
 
 
 def _values(one: Checkpoint, other: Checkpoint) -> Difference | None:
-    left, right = (dict(_leaves(saved.json("state.json"), ())) for saved in (one, other))
+    left, right = (dict(leaves(saved.json("state.json"), ())) for saved in (one, other))
     for path in dict.fromkeys([*left, *right]):
-        if _text(left.get(path)) != _text(right.get(path)):
+        if as_text(left.get(path)) != as_text(right.get(path)):
             return Difference(f"step {one.step}: state.json {dotted(path)}", left.get(path), right.get(path))
     return None
 
@@ -295,11 +236,6 @@ def _digest(saved: Checkpoint, name: str) -> str | None:
 
 def _first(name: str, compared: str, difference: Difference) -> Section:
     return Section(name, compared, [difference])
-
-
-def _text(value: Any) -> str:
-    """One text a value: equal numbers of other types differ, NaN equals itself."""
-    return json.dumps(value, sort_keys=True, default=str)
 
 
 def plain(value: Any) -> Any:

@@ -15,6 +15,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from rlcli.config.settings import setting
 from rlcli.errors import CheckpointError, MachineError, UsageError, did_you_mean, listing
 from rlcli.rl.files import disk_error, to_json, write_atomic
 from rlcli.rl.reading import JSON_LIMIT, parse_json, read_file, refuse_links
@@ -353,8 +354,8 @@ def _newest_good(run: Run, have: list[int], why: str, whole: bool, tell: Callabl
 
 
 def default_runs_dir() -> Path:
-    """RLCLI_RUNS_DIR, or `runs` in the current folder."""
-    return Path(os.environ.get("RLCLI_RUNS_DIR") or "runs")
+    """RLCLI_RUNS_DIR, or what the user's settings say, or `runs` in the current folder."""
+    return Path(os.environ.get("RLCLI_RUNS_DIR") or Path(setting("runs_dir") or "runs").expanduser())
 
 
 _TYPES: dict[str, tuple[type, ...]] = {

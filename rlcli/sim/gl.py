@@ -58,10 +58,10 @@ def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[A
         MachineError: if nothing works, with what was tried and what to install.
     """
     tried = []
-    candidates = _candidates()
+    backends = candidates()
     if in_thread:
-        candidates.sort(key=lambda backend: backend == "glfw")
-    for backend in candidates:
+        backends.sort(key=lambda backend: backend == "glfw")
+    for backend in backends:
         try:
             context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
             context.make_current()
@@ -72,7 +72,7 @@ def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[A
             _forget_opengl()
             continue
         return context, backend
-    packages = " or ".join(_PACKAGES.get(backend, backend) for backend in _candidates())
+    packages = " or ".join(_PACKAGES.get(backend, backend) for backend in candidates())
     raise MachineError(
         f"nothing can draw on this machine; tried {', '.join(tried)}",
         hint=f"install {packages} (Debian, Ubuntu: apt install libegl1 libosmesa6), or set MUJOCO_GL",
@@ -86,7 +86,12 @@ def _has_window() -> bool:
     return bool(glfw.get_current_context())
 
 
-def _candidates() -> list[str]:
+def candidates() -> list[str]:
+    """The libraries to try, in this order.
+
+    Raises:
+        MachineError: if MUJOCO_GL says that nothing is to be drawn.
+    """
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
     if chosen in ("egl", "osmesa", "glfw", "cgl"):
         return [chosen]

@@ -105,6 +105,24 @@ def test_what_was_given_comes_first_with_its_place_and_its_consequences_follow(c
     assert found["policy"][0]["where"] == "step 192: policy.safetensors sha256"
 
 
+def test_a_run_is_compared_with_a_task_by_configuration_and_files(cli, run, coin):
+    result = cli("diff", run, coin, "--json")
+    assert result.code == 9
+    found = {d["where"]: (d["left"], d["right"], d["category"]) for d in sections(result)["configuration"]}
+    assert found["agent.max_iterations"] == (3, 2, "agent")
+    assert found["scene.num_envs"][::2] == (8, "agent")
+    assert found["agent.save_interval"] == (1, None, "cosmetic")
+    assert "seed" not in found, "a task has none"
+    assert sections(result)["files"] == []
+    same = cli("diff", coin, *SMALL[:3], "agent.max_iterations=3", run, "--json")
+    assert (same.code, sections(same)["configuration"]) == (0, [])
+    model = Path(shutil.copytree(coin, "other")) / "model.xml"  # not of the task that this process's runs share
+    model.write_text(model.read_text().replace('mass="1"', 'mass="2"'))
+    changed = cli("diff", "./other", *SMALL[:3], "agent.max_iterations=3", run, "--json")
+    assert (changed.code, [d["where"] for d in sections(changed)["files"]]) == (9, ["model.xml"])
+    assert cli("diff", run, "sim.dt=0.1", coin).code == 2, "a run has no overrides"
+
+
 def test_the_environment_is_compared_by_what_changes_bits(cli, run, copy):
     def change(record):
         record["versions"]["torch"] = "2.10.0"

@@ -18,15 +18,18 @@ def checks(done):
 @pytest.mark.slow
 def test_a_sound_installation_is_healthy_and_every_part_is_named(plugins, cli):
     plugins("good", SPEC, files=FILES)
-    done = cli("doctor", "--json", MUJOCO_GL="", RLCLI_PLUGINS="good, nmae")
+    done = cli("doctor", "--json", "--probe-timeout", "100", MUJOCO_GL="", RLCLI_PLUGINS="good, nmae")
     found = checks(done)
     assert done.returncode == 0, done.stdout
     assert {"python", "rlcli", "packages", "cores", "runs folder", "torch", "mujoco", "gpu", "graphics"} <= set(found)
     assert {"task cartpole", "task good-task", "trainer sb3", "trainer ppo"} <= set(found)
     assert found["cores"]["details"]["available"] >= 1
     assert found["packages"]["details"]["versions"]["torch"] in found["torch"]["found"]
-    assert set(found["graphics"]["details"]) == {"egl", "osmesa", "glfw"}
-    assert (found["settings"]["state"], "nmae" in found["settings"]["found"]) == ("warning", True)
+    drawn = found["graphics"]["details"]
+    assert set(drawn["drawn"]) == {"egl", "osmesa", "glfw"}
+    assert drawn["used"] in (None, *(name for name, draws in drawn["drawn"].items() if draws))
+    assert found["mujoco packages"]["state"] == "ok"
+    assert (found["variables"]["state"], "nmae" in found["variables"]["found"]) == ("warning", True)
 
 
 @pytest.mark.slow

@@ -1,0 +1,155 @@
+"""Completion of a line: what is offered, in a real bash and by the shells' protocols, and that nothing heavy loads."""
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("torch", "mujoco", "numpy", "stable_baselines3", "gymnasium")
+ASKED = f"""
+import atexit, sys
+atexit.register(lambda: print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr))
+from rlcli.cli.app import main
+sys.exit(main())
+"""
+
+
+def question(words, shell):
+    """What a shell sets in the environment to ask how the last word may go on."""
+    line = ["rlcli", *words]
+    asked = {"_RLCLI_COMPLETE": f"complete_{shell}"}
+    if shell == "bash":
+        return asked | {"COMP_WORDS": "\n".join(line), "COMP_CWORD": str(len(words))}
+    said = f"{shlex.join(line[:-1])} {words[-1]}"
+    return asked | {"_TYPER_COMPLETE_ARGS": said, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+
+
+@pytest.fixture
+def offered(in_process, monkeypatch, tmp_path, capfd):
+    """offered(words..., last) -> what a shell is told for the last one."""
+
+    def ask(*words, shell="bash"):
+        with monkeypatch.context() as patched:
+            patched.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+            for name, value in question(words, shell).items():
+                patched.setenv(name, value)
+            with pytest.raises(SystemExit, match=r"^0$"):  # it has answered, and is done
+                in_process()
+        out, err = capfd.readouterr()
+        assert err == ""
+        return [line for line in out.splitlines() if line]
+
+    return ask
+
+
+@pytest.fixture
+def a_run(here):
+    """A run folder with two checkpoints' folders, as `find_run` needs it."""
+
+    def make(name, task="cartpole", runs="runs"):
+        folder = here / runs / task / name
+        (folder / "checkpoints" / f"{64:012d}").mkdir(parents=True)
+        (folder / "run.json").write_text("{}")
+        return folder
+
+    return make
+
+
+def test_commands_options_and_tasks_are_offered(offered):
+    assert offered("tra") == ["train"]
+    assert offered("train", "cartpole-") == ["cartpole-camera", "cartpole-direct"]
+    assert "--max-iterations" in offered("train", "cartpole", "--max")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("play", "--viewer", ""), ["auto", "native", "web", "none"]),
+        (("play", "cartpole", "--policy", "z"), ["zero"]),
+        (("train", "cartpole", "--logger", "t"), ["tensorboard", "trackio"]),
+        (("train", "--device", "c"), ["cpu", "cuda"]),
+        (("export", "--format", "o"), ["onnx"]),
+        (("diff", "--only", "w"), ["weights"]),
+        (("import", "s"), ["sb3"]),
+    ],
+)
+def test_choices_are_offered(offered, words, expected):
+    assert offered(*words) == expected
+
+
+def test_agents_are_those_of_the_task_on_the_line(offered, small):
+    agents = "  small: {trainer: sb3, algorithm: ppo, max_iterations: 1}\n"
+    task = small((agents, agents + "  smart: {trainer: sb3, algorithm: sac, max_iterations: 1}\n"))
+    assert offered("train", task, "--agent", "") == ["small", "smart"]
+    assert offered("train", task, "--agent", "sma") == ["small", "smart"]
+    assert len(offered("train", "cartpole", "--agent", "")) >= 2
+    assert offered("train", "no-such-task", "--agent", "") == []
+
+
+def test_runs_are_offered_newest_first_from_the_folder_that_holds_them(offered, a_run, monkeypatch):
+    for age, name in ((200, "older"), (100, "newer")):
+        folder = a_run(name)
+        os.utime(folder, (1e9 - age, 1e9 - age))
+    a_run("elsewhere", runs="mine")
+    assert offered("watch", "") == ["latest", "newer", "older"]
+    assert offered("play", "--checkpoint", "ne") == ["newer"]
+    assert "shipped" in offered("play", "--checkpoint", "")
+    assert offered("watch", "--runs-dir", "mine", "e") == ["elsewhere"]
+    monkeypatch.setenv("RLCLI_RUNS_DIR", "mine")
+    assert offered("watch", "e") == ["elsewhere"]
+    assert offered("diff", "cartpole-c") == ["cartpole-camera"]
+    assert offered("watch", "runs/") == [], "paths are left to the shell"
+
+
+@pytest.mark.parametrize("words", [("train", "cartpole-"), ("train", "cartpole", "--agent", ""), ("watch", "")])
+def test_nothing_heavy_is_imported_for_a_key_press(here, words):
+    command = [sys.executable, "-c", ASKED]
+    env = os.environ | question(words, "bash")
+    done = subprocess.run(command, env=env, capture_output=True, text=True, cwd=here, timeout=120)
+    assert done.stdout
+    assert done.stderr.strip() == "[]"
+
+
+def test_zsh_and_fish_are_told_what_a_task_is(offered):
+    (line,) = offered("train", "cartpole-d", shell="fish")
+    name, said = line.split("\t")
+    assert name == "cartpole-direct"
+    assert "direct" in said
+    assert '"cartpole-direct":"' in "\n".join(offered("train", "cartpole-d", shell="zsh"))
+
+
+def test_broken_settings_and_broken_tasks_disturb_no_completion(offered, small, tmp_path, monkeypatch):
+    (tmp_path / "mine.yaml").write_text("[")
+    monkeypatch.setenv("RLCLI_SETTINGS", str(tmp_path / "mine.yaml"))
+    assert offered("tra") == ["train"]
+    task = small(("agents:", "agents: ["))
+    assert offered("train", task, "--agent", "") == []
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash on this machine")
+def test_bash_completes_with_the_function_that_rlcli_prints(here, tmp_path):
+    program = tmp_path / "bin" / "rlcli"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m rlcli "$@"\n')
+    program.chmod(0o755)
+    script = """
+eval "$(_RLCLI_COMPLETE=source_bash rlcli)"
+complete -p rlcli
+COMP_WORDS=(rlcli train cartpole-); COMP_CWORD=2; _rlcli_completion rlcli cartpole- train; echo "${COMPREPLY[@]}"
+COMP_WORDS=(rlcli play --viewer n); COMP_CWORD=3; _rlcli_completion rlcli n --viewer; echo "${COMPREPLY[@]}"
+COMP_WORDS=(rlcli train ./no); COMP_CWORD=2; _rlcli_completion rlcli ./no train; echo "${#COMPREPLY[@]}"
+"""
+    env = {**os.environ, "PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(
+        ["bash", "--norc", "-c", script], capture_output=True, text=True, cwd=here, env=env, timeout=120
+    )
+    assert done.stderr == ""
+    assert done.stdout.splitlines() == [
+        "complete -o default -F _rlcli_completion rlcli",
+        "cartpole-camera cartpole-direct",
+        "native none",
+        "0",
+    ]

@@ -1,0 +1,95 @@
+"""Forty columns, and no terminal at all: what commands print stays whole, and a pipe holds text alone."""
+
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+
+import pytest
+
+from rlcli.cli.app import COMMANDS
+
+fcntl = pytest.importorskip("fcntl", reason="pseudo-terminals are those of Unix")
+termios = pytest.importorskip("termios")
+
+STYLES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+
+
+@pytest.fixture
+def narrow(here):
+    """narrow(arguments...) -> (exit code, lines) of a command on a terminal of 40 columns."""
+
+    def run(*arguments):
+        leader, follower = pty.openpty()
+        fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 40, 0, 0))
+        env = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+        process = subprocess.Popen(
+            [sys.executable, "-m", "rlcli", *arguments],
+            stdin=follower,
+            stdout=follower,
+            stderr=follower,
+            cwd=here,
+            env=env | {"TERM": "xterm-256color"},
+        )
+        os.close(follower)
+        said = b""
+        try:
+            while chunk := os.read(leader, 65536):
+                said += chunk
+        except OSError:  # Linux's way to say that the other end is closed
+            pass
+        os.close(leader)
+        code = process.wait()
+        return code, STYLES.sub("", said.decode()).replace("\r\n", "\n").split("\n")
+
+    return run
+
+
+@pytest.mark.slow
+def test_tables_fit_forty_columns_and_no_letter_is_lost(narrow, rlcli):
+    code, lines = narrow("list-tasks", "cartpole")
+    assert code == 0
+    assert max(map(len, lines)) <= 40
+    assert "…" not in "".join(lines)
+    for task in ("cartpole", "cartpole-camera", "cartpole-direct"):
+        assert f"TASK {task}" in lines
+    piped = rlcli("list-tasks", "cartpole").stdout
+    words = set(" ".join(lines).split())
+    assert set(piped.split("\n")[1].split()) <= words | {"?"}
+
+
+@pytest.mark.slow
+def test_differences_are_whole_on_forty_columns(narrow, small):
+    code, lines = narrow("diff", small(), "sim.dt=0.005", "viewer.width=320")
+    assert code == 9
+    assert "Traceback" not in "\n".join(lines)
+    flat = "".join(lines).replace(" ", "")
+    for said in ("sim.dt", "0.005", "override'sim.dt=0.005'", "viewer.width", "differences:physics1,cosmetic1"):
+        assert said in flat
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--help"], ["--version"], ["list-tasks"], ["show", "cartpole"], ["show", "cartpole", "--origin"],
+        ["validate", "cartpole"], ["runs"], ["diff", "cartpole", "ant"], ["diff", "cartpole", "nothing"], ["nonsense"],
+        ["train", "nothing"], ["watch"], ["report", "latest"], ["import", "oige", "gone.yaml"], ["plot", "latest"],
+    ],
+)  # fmt: skip
+def test_a_pipe_holds_text_alone(in_process, arguments):
+    _, out, err = in_process(*arguments)
+    assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f]", out + err)
+    assert "Traceback" not in err
+    assert "this is a bug" not in err
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_command_can_be_quiet_and_say_more_and_has_a_summary_that_is_whole(in_process, command):
+    code, out, _ = in_process(command, "--help")
+    assert code == 0
+    for option in ("-q, --quiet", "-v, --verbose", "--json", "--debug"):
+        assert option in out
+    (line,) = [line for line in in_process("--help")[1].splitlines() if line.split()[:1] == [command]]
+    assert not line.endswith("...")

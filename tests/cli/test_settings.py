@@ -1,0 +1,212 @@
+"""The user's settings: what they change, what comes before them, and what a broken file is answered with."""
+
+import json
+import os
+import pty
+import subprocess
+import sys
+import typing
+
+import pytest
+
+from rlcli.cli import viewing
+from rlcli.config.preferences import UserSettings
+from rlcli.config.settings import applied, read_settings, settings_file
+from rlcli.rl.loggers import LOGGERS
+from rlcli.rl.run import default_runs_dir
+
+
+@pytest.fixture
+def settings(tmp_path, monkeypatch):
+    """settings(text) writes them; the file."""
+    file = tmp_path / "my settings.yaml"
+    monkeypatch.setenv("RLCLI_SETTINGS", str(file))
+
+    def write(text):
+        file.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return file
+
+    return write
+
+
+def test_a_flag_comes_before_the_variable_and_that_before_the_settings_and_they_before_the_default(
+    settings, in_process, monkeypatch, tmp_path
+):
+    settings(f"runs_dir: '{tmp_path}/of-settings'\n")
+
+    def said(*flags):
+        return in_process("runs", *flags)[2]
+
+    monkeypatch.delenv("RLCLI_RUNS_DIR", raising=False)
+    assert f"no run in {tmp_path}/of-settings" in said()
+    monkeypatch.setenv("RLCLI_RUNS_DIR", "of-variable")
+    assert "no run in of-variable" in said()
+    assert "no run in of-flag" in said("--runs-dir", "of-flag")
+    monkeypatch.delenv("RLCLI_RUNS_DIR")
+    monkeypatch.setenv("RLCLI_SETTINGS", "none")
+    assert "no run in runs" in said()
+
+
+def test_home_is_understood_and_the_library_has_no_preferences(settings, in_process, monkeypatch, tmp_path):
+    settings("runs_dir: ~/experiments\n")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("RLCLI_RUNS_DIR", raising=False)
+    assert f"no run in {tmp_path}/experiments" in in_process("runs")[2]
+    assert str(default_runs_dir()) == "runs"
+
+
+@pytest.mark.parametrize(
+    ("verbosity", "flags", "loud"),
+    [
+        ("verbose", (), True),
+        ("verbose", ("-q",), False),
+        ("quiet", (), False),
+        ("quiet", ("-v",), True),
+        ("normal", (), False),
+        ("normal", ("-v",), True),
+        ("normal", ("-v", "-q"), False),
+        ("normal", ("--quiet", "--verbose"), True),
+    ],
+)
+def test_quiet_and_verbose_are_settings_that_a_flag_turns_round(
+    settings, in_process, monkeypatch, verbosity, flags, loud
+):
+    settings(f"verbosity: {verbosity}\n")
+    monkeypatch.setattr("rlcli.cli.validate.tell_notes", lambda _: viewing.console.detail("a detail"))
+    code, _, err = in_process("validate", "cartpole", *flags)
+    assert code == 0
+    assert ("a detail" in err) == loud
+
+
+def test_a_preferred_viewer_is_opened_only_where_play_may_choose(monkeypatch):
+    monkeypatch.setattr("rlcli.sim.gl.has_display", lambda: False)
+
+    def first(viewer, port=None, headless=False):
+        return viewing.choose_viewers(viewer, port, headless=headless)[0][0]
+
+    with applied({"viewer": "web"}):
+        assert first(None) == "web"
+        assert first("auto") == "none", "no terminal asks"
+        assert first("none") == "none"
+        assert first(None, headless=True) == "none", "a file is written"
+    with applied({"viewer": "native"}):
+        assert first(None) == "none", "there is no display"
+    with applied({"viewer": "none"}):
+        assert first(None, port=8080) == "web", "a port is a viewer in the browser"
+
+
+def test_preferred_plugins_leave_the_others_out(settings, in_process, monkeypatch):
+    monkeypatch.delenv("RLCLI_PLUGINS", raising=False)
+    file = settings("plugins: [no-such-plugin]\n")
+    code, out, err = in_process("list-tasks", "--json")
+    assert code == 0
+    assert {task["distribution"] for task in json.loads(out)["tasks"]} == {"rlcli"}
+    assert f"plugins in {file} names 'no-such-plugin'" in err
+    monkeypatch.setenv("RLCLI_PLUGINS", "another")
+    assert "RLCLI_PLUGINS names 'another'" in in_process("list-tasks")[2]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("verbosity: loud\n", ":1:1: verbosity: expected 'quiet', 'normal' or 'verbose', found 'loud'"),
+        ("# mine\nveiwer: none\n", ":2:1: veiwer: unknown key 'veiwer'; did you mean 'viewer'?"),
+        ("viewer: none\nagent: {}\n", ":2:1: agent: unknown key 'agent'"),
+        ("loggers: [tensorboard, tensorbord]\n", ":1:24: loggers.1: expected"),
+        ("loggers: []\n", ":1:1: loggers: expected at least 1 item"),
+        ("runs_dir: 3\n", ":1:1: runs_dir: expected text, found 3"),
+        ("runs_dir: [\n", ":2:1: "),
+        ("- runs_dir\n", ":1:1: the top level must be a mapping"),
+        (b"runs_dir: \xff\n", ":1:11: not UTF-8"),
+        ("runs_dir: a\nruns_dir: b\n", ":2:1: duplicate key 'runs_dir'"),
+        ("runs_dir: &a a\n", ":1:11: anchors and aliases are not allowed"),
+        ("runs_dir: \x00\n", ":1:11: "),
+    ],
+)
+def test_a_broken_file_is_one_message_with_its_place_and_exit_code_3(settings, in_process, text, said):
+    file = settings(text)
+    for command in (["runs"], ["list-tasks"], ["train", "cartpole"], ["show", "cartpole"]):
+        code, out, err = in_process(*command)
+        assert (code, out) == (3, "")
+        assert err.startswith(f"error: {file}{said}")
+        assert len(err.splitlines()) == 1
+    assert json.loads(in_process("runs", "--json")[1])["error"]["exit_code"] == 3
+
+
+@pytest.mark.parametrize("command", [["--help"], ["train", "--help"], ["--version"], ["sweep", "-h"]])
+def test_help_is_there_with_a_broken_file_too(settings, in_process, command):
+    settings("[")
+    code, out, err = in_process(*command)
+    assert (code, err) == (0, "")
+    assert "rlcli" in out
+
+
+def test_what_is_no_file_is_said_where_it_was_named(monkeypatch, in_process, tmp_path):
+    for named in (tmp_path / "gone.yaml", tmp_path):
+        monkeypatch.setenv("RLCLI_SETTINGS", str(named))
+        code, _, err = in_process("runs")
+        assert code == 3
+        assert err.startswith(f"error: {named}: cannot be read")
+        assert "RLCLI_SETTINGS=none" in err
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the folder of other platforms is not moved by XDG")
+def test_the_file_lies_in_the_platforms_folder_and_need_not_be_there(monkeypatch, tmp_path):
+    monkeypatch.delenv("RLCLI_SETTINGS")
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    assert settings_file() == tmp_path / "rlcli" / "settings.yaml"
+    assert read_settings() == {}
+    settings_file().parent.mkdir()
+    settings_file().write_text("# nothing yet\n")
+    assert read_settings() == {}
+    settings_file().write_text("color: never\n")
+    assert read_settings() == {"color": "never"}
+
+
+def test_what_can_be_set_is_what_the_flags_take():
+    def choices(field):
+        return set(typing.get_args(UserSettings.model_fields[field].annotation))
+
+    assert choices("viewer") == set(viewing.VIEWERS)
+    for name in (*LOGGERS, "none"):
+        UserSettings(loggers=[name])
+    assert not {"tasks", "agent", "device", "seed"} & set(UserSettings.model_fields)
+
+
+def colored(arguments, tmp_path, **variables):
+    """What a command writes on a terminal of 120 columns."""
+    leader, follower = pty.openpty()
+    env = {**os.environ, "TERM": "xterm", "COLUMNS": "120", **variables}
+    process = subprocess.Popen([sys.executable, "-m", "rlcli", *arguments], stdout=follower, env=env, cwd=tmp_path)
+    os.close(follower)
+    said = b""
+    try:
+        while chunk := os.read(leader, 65536):
+            said += chunk
+    except OSError:  # Linux's way to say that the other end is closed
+        pass
+    os.close(leader)
+    assert process.wait() == 0
+    return said
+
+
+def test_colours_are_for_terminals_unless_a_variable_or_the_settings_say_otherwise(settings, tmp_path):
+    settings("{}")
+    command = ["list-tasks", "cartpole"]
+    assert b"\x1b[" in colored(command, tmp_path)
+    assert b"\x1b[" not in colored(command, tmp_path, NO_COLOR="1")
+    assert b"\x1b[" not in colored(command, tmp_path, TERM="dumb")
+    assert b"\x1b[" in colored(command, tmp_path, NO_COLOR="")
+    settings("color: never\n")
+    assert b"\x1b[" not in colored(command, tmp_path)
+    assert b"\x1b[" in colored(command, tmp_path, FORCE_COLOR="1")
+
+
+def test_a_pipe_has_colours_only_where_they_are_forced(settings, rlcli):
+    settings("{}")
+    assert "\x1b" not in rlcli("list-tasks", "cartpole").stdout
+    assert "\x1b[" in rlcli("list-tasks", "cartpole", FORCE_COLOR="1").stdout
+    assert "\x1b" not in rlcli("list-tasks", "cartpole", FORCE_COLOR="1", NO_COLOR="1").stdout
+    assert "\x1b" not in rlcli("list-tasks", "cartpole", "--json", FORCE_COLOR="1").stdout
+    settings("color: always\n")
+    assert "\x1b[" in rlcli("list-tasks", "cartpole").stdout
