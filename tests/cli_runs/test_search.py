@@ -35,7 +35,9 @@ def finish(search, count):
 
 
 def test_the_same_seed_draws_the_same_trials_and_another_seed_others(tmp_path):
-    first, again, other = (finish(begin(tmp_path / name, seed=seed), 12) for name, seed in (("a", 3), ("b", 3), ("c", 4)))
+    first, again, other = (
+        finish(begin(tmp_path / name, seed=seed), 12) for name, seed in (("a", 3), ("b", 3), ("c", 4))
+    )
     assert first == again
     assert not [values for values in first if values in other]
     assert len({values["agent.learning_rate"] for values in first}) == 12
