@@ -98,10 +98,11 @@ def test_nothing_that_is_installed_along_is_under_a_licence_that_would_bind_rlcl
 def archives(tmp_path_factory):
     """The source archive, the wheel built from it, and a wheel built from another folder."""
     folder = tmp_path_factory.mktemp("archives")
+    ignored = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache", ".hypothesis", "_build")
+    shutil.copytree(REPOSITORY, folder / "one" / "rlcli", ignore=ignored)
+    shutil.copytree(folder / "one" / "rlcli", folder / "another" / "rlcli")
     for place in ("one", "another"):
-        ignored = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache", ".hypothesis", "_build")
-        shutil.copytree(REPOSITORY, folder / place / "rlcli", ignore=ignored)
-        for junk in ("runs/cartpole/x/run.json", "rlcli/__pycache__/a.pyc", "docs/_build/x.html", "notes.txt"):
+        for junk in ("runs/cartpole/x/run.json", "rlcli/__pycache__/a.pyc", "docs/_build/x.html", "junk.txt"):
             file = folder / place / "rlcli" / junk
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text("junk")
@@ -127,7 +128,7 @@ def test_the_source_archive_holds_what_a_release_is_made_and_tested_from_and_not
     needed = ["LICENSE", "README.md", "CHANGELOG.md", "pyproject.toml", "constraints.txt", "Makefile", "rlcli/py.typed"]
     needed += ["docs/index.md", "docs/conf.py", "tests/conftest.py", "tasks/rlcli_tasks/index.json"]
     assert set(needed) <= names
-    assert not [name for name in names if re.search(r"__pycache__|\.pyc$|^runs/|_build|\.egg-info|notes", name)]
+    assert not [name for name in names if re.search(r"__pycache__|\.pyc$|^runs/|_build|\.egg-info|junk\.txt", name)]
 
 
 @pytest.mark.slow
