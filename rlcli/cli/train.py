@@ -145,6 +145,7 @@ def command(
     if several is not None:
         from rlcli.cli.seeds import create, train_all
 
+        assert resolved is not None  # --seeds begins a study; one that goes on is a folder
         how = {"logger": logger, "init_from": init_from, "video_every": video_every}
         folder = create(resolved, runs, name, {"device": device}, several, **how)
         train_all(folder, device, jobs or 1, stop)
