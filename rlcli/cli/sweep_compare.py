@@ -157,7 +157,7 @@ def _train(search: Search, base: Base, arm: str, changes: Sequence[str], bar: Ba
         finally:
             child.process.kill()
         training.reached = reached()
-        if child.exit_code and not (child.asked and child.exit_code == STOPPED):
+        if child.exit_code and stop.signal is None and not (child.asked and child.exit_code == STOPPED):
             training.error = failure(child, child.why)
             console.warn(f"{arm}, seed {base.seed}: {child.why}")
     found = training.reached
