@@ -10,6 +10,8 @@ from typing import Any
 
 PUBLIC = Path(__file__).parent / "public-names.txt"
 """What others may rely on, a name a line; tests/docs compares it with the code."""
+WORDS = Path(__file__).parent / "public-words.txt"
+"""Likewise what task files and command lines may say; tests/packaging compares it with the code."""
 MODULES = (
     "rlcli.task",
     "rlcli.trainers",
@@ -62,6 +64,35 @@ def public_names(module_name: str) -> list[str]:
         if not name.startswith("_") and own and (inspect.isclass(value) or inspect.isfunction(value)):
             found.append(name)
     return sorted(found)
+
+
+def public_words() -> list[str]:
+    """Terms, configuration keys, commands and their options: renaming one breaks somebody's files or scripts."""
+    import typer
+
+    from rlcli.cli.app import build
+    from rlcli.config.schema import TaskConfig
+    from rlcli.rl import ppo_config, sb3_config
+
+    words = [f"term {section}.{name}" for section in TERMS for name, _ in _terms_of(section)]
+    models: dict[str, Any] = {"Task": TaskConfig}
+    for trainer, spec in (("ppo", ppo_config.SPEC), ("sb3", sb3_config.SPEC)):
+        for algorithm, place in spec.algorithms.items():
+            module, _, name = place.partition(":")
+            models[f"{trainer}.{algorithm}"] = getattr(importlib.import_module(module), name)
+    for model, value in models.items():
+        schema = value.model_json_schema()
+        for name, fields in {model: schema, **schema.get("$defs", {})}.items():
+            words += [f"key {name}.{key}" for key in fields.get("properties", {})]
+    pending = [("rlcli", typer.main.get_command(build()))]
+    while pending:
+        path, command = pending.pop()
+        inner = getattr(command, "commands", {})
+        pending += [(f"{path} {name}", each) for name, each in inner.items()]
+        if not inner:
+            options = [option for parameter in command.params for option in parameter.opts if option[0] == "-"]
+            words += [f"command {path}", *(f"option {path} {option}" for option in options)]
+    return sorted(set(words))
 
 
 def write(folder: Path) -> None:
@@ -140,19 +171,25 @@ def _terms() -> Iterator[str]:
     yield "# Terms\n"
     yield "What `func:` may name in each section of a task. A term's keyword parameters are its YAML keys.\n"
     for section in TERMS:
-        module = importlib.import_module(f"rlcli.mdp.{section}")
         yield f"## {section.capitalize()}\n"
-        for name, value in vars(module).items():
-            if name.startswith("_") or getattr(value, "__module__", "") != module.__name__:
-                continue
-            if inspect.isclass(value) or inspect.isfunction(value):
-                yield from _term(name, value)
+        for name, value in _terms_of(section):
+            yield from _term(name, value)
+
+
+def _terms_of(section: str) -> Iterator[tuple[str, Any]]:
+    """The terms of a section, by the names that `func:` knows them by."""
+    from rlcli.config.terms import snake_case
+
+    module = importlib.import_module(f"rlcli.mdp.{section}")
+    for name, value in vars(module).items():
+        if name.startswith("_") or getattr(value, "__module__", "") != module.__name__:
+            continue
+        if inspect.isclass(value) or inspect.isfunction(value):
+            yield snake_case(name) if inspect.isclass(value) else name, value
 
 
 def _term(name: str, value: Any) -> Iterator[str]:
-    from rlcli.config.terms import snake_case
-
-    yield f"### {snake_case(name) if inspect.isclass(value) else name}\n"
+    yield f"### {name}\n"
     parameters = [
         f"`{parameter.name}`" + ("" if parameter.default is parameter.empty else f" = `{parameter.default!r}`")
         for parameter in inspect.signature(value).parameters.values()
@@ -216,3 +253,4 @@ def _cell(text: str) -> str:
 
 if __name__ == "__main__":
     PUBLIC.write_text("".join(f"{m}.{n}\n" for m in MODULES for n in public_names(m)), encoding="utf-8")
+    WORDS.write_text("".join(f"{word}\n" for word in public_words()), encoding="utf-8")

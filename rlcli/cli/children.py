@@ -85,9 +85,9 @@ def start(run: Path, words: Sequence[str]) -> Child:
     return Child(run, process)
 
 
-def train(run: Path, device: str) -> Child:
-    """The process that trains a run that waits, or goes on with one that was interrupted."""
-    return start(run, ["train", "--resume", str(run), "--device", device])
+def train(run: Path, device: str, words: Sequence[str] = ()) -> Child:
+    """The process that trains a run that waits, or goes on with one that was interrupted; `words` are more options."""
+    return start(run, ["train", "--resume", str(run), "--device", device, *words])
 
 
 def on_leash() -> None:
@@ -110,6 +110,7 @@ def run_all(
     device: str,
     jobs: int,
     *,
+    words: Sequence[str] = (),
     stopped: Callable[[], bool],
     tell: Callable[[Child, bool], None],
     look: Callable[[], None],
@@ -120,6 +121,7 @@ def run_all(
         runs: their folders.
         device: where they train.
         jobs: processes at a time.
+        words: further options of each.
         stopped: whether to stop; no further run is begun then, and those that train are asked to stop.
         tell: hears of a process that was started, and (True) of one that has ended.
         look: called now and then.
@@ -132,7 +134,7 @@ def run_all(
                 for child in active:
                     child.stop()
             while waiting and len(active) < jobs:
-                active.append(train(waiting.pop(0), device))
+                active.append(train(waiting.pop(0), device, words))
                 tell(active[-1], False)
             for child in [child for child in active if child.has_ended()]:
                 active.remove(child)

@@ -36,7 +36,9 @@ def create(
     return folder
 
 
-def train_all(folder: Path, device: str | None, jobs: int, stop: StopRequest) -> None:
+def train_all(
+    folder: Path, device: str | None, jobs: int, stop: StopRequest, *, longer: bool = False, words: Sequence[str] = ()
+) -> None:
     """Train what is left of a study, then say what its seeds say together.
 
     Args:
@@ -44,6 +46,8 @@ def train_all(folder: Path, device: str | None, jobs: int, stop: StopRequest) ->
         device: where; None is as it began.
         jobs: trainings at a time.
         stop: whether somebody asks to stop.
+        longer: whether those that have finished have another budget now.
+        words: options of `rlcli train --resume` that hold for each of them.
 
     Raises:
         Stopped: if somebody did.
@@ -68,9 +72,11 @@ def train_all(folder: Path, device: str | None, jobs: int, stop: StopRequest) ->
             console.warn(f"{child.run.name}: {child.why}")
 
     with stop:
-        left = [run for run in runs if overview(run).state != "finished"]
+        left = [run for run in runs if longer or overview(run).state != "finished"]
         with view:
-            ended = run_all(left, place, jobs, stopped=lambda: stop.signal is not None, tell=tell, look=view.look)
+            ended = run_all(
+                left, place, jobs, words=words, stopped=lambda: stop.signal is not None, tell=tell, look=view.look
+            )
     wrong = [(run, child) for run, child in ended.items() if child.exit_code and not child.asked]
     asked = stop.signal is not None
     summary = _conclude(folder, runs)

@@ -142,8 +142,22 @@ def command(
     if gpus is not None and gpus > 1 and not distributed.launched():
         raise typer.Exit(distributed.launch(gpus, sys.argv[1:]))
 
+    if isinstance(several, Path):
+        from rlcli.cli.seeds import train_all
+
+        more = {"--max-iterations": max_iterations, "--max-steps": max_steps, "--video-every": video_every}
+        words = [word for flag, value in more.items() if value is not None for word in (flag, str(value))]
+        words += [word for one in logger or [] for word in ("--logger", one)]
+        place = None if wanted == "auto" else device
+        train_all(several, place, jobs or 1, stop, longer=bool(budget), words=words)
+        return
     if several is not None:
-        _train_several(several, jobs or 1, stop, resolved, device, wanted, runs, name, logger, init_from, video_every)
+        from rlcli.cli.seeds import create, train_all
+
+        assert resolved is not None  # --seeds begins a study; one that goes on is a folder
+        how = {"logger": logger, "init_from": init_from, "video_every": video_every}
+        folder = create(resolved, runs, name, {"device": device}, several, **how)
+        train_all(folder, device, jobs or 1, stop)
         return
 
     def begin() -> Job | None:
@@ -184,29 +198,6 @@ def _several(
         other = "--seed" if seed is not None else "--gpus"
         raise UsageError(f"--seeds and {other} contradict each other", hint=f"leave out {other}")
     return study if seeds is None else read_seeds(seeds)
-
-
-def _train_several(
-    several: list[int] | Path,
-    jobs: int,
-    stop: StopRequest,
-    resolved: Any,
-    device: str,
-    wanted: str,
-    runs: Path,
-    name: str | None,
-    logger: list[str] | None,
-    init_from: str | None,
-    video_every: int | None,
-) -> None:
-    from rlcli.cli.seeds import create, train_all
-
-    if isinstance(several, Path):
-        train_all(several, None if wanted == "auto" else device, jobs, stop)
-        return
-    how = {"logger": logger, "init_from": init_from, "video_every": video_every}
-    folder = create(resolved, runs, name, {"device": device}, several, **how)
-    train_all(folder, device, jobs, stop)
 
 
 def _budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:

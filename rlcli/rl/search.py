@@ -3,43 +3,39 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import platform
-import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
-from rlcli.errors import CheckpointError, DependencyError, MachineError, UsageError
+from rlcli.errors import CheckpointError, MachineError, UsageError
 from rlcli.random import derive
 from rlcli.rl.files import disk_error, to_json, write_atomic
 from rlcli.rl.run import STUDY
 from rlcli.rl.space import Parameter
+from rlcli.rl.storage import hidden, open_study
 from rlcli.rl.study import read_study
 
-JOURNAL = "journal.log"
 PRESET = "best.yaml"
 _GUARD, _HELD = ".sweep", ".worker"
 _SETTINGS = "rlcli"
 """Attribute of an Optuna study: what all of its processes agree on."""
 _PLACE = "place"
 """Attribute of a trial: the machine and the folder of who works on it; only there its run can go on."""
-_TRIES = 5
+_SURPLUS = "surplus"
+"""Attribute of a trial that was begun at the same moment as the last one wanted; it is none."""
+_KINDS: dict[str, type] = {
+    **dict.fromkeys(("task", "name", "agent", "objective", "direction", "pruner"), str),
+    **dict.fromkeys(("trials", "episodes", "seed"), int),
+    **dict.fromkeys(("params", "overrides"), list),
+    **dict.fromkeys(("source", "flags"), dict),
+}
+"""What `study.json` says of a sweep."""
 _ENDED = ("COMPLETE", "PRUNED", "FAIL")
-
-
-def check_optuna() -> None:
-    """Refuse where there is no Optuna.
-
-    Raises:
-        DependencyError: with the line that installs it.
-    """
-    if importlib.util.find_spec("optuna") is None:
-        raise DependencyError("a sweep needs Optuna", hint='pip install "rlcli[sweep]"')
 
 
 @dataclass(slots=True)
@@ -72,8 +68,8 @@ class Search:
     _held: dict[int, Trial] = field(default_factory=dict)
 
     def trials(self) -> list[Any]:
-        """Optuna's trials, in order."""
-        return list(self.study.get_trials(deepcopy=False))
+        """Optuna's trials, in order; those that were begun beyond what was wanted are none."""
+        return [trial for trial in self.study.get_trials(deepcopy=False) if _SURPLUS not in trial.user_attrs]
 
     def ended(self) -> list[Any]:
         """Those that need nothing more."""
@@ -108,25 +104,27 @@ class Search:
         """
         with _locked(self.folder / _GUARD):
             for trial in self.trials():
-                if trial.state.name == "RUNNING" and trial.number not in self._held and self._is_here(trial):
-                    taken = self._take(trial.number)
-                    if taken is not None:
-                        return self._hold(taken, self._adopted(trial))
+                if trial.state.name != "RUNNING" or trial.number in self._held or not self._is_here(trial):
+                    continue
+                taken = self._take(trial.number)
+                if taken is None:
+                    continue
+                if any(other.number == trial.number for other in self.ended()):  # until now it was another's
+                    taken.release()
+                    continue
+                return self._hold(taken, self._adopted(trial))
             if len(self.trials()) >= self.settings["trials"]:
                 return None
-            number = len(self.trials())
-            self.study.sampler = _sampler(derive(self.settings["seed"], f"trial {number}"))
             asked = self.study.ask()
             asked.set_user_attr(_PLACE, self._here)
-            if asked.number >= self.settings["trials"]:  # another machine was quicker
+            if sum(trial.number < asked.number for trial in self.trials()) >= self.settings["trials"]:
+                asked.set_user_attr(_SURPLUS, True)  # another machine was quicker
                 self.study.tell(asked, state=_state("FAIL"))
                 return None
             held = self._take(asked.number)
             if held is None:
                 raise MachineError(f"{self.place(asked.number)} is being written to by another process")
-            for parameter in self.parameters:
-                parameter.draw(asked)
-            return self._hold(held, asked)
+            return self._hold(held, self._adopted(asked))
 
     def tell(self, trial: Trial, value: float | None = None, *, state: str | None = None, **notes: Any) -> None:
         """A trial has ended; `notes` are kept with it."""
@@ -138,6 +136,26 @@ class Search:
             self.study.tell(trial.trial, state=_state(state))
         self._held.pop(trial.number, None)
         trial.let_go()
+
+    def keep_preset(self, data: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> Path | None:
+        """Write the best trial as a file for `--config`, with a comment that says where it is from.
+
+        Args:
+            data: the content of such a file, of the values of a trial.
+
+        Raises:
+            MachineError: if it cannot be written.
+        """
+        from rlcli.config.dump import to_yaml
+
+        with _locked(self.folder / _GUARD):  # the best that one process knows may be an older one than another's
+            best = self.best()
+            if best is None:
+                return None
+            score = f"{self.settings['objective']} = {best.value:.6g}"
+            title = f"# {self.settings['task']}: trial {best.number} of {self.folder.name}, {score}\n"
+            write_atomic(self.folder / PRESET, title + to_yaml(dict(data(self.values(best)))))
+        return self.folder / PRESET
 
     def let_go(self) -> None:
         """Leave unfinished trials to whoever goes on with the sweep."""
@@ -166,48 +184,57 @@ class Search:
             return None
         return lock
 
-    def _adopted(self, frozen: Any) -> Any:
+    def _adopted(self, trial: Any) -> Any:
+        """A trial whose values are those of its number, whoever draws them; what it had drawn, it keeps."""
         import optuna
 
-        return optuna.trial.Trial(self.study, frozen._trial_id)
+        self.study.sampler = _sampler(derive(self.settings["seed"], f"trial {trial.number}"))
+        return optuna.trial.Trial(self.study, trial._trial_id)
 
     def _hold(self, lock: FileLock, trial: Any) -> Trial:
         for parameter in self.parameters:
-            parameter.draw(trial)  # of one that was begun: what it had drawn
+            parameter.draw(trial)
         taken = Trial(trial.number, self.place(trial.number), trial, self.values(trial), lock)
         self._held[taken.number] = taken
         return taken
 
 
 def open_search(
-    folder: Path, settings: dict[str, Any], parameters: list[Parameter], storage: str | None, pruner: str
+    folder: Path,
+    settings: dict[str, Any],
+    source: Mapping[str, Any],
+    parameters: list[Parameter],
+    storage: str | None,
 ) -> Search:
     """Begin a sweep in a folder, or join the one that is there.
 
     Args:
         folder: of the sweep; made if it is not there.
         settings: what all processes of the sweep agree on; `trials` may grow.
+        source: where the task is from, which all processes that share the folder agree on.
         parameters: what is drawn.
         storage: URL of a database; None keeps a journal in the folder.
-        pruner: median or none.
 
     Raises:
         UsageError: if the folder or the storage holds another sweep.
+        CheckpointError: if what the folder holds is damaged.
         MachineError: if the storage cannot be reached, or the folder not written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise disk_error(folder, error) from error
+    about = {"kind": "sweep", **settings, "source": dict(source)}
     with _locked(folder / _GUARD):
-        if (folder / STUDY).is_file():
-            _require_same(folder, read_study(folder, "sweep"), settings)
-        study = _open(folder, settings, storage, pruner, create=True)
+        begun = (folder / STUDY).is_file()
+        if begun:
+            _require_same(folder, read_study(folder, "sweep"), about)
+        study = open_study(folder, settings, storage, create=storage is not None or not begun)
         known = study.user_attrs.get(_SETTINGS)
         if known is not None:
             _require_same(storage or folder, known, settings)
         study.set_user_attr(_SETTINGS, settings)
-        write_atomic(folder / STUDY, to_json({"kind": "sweep", **settings}))
+        write_atomic(folder / STUDY, to_json(about))
     return Search(folder, settings, parameters, study)
 
 
@@ -215,107 +242,18 @@ def read_search(folder: Path, storage: str | None = None) -> Search:
     """A sweep to look at.
 
     Raises:
-        CheckpointError: if there is none.
+        CheckpointError: if there is none, or it is damaged.
         MachineError: if its storage cannot be reached.
     """
     from rlcli.rl.space import read_parameters
 
     settings = read_study(folder, "sweep")
-    texts, wanted = settings.get("params"), ("objective", "direction", "trials", "name")
-    if not isinstance(texts, list) or any(key not in settings for key in wanted):
+    if any(not isinstance(settings.get(key), kind) for key, kind in _KINDS.items()):
         raise CheckpointError(f"{folder / STUDY} is corrupt: it lacks what a sweep is told")
     if settings.get("storage") and storage is None:
         raise UsageError(f"{folder} keeps its trials in a database", hint="--storage URL, as it was begun")
-    study = _open(folder, settings, storage, "none", create=False)
-    return Search(folder, settings, read_parameters(texts), study)
-
-
-def _open(folder: Path, settings: Mapping[str, Any], storage: str | None, pruner: str, *, create: bool) -> Any:
-    import optuna
-
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-    name = f"rlcli/{settings['task']}/{settings['name']}"
-    prune = optuna.pruners.MedianPruner(n_startup_trials=4, n_warmup_steps=30) if pruner == "median" else None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            place = _journal(folder) if storage is None else _database(storage)
-        if not create:
-            return optuna.load_study(study_name=name, storage=place)
-        return optuna.create_study(
-            storage=place,
-            study_name=name,
-            load_if_exists=True,
-            direction=settings["direction"],
-            pruner=prune or optuna.pruners.NopPruner(),
-        )
-    except KeyError:
-        raise CheckpointError(f"there is no sweep '{name}' in {storage or folder}") from None
-    except OSError as error:
-        raise disk_error(folder / JOURNAL, error) from error
-
-
-def _journal(folder: Path) -> Any:
-    from optuna.storages import JournalStorage
-    from optuna.storages.journal import JournalFileBackend
-
-    class Lock:
-        """The system's lock: it is free again when whoever held it was killed."""
-
-        def __init__(self) -> None:
-            self._lock = FileLock(folder / f".{JOURNAL}")
-
-        def acquire(self) -> bool:
-            self._lock.acquire()
-            return True
-
-        def release(self) -> None:
-            self._lock.release()
-
-    file = folder / JOURNAL
-    if file.is_symlink():
-        raise CheckpointError(f"{file} is a link; it was not made by rlcli")
-    lock: Any = Lock()
-    return JournalStorage(JournalFileBackend(str(file), lock_obj=lock))
-
-
-def _database(url: str) -> Any:
-    try:
-        import sqlalchemy
-        from optuna.storages import RDBStorage
-    except ImportError:
-        raise DependencyError("a shared storage needs SQLAlchemy", hint='pip install "rlcli[sweep]"') from None
-    try:
-        closed_after_use = {"poolclass": sqlalchemy.pool.NullPool}  # a trial lasts longer than a connection
-        for _ in range(_TRIES):
-            with contextlib.suppress(sqlalchemy.exc.IntegrityError, sqlalchemy.exc.ProgrammingError):
-                return RDBStorage(url, engine_kwargs=closed_after_use)
-            time.sleep(1.0)  # another machine makes the same tables at this moment
-        return RDBStorage(url, engine_kwargs=closed_after_use)
-    except ModuleNotFoundError as error:
-        raise DependencyError(f"--storage needs the driver {error.name}", hint=f"pip install {error.name}") from None
-    except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError) as error:
-        raise UsageError(
-            f"--storage '{_hidden(url)}' is no address of a database: {_first_line(error)}",
-            hint="as in postgresql+psycopg://user@host/name",
-        ) from None
-    except (sqlalchemy.exc.SQLAlchemyError, OSError) as error:
-        raise MachineError(f"--storage {_hidden(url)} cannot be reached: {_first_line(error)}") from None
-
-
-def _hidden(url: str) -> str:
-    """An address without its password."""
-    before, at, after = url.rpartition("@")
-    if not at:
-        return url
-    scheme, _, user = before.partition("://")
-    return f"{scheme}://{user.partition(':')[0]}@{after}"
-
-
-def _first_line(error: BaseException) -> str:
-    cause = getattr(error, "orig", None) or error
-    return (str(cause).strip().splitlines() or [type(cause).__name__])[0][:300]
+    study = open_study(folder, settings, storage, create=False)
+    return Search(folder, settings, read_parameters(settings["params"]), study)
 
 
 def _require_same(place: Any, known: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
@@ -327,7 +265,7 @@ def _require_same(place: Any, known: Mapping[str, Any], settings: Mapping[str, A
     differing = [key for key in settings if key != "trials" and known.get(key) != settings[key]]
     if differing:
         said = "; ".join(f"{key}: {known.get(key)!r} there, {settings[key]!r} here" for key in differing[:3])
-        where = _hidden(str(place))
+        where = hidden(str(place))
         raise UsageError(f"{where} is another sweep ({said})", hint="another --name, or the same command again")
 
 
@@ -358,16 +296,3 @@ def _locked(file: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
-
-
-def preset(search: Search, overrides: Sequence[str]) -> str | None:
-    """The best trial as a file for `--config`, with a comment that says where it is from."""
-    from rlcli.config.dump import to_yaml
-    from rlcli.rl.space import nested
-
-    best = search.best()
-    if best is None:
-        return None
-    data = nested([*overrides, *search.overrides(search.values(best))])
-    score = f"{search.settings['objective']} = {best.value:.6g}"
-    return f"# {search.settings['task']}: trial {best.number} of {search.folder.name}, {score}\n{to_yaml(data)}"

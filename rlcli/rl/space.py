@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from rlcli.config import strict_yaml
 from rlcli.config.layers import parse_address, parse_override
-from rlcli.config.strict_yaml import YamlError
-from rlcli.errors import ConfigError, UsageError
+from rlcli.config.strict_yaml import Path, YamlError
+from rlcli.errors import ConfigError, UsageError, listing
 
 _RANGE = re.compile(r"(log:)?([^:,\[\]]+):([^:,\[\]]+)")
 _OBJECTIVE = re.compile(
     r"((?:success|return|length)|(?:reward_terms|terminations)\.[^@\s]+)(?:@([0-9.e+]+)(s|steps)?)?"
 )
+_LARGEST = {int: 2**53, float: 1e300}
+"""Of a range: up to there floats hold every whole number, and the width of a range is a number."""
 HINT = "KEY=LOW:HIGH, KEY=log:LOW:HIGH or KEY=A,B,C"
 
 
@@ -65,7 +68,7 @@ class Objective:
     """Training ends after so many environment steps."""
 
     def read(self, document: Mapping[str, Any]) -> float:
-        """Its value in the document of an evaluation.
+        """Its value in the document of an evaluation; NaN where that was not finite.
 
         Raises:
             UsageError: if it is not in there.
@@ -74,10 +77,13 @@ class Objective:
         found = document.get(first)
         entry = found.get(name) if name and isinstance(found, dict) else found
         if not isinstance(entry, dict):
+            told = listing(f"{first}.{key}" for key in found) if name and isinstance(found, dict) else ""
             raise UsageError(
-                f"--objective {self.key}: the evaluation does not tell it", hint="return, success or length"
+                f"--objective {self.key}: the evaluation does not tell it",
+                hint=f"there are: {told}" if told else "return, success or length",
             )
-        return float(entry["rate"] if "rate" in entry else entry["mean"])
+        value = entry["rate"] if "rate" in entry else entry["mean"]
+        return math.nan if value is None else float(value)
 
     @property
     def told(self) -> str | None:
@@ -123,11 +129,20 @@ def read_objective(text: str) -> Objective:
         ) from None
 
 
-def nested(overrides: Sequence[str]) -> dict[str, Any]:
-    """Overrides as the mapping that a `--config` file holds."""
+def nested(overrides: Sequence[str], whole: Callable[[Path], Any] = lambda _: None) -> dict[str, Any]:
+    """Overrides as the mapping that a `--config` file holds.
+
+    Args:
+        overrides: as on a command line.
+        whole: the value of a path in the configuration with these overrides; a `--config` file replaces a list as a
+            whole, also where only one of its elements was changed.
+    """
     data: dict[Any, Any] = {}
     for text in overrides:
         path, value = parse_override(text)
+        end = next((end for end in range(1, len(path)) if isinstance(whole(path[:end]), list)), len(path))
+        if end < len(path):
+            path, value = path[:end], whole(path[:end])
         inner = data
         for key in path[:-1]:
             inner = inner.setdefault(key, {})
@@ -152,8 +167,8 @@ def _read(text: str) -> Parameter:
     except YamlError as error:
         raise UsageError(f"--param '{text}': {error.message}", hint=HINT) from None
     log = span[1] is not None
-    if any(type(end) not in (int, float) for end in (low, high)):
-        raise UsageError(f"--param '{text}': the ends of a range are numbers", hint=HINT)
+    if any(type(end) not in (int, float) or not abs(end) < _LARGEST[type(end)] for end in (low, high)):
+        raise UsageError(f"--param '{text}': the ends of a range are numbers, not beyond all bounds", hint=HINT)
     if not low < high:
         raise UsageError(f"--param '{text}' is empty: {low} is not below {high}", hint=HINT)
     if log and low <= 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,7 @@ def create_study(
 
     Raises:
         UsageError: for a name that cannot be part of a folder's.
-        MachineError: if it cannot be written.
+        MachineError: if it cannot be written; the folder is gone then.
     """
     folder = new_folder(runs_dir, task, name)
     try:
@@ -57,8 +58,9 @@ def create_study(
         for seed, run_name in zip(seeds, names, strict=True):
             (folder / run_name).mkdir()
             begin_run(folder / run_name, config, {**record, "seed": seed, "state": WAITING}).unlock()
-    except OSError as error:
-        raise disk_error(folder, error) from error
+    except (OSError, MachineError) as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise disk_error(folder, error) if isinstance(error, OSError) else error from error
     return folder
 
 
@@ -107,10 +109,5 @@ def write_summary(folder: Path, name: str, content: bytes | str) -> Path:
     Raises:
         MachineError: if it cannot be written.
     """
-    try:
-        write_atomic(folder / name, content)
-    except OSError as error:
-        raise disk_error(folder / name, error) from error
-    except MachineError:
-        raise
+    write_atomic(folder / name, content)
     return folder / name

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -133,3 +134,61 @@ def test_a_seed_that_goes_wrong_is_named_and_the_others_are_trained(cli):
     result = cli("train", "--resume", study, "--json")
     assert result.code != 0
     assert "seed-1" in result.err
+
+
+@pytest.mark.slow
+def test_a_finished_study_is_trained_longer_when_a_new_budget_is_given(cli):
+    done = cli("train", "cartpole", *SMALL, "--max-iterations", 2, "--seeds", "4..5", "--jobs", 5, "--json")
+    assert done.code == 0, done.err
+    longer = cli("train", "--resume", study_folder(), "--max-iterations", 3, "--logger", "tensorboard", "--json")
+    assert longer.code == 0, longer.err
+    alone = cli("train", "cartpole", *SMALL, "--max-iterations", 3, "--seed", 5, "--runs-dir", "alone", "--json")
+    assert [row["step"] for row in longer.json["runs"]] == [3 * 32 * 16] * 2
+    assert rows_of(study_folder() / "seed-5") == rows_of(Path(alone.json["run"]))
+    assert list((study_folder() / "seed-5").rglob("events.out.tfevents*")), "further options hold for each"
+
+
+@pytest.mark.slow
+def test_a_single_seed_is_a_study_without_an_interval(cli):
+    done = cli("train", "cartpole", *SMALL, "--max-iterations", 2, "--seeds", "7..7", "--json")
+    assert done.code == 0, done.err
+    assert [(row["seed"], row["state"]) for row in done.json["runs"]] == [(7, "finished")]
+    (run,) = list_runs(Path("runs"), "cartpole")
+    assert run.folder == study_folder() / "seed-7"
+    told = cli("train", "--resume", study_folder())
+    assert told.code == 0
+    assert "nan" not in told.out
+
+
+@pytest.mark.slow
+def test_a_full_disk_leaves_no_half_study(cli):
+    small = Path("small")
+    small.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "none", small], capture_output=True).returncode:
+        pytest.skip("this user cannot mount a small file system")
+    try:
+        done = cli("train", "cartpole", *SMALL, "--seeds", "0..20", "--runs-dir", small)
+        assert done.code == 10
+        assert "No space left on device" in done.err
+        assert not list(small.glob("*/*"))
+    finally:
+        subprocess.run(["umount", small], check=True)
+
+
+@pytest.mark.slow
+def test_a_second_ctrl_c_ends_a_study_at_once_and_it_can_be_resumed(start, cli):
+    process = start("train", "cartpole", *SMALL, "--max-iterations", 100_000, "--seeds", "0..1", "--jobs", 2)
+    deadline = time.monotonic() + 120
+    while (
+        time.monotonic() < deadline
+        and len([file for file in Path("runs").glob("*/*/seed-*/metrics.jsonl") if file.stat().st_size]) < 2
+    ):
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "Traceback" not in err
+    done = cli("train", "--resume", study_folder(), "--max-iterations", 1, "--json")
+    assert done.code == 0, done.err
+    assert [row["state"] for row in done.json["runs"]] == ["finished"] * 2

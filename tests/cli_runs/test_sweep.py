@@ -2,6 +2,7 @@
 
 import getpass
 import json
+import math
 import os
 import shutil
 import signal
@@ -228,6 +229,85 @@ def test_settings_that_no_trial_survives_end_the_sweep_with_what_is_wrong(cli):
     assert result.code == 6, result.err
     assert "the first 3 trials failed" in result.err
     assert len(list(Path("runs/cartpole/sweep-sweep").glob("trial-*"))) == 3
+
+
+@pytest.mark.slow
+def test_a_sweep_whose_only_trial_fails_says_so(cli):
+    words = ("--param", "agent.learning_rate=1e30,1e31", "--trials", 1, "--max-iterations", 3)
+    result = cli("sweep", "cartpole", *SMALL, *words, "--json")
+    assert result.code == 6, result.err
+    assert "the first trial failed" in result.json["error"]["message"]
+    shown = cli("sweep", "show", "--json").json
+    assert [(trial["state"], trial["value"]) for trial in shown["trials"]] == [("fail", None)]
+    assert shown["trials"][0]["why"] in result.err
+    assert (shown["best"], shown["preset"]) == (None, None)
+
+
+@pytest.mark.slow
+def test_a_trial_whose_process_was_killed_before_its_result_was_told_is_judged_and_not_trained_again(cli):
+    words = ("sweep", "cartpole", *SMALL, *RATE, "--max-iterations", 2, "--episodes", 4)
+    first = cli(*words, "--trials", 1, "--json").json
+    folder = Path(first["sweep"])
+    journal = (folder / "journal.log").read_text().splitlines(keepends=True)
+    told = next(place for place, line in enumerate(journal) if '"op_code":6' in line and '"state":1' in line)
+    (folder / "journal.log").write_text("".join(journal[:told]))
+    (folder / "best.yaml").unlink()
+    trained = (folder / "trial-0000" / "metrics.jsonl").read_bytes()
+    again = cli(*words, "--trials", 2, "--json").json
+    assert [trial["state"] for trial in again["trials"]] == ["complete"] * 2
+    assert again["trials"][0]["value"] == first["trials"][0]["value"]
+    assert (folder / "trial-0000" / "metrics.jsonl").read_bytes() == trained
+    assert Path(again["preset"]).is_file()
+
+
+@pytest.mark.slow
+def test_a_full_disk_costs_no_trial(cli):
+    small = Path("small")
+    small.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=120k", "none", small], capture_output=True).returncode:
+        pytest.skip("this user cannot mount a small file system")
+    words = ("sweep", "cartpole", *SMALL, *RATE, "--trials", 4, "--max-iterations", 2, "--episodes", 4)
+    try:
+        full = cli(*words, "--runs-dir", small)
+        assert full.code == 10, full.err
+        assert "No space left on device" in full.err
+        subprocess.run(["mount", "-o", "remount,size=20m", small], check=True)
+        done = cli(*words, "--runs-dir", small, "--json")
+        assert done.code == 0, done.err
+        assert [trial["state"] for trial in done.json["trials"]] == ["complete"] * 4
+    finally:
+        subprocess.run(["umount", small], check=True)
+
+
+@pytest.mark.slow
+def test_the_preset_is_the_trial_without_its_budget(cli):
+    Path("more.yaml").write_text("rewards: {alive: {weight: 2.0}}\nagent: {gamma: 0.9}\n")
+    words = ("--param", "agent.policy.hidden.0=8:12", "--trials", 1, "--max-iterations", 1, "--episodes", 4)
+    done = cli("sweep", "cartpole", "--num-envs", 16, "--agent", "ppo", "--config", "more.yaml", *words, "--json")
+    assert done.code == 0, done.err
+    own, plain = (
+        cli("show", "cartpole", *options, "--json").json["config"]
+        for options in (("--config", done.json["preset"]), ("--agent", "ppo"))
+    )
+    trial = yaml.safe_load((Path(done.json["best"]["run"]) / "config.yaml").read_text())
+    assert own["agents"]["default"] == "ppo"
+    for key in ("max_iterations", "max_steps"):
+        assert own["agents"]["ppo"].pop(key) == plain["agents"]["ppo"][key]
+        trial["agents"]["ppo"].pop(key)
+    assert json.loads(json.dumps(own)) == json.loads(json.dumps(trial))
+    assert own["agents"]["ppo"]["policy"]["hidden"][0] == done.json["best"]["params"]["agent.policy.hidden.0"]
+
+
+def test_an_objective_that_is_not_finite_is_no_number():
+    assert math.isnan(Objective("values.x").read({"values": {"x": {"mean": None}}}))
+
+
+def test_an_objective_that_the_task_does_not_tell_is_said_before_anything_is_trained(cli):
+    for objective, said in (("reward_terms.aliv", "did you mean 'alive'"), ("terminations.nope", "time_out")):
+        result = cli("sweep", "cartpole", *SMALL, *RATE, "--objective", objective)
+        assert result.code == 2
+        assert said in result.err
+    assert not Path("runs").exists()
 
 
 def postgres_programs():

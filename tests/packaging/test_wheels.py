@@ -11,6 +11,8 @@ from email.parser import Parser
 import pytest
 from fenced import REPOSITORY, blocks, run_commands, success_rate, success_rates, write_files
 
+import rlcli
+
 ACROBOT = REPOSITORY / "plugins" / "rlcli-example-acrobot"
 TRAINERS = ("rlcli-rsl-rl", "rlcli-rl-games")
 pytestmark = pytest.mark.slow
@@ -93,7 +95,7 @@ def test_our_wheel_holds_every_file_of_the_tasks_and_nothing_of_the_tests(wheels
         files = {f.relative_to(root).as_posix() for f in (root / package).rglob("*") if f.is_file()}
         assert {f for f in files if "__pycache__" not in f} <= inside
     assert {"rlcli_tasks/index.json", "rlcli_tasks/cartpole/task.yaml", "rlcli_tasks/cartpole/cartpole.xml"} <= inside
-    assert {name.split("/")[0] for name in inside} == {"rlcli", "rlcli_tasks", "rlcli-0.1.0.dist-info"}
+    assert {name.split("/")[0] for name in inside} == {"rlcli", "rlcli_tasks", f"rlcli-{rlcli.__version__}.dist-info"}
 
 
 def test_plugin_wheel_holds_its_task_and_asks_for_rlcli(wheels):
@@ -121,7 +123,7 @@ def test_the_installed_pair_lists_checks_trains_and_plays(elsewhere, site):
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
 def test_a_built_in_task_is_seen_right_after_the_installation(elsewhere, tmp_path, task):
     done = elsewhere("-m", "rlcli", "play", task, "--video")
-    assert "(the policy shipped with rlcli 0.1.0)" in done.stderr
+    assert f"(the policy shipped with rlcli {rlcli.__version__})" in done.stderr
     assert (tmp_path / "play.mp4").stat().st_size > 10_000
     assert (
         json.loads(elsewhere("-m", "rlcli", "eval", task, "--episodes", "16", "--json").stdout)["success"]["rate"] > 0.9
