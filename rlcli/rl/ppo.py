@@ -109,7 +109,7 @@ class PpoTrainer:
         if how:
             self._parts = fused(self._parts, self._rehearse, self._notes.append, tuned=how == "tuned")
         by_hand = not how and has_closed_form(self.networks)
-        written = (self.networks, config, self._shared, places, max(minibatches), torch_threads)
+        written = (self.networks, self._shared, places, max(minibatches), torch_threads)
         self._gradient_of = PpoGradient(*written) if by_hand else None
         """On a CPU, for plain networks: a thread takes whole parts of a minibatch; torch has one within a part."""
         self._learn = captured(self._update, self.device, tell=self._notes.append)
@@ -322,7 +322,7 @@ class PpoTrainer:
         judged = self._differentiate(self._parts.judge, batch, number)
         self._sums += judged.metrics
         self.peers.average_(self._shared)
-        if self._checks and not is_finite(self._shared):
+        if self._checks and not (is_finite(self._shared) and is_finite(judged.metrics)):
             require_finite(self._stages(judged), self.iteration)
         if self.config.kl_from == "rollout":
             self._adapt(self._shared_kl, "minibatch")
@@ -343,7 +343,7 @@ class PpoTrainer:
         per_minibatch = self.config.normalize_advantage == "minibatch"
         advantage = self._standardized(batch.advantage) if per_minibatch else batch.advantage
         if self._gradient_of is not None:
-            return self._gradient_of(batch, advantage, self._old_std[number])
+            return self._gradient_of(self.config, batch, advantage, self._old_std[number])
         judged = judge(self.networks, self.config, batch, obs, critic_obs, advantage, self._old_std[number])
         gradients = torch.autograd.grad(judged.loss, list(self.networks.parameters()))
         torch.cat([*(part.flatten() for part in gradients), judged.metrics[KL : KL + 1]], out=self._shared)

@@ -30,7 +30,6 @@ class PpoGradient:
 
     Args:
         networks: actor and critic, of which `has_closed_form` holds.
-        config: weights and clipping.
         shared: the vector.
         places: where in it each parameter's gradient lies.
         rows: samples of the largest minibatch.
@@ -40,22 +39,21 @@ class PpoGradient:
     def __init__(
         self,
         networks: ActorCritic,
-        config: PpoConfig,
         shared: Tensor,
         places: Mapping[str, slice],
         rows: int,
         threads: int,
     ) -> None:
-        self._networks, self._config, self._shared = networks, config, shared
+        self._networks, self._shared = networks, shared
         parameters = dict(networks.named_parameters())
         gradients = {name: shared[place].view_as(parameters[name]) for name, place in places.items()}
         (name,) = (name for name in gradients if name.endswith("_std"))
         self._of_std = gradients.pop(name)
         self._mlps = MlpGradients(networks.actor, networks.critic, list(gradients.values()), rows, threads)
 
-    def __call__(self, batch: Samples, advantage: Tensor, old_std: Tensor) -> Judged:
+    def __call__(self, config: PpoConfig, batch: Samples, advantage: Tensor, old_std: Tensor) -> Judged:
         """The same as `ppo_loss.judge`, but for what the loss carries: its gradient is written already."""
-        config, networks = self._config, self._networks
+        networks = self._networks
         with torch.no_grad():
             std, spread = networks.std, entropy(networks.std)
             objective = _Objective(config, batch, advantage, std)
