@@ -1,8 +1,9 @@
 """Training speed as a share of the bare physics: `python benchmarks/train.py`.
 
 PPO with the sizes of the field's cartpole (4,096 environments x 16 steps, 5 epochs, 4 minibatches, two networks of
-32-32 ELU) against `mujoco.batch.Batch.step` of the same model, in turn in one process; beside it stock
-Stable-Baselines3 on the same environment through its plain VecEnv interface. Medians of the ratios.
+32-32 ELU) against `mujoco.batch.Batch.step` of the same model, in turn in one process: the built-in trainer `ppo`, the
+trainer `sb3`, and stock Stable-Baselines3 on the same environment through its plain VecEnv interface. Medians of the
+ratios.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 import json
 import statistics
 import time
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,12 +27,31 @@ from rlcli.config.load import resolve
 from rlcli.envs.vec_env import make_env
 from rlcli.machine import available_cores
 from rlcli.registry import find_task
+from rlcli.rl.ppo import PpoTrainer
 from rlcli.rl.sb3 import Sb3Trainer
 
-SIZES = ["agent.n_steps=16", "agent.n_epochs=5", "agent.num_minibatches=4"]
+SIZES = {
+    "ppo": ["agent.num_steps=16", "agent.num_epochs=5", "agent.num_minibatches=4"],
+    "sb3-ppo": ["agent.n_steps=16", "agent.n_epochs=5", "agent.num_minibatches=4"],
+}
+TRAINERS: dict[str, Any] = {"ppo": PpoTrainer, "sb3-ppo": Sb3Trainer}
+STOCK = "stock SB3"
 
 
-def fast_block(trainer: Sb3Trainer) -> tuple[float, dict[str, float]]:
+def trainer_of(agent: str, num_envs: int, threads: int) -> Any:
+    """A trainer of ours on the field's cartpole, its first iterations done."""
+    flags = {"scene.num_envs": num_envs}
+    resolved = resolve(find_task("cartpole"), agent=agent, overrides=SIZES[agent], flags=flags)
+    trainer = TRAINERS[agent](
+        make_env(resolved, seed=0), resolved.agent, seed=0, device="cpu", torch_threads=min(4, threads)
+    )
+    trainer.start()
+    for _ in range(3):
+        trainer.iterate()
+    return trainer
+
+
+def own_block(trainer: PpoTrainer | Sb3Trainer) -> tuple[float, dict[str, float]]:
     """Seconds of one iteration, and its parts."""
     begin = time.perf_counter()
     report = trainer.iterate()
@@ -60,56 +81,65 @@ def stock_model(num_envs: int) -> PPO:
     return model
 
 
+def measure(num_envs: int, repeats: int) -> list[dict[str, Any]]:
+    """The rows of one number of environments: bare physics, then an iteration of each, then again."""
+    threads = available_cores()
+    trainers = {agent: trainer_of(agent, num_envs, threads) for agent in SIZES}
+    stock = stock_model(num_envs)
+    env = trainers["ppo"].env
+    batch = Batch(env.engine.model, num_envs, threads)
+    controls = np.random.default_rng(0).uniform(-100.0, 100.0, (16, num_envs, 1))
+    for _ in range(3):
+        stock_block(stock)
+    ratios: dict[str, list[float]] = {name: [] for name in (*trainers, STOCK)}
+    rates: dict[str, list[float]] = {name: [] for name in ratios}
+    parts: dict[str, list[dict[str, float]]] = {name: [] for name in trainers}
+    for _ in range(repeats):
+        bare = bare_block(batch, controls, env.config.decimation, 16)
+        batch.reset()
+        for name in ratios:
+            if name == STOCK:
+                torch.set_num_threads(min(4, threads))
+                seconds = stock_block(stock)
+            else:
+                seconds, split = own_block(trainers[name])
+                parts[name].append(split)
+            ratios[name].append(bare / seconds)
+            rates[name].append(16 * num_envs / seconds)
+    return [
+        {
+            "trainer": name,
+            "num_envs": num_envs,
+            "ratio": statistics.median(found),
+            "ratio_min": min(found),
+            "ratio_max": max(found),
+            "train_steps_per_s": statistics.median(rates[name]),
+            "ms": {
+                part: 1e3 * statistics.median(split[part] for split in parts[name])
+                for part in (parts[name][0] if name in parts else ())
+            },
+        }
+        for name, found in ratios.items()
+    ]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--num-envs", nargs="+", type=int, default=[512, 4096])
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    threads = available_cores()
-    rows = []
-    for num_envs in options.num_envs:
-        resolved = resolve(find_task("cartpole"), overrides=SIZES, flags={"scene.num_envs": num_envs})
-        env = make_env(resolved, seed=0)
-        trainer = Sb3Trainer(env, resolved.agent, seed=0, device="cpu", torch_threads=min(4, threads))
-        trainer.start()
-        stock = stock_model(num_envs)
-        batch = Batch(env.engine.model, num_envs, threads)
-        controls = np.random.default_rng(0).uniform(-100.0, 100.0, (16, num_envs, 1))
-        for _ in range(3):
-            trainer.iterate()
-            stock_block(stock)
-        fast, plain, rates, parts = [], [], [], []
-        for _ in range(options.repeats):
-            bare = bare_block(batch, controls, env.config.decimation, 16)
-            seconds, split = fast_block(trainer)
-            torch.set_num_threads(min(4, threads))
-            plain.append(bare / stock_block(stock))
-            batch.reset()
-            fast.append(bare / seconds)
-            rates.append(16 * num_envs / seconds)
-            parts.append(split)
-        rows.append(
-            {
-                "num_envs": num_envs,
-                "ratio": statistics.median(fast),
-                "ratio_min": min(fast),
-                "ratio_max": max(fast),
-                "stock_sb3_ratio": statistics.median(plain),
-                "train_steps_per_s": statistics.median(rates),
-                "ms": {name: 1e3 * statistics.median(p[name] for p in parts) for name in parts[0]},
-            }
-        )
+    rows = [row for num_envs in options.num_envs for row in measure(num_envs, options.repeats)]
     if options.json:
         print(json.dumps({"machine": describe(), "rows": rows}, indent=2))
         return
     print(describe())
-    print(f"{'envs':>6}{'of bare Batch':>15}{'min .. max':>16}{'stock SB3':>11}{'steps/s':>11}   ms an iteration")
+    print(f"{'trainer':10}{'envs':>6}{'of bare Batch':>15}{'min .. max':>16}{'steps/s':>11}   ms an iteration")
     for row in rows:
         spread = f"{row['ratio_min']:.3f} .. {row['ratio_max']:.3f}"
         split = "  ".join(f"{name} {value:.0f}" for name, value in row["ms"].items())
-        figures = f"{row['stock_sb3_ratio']:>11.3f}{row['train_steps_per_s']:>11,.0f}"
-        print(f"{row['num_envs']:>6}{row['ratio']:>15.3f}{spread:>16}{figures}   {split}")
+        figures = f"{row['ratio']:>15.3f}{spread:>16}{row['train_steps_per_s']:>11,.0f}"
+        print(f"{row['trainer']:10}{row['num_envs']:>6}{figures}   {split}")
 
 
 if __name__ == "__main__":

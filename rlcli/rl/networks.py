@@ -59,6 +59,10 @@ class ActorCritic(nn.Module):
         """Deviation of each action. (a,)"""
         return self.log_std.exp() if hasattr(self, "log_std") else self.raw_std.clamp(min=_MIN_STD)
 
+    def std_gradient(self, of_log: Tensor) -> Tensor:
+        """What changes so with the deviation's logarithm changes so with its parameter. (a,) -> (a,)"""
+        return of_log if hasattr(self, "log_std") else of_log / self.std * (self.raw_std >= _MIN_STD)
+
     def mean(self, obs: Tensor) -> Tensor:
         """The mean action. (n, d) -> (n, a)"""
         return self.actor[-1](self.hidden(obs))

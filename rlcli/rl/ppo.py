@@ -27,6 +27,7 @@ from rlcli.rl.networks import ActorCritic, ValueNormalizer, adam, flatten, remem
 from rlcli.rl.optimizers import below
 from rlcli.rl.policy import Lstm, Normalizer, Policy
 from rlcli.rl.ppo_config import PpoConfig
+from rlcli.rl.ppo_gradient import PpoGradient, has_closed_form
 from rlcli.rl.ppo_loss import KL, METRICS, Judged, Parts, log_prob
 from rlcli.rl.ppo_rollout import Rollout, Samples
 from rlcli.rl.ppo_setup import compilation, critic_groups, minibatch_sizes, policy_spec, vision_spec
@@ -107,6 +108,10 @@ class PpoTrainer:
         how = compilation(config, self.device, self.steps_per_iteration)
         if how:
             self._parts = fused(self._parts, self._rehearse, self._notes.append, tuned=how == "tuned")
+        by_hand = not how and has_closed_form(self.networks)
+        written = (self.networks, self._shared, places, max(minibatches), torch_threads)
+        self._gradient_of = PpoGradient(*written) if by_hand else None
+        """On a CPU, for plain networks: a thread takes whole parts of a minibatch; torch has one within a part."""
         self._learn = captured(self._update, self.device, tell=self._notes.append)
 
     def start(self) -> None:
@@ -126,7 +131,7 @@ class PpoTrainer:
             raise
         self._record()
         collected = self._now()
-        torch.set_num_threads(self.torch_threads)
+        torch.set_num_threads(self.torch_threads if self._gradient_of is None else 1)
         self._decay()
         self.iteration += 1
         self.env_steps += self.steps_per_iteration
@@ -317,7 +322,7 @@ class PpoTrainer:
         judged = self._differentiate(self._parts.judge, batch, number)
         self._sums += judged.metrics
         self.peers.average_(self._shared)
-        if self._checks and not is_finite(self._shared):
+        if self._checks and not (is_finite(self._shared) and is_finite(judged.metrics)):
             require_finite(self._stages(judged), self.iteration)
         if self.config.kl_from == "rollout":
             self._adapt(self._shared_kl, "minibatch")
@@ -337,6 +342,8 @@ class PpoTrainer:
         obs, critic_obs = self._inputs(batch, number)
         per_minibatch = self.config.normalize_advantage == "minibatch"
         advantage = self._standardized(batch.advantage) if per_minibatch else batch.advantage
+        if self._gradient_of is not None:
+            return self._gradient_of(self.config, batch, advantage, self._old_std[number])
         judged = judge(self.networks, self.config, batch, obs, critic_obs, advantage, self._old_std[number])
         gradients = torch.autograd.grad(judged.loss, list(self.networks.parameters()))
         torch.cat([*(part.flatten() for part in gradients), judged.metrics[KL : KL + 1]], out=self._shared)

@@ -62,8 +62,8 @@ def judge(
     ratio = log_ratio.exp()
     clipped = ratio.clamp(1.0 - config.clip_range, 1.0 + config.clip_range)
     surrogate = -torch.min(advantage * ratio, advantage * clipped).mean()
-    entropy = (std.log() + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
-    loss = surrogate + config.value_coef * value_loss - config.entropy_coef * entropy
+    spread = entropy(std)
+    loss = surrogate + config.value_coef * value_loss - config.entropy_coef * spread
     if networks.teller is not None:
         loss = loss + config.tell_coef * (networks.teller(hidden) - _standard(critic_obs)).square().mean()
     if config.bounds_coef:
@@ -73,10 +73,9 @@ def judge(
         bounds = torch.zeros_like(loss)
 
     with torch.no_grad():
-        old, new = (batch.mean, old_std), (mean, std)
-        kl = _divergence(*old, *new) if config.kl_from == "rollout" else _divergence(*new, *old, eps=1e-5)
-        clip_fraction = ((ratio - 1.0).abs() > config.clip_range).float().mean()
-        metrics = torch.stack((surrogate, value_loss, entropy, kl, clip_fraction, bounds))
+        kl = policy_divergence(config, (batch.mean - mean).square().mean(dim=0), std, old_std)
+        clip_fraction = (ratio != clipped).float().mean()
+        metrics = torch.stack((surrogate, value_loss, spread, kl, clip_fraction, bounds))
     return Judged(loss, metrics, mean.detach(), std.detach())
 
 
@@ -109,6 +108,25 @@ def log_prob(noise: Tensor, std: Tensor) -> Tensor:
     return -(0.5 * noise.square() + std.log() + 0.5 * math.log(2.0 * math.pi)).sum(dim=-1)
 
 
+def entropy(std: Tensor) -> Tensor:
+    """Of a Gaussian with these deviations. (a,) -> ()"""
+    return (std.log() + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
+
+
+def policy_divergence(config: PpoConfig, distance: Tensor, std: Tensor, old_std: Tensor) -> Tensor:
+    """Between old and new policy, the way round that is asked for.
+
+    Args:
+        config: of which `kl_from` counts.
+        distance: mean square of what their mean actions differ by. (a,)
+        std: the new deviation. (a,)
+        old_std: the old one. (a,)
+    """
+    if config.kl_from == "rollout":
+        return _divergence(distance, old_std, std)
+    return _divergence(distance, std, old_std, eps=1e-5)
+
+
 def _standard(values: Tensor) -> Tensor:
     """Each column less its mean, by its deviation, within +-3. (n, d)"""
     deviation, mean = torch.std_mean(values, dim=0)
@@ -125,7 +143,7 @@ def _value_loss(value: Tensor, batch: Samples, config: PpoConfig) -> Tensor:
     return error.mean()
 
 
-def _divergence(mean: Tensor, std: Tensor, other_mean: Tensor, other_std: Tensor, eps: float = 0.0) -> Tensor:
-    """Mean of KL(N(mean, std) || N(other_mean, other_std)). (n, a), (a,), (n, a), (a,) -> ()"""
-    variances = (std.square() + (mean - other_mean).square()) / (2.0 * (other_std.square() + eps))
-    return ((other_std / std + eps).log() + variances - 0.5).sum(dim=-1).mean()
+def _divergence(distance: Tensor, std: Tensor, other_std: Tensor, eps: float = 0.0) -> Tensor:
+    """Mean of KL(N(mean, std) || N(other_mean, other_std)), from the mean square of what the means differ by. (a,)"""
+    variances = (std.square() + distance) / (2.0 * (other_std.square() + eps))
+    return ((other_std / std + eps).log() + variances - 0.5).sum()

@@ -71,7 +71,18 @@ def poison(trainer, what, where):
             gradient.view(-1)[at(range(gradient.numel()), where)] = math.nan
             return gradient
 
-        parameter.register_hook(spoil)
+        written = getattr(trainer, "_gradient_of", None)
+        if written is None:
+            parameter.register_hook(spoil)
+            return f"the gradient of '{name}'"
+
+        def spoilt(*batch):  # of a gradient that is written out, no hook is told
+            judged = written(*batch)
+            place = parameter.storage_offset() + at(range(parameter.numel()), where)
+            trainer._gradient[place] = math.nan
+            return judged
+
+        trainer._gradient_of = spoilt
         return f"the gradient of '{name}'"
     if what == "advantage":  # rewards that are finite, and whose discounted sum is not
         who = {"first": WHO[0], "middle": WHO[1], "last": WHO[2]}[where]
