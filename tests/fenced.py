@@ -55,6 +55,10 @@ def write_files(found, folder):
             file.write_text(block.text, encoding="utf-8")
 
 
+_PYTHON = 'python() { if [[ "$1" == *.py ]]; then PYTHONSAFEPATH= "$PY" "$@"; else "$PY" "$@"; fi; }'
+"""A script finds the files beside it; `python -m` does not find those of the folder it is called in."""
+
+
 def shortened(block):
     """The block with trainings, sweeps and evaluations of a few steps, and no bar for what they reach."""
     brief = (
@@ -77,7 +81,7 @@ def run_commands(found, folder, *, site=None, languages=("sh",), run=None):
     `rlcli` and `python` are this interpreter's; with `site`, pip installs there, without network, and rlcli is found
     there. (`-e` is left out: an editable installation has no target.)
     """
-    script = ["set -euo pipefail", 'rlcli() { "$PY" -m rlcli "$@"; }', 'python() { "$PY" "$@"; }']
+    script = ["set -euo pipefail", 'rlcli() { "$PY" -m rlcli "$@"; }', _PYTHON]
     script += [
         'pip() { local wanted=(); for word in "${@:2}"; do [ "$word" = -e ] || wanted+=("$word"); done; '
         '"$PY" -m pip install -q --disable-pip-version-check --no-deps --no-index --no-build-isolation'

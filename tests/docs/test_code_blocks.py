@@ -1,9 +1,12 @@
 """No block of code of any page is there unread: each is run by a test, or says why it is not."""
 
 import ast
+import json
+import os
 import re
 import shlex
 import subprocess
+import sys
 from functools import cache
 
 import pytest
@@ -37,7 +40,7 @@ RUN_BY = {
     "from-isaac-lab.md": f"{OF_PAGES}::test_the_examples_for_isaac_labs_users_train_as_written",
     "from-omniisaacgymenvs.md": "tests/oige/test_oige_page.py::"
     "test_the_example_validates_and_a_push_towards_the_middle_earns_more_than_none",
-    "gpu.md: On a cluster": f"{HERE}::test_the_script_for_a_cluster_can_be_read_and_its_commands_exist",
+    "gpu.md: On a cluster": f"{HERE}::test_the_script_for_a_cluster_trains_and_goes_on_when_it_is_begun_again",
     "on-a-robot.md": "tests/docs/test_robot_page.py::test_the_loop_of_the_page_balances_the_pole_in_time",
     "play.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
     "plots-and-reports.md": f"{OF_PAGES}::test_the_page_on_plots_and_reports_works_as_written",
@@ -55,8 +58,7 @@ RUN_BY = {
     "test_the_plugins_of_the_page_are_made_installed_and_learned_as_written",
     "write-a-task.md": f"{OF_PAGES}::test_the_task_of_a_page_checks_trains_and_learns",
     "write-a-task.md: Scenes": f"{OF_PAGES}::test_the_scenes_of_the_page_build_and_run",
-    "write-a-task.md: Events and randomisation": "tests/docs/test_code_blocks.py::"
-    "test_the_events_of_the_page_change_what_they_say",
+    "write-a-task.md: Events and randomisation": f"{HERE}::test_the_randomisations_of_the_page_give_each_environment_a_model",
     **dict.fromkeys(
         (f"write-a-task.md: {part}" for part in ("What the policy sees", "Commands", "Actuators", "Curriculum")),
         f"{OF_PAGES}::test_the_sections_on_what_is_seen_asked_driven_and_changed_work_together",
@@ -170,6 +172,18 @@ def test_the_mistake_of_the_readme_is_answered_as_it_says(capsys):
     assert capsys.readouterr().err.strip() == said
 
 
+def test_the_randomisations_of_the_page_give_each_environment_a_model(tmp_path):
+    """write-a-task.md"""
+    (block,) = blocks(DOCS / "write-a-task.md", "## Events and randomisation", "## What the policy sees")
+    text = block.text.replace("torso", "trunk").replace("foot_.*", ".*")
+    part = yaml.safe_load(text)
+    env = build(write(tmp_path / "task", edited(CRITTER_TASK, **part), critter_xml=CRITTER), 3)
+    env.reset()
+    env.step(torch.zeros(3, 4))
+    assert set(part["events"]) <= {term for mode in env.events.terms.values() for term in mode}
+    env.close()
+
+
 def options(command):
     """The names of the options of a command."""
     return {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
@@ -204,9 +218,41 @@ def test_the_command_table_of_this_file_is_the_command_line():
     assert set(table()) == {*COMMANDS, *GROUPS}
 
 
-def test_the_script_for_a_cluster_can_be_read_and_its_commands_exist(tmp_path):
-    (script,) = [b for b in all_blocks(DOCS / "gpu.md") if b.file and b.file.endswith(".sbatch")]
+STUBS = {
+    "scontrol": 'if [ "$1" = show ]; then echo here; else echo "$2" >> requeued; fi',
+    "srun": '"$@"',
+    "torchrun": 'while [ "$1" != rlcli ]; do echo "$1" >> launched; shift; done; shift; words=("${@/cuda/cpu}"); '
+    'exec "$PY" -m rlcli "${words[@]}" --max-iterations "$UNTIL"',
+}
+"""What a cluster brings, on one machine without one: torchrun starts a single process on the CPU."""
+
+
+@pytest.mark.slow
+def test_the_script_for_a_cluster_trains_and_goes_on_when_it_is_begun_again(tmp_path):
+    (script,) = [b for b in all_blocks(DOCS / "gpu.md") if b.file == "train.sbatch"]
+    (tmp_path / "train.sbatch").write_text(script.text)
+    for name, text in STUBS.items():
+        (tmp_path / name).write_text(f"#!/bin/bash\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    job = {"SLURM_JOB_ID": "7", "SLURM_NNODES": "2", "SLURM_GPUS_ON_NODE": "8", "SLURM_JOB_NODELIST": "here"}
+    environment = {**os.environ, **job, "SCRATCH": str(tmp_path), "PY": sys.executable,
+                   "PATH": f"{tmp_path}:{os.environ['PATH']}"}  # fmt: skip
+    for until in ("2", "4"):
+        command = ["bash", "train.sbatch", "cartpole"]
+        subprocess.run(command, cwd=tmp_path, env={**environment, "UNTIL": until}, check=True, timeout=200)
+        (run,) = (tmp_path / "runs" / "cartpole").glob("*-job-7")
+        text = (run / "run.json").read_text()
+        assert json.loads(text)["iteration"] == int(until)
+        assert '"state": "finished"' in text  # the form that the script looks for
+    assert not (tmp_path / "requeued").exists()
+    launched = (tmp_path / "launched").read_text().split()
+    assert launched[launched.index("--rdzv-endpoint") + 1] == "here:29500"
+
+
+def test_the_script_for_a_cluster_can_be_read_and_its_commands_exist():
+    """gpu.md"""
+    (script,) = [b for b in all_blocks(DOCS / "gpu.md") if b.file == "train.sbatch"]
     done = subprocess.run(["bash", "-n"], input=script.text, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "torchrun" in script.text
-    assert "--resume" in script.text
+    options = set(re.findall(r"(?<=[ (])--[a-z-]+", script.text.partition("-m rlcli train")[2])) | {"--resume", "--name"}
+    assert options <= table()["train"]

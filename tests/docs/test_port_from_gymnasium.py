@@ -9,7 +9,7 @@ PAGE = REPOSITORY / "docs" / "coming-from-gymnasium-and-sb3.md"
 
 
 def script(file):
-    return Block("sh", None, f"PYTHONSAFEPATH= python {file}\n")
+    return Block("sh", None, f"python {file}\n")
 
 
 @pytest.fixture

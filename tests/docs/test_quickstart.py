@@ -7,11 +7,16 @@ import subprocess
 import sys
 
 import pytest
-from consoles import commands, difference
+from consoles import Command, commands, difference
 from empty_environment import make, requirements_of_rlcli
 from fenced import REPOSITORY
 
 LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", "tests", "docs", ".*_cache", ".hypothesis")
+
+CLOSING = (
+    Command('python -c "import rlcli, rlcli_tasks; print(rlcli.__file__, rlcli_tasks.__file__)"', ""),
+    Command("python -m pip check", ""),
+)
 
 
 @pytest.fixture
@@ -63,17 +68,12 @@ def test_every_command_of_the_quickstart_prints_what_the_page_shows(built, clone
         found += commands(text)
         allowed += [int(stated[1]) / 100 if stated else 0.0] * (len(found) - len(allowed))
     assert len(found) > 12
-    results = typed(found, clone)
-    assert len(results) == len(found)
+    *results, (places, _), (check, broken) = typed([*found, *CLOSING], clone)
     for command, (printed, code), within in zip(found, results, allowed, strict=True):
         wrong = difference(command.printed, printed, within)
         assert wrong is None, f"$ {command.text}\n{wrong}"
         assert (code != 0) == command.printed.startswith("error:"), f"$ {command.text}: exit code {code}"
-    place = "import rlcli, rlcli_tasks; print(rlcli.__file__, rlcli_tasks.__file__)"
-    python = clone / ".venv" / "bin" / "python"
-    imported = subprocess.run([python, "-c", place], cwd=clone.parent / "robots", capture_output=True, text=True).stdout
-    assert imported.count(str(clone / ".venv")) == 2
-    check = subprocess.run([python, "-m", "pip", "check"], capture_output=True, text=True)
-    assert check.returncode == 0, check.stdout
+    assert places.count(str(clone / ".venv")) == 2, places
+    assert not broken, check
     for video in ("shipped.mp4", "cartpole.mp4"):
         assert (clone.parent / "robots" / video).stat().st_size > 10_000
