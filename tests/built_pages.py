@@ -34,6 +34,7 @@ class Page(HTMLParser):
     file: Path
     ids: set = field(default_factory=set)
     targets: list = field(default_factory=list)
+    loaded: set = field(default_factory=set)
     blocks: list = field(default_factory=list)
     """(language, text, comment before it or None)"""
 
@@ -48,6 +49,8 @@ class Page(HTMLParser):
         if "id" in found:
             self.ids.add(found["id"])
         self.targets += [found[name] for name in ("href", "src") if found.get(name)]
+        if tag in ("script", "img", "link", "iframe", "video"):  # what the browser fetches by itself
+            self.loaded |= {found[name] for name in ("href", "src") if found.get(name)}
         language = re.match(r"highlight-(\S+) notranslate", found.get("class") or "")
         if language:
             self._language = language[1]
