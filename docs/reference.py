@@ -96,9 +96,9 @@ def _configuration() -> Iterator[str]:
 
     schema = TaskConfig.model_json_schema()
     yield "# Configuration\n"
-    yield "Every key of a `task.yaml`, with its type, default, unit and range; for an editor: `rlcli show TASK --schema`."
-    yield "A number may be written as a fraction, `1/120`. Mappings of terms (`rewards:`, `events:`, ...) have names that"
-    yield "you choose, and what `func` names has [further keys](terms.md).\n"
+    yield "Every key of a `task.yaml`, with its type, default, unit and range; for editors: `show TASK --schema`."
+    yield "A number may be a fraction, `1/120`. Mappings of terms (`rewards:`, `events:`, ...) have names that you"
+    yield "choose, and what `func` names has [further keys](terms.md).\n"
     yield from _models("Task", schema)
     yield "## Agents\n"
     yield "What stands in `agents.NAME`, by `trainer` and `algorithm`; `agent.KEY=VALUE` on the command line.\n"

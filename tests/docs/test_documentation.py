@@ -109,7 +109,9 @@ def test_the_built_reference_has_every_key_with_its_description_and_range(html, 
                 assert key in lines(found[heading]), f"{heading}: {key}"
                 assert field.get("description") or "const" in field, f"{heading}: {key} says nothing"
                 for bound in re.findall(r"'(?:exclusiveM|m)(?:inimum|aximum)': ([^,}]+)", str(field)):
-                    assert re.search(rf"[<>]=? {re.escape(bound)}(?![\d.])", found[heading]), f"{heading}: {key}: {bound}"
+                    assert re.search(rf"[<>]=? {re.escape(bound)}(?![\d.])", found[heading]), (
+                        f"{heading}: {key}: {bound}"
+                    )
 
 
 @pytest.mark.slow
@@ -127,7 +129,9 @@ def test_the_built_reference_has_every_term_with_its_formula_and_keys(html):
             words = re.findall(r"[a-z]{3,}", term.summary)
             assert all(word in said for word in words), f"{section}: {name}: {term.summary}"
             for parameter in term.parameters:
-                assert f'<span class="pre">{parameter.name}</span>' in heading[0], f"{section}: {name}: {parameter.name}"
+                assert f'<span class="pre">{parameter.name}</span>' in heading[0], (
+                    f"{section}: {name}: {parameter.name}"
+                )
 
 
 @pytest.mark.slow
