@@ -186,7 +186,7 @@ def test_the_mistake_of_the_readme_is_answered_as_it_says(capsys):
 def test_randomised_models_of_the_page_differ(tmp_path):
     """write-a-task.md"""
     (block,) = blocks(DOCS / "write-a-task.md", "## Events and randomisation", "## What the policy sees")
-    part = yaml.safe_load(block.text.replace("foot_.*", "torso"))
+    part = yaml.safe_load(block.text.replace("foot_.*", "geom_.*"))
     env = build_env(write(tmp_path / "task", edited(CRITTER_TASK, **part), critter_xml=CRITTER), 3)
     env.reset()
     env.step(torch.zeros(3, 4))
