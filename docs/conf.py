@@ -33,6 +33,14 @@ suppress_warnings = [
 ]
 
 
+_FILE = re.compile(r"^( *)```([a-z]+) file=(\S+)$", re.MULTILINE)
+
+
+def with_file_names(app, docname, source):
+    """Of a block that is to be written to a file, the page shows the file's name."""
+    source[0] = _FILE.sub(r"\1```{code-block} \2\n\1:caption: \3\n", source[0])
+
+
 _CODE = re.compile(r"(`+)(.+?)\1", re.DOTALL)
 
 
@@ -56,4 +64,5 @@ def in_rst(app, what, name, obj, options, lines):
 def setup(app):
     """The reference is written from the code before it is read."""
     app.connect("builder-inited", lambda app: reference.write(Path(app.srcdir) / "reference"))
+    app.connect("source-read", with_file_names)
     app.connect("autodoc-process-docstring", in_rst, priority=400)  # before napoleon reads it

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,8 @@ MODULES = (
     "rlcli.testing",
 )
 """Modules whose public names are the Python interface."""
+TRAINERS = ("ppo", "sb3")
+"""The trainers that come with rlcli, whose agents' settings are part of the configuration."""
 TERMS = (
     "observations",
     "actions",
@@ -120,51 +123,73 @@ def _index() -> Iterator[str]:
 
 def _configuration() -> Iterator[str]:
     from rlcli.config.schema import TaskConfig
+    from rlcli.trainers import TrainerSpec
 
     schema = TaskConfig.model_json_schema()
     yield "# Configuration\n"
-    yield "Every key of a `task.yaml`, with its type, default and range; for an editor: `rlcli show TASK --schema`.\n"
-    yield from _model("Task", schema, schema)
+    yield "Every key of a `task.yaml`, with its type, default, unit and range; for editors: `show TASK --schema`."
+    yield "A number may be a fraction, `1/120`. Mappings of terms (`rewards:`, `events:`, ...) have names that you"
+    yield "choose, and what `func` names has [further keys](terms.md).\n"
+    yield from _models("Task", schema)
+    yield "## Agents\n"
+    yield "What stands in `agents.NAME`, by `trainer` and `algorithm`; `agent.KEY=VALUE` on the command line.\n"
+    for trainer in TRAINERS:
+        spec: TrainerSpec = importlib.import_module(f"rlcli.rl.{trainer}_config").SPEC
+        for algorithm, place in spec.algorithms.items():
+            module, _, name = place.partition(":")
+            settings = getattr(importlib.import_module(module), name).model_json_schema()
+            yield from _models(f"{trainer}, {algorithm}", settings, within=f"{trainer}, {algorithm}: ", level="###")
+
+
+def _models(title: str, schema: dict[str, Any], within: str = "", level: str = "##") -> Iterator[str]:
+    """A model, and those that it has inside."""
+    yield from _model(f"{level} {title}", schema)
     for name, model in sorted(schema.get("$defs", {}).items()):
         if "properties" in model:
-            yield from _model(name, model, schema)
+            yield from _model(f"{level} {within}{name}", model)
 
 
-def _model(name: str, model: dict[str, Any], schema: dict[str, Any]) -> Iterator[str]:
-    yield f"## {name}\n"
+def _model(heading: str, model: dict[str, Any]) -> Iterator[str]:
+    yield f"{heading}\n"
     if model.get("description"):
         yield _one_line(model["description"]) + "\n"
     if not model.get("properties"):
         return
     yield "| key | type | default | |\n| --- | --- | --- | --- |"
     for key, field in model["properties"].items():
-        default = "required" if key in model.get("required", ()) else f"`{_cell(repr(field.get('default')))}`"
-        bounds = [f"{sign} {field[word]}" for word, sign in _BOUNDS if word in field]
-        said = " ".join([_one_line(field.get("description", "")), f"({', '.join(bounds)})" if bounds else ""]).strip()
-        yield f"| `{key}` | {_cell(_type(field))} | {default} | {_cell(said)} |"
+        default = "required" if key in model.get("required", ()) else f"`{_cell(_default(field.get('default')))}`"
+        yield f"| `{key}` | {_cell(_type(field))} | {default} | {_cell(_one_line(field.get('description', '')))} |"
     yield ""
 
 
 _BOUNDS = (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("exclusiveMaximum", "<"))
 
 
+def _default(value: Any) -> str:
+    """As a YAML has it."""
+    return value if isinstance(value, str) and value else json.dumps(value)
+
+
 def _type(field: dict[str, Any]) -> str:
+    """The type with its range: `number > 0`, `[number >= 0, number] or null`."""
     if "$ref" in field:
         return field["$ref"].rsplit("/", 1)[-1]
     for several in ("anyOf", "oneOf", "allOf"):
         if several in field:
-            return " or ".join(dict.fromkeys(_type(each) for each in field[several]))
-    if "enum" in field:
-        return ", ".join(map(str, field["enum"]))
+            written = [each for each in field[several] if not ("pattern" in each and len(field[several]) > 1)]
+            return " or ".join(dict.fromkeys(_type(each) for each in written))
+    if "enum" in field or "const" in field:
+        return ", ".join(map(str, field.get("enum", [field.get("const")])))
     if field.get("type") == "array":
-        items = field.get("items") or field.get("prefixItems")
+        items = field.get("prefixItems") or field.get("items")
         if isinstance(items, list):
             return "[" + ", ".join(_type(item) for item in items) + "]"
         return f"list of {_type(items)}" if isinstance(items, dict) else "list"
     if field.get("type") == "object":
         inner = field.get("additionalProperties")
         return f"mapping to {_type(inner)}" if isinstance(inner, dict) and inner else "mapping"
-    return str(field.get("type", "any"))
+    bounds = [f"{sign} {field[word]}" for word, sign in _BOUNDS if word in field]
+    return " ".join([str(field.get("type", "any")), " and ".join(bounds)]).strip()
 
 
 def _terms() -> Iterator[str]:
@@ -207,8 +232,22 @@ def _command_line() -> Iterator[str]:
 
     command = typer.main.get_command(build())
     yield "# Command line\n"
-    yield "Data goes to stdout, messages to stderr; `--json` prints one document. [Exit codes](../exit-codes.md).\n"
+    yield "Data goes to stdout, messages to stderr; `--json` prints one document. `KEY=VALUE` are overrides of the"
+    yield "[configuration](configuration.md). `--debug`, on every command, adds the traceback to an error.\n"
+    yield "## Exit codes\n"
+    yield "| code | kind | |\n| --- | --- | --- |\n| 0 | | It worked. |\n| 1 | bug | A mistake of rlcli's. |"
+    for error in sorted(_errors(), key=lambda error: error.exit_code):
+        yield f"| {error.exit_code} | {error.kind} | {_cell(_one_line(error.__doc__ or ''))} |"
+    yield "| 75, 130 | stopped | It was asked to stop, by a signal or by Ctrl-C; a training can be resumed. |\n"
+    yield "What one sees of each, and what to do: [when something goes wrong](../exit-codes.md).\n"
     yield from _commands(command, "rlcli")
+
+
+def _errors() -> list[Any]:
+    from rlcli import errors
+
+    kinds = [e for e in vars(errors).values() if inspect.isclass(e) and issubclass(e, errors.RlcliError)]
+    return [e for e in kinds if e.kind not in ("error", "stopped") and "kind" in vars(e)]
 
 
 def _commands(command: Any, path: str) -> Iterator[str]:
@@ -218,14 +257,36 @@ def _commands(command: Any, path: str) -> Iterator[str]:
         if hasattr(inner, "commands"):
             yield from _commands(inner, f"{path} {name}")
             continue
-        yield "| | |\n| --- | --- |"
+        yield "| | default | |\n| --- | --- | --- |"
         for parameter in inner.params:
             if getattr(parameter, "hidden", False) or parameter.name == "help":
                 continue
-            names = ", ".join(f"`{option}`" for option in parameter.opts) if parameter.opts[0].startswith("-") else None
-            shown = names or f"`{(parameter.metavar or parameter.name).upper()}`"
-            yield f"| {shown} | {_cell(_one_line(getattr(parameter, 'help', None) or ''))} |"
+            yield f"| {_cell(_names(parameter))} | {_cell(_given(parameter))} | {_cell(_help(parameter))} |"
         yield ""
+
+
+def _names(parameter: Any) -> str:
+    """The spellings of an option, and what it takes; of an argument, its name."""
+    if not parameter.opts[0].startswith("-"):
+        return f"`{(parameter.metavar or parameter.name).upper()}`"
+    kind = getattr(parameter, "metavar", None) or _METAVARS.get(parameter.type_descriptor.annotation, "TEXT")
+    takes = "" if parameter.is_flag else f" {kind}"
+    return ", ".join(f"`{option}{takes}`" for option in (*parameter.opts, *parameter.secondary_opts))
+
+
+_METAVARS: dict[Any, str] = {int: "N", float: "X", Path: "PATH"}
+
+
+def _given(parameter: Any) -> str:
+    """The default, where there is one that says something."""
+    value = parameter.default
+    if parameter.required:
+        return "required"
+    return f"`{value}`" if isinstance(value, (str, int, float)) and not isinstance(value, bool) and value != "" else ""
+
+
+def _help(parameter: Any) -> str:
+    return _one_line(getattr(parameter, "help", None) or "")
 
 
 def _python() -> Iterator[str]:

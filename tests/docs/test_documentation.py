@@ -4,13 +4,19 @@ import importlib
 import importlib.util
 import inspect
 import re
-import subprocess
-import sys
-from pathlib import Path
+from html import unescape
+from urllib.parse import unquote
 
 import pytest
+import typer
+from fenced import REPOSITORY as ROOT
+from fenced import all_blocks
 
-ROOT = Path(__file__).parents[2]
+import rlcli.errors
+from rlcli.cli.app import build
+from rlcli.config.schema import TaskConfig
+from rlcli.config.terms import SECTIONS, builtin_terms
+
 DOCS = ROOT / "docs"
 PAGES = sorted(page for page in DOCS.rglob("*.md") if not {"_build", "reference"} & set(page.relative_to(DOCS).parts))
 _LINK = re.compile(r"(?<!!)\[[^\]]*\]\(([^)\s]+)\)|!\[[^\]]*\]\(([^)\s]+)\)")
@@ -72,35 +78,112 @@ def test_every_public_name_says_what_it_is(reference):
             assert (value.__doc__ or "").strip(), line
 
 
-def test_the_reference_has_every_key_term_and_command(reference, tmp_path):
-    from rlcli.cli.app import COMMANDS
-    from rlcli.config.schema import TaskConfig
+def sections(html, page):
+    """The text below each heading of a built page, by heading."""
+    text = (html / f"{page}.html").read_text(encoding="utf-8")
+    parts = re.split(r"<h[2-4]>(.*?)<a class=\"headerlink\".*?</h[2-4]>", text, flags=re.DOTALL)
+    plain = [unescape(re.sub(r"<[^>]+>", "", part)) for part in parts]
+    return dict(zip(plain[1::2], plain[2::2], strict=True))
 
-    reference.write(tmp_path)
-    configuration = (tmp_path / "configuration.md").read_text()
-    for key in TaskConfig.model_fields:
-        assert f"| `{key}` |" in configuration
-    commands = (tmp_path / "command-line.md").read_text()
-    for command in COMMANDS:
-        assert f"## rlcli {command}\n" in commands
-    assert "`--checkpoint`" in commands
-    terms = (tmp_path / "terms.md").read_text()
-    for term in ("joint_pos_rel", "joint_position", "track_lin_vel_xy_exp", "time_out", "uniform_velocity"):
-        assert f"### {term}\n" in terms
-    python = (tmp_path / "python.md").read_text()
-    for line in reference.PUBLIC.read_text().split():
-        assert f":: {line}\n" in python
+
+def lines(text):
+    return {line.strip() for line in text.splitlines()}
+
+
+def settings_of_trainers(reference):
+    for trainer in reference.TRAINERS:
+        for algorithm, place in importlib.import_module(f"rlcli.rl.{trainer}_config").SPEC.algorithms.items():
+            module, _, name = place.partition(":")
+            schema = getattr(importlib.import_module(module), name).model_json_schema()
+            yield f"{trainer}, {algorithm}", schema
 
 
 @pytest.mark.slow
-def test_the_pages_build_without_a_warning_and_without_a_network(tmp_path):
-    blocked = "import socket\ndef no(*a, **k): raise OSError('no network')\nsocket.socket.connect = no\n"
-    code = f"{blocked}import sys\nfrom sphinx.cmd.build import main\nsys.exit(main(sys.argv[1:]))"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "-q", "-W", "--keep-going", "-b", "html", DOCS, tmp_path / "html"],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-    )
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "html" / "index.html").is_file()
+def test_the_built_reference_has_every_key_with_its_description_and_range(html, reference):
+    found = sections(html, "reference/configuration")
+    for title, schema in [("Task", TaskConfig.model_json_schema()), *settings_of_trainers(reference)]:
+        within = "" if title == "Task" else f"{title}: "
+        models = {title: schema} | {f"{within}{name}": model for name, model in schema.get("$defs", {}).items()}
+        for heading, model in models.items():
+            for key, field in model.get("properties", {}).items():
+                assert key in lines(found[heading]), f"{heading}: {key}"
+                assert field.get("description") or "const" in field, f"{heading}: {key} says nothing"
+                for bound in re.findall(r"'(?:exclusiveM|m)(?:inimum|aximum)': ([^,}]+)", str(field)):
+                    assert re.search(rf"[<>]=? {re.escape(bound)}(?![\d.])", found[heading]), (
+                        f"{heading}: {key}: {bound}"
+                    )
+
+
+@pytest.mark.slow
+def test_the_built_reference_has_every_term_with_its_formula_and_keys(html):
+    text = (html / "reference" / "terms.html").read_text(encoding="utf-8")
+    parts = re.split(r"<h2>(.*?)<a", text)
+    by_section = dict(zip(map(str.lower, parts[1::2]), parts[2::2], strict=True))
+    for section in SECTIONS:
+        for name, term in builtin_terms(section).items():
+            page = by_section["randomization" if term.file.stem == "randomization" else section]
+            heading = re.search(rf"<h3>{name}<a.*?(?=<h3>|\Z)", page, re.DOTALL)
+            assert heading, f"{section}: {name}"
+            said = " ".join(unescape(re.sub(r"<[^>]+>", "", heading[0])).split())
+            assert len(term.summary) > 10, f"{section}: {name} does not say what it computes"
+            words = re.findall(r"[a-z]{3,}", term.summary)
+            assert all(word in said for word in words), f"{section}: {name}: {term.summary}"
+            for parameter in term.parameters:
+                assert f'<span class="pre">{parameter.name}</span>' in heading[0], (
+                    f"{section}: {name}: {parameter.name}"
+                )
+
+
+@pytest.mark.slow
+def test_the_built_reference_has_every_command_option_and_exit_code(html):
+    found = sections(html, "reference/command-line")
+
+    def walk(command, path):
+        for name, inner in command.commands.items():
+            assert f"{path} {name}" in found
+            if hasattr(inner, "commands"):
+                walk(inner, f"{path} {name}")
+                continue
+            for parameter in inner.params:
+                if not getattr(parameter, "hidden", False) and parameter.name != "help":
+                    for option in (*parameter.opts, *parameter.secondary_opts):
+                        shown = option if option.startswith("-") else (parameter.metavar or option).upper()
+                        assert shown in found[f"{path} {name}"], f"{path} {name}: {shown}"
+                        assert (getattr(parameter, "help", None) or "").strip(), f"{path} {name}: {shown} says nothing"
+
+    walk(typer.main.get_command(build()), "rlcli")
+    codes = {error.exit_code for error in vars(rlcli.errors).values() if hasattr(error, "exit_code")}
+    assert all(re.search(rf"^\s*{code}\b", found["Exit codes"], re.MULTILINE) for code in (0, *codes, 75))
+
+
+@pytest.mark.slow
+def test_the_built_reference_has_every_public_name(html, reference):
+    text = (html / "reference" / "python.html").read_text(encoding="utf-8")
+    plain = re.sub(r"<[^>]+>", "", text)
+    for line in reference.PUBLIC.read_text().split():
+        assert re.search(rf"\b{line.rpartition('.')[2]}\b", plain), line
+
+
+@pytest.mark.slow
+def test_every_link_and_picture_of_the_built_pages_leads_somewhere(html, built):
+    """Building itself is without a warning and without a network (`built_pages.build`)."""
+    assert len(built) > 40
+    for name, page in built.items():
+        for target in page.targets:
+            if re.match(r"[a-z]+:", target):
+                assert not re.match(r"https?:", target) or target not in page.loaded, f"{name} loads {target}"
+                continue
+            path, _, anchor = unquote(target).partition("#")
+            file = (page.file.parent / path.partition("?")[0]).resolve() if path else page.file
+            file = file / "index.html" if file.is_dir() else file
+            assert file.is_file(), f"{name}: {target}"
+            other = built.get(file.relative_to(html.resolve()).with_suffix("").as_posix()) if anchor else None
+            assert other is None or anchor in other.ids, f"{name}: {target}"
+
+
+@pytest.mark.slow
+def test_the_built_pages_show_every_block_of_the_sources(built):
+    for page in DOCS.glob("*.md"):
+        shown = built[page.relative_to(DOCS).with_suffix("").as_posix()].blocks
+        written = [block for block in all_blocks(page) if not block.language.startswith("{")]
+        assert [text.strip() for _, text, _ in shown] == [block.text.strip() for block in written], page.name

@@ -22,18 +22,6 @@ EVALUATION = DOCS / "evaluation.md"
 
 
 @pytest.mark.slow
-def test_quickstart_works_as_written(tmp_path):
-    output = run_commands(blocks(DOCS / "quickstart.md"), tmp_path)
-    assert success_rate(output) >= 0.99
-    assert (tmp_path / "cartpole.mp4").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_the_recording_page_works_as_written(tmp_path):
-    assert "20 episodes" in run_commands(blocks(DOCS / "recording.md"), tmp_path)
-
-
-@pytest.mark.slow
 def test_the_page_on_evaluation_works_as_written(tmp_path):
     train = Block("sh", None, "rlcli train cartpole --max-iterations 2 --logger none\n")
     found = [replace(b, text=re.sub("(episodes) [0-9]+ --fail-under .*", r"\1 4", b.text)) for b in blocks(EVALUATION)]
@@ -159,19 +147,6 @@ def test_the_readmes_task_of_your_own_works_as_written(tmp_path):
     found = blocks(README, "## A task of your own", "## Licence")
     write_files(found, tmp_path)
     assert "./my_task: 0 errors, 0 warnings" in run_commands(found, tmp_path)
-
-
-@pytest.mark.slow
-def test_each_example_of_the_exit_codes_ends_with_its_code(tmp_path):
-    (block,) = [b for b in blocks(DOCS / "exit-codes.md") if b.language == "sh"]
-    examples = re.findall(r"^rlcli (.*?)\s+# (\d+)$", block.text, re.MULTILINE)
-    assert len(examples) == len(block.text.splitlines())
-    for arguments, code in examples:
-        done = subprocess.run(
-            [sys.executable, "-m", "rlcli", *arguments.split()], cwd=tmp_path, capture_output=True, text=True
-        )
-        assert done.returncode == int(code), f"{arguments}: {done.returncode}\n{done.stderr}"
-        assert "Traceback" not in done.stderr
 
 
 def test_the_page_of_exit_codes_has_every_code_and_kind_that_errors_have():

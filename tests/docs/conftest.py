@@ -1,0 +1,15 @@
+import pytest
+from built_pages import Page, build
+
+
+@pytest.fixture(scope="session")
+def html(tmp_path_factory):
+    """The folder of the built pages."""
+    return build(tmp_path_factory.mktemp("pages"))
+
+
+@pytest.fixture(scope="session")
+def built(html):
+    """Every built page, by its path: `quickstart`, `zoo/cartpole`, `reference/terms`."""
+    files = [file for file in html.rglob("*.html") if file.name not in ("genindex.html", "search.html")]
+    return {file.relative_to(html).with_suffix("").as_posix(): Page(file) for file in files}

@@ -1,0 +1,30 @@
+"""docs/exit-codes.md: each message is what one sees, with the code of its heading."""
+
+import shlex
+
+import pytest
+from consoles import commands, difference
+from fenced import REPOSITORY, blocks
+
+from rlcli.cli.app import main
+
+CASES = [
+    pytest.param(int(block.section.partition(":")[0]), command, id=command.text)
+    for block in blocks(REPOSITORY / "docs" / "exit-codes.md")
+    for command in commands(block.text)
+]
+
+
+def test_every_code_that_a_command_alone_can_end_with_is_shown():
+    assert {code for (code, _) in (case.values for case in CASES)} == set(range(2, 11))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("code", "command"), CASES)
+def test_what_one_sees_is_what_the_page_says(code, command, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    assert main(shlex.split(command.text.removeprefix("rlcli "))) == code
+    printed = capfd.readouterr()
+    if code not in (6, 9):  # those simulate before they end
+        assert printed.out == ""
+    assert difference(command.printed, printed.out + printed.err) is None
