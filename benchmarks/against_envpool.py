@@ -66,8 +66,10 @@ def one(task: str, num_envs: int, ours: Side, theirs: Side, repeats: int, second
     }
 
 
-def mujocos_part(model: str, physics_steps: int, new: Side, old: Side, repeats: int, seconds: float) -> dict[str, float]:
-    """How many times as fast this release's MuJoCo simulates a model as EnvPool's, on one thread without anything else."""
+def mujocos_part(
+    model: str, physics_steps: int, new: Side, old: Side, repeats: int, seconds: float
+) -> dict[str, float]:
+    """How many times as fast this release's MuJoCo simulates a model as EnvPool's, on one thread."""
     for each in (new, old):
         each("open_model", path=model, physics_steps=physics_steps)
     blocks = {"new": lambda n: new("step", steps=n), "old": lambda n: old("step", steps=n)}

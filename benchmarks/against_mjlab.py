@@ -72,7 +72,9 @@ def waits(repeats: int, cold: bool) -> dict[str, Any]:
             rounds = []
             for _ in range(repeats):
                 with tempfile.TemporaryDirectory() as empty:
-                    rounds.append((first(0, "first step", folder), first(1, "first step", folder, WARP_CACHE_PATH=empty)))
+                    rounds.append(
+                        (first(0, "first step", folder), first(1, "first step", folder, WARP_CACHE_PATH=empty))
+                    )
             found["first step, nothing compiled yet"] = columns(rounds)
     lists = [[str(here.with_name("rlcli")), "list-tasks"], [str(there.with_name("list-envs"))]]
     for command in lists:
@@ -106,10 +108,14 @@ def markdown(result: dict[str, Any]) -> str:
              f"**{result['ratio']:.1f}** times as many ({spread(result)})"]]  # fmt: skip
     for what, row in result["waits"].items():
         name = what if what.startswith("list") else f"from start to {what}"
-        times = f"**1/{row['ratio']:.1f}** of its time" if row["ratio"] > 1 else f"**{1 / row['ratio']:.1f}** times as long"
+        times = (
+            f"**1/{row['ratio']:.1f}** of its time" if row["ratio"] > 1 else f"**{1 / row['ratio']:.1f}** times as long"
+        )
         rows.append([name, f"{row['ours']:.2f} s", f"{row['theirs']:.2f} s", f"{times} (1/{row['ratio_min']:.1f} ..)"])
     share = memory["ours"] / memory["theirs"]
-    rows.append(["memory at its most, stepping", f"{memory['ours']:.0f} MB", f"{memory['theirs']:.0f} MB", f"{share:.2f}"])
+    rows.append(
+        ["memory at its most, stepping", f"{memory['ours']:.0f} MB", f"{memory['theirs']:.0f} MB", f"{share:.2f}"]
+    )
     return f"{stands(result, peer)}\n\n{table(['', 'rlcli', 'mjlab on the CPU', ''], rows)}"
 
 

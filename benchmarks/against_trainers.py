@@ -1,8 +1,8 @@
 """Training against other libraries' PPO: `python benchmarks/against_trainers.py`.
 
 Stable-Baselines3 with the same cartpole written as a plain Gymnasium environment, in a `DummyVecEnv` and in a
-`SubprocVecEnv`, each with the number of environments that suits it best; RSL-RL and skrl on rlcli's own environment. The
-sizes are the same everywhere: 16 steps, 5 epochs, 4 minibatches, two networks of 32-32 ELU; what a side trains in an
+`SubprocVecEnv`, each with the number of environments that suits it best; RSL-RL and skrl on rlcli's own environment.
+The sizes are the same everywhere: 16 steps, 5 epochs, 4 minibatches, two networks of 32-32 ELU; what a side trains in an
 iteration grows with its number of environments, and steps a second are what is compared.
 """
 
@@ -87,7 +87,14 @@ def measure(quick: bool) -> dict[str, Any]:
         }
         for name, values in samples.items()
     ]
-    return {"machine": machine, "versions": versions, "rows": rows, "scans": scans, "failed": failed, "memory_mb": memory}
+    return {
+        "machine": machine,
+        "versions": versions,
+        "rows": rows,
+        "scans": scans,
+        "failed": failed,
+        "memory_mb": memory,
+    }
 
 
 def markdown(result: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Other libraries, each installed into an environment of its own under `.bench`: `python benchmarks/peers.py` does it."""
+"""Other libraries, each in an environment of its own under `.bench`: `python benchmarks/peers.py` installs them."""
 
 from __future__ import annotations
 
@@ -56,13 +56,6 @@ def add(name: str, *requirements: str) -> None:
         Failed: if pip cannot.
     """
     _run([str(python(name)), "-m", "pip", "--disable-pip-version-check", "-q", "install", *requirements])
-
-
-def version(name: str, *packages: str) -> dict[str, str]:
-    """What is installed in an environment."""
-    code = "import sys, json; from importlib.metadata import version as v; print(json.dumps({n: v(n) for n in sys.argv[1:]}))"
-    done = subprocess.run([str(python(name)), "-c", code, *packages], capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)
 
 
 def _run(command: list[str]) -> None:

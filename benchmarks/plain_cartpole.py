@@ -1,4 +1,4 @@
-"""The cartpole of `tasks/rlcli_tasks/cartpole/task.yaml` as anybody would write it for Gymnasium: `mj_step` in Python."""
+"""The cartpole of `tasks/rlcli_tasks/cartpole/task.yaml` as one writes it for Gymnasium: `mj_step` in Python."""
 
 from __future__ import annotations
 

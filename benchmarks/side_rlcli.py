@@ -69,8 +69,8 @@ def differs(path: str) -> list[str]:
         values = {name: getattr(model, name) for name in dir(model) if name.startswith(fields)}
         return {name: value for name, value in values.items() if isinstance(value, int | float | np.ndarray)}
 
-    physical = ("body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "jnt_", "dof_", "geom_size", "geom_pos",
-                "geom_con", "geom_friction", "geom_sol", "geom_margin", "actuator_", "eq_", "tendon_")  # fmt: skip
+    physical = ("body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "jnt_", "dof_", "geom_size",
+                "geom_pos", "geom_con", "geom_friction", "geom_sol", "geom_margin", "actuator_", "eq_", "tendon_")  # fmt: skip
     model, other = ours["env"].engine.model, mujoco.MjModel.from_xml_path(path)
     pairs = [(numbers(model, physical), numbers(other, physical))]
     options = ("timestep", "gravity", "density", "viscosity", "integrator", "solver", "cone", "iterations", "tolerance",
@@ -117,7 +117,9 @@ def open_trainer(agent: str, num_envs: int) -> dict[str, Any]:
     env = make_env(resolved, seed=0)
     assert resolved.agent is not None
     assert resolved.trainer is not None
-    trainer = load_object(resolved.trainer.trainer)(env, resolved.agent, seed=0, device="cpu", torch_threads=min(4, available_cores()))
+    trainer = load_object(resolved.trainer.trainer)(
+        env, resolved.agent, seed=0, device="cpu", torch_threads=min(4, available_cores())
+    )
     trainer.start()
     ours.update(env=env, trainer=trainer)
     return {"samples": 16 * num_envs}
@@ -139,4 +141,9 @@ def close() -> None:
 
 
 if __name__ == "__main__":
-    serve({f.__name__: f for f in (machine, open_env, step, differs, open_bare, step_bare, open_trainer, train, memory_mb, close)})
+    serve(
+        {
+            f.__name__: f
+            for f in (machine, open_env, step, differs, open_bare, step_bare, open_trainer, train, memory_mb, close)
+        }
+    )

@@ -1,7 +1,7 @@
 """Programs that are timed in turn: each a child process that does a block of its work when it is asked to.
 
-A child is a Python script, of an environment of its own if need be, that hands its methods to `serve`; this module is all
-that it shares with the others, and needs the standard library alone. Requests and answers are lines of JSON.
+A child is a Python script, of an environment of its own if need be, that hands its methods to `serve`; this module is
+all that it shares with the others, and needs the standard library alone. Requests and answers are lines of JSON.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ Block = Callable[[int], float]
 
 
 clock = time.process_time if os.environ.get("RLCLI_BENCH_CLOCK") == "cpu" else time.perf_counter
-"""What blocks are timed by. `RLCLI_BENCH_CLOCK=cpu` counts the processor time of all threads of a side: for looking into
-ratios on a busy machine, with one thread."""
+"""What blocks are timed by. `RLCLI_BENCH_CLOCK=cpu` counts the processor time of all threads of a side: for looking
+into ratios on a busy machine, with one thread."""
 
 
 class Failed(Exception):
@@ -65,7 +65,8 @@ class Side:
             )
 
     def __call__(self, method: str, *, timeout: float | None = None, **arguments: Any) -> Any:
-        assert self._process.stdin is not None and self._process.stdout is not None
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
         try:
             self._process.stdin.write(json.dumps({"method": method, "arguments": arguments}) + "\n")
         except OSError:

@@ -1,7 +1,7 @@
-"""The tables of `docs/benchmarks.md`: what was measured is kept in `results.json`, and the page is written from that.
+"""The tables of `docs/benchmarks.md`: what was measured is kept in `results.json`, and the pages are written from that.
 
-A table is a module with `NAME`, `measure(quick)`, which gives a JSON object, and `markdown(result)`. Run as a program it
-measures, keeps the result and writes it into the page; `--quick` only tries it out and prints.
+A table is a module with `NAME`, `measure(quick)`, which gives a JSON object, and `markdown(result)`. Run as a program
+it measures, keeps the result and writes it into the pages; `--quick` only tries it out and prints.
 """
 
 from __future__ import annotations
