@@ -2,8 +2,8 @@
 
 Stable-Baselines3 with the same cartpole written as a plain Gymnasium environment, in a `DummyVecEnv` and in a
 `SubprocVecEnv`, each with the number of environments that suits it best; RSL-RL and skrl on rlcli's own environment.
-The sizes are the same everywhere: 16 steps, 5 epochs, 4 minibatches, two networks of 32-32 ELU; what a side trains in an
-iteration grows with its number of environments, and steps a second are what is compared.
+The sizes are the same everywhere: 16 steps, 5 epochs, 4 minibatches, two networks of 32-32 ELU; an iteration has more
+samples where there are more environments, and steps a second are what is compared.
 """
 
 from __future__ import annotations

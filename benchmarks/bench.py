@@ -60,11 +60,29 @@ def train(result: dict[str, Any]) -> str:
     return f"{stands(result)}\n\n{table(heads, rows)}"
 
 
+def readme(kept: dict[str, Any]) -> str:
+    """The figures in the README's sentences."""
+    steps = {(row["task"], row["num_envs"]): row["ratio"] for row in kept["env_step"]["rows"]}
+    said = [f"The environment step runs at {steps['cartpole', 4096]:.3f} of the bare physics at 4,096 cartpoles"]
+    if "ratio" in kept.get("mjlab", {}):
+        said.append(f"takes 1/{kept['mjlab']['ratio']:.1f} of mjlab's time on a CPU at 1,024")
+    means = kept.get("envpool", {}).get("means")
+    if means:
+        said.append(f"is {means['1024']:.2f} times as fast as EnvPool's over Gymnasium's eleven tasks")
+    times = {
+        row["name"]: row["times"]["ppo"]["ratio"] for row in kept.get("trainers", {}).get("rows", []) if row["times"]
+    }
+    if "dummy" in times:
+        said.append(f"training is {times['dummy']:.1f} times as fast as SB3's on a plain Gymnasium cartpole")
+    return f"{', '.join(said)}\n([figures](docs/benchmarks.md))."
+
+
 def texts(kept: dict[str, Any]) -> dict[str, str]:
     """Name of a part -> its text, of what has been measured."""
     makers: dict[str, Callable[[dict[str, Any]], str]] = {"env_step": env_step, "train": train}
     makers |= {name: importlib.import_module(module).markdown for name, module in MODULES.items() if name in kept}
-    return {name: makers[name](kept[name]) for name in TABLES if name in kept}
+    found = {name: makers[name](kept[name]) for name in TABLES if name in kept}
+    return {**found, **({"readme": readme(kept)} if "env_step" in kept else {})}
 
 
 def write_pages() -> None:

@@ -70,7 +70,8 @@ def differs(path: str) -> list[str]:
         return {name: value for name, value in values.items() if isinstance(value, int | float | np.ndarray)}
 
     physical = ("body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "jnt_", "dof_", "geom_size",
-                "geom_pos", "geom_con", "geom_friction", "geom_sol", "geom_margin", "actuator_", "eq_", "tendon_")  # fmt: skip
+                "geom_pos", "geom_con", "geom_friction", "geom_sol", "geom_margin", "actuator_", "eq_",
+                "tendon_")  # fmt: skip
     model, other = ours["env"].engine.model, mujoco.MjModel.from_xml_path(path)
     pairs = [(numbers(model, physical), numbers(other, physical))]
     options = ("timestep", "gravity", "density", "viscosity", "integrator", "solver", "cone", "iterations", "tolerance",

@@ -21,7 +21,9 @@ from machine import describe
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).with_name("results.json")
 PAGES = [ROOT / "docs" / "benchmarks.md", ROOT / "README.md"]
-_MARKED = re.compile(r"(<!-- bench: (?P<name>[\w-]+) -->\n)(?P<text>.*?)(<!-- end bench -->)", re.DOTALL)
+_MARKED = re.compile(
+    r"^(?P<indent> *)<!-- bench: (?P<name>[\w-]+) -->\n(?P<text>.*?)^ *<!-- end bench -->", re.DOTALL | re.MULTILINE
+)
 
 
 def results() -> dict[str, Any]:
@@ -37,12 +39,15 @@ def keep(name: str, result: dict[str, Any]) -> None:
 def filled(text: str, texts: dict[str, str]) -> str:
     """A page with its generated parts written anew; those not given stay.
 
-    A part stands between the comments `bench: NAME` and `end bench`.
+    A part stands between the comments `bench: NAME` and `end bench`, and is indented as they are.
     """
 
     def part(found: re.Match[str]) -> str:
-        own = texts.get(found["name"])
-        return found[0] if own is None else f"{found[1]}{own.strip()}\n{found[4]}"
+        name = found["name"]
+        if name not in texts:
+            return found[0]
+        lines = [f"<!-- bench: {name} -->", *texts[name].strip().splitlines(), "<!-- end bench -->"]
+        return "\n".join(f"{found['indent']}{line}".rstrip() for line in lines)
 
     return _MARKED.sub(part, text)
 
