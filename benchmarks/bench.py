@@ -35,35 +35,44 @@ MODULES = {
 TABLES = [*SCRIPTS, *MODULES]
 
 
-def env_step(result: dict[str, Any]) -> str:
-    """The environment step of bare physics."""
-    rows = [
-        [row["task"], f"{row['num_envs']:,}", f"**{row['ratio']:.3f}**",
-         f"{row['ratio_min']:.3f} .. {row['ratio_max']:.3f}", f"{row['env_steps_per_s']:,.0f}",
-         f"{row['bare_steps_per_s']:,.0f}"]
-        for row in result["rows"]
-    ]  # fmt: skip
-    heads = ["task", "environments", "of bare `Batch`", "min .. max", "environment steps/s", "bare steps/s"]
-    return f"{stands(result)}\n\n{table(heads, rows)}"
+HEADS = {
+    "num_envs": "environments",
+    "ratio": "of bare `Batch`",
+    "stock_sb3_ratio": "stock SB3 on the same task",
+    "env_steps_per_s": "environment steps/s",
+    "bare_steps_per_s": "bare steps/s",
+    "train_steps_per_s": "training steps/s",
+    "ms": "ms an iteration",
+}
+"""Keys of the programs' rows that have a longer name in the page."""
 
 
-def train(result: dict[str, Any]) -> str:
-    """Training of bare physics."""
-    rows = [
-        [f"{row['num_envs']:,}", f"**{row['ratio']:.3f}**", f"{row['ratio_min']:.3f} .. {row['ratio_max']:.3f}",
-         f"{row['stock_sb3_ratio']:.3f}", f"{row['train_steps_per_s']:,.0f}",
-         " ".join(f"{name} {value:.0f}" for name, value in row["ms"].items())]
-        for row in result["rows"]
-    ]  # fmt: skip
-    heads = ["environments", "of bare `Batch`", "min .. max", "stock SB3 on the same task", "training steps/s",
-             "ms an iteration"]  # fmt: skip
-    return f"{stands(result)}\n\n{table(heads, rows)}"
+def shown(key: str, row: dict[str, Any]) -> str:
+    """A value of a row, as the page has it."""
+    value = row.get(key)
+    if value is None:
+        return ""
+    if isinstance(value, dict):
+        return " ".join(f"{name} {part:.0f}" for name, part in value.items())
+    if not isinstance(value, int | float):
+        return str(value)
+    if f"{key}_min" in row:
+        return f"**{value:.3f}** ({row[f'{key}_min']:.3f} .. {row[f'{key}_max']:.3f})"
+    return f"{value:.3f}" if value < 10 else f"{value:,.0f}"
+
+
+def printed(result: dict[str, Any]) -> str:
+    """The table of a program: a column a key."""
+    keys = dict.fromkeys(key for row in result["rows"] for key in row if not key.endswith(("_min", "_max")))
+    rows = [[shown(key, row) for key in keys] for row in result["rows"]]
+    return f"{stands(result)}\n\n{table([HEADS.get(key, key) for key in keys], rows)}"
 
 
 def readme(kept: dict[str, Any]) -> str:
     """The figures in the README's sentences."""
-    steps = {(row["task"], row["num_envs"]): row["ratio"] for row in kept["env_step"]["rows"]}
-    said = [f"The environment step runs at {steps['cartpole', 4096]:.3f} of the bare physics at 4,096 cartpoles"]
+    rows = kept["env_step"]["rows"]
+    ratio = next(row["ratio"] for row in rows if (row["task"], row["num_envs"]) == ("cartpole", 4096))
+    said = [f"The environment step runs at {ratio:.3f} of the bare physics at 4,096 cartpoles"]
     if "ratio" in kept.get("mjlab", {}):
         said.append(f"takes 1/{kept['mjlab']['ratio']:.1f} of mjlab's time on a CPU at 1,024")
     means = kept.get("envpool", {}).get("means")
@@ -79,7 +88,7 @@ def readme(kept: dict[str, Any]) -> str:
 
 def texts(kept: dict[str, Any]) -> dict[str, str]:
     """Name of a part -> its text, of what has been measured."""
-    makers: dict[str, Callable[[dict[str, Any]], str]] = {"env_step": env_step, "train": train}
+    makers: dict[str, Callable[[dict[str, Any]], str]] = dict.fromkeys(SCRIPTS, printed)
     makers |= {name: importlib.import_module(module).markdown for name, module in MODULES.items() if name in kept}
     found = {name: makers[name](kept[name]) for name in TABLES if name in kept}
     return {**found, **({"readme": readme(kept)} if "env_step" in kept else {})}
