@@ -14,7 +14,7 @@ from typing import Any
 
 import peers
 from machine import cores
-from sides import CACHE, HERE, Failed, Side, alternate, opened, ratio, steps_for, wall
+from sides import CACHE, CHECKOUT, HERE, Failed, Side, alternate, opened, ratio, steps_for, wall
 from tables import main, rate, spread, stands, table
 
 NAME = "mjlab"
@@ -31,7 +31,7 @@ FIRST = {
 
 def steps_of_both(repeats: int, seconds: float) -> dict[str, Any]:
     """Environment steps in turn, and what both sides hold in memory then."""
-    ours = Side("mjlab-rlcli", [str(peers.python("rlcli")), str(HERE / "side_rlcli.py")])
+    ours = Side("mjlab-rlcli", [sys.executable, str(HERE / "side_rlcli.py")], environment=CHECKOUT)
     theirs = Side("mjlab-mjlab", [str(peers.python("mjlab")), str(HERE / "side_mjlab.py")], environment=quietly())
     with opened(ours, theirs):
         ours("open_env", task="cartpole", num_envs=NUM_ENVS, threads=cores())

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 import peers
-from sides import HERE, Block, Failed, Side, alternate, opened, ratio, steps_for
+from sides import CHECKOUT, HERE, Block, Failed, Side, alternate, opened, ratio, steps_for
 from tables import main, rate, spread, stands, table
 
 NAME = "trainers"
@@ -54,9 +54,17 @@ def measure(quick: bool) -> dict[str, Any]:
     """Steps a second of each, and how many times as many ours are."""
     repeats, seconds, warm = (2, 0.05, 1) if quick else (7, 1.0, 3)
     sizes = {name: 64 if quick else NUM_ENVS for name in (*OURS, "rsl_rl", "skrl")}
-    python, scans, failed = str(peers.python("rlcli")), {}, {}
-    ours = {name: Side(f"{NAME}-{name}", [python, str(HERE / "side_rlcli.py")]) for name in OURS}
-    theirs = {name: Side(f"{NAME}-{name}", [python, str(HERE / "side_trainers.py")]) for name in PEERS}
+    scans: dict[str, dict[str, float]] = {}
+    failed: dict[str, str] = {}
+    try:
+        script = [str(peers.python("rlcli")), str(HERE / "side_trainers.py")]
+        theirs = {name: Side(f"{NAME}-{name}", script) for name in PEERS}
+    except Failed as error:
+        theirs, failed = {}, dict.fromkeys(PEERS, str(error))
+    ours = {
+        name: Side(f"{NAME}-{name}", [sys.executable, str(HERE / "side_rlcli.py")], environment=CHECKOUT)
+        for name in OURS
+    }
     with opened(*ours.values(), *theirs.values()):
         blocks: dict[str, Block] = {}
         for name, side in ours.items():
@@ -75,7 +83,7 @@ def measure(quick: bool) -> dict[str, Any]:
                 failed[name] = str(error)
         steps = {name: steps_for(block, seconds) for name, block in blocks.items()}
         found = alternate(blocks, steps, repeats)
-        machine, versions = ours["ppo"]("machine"), theirs["dummy"]("version")
+        machine, versions = ours["ppo"]("machine"), theirs["dummy"]("version") if theirs else {}
         memory = {name: side("memory_mb")["most"] for name, side in ours.items()}
     samples = {name: [16 * sizes[name] / each for each in seconds] for name, seconds in found.items()}
     rows = [
@@ -110,9 +118,9 @@ def markdown(result: dict[str, Any]) -> str:
         f"{names[kind]} at {', '.join(f'{size}: {rate(value)}' for size, value in scan.items())}"
         for kind, scan in result["scans"].items()
     ]
-    peer = f"rsl_rl {versions['rsl-rl-lib']}, skrl {versions['skrl']}, gymnasium {versions['gymnasium']}"
+    peer = ", ".join(f"{name} {versions[name]}" for name in ("rsl-rl-lib", "skrl", "gymnasium") if name in versions)
     tried = f"\n\nTraining steps/s by number of environments: {'; '.join(scans)}." if scans else ""
-    return f"{stands(result, peer)}\n\n{table(heads, rows)}{tried}"
+    return f"{stands(result, *([peer] if peer else []))}\n\n{table(heads, rows)}{tried}"
 
 
 if __name__ == "__main__":

@@ -13,9 +13,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import peers
 from machine import cores
-from sides import HERE, Side, alternate, opened, steps_for
+from sides import CHECKOUT, HERE, Side, alternate, opened, steps_for
 from tables import main, stands, table
 
 NAME = "growth"
@@ -27,7 +26,7 @@ ENVIRONMENT_STEPS = 10_000_000
 
 def side(name: str) -> Side:
     """A process of rlcli's."""
-    return Side(f"{NAME}-{name}", [str(peers.python("rlcli")), str(HERE / "side_rlcli.py")])
+    return Side(f"{NAME}-{name}", [sys.executable, str(HERE / "side_rlcli.py")], environment=CHECKOUT)
 
 
 def costs(settings: Mapping[str, Mapping[str, Any]], repeats: int, seconds: float) -> list[dict[str, Any]]:

@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
+CHECKOUT = {"PYTHONPATH": os.pathsep.join([str(HERE.parent), str(HERE.parent / "tasks")])}
+"""What makes this process' own Python run the checkout that the benchmarks are of, whichever is installed."""
 CACHE = HERE.parent / ".bench"
 LOGS = CACHE / "logs"
 Block = Callable[[int], float]
@@ -69,7 +71,7 @@ class Side:
         assert self._process.stdout is not None
         try:
             self._process.stdin.write(json.dumps({"method": method, "arguments": arguments}) + "\n")
-        except OSError:
+        except (OSError, ValueError):  # the pipe is broken, or closed
             raise self._failure("ended") from None
         limit = self.timeout if timeout is None else timeout
         if not select.select([self._process.stdout], [], [], limit)[0]:
@@ -87,6 +89,10 @@ class Side:
         """End the child, and wait for it."""
         self._process.kill()
         self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):  # it held a request that nobody will read
+                    pipe.close()
 
     def _failure(self, what: str) -> Failed:
         said = [line for line in self._log.read_text(errors="replace").splitlines() if line.strip()]
