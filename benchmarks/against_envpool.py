@@ -79,39 +79,39 @@ def mujocos_part(
     return ratio(found["old"], found["new"])
 
 
+def row_of(task: str, repeats: int, seconds: float) -> dict[str, Any]:
+    """A task, in processes of its own: one that fails spoils no other."""
+    row: dict[str, Any] = {"task": task}
+    try:
+        sides = side("rlcli", "rlcli"), side("envpool", "envpool"), side("mujoco", "rlcli"), side("mujoco", "envpool")
+        with opened(*sides) as (ours, theirs, new, old):
+            for num_envs in (64, 1024):
+                row[str(num_envs)] = one(task, num_envs, ours, theirs, repeats, seconds)
+            setting = {key: row["64"][key] for key in ("model", "physics_steps")}
+            row["mujoco"] = mujocos_part(**setting, new=new, old=old, repeats=repeats, seconds=seconds / 2)
+            row["versions"] = [theirs("version")["envpool"], old("version")["mujoco"]]
+    except Failed as error:
+        row["failed"] = str(error)
+    for column in ("64", "1024"):
+        row.get(column, {}).pop("model", None)
+    print(row, file=sys.stderr, flush=True)
+    return row
+
+
 def measure(quick: bool) -> dict[str, Any]:
-    """A row a task and number of environments."""
+    """A row a task."""
     repeats, seconds = (2, 0.05) if quick else (7, 0.4)
-    tasks = ["gym-hopper", "gym-ant"] if quick else list(TASKS)
-    rows: list[dict[str, Any]] = []
-    with opened(side("rlcli", "rlcli")) as (ours,):
-        machine = ours("machine")
-        try:
-            peers.add("envpool", f"mujoco=={MUJOCO_OF_ENVPOOL}")
-            sides = side("envpool", "envpool"), side("mujoco", "rlcli"), side("mujoco", "envpool")
-        except Failed as error:
-            return {"machine": machine, "envpool": "", "rows": [], "failed": str(error)}
-        with opened(*sides) as (theirs, new, old):
-            for task in tasks:
-                row: dict[str, Any] = {"task": task}
-                rows.append(row)
-                try:
-                    for num_envs in (64, 1024):
-                        row[str(num_envs)] = one(task, num_envs, ours, theirs, repeats, seconds)
-                    setting = {key: row["64"][key] for key in ("model", "physics_steps")}
-                    row["mujoco"] = mujocos_part(**setting, new=new, old=old, repeats=repeats, seconds=seconds / 2)
-                except Failed as error:
-                    row["failed"] = str(error)
-                print(row, file=sys.stderr, flush=True)
-            versions = f"EnvPool {theirs('version')['envpool']} with MuJoCo {old('version')['mujoco']}"
-    means = {}
+    try:
+        peers.add("envpool", f"mujoco=={MUJOCO_OF_ENVPOOL}")
+    except Failed as error:
+        return {"failed": str(error)}
+    rows = [row_of(task, repeats, seconds) for task in (["gym-hopper", "gym-ant"] if quick else TASKS)]
     whole = [row for row in rows if "failed" not in row]
-    for column in ("64", "1024", "mujoco"):
-        means[column] = geometric_mean([row[column]["ratio"] for row in whole]) if whole else float("nan")
-    for row in whole:
-        for column in ("64", "1024"):
-            del row[column]["model"]
-    return {"machine": machine, "envpool": versions, "rows": rows, "means": means}
+    if not whole:
+        return {"failed": rows[0]["failed"]}
+    versions = "EnvPool {} with MuJoCo {}".format(*whole[0]["versions"])
+    means = {key: geometric_mean([row[key]["ratio"] for row in whole]) for key in ("64", "1024", "mujoco")}
+    return {"envpool": versions, "rows": rows, "means": means}
 
 
 def markdown(result: dict[str, Any]) -> str:
