@@ -7,6 +7,8 @@ RUNS ?= runs
 # of `make learn-TASK`: cpu or cuda (else the device that docs/zoo/zoo.yaml names), and the seed
 DEVICE ?=
 SEED ?= 1
+# of `make bench`: which tables; all, if empty
+TABLES ?=
 # Tests run beside each other: threads of theirs that wait must not keep a core busy.
 export OMP_WAIT_POLICY ?= PASSIVE
 
@@ -66,9 +68,10 @@ docs: $(VENV)/.dev
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
 	@echo "docs/_build/html/index.html"
 
+# Every table of the CPU in docs/benchmarks.md, and the figures of the README: about half an hour on an idle machine.
+# The libraries that it compares with are installed below .bench. TABLES=envpool: one of them.
 bench: $(VENV)/.dev
-	$(BIN)/python benchmarks/env_step.py
-	$(BIN)/python benchmarks/train.py
+	$(BIN)/python benchmarks/bench.py $(TABLES)
 
 clean:
-	rm -rf $(VENV) .coverage* .pytest_cache .ruff_cache
+	rm -rf $(VENV) .bench .coverage* .pytest_cache .ruff_cache

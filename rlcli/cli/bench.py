@@ -44,7 +44,6 @@ def command(
     from rlcli.machine import wait_calmly
     from rlcli.rl.trust import named_task
 
-    console.quiet, console.verbose = quiet, verbose
     wait_calmly()
     file = None if save_preset is None else _preset_file(save_preset, overwrite)
     source = named_task(task)

@@ -21,7 +21,8 @@ from rlcli.sim.selection import Selection
 class GymnasiumTask(DirectTask):
     """One of Gymnasium's MuJoCo tasks.
 
-    `observation` (num_envs, k) and `reward` (num_envs,) are what the buffers hold, before the cast to float32.
+    `observation` (num_envs, k) and `reward` (num_envs,) are what the buffers hold, before the cast to float32. `ended`
+    (num_envs,) is where the task ends the episode: it is judged once a step, for the reward as well.
     """
 
     motors = False
@@ -46,6 +47,7 @@ class GymnasiumTask(DirectTask):
         self.actions = torch.zeros(self.num_envs, self.num_actions, device=self.device)
         self.observation = torch.zeros(self.num_envs, self.num_observations, dtype=self.dtype, device=self.device)
         self.reward = torch.zeros(self.num_envs, dtype=self.dtype, device=self.device)
+        self.ended = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.before = self.progress().clone()
 
     def pre_physics_step(self, actions: Tensor) -> None:
@@ -61,12 +63,13 @@ class GymnasiumTask(DirectTask):
 
     def calculate_metrics(self) -> None:
         """Fill rew_buf."""
+        self.judge()
         self.reward.copy_(self.score())
         self.rew_buf.copy_(self.reward)
 
     def is_done(self) -> None:
         """Fill reset_buf."""
-        self.reset_buf.copy_(self.failed())
+        self.reset_buf.copy_(self.ended)
 
     def reset(self, selection: Selection) -> None:
         """Write the start state."""
@@ -84,9 +87,8 @@ class GymnasiumTask(DirectTask):
         """The reward. (num_envs,)"""
         raise NotImplementedError
 
-    def failed(self) -> Tensor:
-        """Where the task ends the episode: nowhere, unless it says so. (num_envs,) bool"""
-        return torch.zeros_like(self.reward, dtype=torch.bool)
+    def judge(self) -> None:
+        """Fill `ended`, where the task ends the episode: nowhere, unless it says so."""
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Joint positions and velocities of new episodes. (rows, nq), (rows, nv)"""

@@ -95,13 +95,13 @@ class Humanoid(_Humanoid):
     def score(self) -> Tensor:
         """Speed and health, less the cost of controls and contacts."""
         params = self.params
-        gains = params.forward_reward_weight * self.speed() + self.healthy() * params.healthy_reward
+        gains = params.forward_reward_weight * self.speed() + ~self.ended * params.healthy_reward
         contact_cost = self.force_cost(params.contact_cost_weight, params.contact_cost_range)
         return gains - (self.control_cost() + contact_cost)
 
-    def failed(self) -> Tensor:
+    def judge(self) -> None:
         """Not healthy."""
-        return ~self.healthy()
+        torch.logical_not(self.healthy(), out=self.ended)
 
 
 class HumanoidStandup(_Humanoid):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from pydantic import Field
 from torch import Tensor
 
@@ -32,12 +33,12 @@ class InvertedPendulum(GymnasiumTask):
 
     def score(self) -> Tensor:
         """1 unless it fell."""
-        return (~self.failed()).to(self.dtype)
+        return (~self.ended).to(self.dtype)
 
-    def failed(self) -> Tensor:
-        """The pole leans by more than 0.2 rad."""
-        finite = self.field.qpos.isfinite().all(dim=1) & self.field.qvel.isfinite().all(dim=1)
-        return ~finite | (self.field.qpos[:, 1].abs() > 0.2)
+    def judge(self) -> None:
+        """The pole leans by more than 0.2 rad, or the state, which the observation is, is not finite."""
+        upright = self.observation.isfinite().all(dim=1) & (self.observation[:, 1].abs() <= 0.2)
+        torch.logical_not(upright, out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Uniform."""
@@ -78,11 +79,11 @@ class InvertedDoublePendulum(GymnasiumTask):
         first, second = self.field.qvel[:, 1], self.field.qvel[:, 2]
         distance = 0.01 * x.square() + (height - 2).square()
         rates = 0.001 * first.square() + 0.005 * second.square()
-        return self.params.healthy_reward * (~self.failed()) - distance - rates
+        return self.params.healthy_reward * (~self.ended) - distance - rates
 
-    def failed(self) -> Tensor:
+    def judge(self) -> None:
         """The tip is no higher than 1 m, a physics step late."""
-        return self.field.site_xpos[:, 0, 2] <= 1
+        torch.le(self.field.site_xpos[:, 0, 2], 1, out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Uniform positions, Gaussian velocities."""

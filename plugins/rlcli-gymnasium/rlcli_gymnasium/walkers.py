@@ -65,13 +65,13 @@ class Ant(GymnasiumTask):
     def score(self) -> Tensor:
         """Speed and health, less the cost of actions and contacts."""
         params = self.params
-        gains = self.speed() * params.forward_reward_weight + self.healthy() * params.healthy_reward
+        gains = self.speed() * params.forward_reward_weight + ~self.ended * params.healthy_reward
         contact_cost = params.contact_cost_weight * square_sum(self.contact_forces())
         return gains - (self.action_cost(params.ctrl_cost_weight) + contact_cost)
 
-    def failed(self) -> Tensor:
+    def judge(self) -> None:
         """Not healthy."""
-        return ~self.healthy()
+        torch.logical_not(self.healthy(), out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Uniform positions, Gaussian velocities."""
@@ -172,12 +172,12 @@ class Walker2d(GymnasiumTask):
     def score(self) -> Tensor:
         """Speed and health, less the cost of actions."""
         params = self.params
-        gains = params.forward_reward_weight * self.speed() + self.healthy() * params.healthy_reward
+        gains = params.forward_reward_weight * self.speed() + ~self.ended * params.healthy_reward
         return gains - self.action_cost(params.ctrl_cost_weight)
 
-    def failed(self) -> Tensor:
+    def judge(self) -> None:
         """Not healthy."""
-        return ~self.healthy()
+        torch.logical_not(self.healthy(), out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Uniform."""
@@ -214,7 +214,7 @@ class Hopper(Walker2d):
         low, high = params.healthy_z_range
         state = torch.cat([qpos[:, 2:], self.field.qvel], dim=1)
         healthy = within(state, *params.healthy_state_range).all(dim=1)
-        healthy &= within(qpos[:, 1], low, torch.inf if high is None else high)
+        healthy &= qpos[:, 1] > low if high is None else within(qpos[:, 1], low, high)
         return healthy & within(qpos[:, 2], *params.healthy_angle_range)
 
 

@@ -1,0 +1,137 @@
+"""Every table of the CPU in `docs/benchmarks.md`: `make bench`, or `python benchmarks/bench.py [TABLE...]`.
+
+Each table runs in a process of its own, one after the other, and keeps its result in `results.json`; then the generated
+parts of the pages are written from that. `--pages` only writes the pages; `--quick` tries everything out and keeps
+nothing. Run it on a machine that does nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from sides import HERE, child_environment
+from tables import PAGES, filled, keep, results, stands, table
+
+SCRIPTS = {
+    "env_step": ["--repeats", "2", "--seconds", "0.05", "--num-envs", "64"],
+    "train": ["--repeats", "2", "--num-envs", "64"],
+}
+"""Programs that print their result with `--json`; what a trial of them is given."""
+MODULES = {
+    "mjlab": "against_mjlab",
+    "envpool": "against_envpool",
+    "trainers": "against_trainers",
+    "startup": "startup",
+    "growth": "growth",
+}
+"""Tables that keep their own results (tables.py)."""
+TABLES = [*SCRIPTS, *MODULES]
+
+
+HEADS = {
+    "num_envs": "environments",
+    "ratio": "of bare `Batch`",
+    "stock_sb3_ratio": "stock SB3 on the same task",
+    "env_steps_per_s": "environment steps/s",
+    "bare_steps_per_s": "bare steps/s",
+    "train_steps_per_s": "training steps/s",
+    "ms": "ms an iteration",
+}
+"""Keys of the programs' rows that have a longer name in the page."""
+
+
+def shown(key: str, row: dict[str, Any]) -> str:
+    """A value of a row, as the page has it."""
+    value = row.get(key)
+    if value is None:
+        return ""
+    if isinstance(value, dict):
+        return " ".join(f"{name} {part:.0f}" for name, part in value.items())
+    if not isinstance(value, int | float):
+        return str(value)
+    if f"{key}_min" in row:
+        return f"**{value:.3f}** ({row[f'{key}_min']:.3f} .. {row[f'{key}_max']:.3f})"
+    return f"{value:.3f}" if value < 10 else f"{value:,.0f}"
+
+
+def printed(result: dict[str, Any]) -> str:
+    """The table of a program: a column a key."""
+    keys = dict.fromkeys(key for row in result["rows"] for key in row if not key.endswith(("_min", "_max")))
+    rows = [[shown(key, row) for key in keys] for row in result["rows"]]
+    return f"{stands(result)}\n\n{table([HEADS.get(key, key) for key in keys], rows)}"
+
+
+def readme(kept: dict[str, Any]) -> str:
+    """The figures in the README's sentences."""
+    rows = kept["env_step"]["rows"]
+    ratio = next(row["ratio"] for row in rows if (row["task"], row["num_envs"]) == ("cartpole", 4096))
+    said = [f"The environment step runs at {ratio:.3f} of the bare physics at 4,096 cartpoles"]
+    if "ratio" in kept.get("mjlab", {}):
+        said.append(f"takes 1/{kept['mjlab']['ratio']:.1f} of mjlab's time on a CPU at 1,024")
+    means = kept.get("envpool", {}).get("means")
+    if means:
+        said.append(f"is {means['1024']:.2f} times as fast as EnvPool's over Gymnasium's eleven tasks")
+    times = {
+        row["name"]: row["times"]["ppo"]["ratio"] for row in kept.get("trainers", {}).get("rows", []) if row["times"]
+    }
+    if "dummy" in times:
+        said.append(f"training is {times['dummy']:.1f} times as fast as SB3's on a plain Gymnasium cartpole")
+    return f"{', '.join(said)}\n([figures](docs/benchmarks.md))."
+
+
+def texts(kept: dict[str, Any]) -> dict[str, str]:
+    """Name of a part -> its text, of what has been measured."""
+    makers: dict[str, Callable[[dict[str, Any]], str]] = dict.fromkeys(SCRIPTS, printed)
+    makers |= {name: importlib.import_module(module).markdown for name, module in MODULES.items() if name in kept}
+    found = {name: makers[name](kept[name]) for name in TABLES if name in kept}
+    return {**found, **({"readme": readme(kept)} if "env_step" in kept else {})}
+
+
+def write_pages() -> None:
+    """Write the generated parts of the pages anew."""
+    parts = texts(results())
+    for page in PAGES:
+        page.write_text(filled(page.read_text(), parts))
+
+
+def run(name: str, quick: bool) -> bool:
+    """Measure a table; whether that went well."""
+    begin = time.perf_counter()
+    print(f"== {name}", flush=True)
+    script = name if name in SCRIPTS else MODULES[name]
+    command = [sys.executable, str(HERE / f"{script}.py")]
+    if name in MODULES:
+        done = subprocess.run([*command, *(["--quick"] if quick else [])])
+    else:
+        trial = SCRIPTS[name] if quick else []
+        done = subprocess.run([*command, "--json", *trial], stdout=subprocess.PIPE, text=True, env=child_environment())
+        if done.returncode == 0 and not quick:
+            keep(name, json.loads(done.stdout))
+    print(f"== {name}: {time.perf_counter() - begin:.0f} s, exit {done.returncode}", flush=True)
+    return done.returncode == 0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("tables", nargs="*", metavar="TABLE", help=f"of {', '.join(TABLES)}; default: all")
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--pages", action="store_true")
+    options = parser.parse_args()
+    unknown = [name for name in options.tables if name not in TABLES]
+    if unknown:
+        parser.error(f"no table {', '.join(unknown)}; there are {', '.join(TABLES)}")
+    went = [] if options.pages else [run(name, options.quick) for name in options.tables or TABLES]
+    if not options.quick:
+        write_pages()
+    raise SystemExit(0 if all(went) else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""Runs a command of a library until a method of it has returned for the first time, and ends there.
+
+    python benchmarks/first_call.py MODULE:CLASS.METHOD MODULE:FUNCTION ARGUMENT...
+
+So `time` of it is how long a user waits for that. Nothing is imported that the command does not import itself.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import os
+import sys
+from types import ModuleType
+from typing import Any
+
+
+class Ender(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Lets a module load as it would, and then makes a method of it end the process."""
+
+    def __init__(self, place: str) -> None:
+        self.module, _, method = place.partition(":")
+        self.owner, _, self.method = method.partition(".")
+
+    def find_spec(self, name: str, path: Any, target: Any = None) -> importlib.machinery.ModuleSpec | None:
+        if name != self.module:
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        assert spec is not None
+        self.loader, spec.loader = spec.loader, self
+        return spec
+
+    def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType | None:
+        assert self.loader is not None
+        return self.loader.create_module(spec)
+
+    def exec_module(self, module: ModuleType) -> None:
+        assert self.loader is not None
+        self.loader.exec_module(module)
+        owner = getattr(module, self.owner)
+        whole = getattr(owner, self.method)
+
+        def once(*given: Any, **named: Any) -> None:
+            whole(*given, **named)
+            os._exit(0)
+
+        setattr(owner, self.method, once)
+
+
+def main() -> None:
+    place, command, *arguments = sys.argv[1:]
+    sys.meta_path.insert(0, Ender(place))
+    module, _, function = command.partition(":")
+    sys.argv = [module, *arguments]
+    getattr(importlib.import_module(module), function)()
+    raise SystemExit(f"{place} was not called")
+
+
+if __name__ == "__main__":
+    main()

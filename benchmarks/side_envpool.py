@@ -1,0 +1,49 @@
+"""EnvPool's side (see sides.py): Gymnasium's v5 tasks, all environments in every step."""
+
+from __future__ import annotations
+
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from sides import clock, serve
+
+theirs: dict[str, Any] = {}
+
+
+def version() -> dict[str, str]:
+    """Of EnvPool."""
+    return {"envpool": metadata.version("envpool")}
+
+
+def open_env(task: str, num_envs: int, threads: int) -> dict[str, Any]:
+    """Make a pool and uniform random actions within its limits; the model's file, for comparison."""
+    import envpool
+    import numpy as np
+
+    theirs.clear()
+    pool = envpool.make_gymnasium(task, num_envs=num_envs, num_threads=threads, seed=0)
+    pool.reset()
+    space = pool.action_space
+    actions = np.random.default_rng(0).uniform(space.low, space.high, (16, num_envs, *space.shape))
+    theirs.update(pool=pool, actions=actions.astype(space.dtype))
+    config = dict(zip(pool.spec._config_keys, pool.spec._config_values, strict=True))
+    folder, name = Path(config["base_path"]) / "mujoco" / "assets_gym", Path(config["xml_file"]).stem
+    return {
+        "physics_steps": config["frame_skip"],
+        "max_episode_length": config["max_episode_steps"],
+        "model": str(folder / f"{name}_envpool.xml"),
+    }
+
+
+def step(steps: int) -> float:
+    """Seconds of so many environment steps, with its own auto-reset."""
+    pool, actions = theirs["pool"], theirs["actions"]
+    begin = clock()
+    for index in range(steps):
+        pool.step(actions[index % len(actions)])
+    return clock() - begin
+
+
+if __name__ == "__main__":
+    serve({f.__name__: f for f in (version, open_env, step)})

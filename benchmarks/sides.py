@@ -1,0 +1,174 @@
+"""Programs that are timed in turn: each a child process that does a block of its work when it is asked to.
+
+A child is a Python script, of an environment of its own if need be, that hands its methods to `serve`; this module is
+all that it shares with the others, and needs the standard library alone. Requests and answers are lines of JSON.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+CHECKOUT = {"PYTHONPATH": os.pathsep.join([str(HERE.parent), str(HERE.parent / "tasks")])}
+"""What makes this process' own Python run the checkout that the benchmarks are of, whichever is installed."""
+CACHE = HERE.parent / ".bench"
+LOGS = CACHE / "logs"
+Block = Callable[[int], float]
+"""Seconds that so many steps took."""
+
+
+clock = time.process_time if os.environ.get("RLCLI_BENCH_CLOCK") == "cpu" else time.perf_counter
+"""What blocks are timed by. `RLCLI_BENCH_CLOCK=cpu` counts the processor time of all threads of a side: for looking
+into ratios on a busy machine, with one thread."""
+
+
+class Failed(Exception):
+    """A side could not be made, or did not do what it was asked to: the reason stands in its row."""
+
+
+class Side:
+    """A child process. `side("step", steps=3)` calls its method of that name and gives what that returns.
+
+    Args:
+        name: of the log of what it prints, in `.bench/logs`.
+        command: the program and its arguments.
+        timeout: seconds that an answer may take, unless a call says otherwise.
+        environment: variables that differ from this process' own.
+
+    Raises:
+        Failed: from calls, if the child ends, raises, or does not answer in time.
+    """
+
+    def __init__(
+        self, name: str, command: Sequence[str], *, timeout: float = 300.0, environment: Mapping[str, str] | None = None
+    ) -> None:
+        self.name, self.timeout = name, timeout
+        LOGS.mkdir(parents=True, exist_ok=True)
+        self._log = LOGS / f"{name}.txt"
+        with self._log.open("w") as log:
+            self._process = subprocess.Popen(
+                list(command),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+                bufsize=1,
+                env=child_environment(environment),
+            )
+
+    def __call__(self, method: str, *, timeout: float | None = None, **arguments: Any) -> Any:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            self._process.stdin.write(json.dumps({"method": method, "arguments": arguments}) + "\n")
+        except (OSError, ValueError):  # the pipe is broken, or closed
+            raise self._failure("ended") from None
+        limit = self.timeout if timeout is None else timeout
+        if not select.select([self._process.stdout], [], [], limit)[0]:
+            self.close()
+            raise self._failure(f"did not answer {method} within {limit:.0f} s")
+        line = self._process.stdout.readline()
+        if not line:
+            raise self._failure("ended")
+        answer = json.loads(line)
+        if "error" in answer:
+            raise Failed(f"{self.name}: {answer['error']}")
+        return answer["result"]
+
+    def close(self) -> None:
+        """End the child, and wait for it."""
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):  # it held a request that nobody will read
+                    pipe.close()
+
+    def _failure(self, what: str) -> Failed:
+        said = [line for line in self._log.read_text(errors="replace").splitlines() if line.strip()]
+        return Failed(f"{self.name} {what}" + (f": {said[-1].strip()[:200]}" if said else ""))
+
+
+def child_environment(changes: Mapping[str, str] | None = None) -> dict[str, str]:
+    """This process' environment without what is set for rlcli alone, so that every side runs as its users run it."""
+    kept = {k: v for k, v in os.environ.items() if k not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "PYTHONPATH")}
+    return {**kept, **(changes or {})}
+
+
+@contextlib.contextmanager
+def opened(*sides: Side) -> Iterator[tuple[Side, ...]]:
+    """Close them at the end."""
+    try:
+        yield sides
+    finally:
+        for side in sides:
+            side.close()
+
+
+def serve(methods: Mapping[str, Callable[..., Any]]) -> None:
+    """What a child does: answer until nobody asks. What it prints otherwise goes to its log."""
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    for line in sys.stdin:
+        request = json.loads(line)
+        try:
+            answer = {"result": methods[request["method"]](**request["arguments"])}
+        except Exception as error:
+            import traceback
+
+            traceback.print_exc()
+            answer = {"error": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"}
+        answers.write(json.dumps(answer) + "\n")
+
+
+def steps_for(block: Block, seconds: float, least: int = 1) -> int:
+    """How many steps take so long, found by doubling."""
+    steps = least
+    while (took := block(steps)) < 0.25 * seconds:
+        steps = max(2 * steps, min(16 * steps, int(0.5 * seconds / max(took, 1e-6) * steps)))
+    return max(least, round(steps * seconds / took))
+
+
+def alternate(blocks: Mapping[str, Block], steps: Mapping[str, int], repeats: int) -> dict[str, list[float]]:
+    """Seconds a step of each, a value a round; every round runs each block once, in turn."""
+    found: dict[str, list[float]] = {name: [] for name in blocks}
+    for _ in range(repeats):
+        for name, block in blocks.items():
+            found[name].append(block(steps[name]) / steps[name])
+    return found
+
+
+def ratio(numerator: Sequence[float], denominator: Sequence[float]) -> dict[str, float]:
+    """Median, lowest and highest of the ratios of the rounds."""
+    ratios = [above / below for above, below in zip(numerator, denominator, strict=True)]
+    return {"ratio": statistics.median(ratios), "ratio_min": min(ratios), "ratio_max": max(ratios)}
+
+
+def wall(command: Sequence[str], environment: Mapping[str, str] | None = None, timeout: float = 300.0) -> float:
+    """Seconds from starting a program to its end.
+
+    Raises:
+        Failed: if it does not end well.
+    """
+    begin = time.perf_counter()
+    try:
+        done = subprocess.run(
+            list(command), capture_output=True, text=True, env=child_environment(environment), timeout=timeout
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise Failed(f"{Path(command[0]).name}: {' '.join(str(error).split())[:200]}") from None
+    took = time.perf_counter() - begin
+    if done.returncode:
+        said = [line for line in done.stderr.splitlines() if line.strip()] or ["no message"]
+        raise Failed(f"{' '.join(map(str, command))}: exit {done.returncode}: {said[-1].strip()[:200]}")
+    return took
