@@ -23,7 +23,7 @@ ALL = slice(None)
 def in_place(tensor: Tensor) -> Any:
     """The same memory as what small steps in place cost least on: on a CPU a numpy array, whose calls cost half.
 
-    `+=`, `*=`, `[...] =` and `any()` read alike on both.
+    `+=`, `*=` and `[...] =` read alike on both, and a selection takes either for a field.
     """
     return tensor.numpy() if tensor.device.type == "cpu" else tensor
 
@@ -100,7 +100,11 @@ class Selection(Protocol):
 def write_rows(field: Tensor, rows: NDArray[np.int64], values: Tensor | float, columns: Columns = ALL) -> None:
     """Set some rows of a (num_envs, ...) tensor on the CPU."""
     where = rows if columns is ALL else _index(rows, columns)
-    field.numpy()[where] = values.numpy() if isinstance(values, Tensor) else values
+    _array(field)[where] = values.numpy() if isinstance(values, Tensor) else values
+
+
+def _array(field: Any) -> NDArray:
+    return field if isinstance(field, np.ndarray) else field.numpy()
 
 
 def _index(rows: NDArray[np.int64], columns: Columns) -> Any:
@@ -163,7 +167,7 @@ class IdSelection:
 
     def read(self, field: Tensor, columns: Columns = ALL) -> Tensor:
         """The rows of a (num_envs, ...) tensor, copied."""
-        return torch.from_numpy(field.numpy()[self.ids if columns is ALL else _index(self.ids, columns)])
+        return torch.from_numpy(_array(field)[self.ids if columns is ALL else _index(self.ids, columns)])
 
     def peek(self, field: Tensor, columns: Columns = ALL) -> Tensor:
         """The rows of a (num_envs, ...) tensor."""
@@ -175,7 +179,7 @@ class IdSelection:
 
     def add(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
         """Add to the rows of a (num_envs, ...) tensor."""
-        field.numpy()[self.ids if columns is ALL else _index(self.ids, columns)] += (
+        _array(field)[self.ids if columns is ALL else _index(self.ids, columns)] += (
             values.numpy() if isinstance(values, Tensor) else values
         )
 
