@@ -110,7 +110,8 @@ class BatchEngine:
         self._fields: dict[str, Tensor] = {}
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         self._late = late
-        self._step_stage = _NONE
+        self.step_stage = _NONE
+        """mjtStage that the last substep ends with, for what is bound."""
         self._forward_stage = _ACC if late else _NONE  # a start state gets what `mj_forward` makes, warm start included
         self._external: Tensor | None = None
         if external_forces:
@@ -192,7 +193,7 @@ class BatchEngine:
             if self._of_substep(name):
                 self._forward_stage = _ACC
             if name not in _NOT_DERIVED and not self._late and not self._of_forces_alone(name):
-                self._step_stage = _VEL
+                self.step_stage = _VEL
                 self._forward_stage = max(self._forward_stage, _VEL)
             if name not in _NOT_DERIVED:
                 self._forward_all()  # a field asked for late holds zeros until then
@@ -236,7 +237,7 @@ class BatchEngine:
         """Advance every world by `nstep` physics steps; without `derive` the derived fields stay behind."""
         self._history.note(nstep)
         try:
-            self._batch.step(nstep=nstep, stage=self._step_stage if derive else _NONE)
+            self._batch.step(nstep=nstep, stage=self.step_stage if derive else _NONE)
         except SimulationError:
             self._failed |= self._batch.status != 0  # their rows are as they were; the others have been stepped
             self._error = " ".join(self._batch.error(int(self._failed.argmax())).split()) or self._error

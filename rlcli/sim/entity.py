@@ -281,6 +281,10 @@ class EntityData:
         soft = torch.stack([middle - half, middle + half], dim=1)
         self.soft_joint_pos_limits = torch.where(limited[:, None], soft, infinite)
         """The limits, drawn in by `soft_joint_pos_limit_factor`. (k, 2) [m or rad]"""
+        self._limits = {
+            soft: tuple(end[None] for end in limits.unbind(dim=1))
+            for soft, limits in ((False, self.joint_pos_limits), (True, self.soft_joint_pos_limits))
+        }
         self._limited = limited
         self._joint_index = as_index(entity.joint_ids.tolist(), device)
         self._infinite = infinite
@@ -432,8 +436,8 @@ class EntityData:
         """
         ranges = self._entity.engine.expanded("jnt_range")
         if ranges is None:
-            low, high = (self.soft_joint_pos_limits if soft else self.joint_pos_limits).unbind(dim=1)
-            return low[None], high[None]
+            low, high = self._limits[soft]
+            return low, high
         low, high = self._once(
             "joint_ranges", lambda: ranges.view(len(ranges), -1, 2)[:, self._joint_index].float()
         ).unbind(dim=2)
