@@ -21,6 +21,7 @@ _S30, _S27, _S31, _S40 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(
 _TO_UNIT = np.float32(2.0**-24)
 
 
+@functools.lru_cache(maxsize=4096)
 def stream(name: str) -> np.uint64:
     """The stream of a term, from its name."""
     return np.uint64(int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little"))

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.sim.entity import Entity, as_index
 from rlcli.sim.rotations import rotate_inverse
-from rlcli.sim.selection import Columns
+from rlcli.sim.selection import Columns, write_rows
 
 if TYPE_CHECKING:
     from rlcli.envs.vec_env import VecEnv
@@ -50,7 +50,7 @@ class ArticulationView:
         self._dof_index = as_index(self._entity.dof_columns.tolist(), engine.device)
         driven = {joint for joint, _ in self._entity.actuators_of("motor")}
         self._without_motor = [j for j in range(len(self._entity.joint_names)) if j not in driven]
-        self._actuators = {kind: _actuator_columns(self._entity, kind) for kind in ("motor", "position", "velocity")}
+        self._actuators = {kind: _drive(self._entity, kind) for kind in ("motor", "position", "velocity")}
 
     @property
     def count(self) -> int:
@@ -116,7 +116,7 @@ class ArticulationView:
         Raises:
             TaskError: for an effort on a joint that only has an actuator of another kind.
         """
-        if len(self._without_motor) and bool(efforts[:, self._without_motor].any()):
+        if self._without_motor and bool(efforts[:, self._without_motor].any()):
             names = listing(self._entity.joint_names[j] for j in self._without_motor)
             hint = "give them `actuator: motor` in scene.entities, or set targets"
             raise TaskError(f"view '{self.name}': no motor drives {names}", hint=hint)
@@ -144,9 +144,9 @@ class ArticulationView:
         self._set("qvel", local, indices, slice(dof, dof + 6))
 
     def _command(self, kind: str, values: Tensor, indices: Tensor | None) -> None:
-        joints, controls, factor = self._actuators[kind]
-        if len(factor):
-            self._write(self._ctrl, values[:, joints] * factor, indices, controls)
+        drive = self._actuators[kind]
+        if drive is not None:
+            self._write(self._ctrl, drive.controls_for(values), indices, drive.controls)
 
     def _set(self, name: str, values: Tensor, indices: Tensor | None, columns: Columns) -> None:
         self._write(self._env.engine.field(name), values, indices, columns)
@@ -154,8 +154,12 @@ class ArticulationView:
         self._env.sim.stamp += 1
 
     def _write(self, field: Tensor, values: Tensor, indices: Tensor | None, columns: Columns) -> None:
-        if indices is None:
+        if indices is None and isinstance(columns, slice):
+            field[:, columns] = values
+        elif indices is None:
             field[:, columns] = values.to(field.dtype)
+        elif field.device.type == "cpu":
+            write_rows(field, indices.long().numpy(), values, columns)
         elif isinstance(columns, slice):
             field[indices.long(), columns] = values.to(field.dtype)
         else:
@@ -168,17 +172,36 @@ def _rows(values: Tensor, indices: Tensor | None, clone: bool) -> Tensor:
     return values.clone() if clone else values
 
 
-def _actuator_columns(entity: Entity, kind: str) -> tuple[Columns, Columns, Tensor]:
-    """Joint columns that have an actuator of the kind, those actuators' control columns, and what makes controls.
+@dataclass(frozen=True, slots=True)
+class _Drive:
+    """The actuators of one kind."""
+
+    joints: Columns | None
+    """Joint columns that have one; None: all, in order."""
+    controls: Columns
+    """Their columns of the controls."""
+    factor: Tensor | None
+    """What makes a control of a joint's value; None: nothing."""
+
+    def controls_for(self, values: Tensor) -> Tensor:
+        """Controls that give the joints these values. (n, num_dof) -> (n, k)"""
+        own = values if self.joints is None else values[:, self.joints]
+        return own if self.factor is None else own * self.factor
+
+
+def _drive(entity: Entity, kind: str) -> _Drive | None:
+    """What drives the joints by this kind of command; None where nothing does.
 
     A gear multiplies forces and lengths alike: so a joint's force is divided by it, a joint's target multiplied.
     """
     columns = entity.actuators_of(kind)
-    joints = [joint for joint, _ in columns]
-    controls = [actuator for _, actuator in columns]
-    gear = np.array([entity.engine.model.actuator_gear[a, 0] for a in controls])
-    return (
-        as_index(joints, entity.engine.device),
-        as_index(controls, entity.engine.device),
-        torch.tensor(1.0 / gear if kind == "motor" else gear, dtype=torch.float32, device=entity.engine.device),
+    if not columns:
+        return None
+    device, joints, controls = entity.engine.device, [joint for joint, _ in columns], [a for _, a in columns]
+    gear = entity.engine.model.actuator_gear[controls, 0]
+    factor = torch.tensor(1.0 / gear if kind == "motor" else gear, dtype=torch.float32, device=device)
+    return _Drive(
+        None if joints == list(range(len(entity.joint_names))) else as_index(joints, device),
+        as_index(controls, device),
+        None if bool((factor == 1.0).all()) else factor,
     )

@@ -20,7 +20,7 @@ from rlcli.random import stream
 from rlcli.registry import load_object
 from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import Scene
-from rlcli.sim.selection import IdSelection, Selection
+from rlcli.sim.selection import IdSelection, Selection, in_place
 
 _RESET = stream("direct.reset")
 
@@ -182,6 +182,8 @@ class DirectEnv(VecEnv):
         task = self.task
         self._returns = torch.zeros(self.num_envs, device=self.device)
         self._fresh = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self._sums, self._begun = in_place(self._returns), in_place(self._fresh)
+        self._resets_by_selection = type(task).reset is not DirectTask.reset
         self._resets_by_id = type(task).reset_idx is not DirectTask.reset_idx
         self._reset_hook = task.reset_idx
         task.reset_idx = self._reset_stale  # type: ignore[method-assign]
@@ -290,15 +292,15 @@ class DirectEnv(VecEnv):
 
     def _final(self) -> dict[str, Tensor]:
         self._final_obs.copy_(self.task.obs_buf)
-        self._final_states.copy_(self.task.states_buf)
         self._require_finite(self._final_obs, "the last observation", self._observation_columns)
         if self.task.num_states:
+            self._final_states.copy_(self.task.states_buf)
             self._require_finite(self._final_states, "the last state (states_buf)")
         return self._group(self._final_obs, self._final_states)
 
     def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         return (
-            ended.read(self._returns),
+            ended.read(self._sums),
             {},
             {name: ended.peek(fired) for name, fired in self._causes.items()},
         )
@@ -308,28 +310,31 @@ class DirectEnv(VecEnv):
 
     def _restart_workflow(self, selection: Selection) -> None:
         task = self.task
-        task.reset(selection.stream(_RESET))
+        if self._resets_by_selection:
+            task.reset(selection.stream(_RESET))
         if self._resets_by_id:
             ids = selection.env_ids()
             if len(ids):
                 self._reset_hook(ids)
         selection.write(task.progress_buf, 0)
         selection.write(task.reset_buf, 1)
-        selection.write(self._fresh, True)
-        selection.write(self._returns, 0.0)
+        selection.write(self._begun, True)
+        selection.write(self._sums, 0.0)
 
     def _observe(self) -> dict[str, Tensor]:
         """Running environments keep what `_judge` observed; only those just reset take a second look."""
         task, obs, states = self.task, next(self._obs), next(self._states)
         if not self._observed:
             self._fill()
-        obs.copy_(task.obs_buf)
-        states.copy_(task.states_buf)
-        if self._observed and not self._settled and self._maybe(self._fresh):
+        looked = [(task.obs_buf, obs), (task.states_buf, states)][: 2 if task.num_states else 1]
+        for buffer, kept in looked:
+            kept.copy_(buffer)
+        fresh = self._select(self._fresh) if self._observed and not self._settled else None
+        if fresh is not None:
             self._fill()
-            fresh = self._fresh[:, None]
-            task.obs_buf.copy_(torch.where(fresh, task.obs_buf, obs, out=obs))
-            task.states_buf.copy_(torch.where(fresh, task.states_buf, states, out=states))
+            for buffer, kept in looked:
+                fresh.write(kept, fresh.peek(buffer))
+                buffer.copy_(kept)
         self._observed, self._settled = False, False
         self._require_finite(obs, "the observation", self._observation_columns)
         if task.num_states:
@@ -342,7 +347,8 @@ class DirectEnv(VecEnv):
         task.get_states()
         if bound is not None:
             task.obs_buf.clamp_(-bound, bound)
-            task.states_buf.clamp_(-bound, bound)
+            if task.num_states:
+                task.states_buf.clamp_(-bound, bound)
 
     def _group(self, obs: Tensor, states: Tensor) -> dict[str, Tensor]:
         return {"policy": obs, "critic": states} if self.task.num_states else {"policy": obs}

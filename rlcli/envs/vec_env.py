@@ -33,7 +33,7 @@ from rlcli.sim.names import NameProblem
 from rlcli.sim.rotations import rotate_inverse
 from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import Scene
-from rlcli.sim.selection import Selection
+from rlcli.sim.selection import Selection, in_place
 from rlcli.sim.sensors import Sensor, make_sensors
 from rlcli.sim.terrain import Terrain
 
@@ -90,8 +90,10 @@ class VecEnv(ABC):
         self._binder.raise_problems()
         self._build()
         self._success_hold = torch.zeros(self.num_envs, device=self.device)
+        self._holds = in_place(self._success_hold)
         self._hold_steps = math.ceil(self.config.success.hold_s / self.step_dt - 1e-6) if self.config.success else 0
         self.layout = self._layout()
+        self._action_shape = (self.num_envs, self.layout.action_size)
         self._action_columns = [
             f"{term.name}[{index}]" if index >= len(term.elements) else f"{term.name}.{term.elements[index]}"
             for term in self.layout.actions
@@ -145,10 +147,8 @@ class VecEnv(ABC):
         if self.before_step is not None:
             self.before_step()
         start = time.perf_counter()
-        if tuple(action.shape) != (self.num_envs, self.layout.action_size):
-            raise ValueError(
-                f"action has shape {tuple(action.shape)}, expected {(self.num_envs, self.layout.action_size)}"
-            )
+        if action.shape != self._action_shape:
+            raise ValueError(f"action has shape {tuple(action.shape)}, expected {self._action_shape}")
         self.engine.attach()
         if begin is not None:
             action = action.masked_fill(begin[:, None], 0.0)
@@ -158,8 +158,8 @@ class VecEnv(ABC):
         diverged = self._simulate()
         if self.after_physics is not None:
             self.after_physics()
-        self.episode_length_buf += 1
-        self._steps += 1
+        self._lengths += 1
+        self._clock += 1
         for sensor in self.sensors.values():
             sensor.update(self.step_dt)
         reward, terminated, truncated = self._judge(diverged)
@@ -172,9 +172,10 @@ class VecEnv(ABC):
         self.episode_index += finished  # before the selection: what begins now draws from its own counter
         ended = self._select(finished)
         if ended is not None:
-            if self.final_obs_of == "finished" or self._maybe(truncated & ~terminated):
+            timed_out = truncated & ~terminated
+            if self.final_obs_of == "finished" or self._maybe(timed_out):
                 final_obs = self._final()
-            episodes = self._episodes(ended, finished, terminated, truncated)
+            episodes = self._episodes(ended, finished, timed_out)
         if self.on_lived is not None:
             self.on_lived(Lived(self._seen, action, reward, self._paid(), episodes))
         if ended is not None:
@@ -511,19 +512,19 @@ class VecEnv(ABC):
 
     def _hold_success(self) -> None:
         if self._success is not None:
-            self._success_hold += 1.0
+            self._holds += 1.0
             self._success_hold *= self._success()
 
-    def _episodes(self, ended: Selection, finished: Tensor, terminated: Tensor, truncated: Tensor) -> Episodes:
+    def _episodes(self, ended: Selection, finished: Tensor, timed_out: Tensor) -> Episodes:
         returns, terms, causes = self._terms_of(ended)
-        timed_out = ended.peek(truncated) & ~ended.peek(terminated)
+        timed_out = ended.peek(timed_out)
         success = None
         if self._success is not None:
-            success = timed_out & (ended.peek(self._success_hold) >= self._hold_steps)
+            success = timed_out & (ended.peek(self._holds) >= self._hold_steps)
         return Episodes(
-            ended.peek(self._ids),
+            ended.peek(self._names),
             returns,
-            ended.read(self.episode_length_buf),
+            ended.read(self._lengths),
             terms,
             causes,
             timed_out,
@@ -539,8 +540,8 @@ class VecEnv(ABC):
         for actuator in self._actuators.values():
             actuator.reset(selection)
         self._restart_workflow(selection)
-        selection.write(self.episode_length_buf, 0)
-        selection.write(self._success_hold, 0.0)
+        selection.write(self._lengths, 0)
+        selection.write(self._holds, 0.0)
         self.sim.moved(selection)
         for sensor in self.sensors.values():
             sensor.reset(selection)
@@ -667,6 +668,8 @@ class VecEnv(ABC):
         self._any_aside = False
         self._ids = torch.arange(self.num_envs, device=self.device)
         self._steps: Tensor = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._names = in_place(self._ids)
+        self._lengths, self._clock = in_place(self.episode_length_buf), in_place(self._steps)
 
 
 def grid(num_envs: int, spacing: float) -> Tensor:

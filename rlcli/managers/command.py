@@ -146,8 +146,9 @@ class CommandManager:
 
     def reset(self, selection: Selection) -> None:
         """New episodes begin with new commands."""
-        selection.write(self._sums, 0.0)
-        selection.write(self._steps, 0.0)
+        if self._measured:
+            selection.write(self._sums, 0.0)
+            selection.write(self._steps, 0.0)
         for number, term in enumerate(self.terms):
             term.reset(selection)
             self._resample(number, selection, _FIRST)

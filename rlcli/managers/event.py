@@ -45,6 +45,9 @@ class EventManager:
         # counted in whole steps: subtracting step_dt again and again drifts
         self._steps_left = torch.zeros(len(self._interval), num_envs, dtype=torch.int64, device=device)
         self._fired_at = torch.full((len(self._reset), num_envs), _NEVER, dtype=torch.int64, device=device)
+        self._resets = list(zip(self._reset, self._fired_at.unbind(0), strict=True))
+        self._intervals = list(zip(self._interval, self._steps_left.unbind(0), strict=True))
+        self._resets_derive = any(map(_derives, self._reset))
 
     @property
     def derives(self) -> bool:
@@ -65,7 +68,7 @@ class EventManager:
     def start_over(self, everyone: Selection) -> None:
         """Forget what has fired, before all environments begin anew."""
         self._fired_at.fill_(_NEVER)
-        for term, left in zip(self._interval, self._steps_left, strict=True):
+        for term, left in self._intervals:
             if _is_global(term):
                 everyone.write(left, self._draw(term, everyone, _FIRST)[:1])
 
@@ -73,15 +76,16 @@ class EventManager:
         """Fire the reset events of new episodes at a `step` since the start, and start their interval timers."""
         for term in self.terms:
             term.reset(selection)
-        for term, fired_at in zip(self._reset, self._fired_at, strict=True):
+        for term, fired_at in self._resets:
             apart = term.config.min_steps_between  # type: ignore[attr-defined]
             due = selection.where(step - fired_at >= apart) if apart else selection
             if due is not None:
                 term.call(due.stream(term.stream))
                 if apart:
                     due.write(fired_at, step.expand(1))
-        self._after(self._reset, selection)
-        for term, left in zip(self._interval, self._steps_left, strict=True):
+        if self._resets_derive:
+            self._settle(selection)
+        for term, left in self._intervals:
             if not _is_global(term):
                 selection.write(left, self._draw(term, selection, _FIRST))
 
@@ -92,7 +96,7 @@ class EventManager:
         """
         for lasting in self._lasting:
             lasting.update(select, running)
-        for term, left in zip(self._interval, self._steps_left, strict=True):
+        for term, left in self._intervals:
             is_global = _is_global(term)
             left -= 1 if is_global else running
             due = select(left <= 0)

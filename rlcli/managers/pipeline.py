@@ -113,7 +113,8 @@ class Pipeline:
     def write(self, view: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         """Compute the term into its columns. view (num_envs, size)"""
         value = view if self._value is None else self._value
-        value.copy_(self.term.call().reshape(value.shape))
+        given = self.term.call()
+        value.copy_(given if given.dim() == 2 else given.reshape(value.shape))
         for stage in self._stages:
             stage(value, draws, fresh, advance)
         if self._frames is not None:

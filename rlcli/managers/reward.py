@@ -11,7 +11,7 @@ from rlcli.errors import DivergedError
 from rlcli.managers.live import LiveValues
 from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.managers.termination import DIVERGED
-from rlcli.sim.selection import Selection
+from rlcli.sim.selection import Selection, in_place
 
 
 class RewardManager:
@@ -34,21 +34,30 @@ class RewardManager:
         weights = [live.get((*term.path, "weight"), term.config.weight) for term in terms]  # type: ignore[attr-defined]
         self._values = torch.zeros(len(terms), num_envs, device=device)
         self._sums = torch.zeros(len(terms), num_envs, device=device)
-        self._sums_by_env = self._sums.t()
+        self._sums_by_env = in_place(self._sums.t())
         self._rows = list(self._values.unbind(0))
+        factors = [0.0 if _moves(weight) else weight * dt for weight in weights]
+        self._factors = torch.tensor(factors, dtype=torch.float32, device=device)[:, None]
         kept = [term.config.while_alive for term in terms]  # type: ignore[attr-defined]
         self._while_alive = torch.tensor(kept, device=device)[:, None] if any(kept) else None
         self._divergence_reward = divergence_reward
         self._divergence_sums = torch.zeros(num_envs, device=device)
-        self._moved = [(row, weight) for row, weight in zip(self._rows, weights, strict=True) if _moves(weight)]
+        self._moved = [
+            (factor, weight)
+            for factor, weight in zip(self._factors.flatten().unbind(0), weights, strict=True)
+            if _moves(weight)
+        ]
         self._active = [
-            (term.call, row, 1.0 if _moves(weight) else weight * dt)
+            (term.call, row)
             for term, row, weight in zip(terms, self._rows, weights, strict=True)
             if _moves(weight) or weight * dt != 0.0
         ]
         self._totals = [torch.zeros(num_envs, device=device) for _ in range(3)]
         self._next = 0
         self._fused = device.type == "cuda"
+        self._paid, self._owed = in_place(self._values), in_place(self._sums)
+        self._added = [in_place(row) for row in self._rows]
+        self._added_to = [in_place(total) for total in self._totals]
         for term, weight in zip(terms, weights, strict=True):
             if _moves(weight) or weight != 0.0:
                 check_shape(term, first_value(term), (num_envs,), "rewards")
@@ -63,10 +72,11 @@ class RewardManager:
         On a CPU the terms are added one after the other: torch's own sum over rows rounds differently for different
         numbers of environments. On a GPU nothing is bit-identical, and one launch is cheaper than many.
         """
-        for call, row, factor in self._active:
-            torch.mul(call(), factor, out=row)
-        for row, weight in self._moved:
-            row.mul_(weight * self._dt)
+        for call, row in self._active:
+            row.copy_(call())
+        for factor, weight in self._moved:
+            torch.mul(weight, self._dt, out=factor)
+        self._values *= self._factors
         if self._while_alive is not None and terminated is not None:
             self._values.masked_fill_(self._while_alive & terminated, 0.0)
         if diverged is not None and not self._fused:
@@ -75,14 +85,15 @@ class RewardManager:
         if self._fused:
             total = torch.sum(self._values, dim=0, out=self._totals[self._next])
         else:
-            total = self._totals[self._next].copy_(self._rows[0])
-            for row in self._rows[1:]:
-                total += row
+            total, added_to = self._totals[self._next], self._added_to[self._next]
+            added_to[...] = self._added[0]
+            for row in self._added[1:]:
+                added_to += row
         return total
 
     def add_up(self) -> None:
         """Take the step's terms into the sums of the running episodes."""
-        self._sums += self._values
+        self._owed += self._paid
 
     @property
     def paid(self) -> Tensor:
@@ -128,7 +139,8 @@ class RewardManager:
     def reset(self, selection: Selection) -> None:
         """Episode sums start at zero."""
         selection.write(self._sums_by_env, 0.0)
-        selection.write(self._divergence_sums, 0.0)
+        if self._divergence_reward is not None:
+            selection.write(self._divergence_sums, 0.0)
         for term in self.terms:
             term.reset(selection)
 

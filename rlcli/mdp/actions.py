@@ -94,6 +94,8 @@ class _AffineJointAction(_JointAction):
         clip: Range | dict[str, Range] | None,
     ) -> None:
         super().__init__(env, entity, joints, scale, clip)
+        # a number is wrapped into a tensor at each use, which costs as much as the product
+        self._factor = torch.as_tensor(self._scale, dtype=torch.float32, device=env.device)
         own = self._by_joint(offset, 0.0, env)
         self._offset = own if default is None else default[:, joints] + own
         self._limits = _command_limits(entity.engine.model, self._drive.actuators, self.actuator)
@@ -105,7 +107,7 @@ class _AffineJointAction(_JointAction):
         return CommandMap(scale, offset, clip, self._limits)
 
     def _target(self, action: Tensor) -> None:
-        torch.mul(action, self._scale, out=self.command)
+        torch.mul(action, self._factor, out=self.command)
         if isinstance(self._offset, Tensor) or self._offset:
             self.command += self._offset
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -250,7 +251,15 @@ def _drawn_wrench(env: ManagedEnv, selection: Selection, bodies: int, force: Pai
 
 def _bounds(env: ManagedEnv, *pairs: Pair) -> tuple[Tensor, Tensor]:
     """Lower and upper ends of several ranges, for draws of shape (rows, ranges, k). (ranges, 1) each"""
-    low, high = Ranges(env.device, *pairs).now()
+    if any(isinstance(pair, Tensor) for pair in pairs):
+        low, high = Ranges(env.device, *pairs).now()
+        return low[:, None], high[:, None]
+    return _fixed_bounds(env.device, *map(tuple, pairs))
+
+
+@functools.lru_cache(maxsize=1024)
+def _fixed_bounds(device: torch.device, *pairs: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    low, high = Ranges(device, *pairs).now()
     return low[:, None], high[:, None]
 
 

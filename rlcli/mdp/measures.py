@@ -24,6 +24,11 @@ def cosine(angle: float | Tensor) -> float | Tensor:
     return angle.cos() if isinstance(angle, Tensor) else math.cos(angle)
 
 
+def total(values: Tensor) -> Tensor:
+    """Sum over the columns; torch takes ten times as long for the sum of one as for the column. (n, k) -> (n,)"""
+    return values[:, 0] if values.shape[1] == 1 else values.sum(dim=1)
+
+
 def only(values: Tensor, what: str) -> Tensor:
     """The single element of (num_envs, 1, ...).
 

@@ -14,6 +14,7 @@ from rlcli.mdp.measures import (
     only,
     paired,
     strongest_force,
+    total,
     vector,
 )
 from rlcli.sim.rotations import axis_x, axis_y, axis_z, length, roll_pitch_yaw, turn_between, wrap_to_pi
@@ -36,28 +37,29 @@ def is_terminated(env: ManagedEnv) -> Tensor:
 
 def joint_pos_target_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", target: float) -> Tensor:
     """Squared joint deviation from `target` [rad^2], positions wrapped to [-pi, pi]. (num_envs,)"""
-    deviation = wrap_to_pi(entity.data.joint_pos[:, joints]) - target
-    return deviation.square_().sum(dim=1)
+    position = wrap_to_pi(entity.data.joint_pos[:, joints])
+    deviation = position - target if isinstance(target, Tensor) or target else position
+    return total(deviation.square_())
 
 
 def joint_vel_l1(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Sum of absolute joint velocities [rad/s]. (num_envs,)"""
-    return entity.data.joint_vel[:, joints].abs().sum(dim=1)
+    return total(entity.data.joint_vel[:, joints].abs())
 
 
 def joint_vel_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Sum of squared joint velocities [rad^2/s^2]. (num_envs,)"""
-    return entity.data.joint_vel[:, joints].square().sum(dim=1)
+    return total(entity.data.joint_vel[:, joints].square())
 
 
 def joint_acc_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Sum of squared joint accelerations over the last substep [rad^2/s^4]. (num_envs,)"""
-    return entity.data.joint_acc[:, joints].square().sum(dim=1)
+    return total(entity.data.joint_acc[:, joints].square())
 
 
 def joint_torques_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Sum of squared actuator efforts on the joints, after their limits [N^2 m^2]. (num_envs,)"""
-    return entity.data.applied_effort[:, joints].square().sum(dim=1)
+    return total(entity.data.applied_effort[:, joints].square())
 
 
 def joint_pos_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:

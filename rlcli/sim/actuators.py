@@ -154,6 +154,7 @@ class JointCommand:
         self._factor = (1.0 / gear if kind == "motor" else gear) if bool((gear != 1.0).any()) else None
         self._ctrl = entity.engine.field("ctrl")
         self._from, self._to = as_index(native, device), as_index(controls, device)
+        self._takes_all = len(native) == len(columns)
         # consecutive controls: a view of the engine's own, made once
         self._target = self._ctrl[:, self._to] if native and isinstance(self._to, slice) else None
         self._models = []
@@ -167,7 +168,7 @@ class JointCommand:
     def write(self, command: Tensor) -> None:
         """Set what is asked from now on. (num_envs, columns)"""
         if self._native:
-            own = command[:, self._from]
+            own = command if self._takes_all else command[:, self._from]
             own = own if self._factor is None else own * self._factor
             if self._target is not None:
                 self._target.copy_(own)

@@ -17,7 +17,7 @@ from rlcli.errors import DivergedError, did_you_mean
 from rlcli.sim.engine import force_sensors
 from rlcli.sim.guard import ENGINE_ERROR, FIELD_OF, MEMORY, SHOWN, Call, Divergence, History, StateLayout
 from rlcli.sim.mjcf import quiet_mujoco
-from rlcli.sim.selection import IdSelection, Selection
+from rlcli.sim.selection import IdSelection, Selection, ids_of
 
 _STATE = mujoco.mjtState
 _STATE_FIELDS = mujoco.batch._STATE_FIELDS
@@ -110,7 +110,8 @@ class BatchEngine:
         self._fields: dict[str, Tensor] = {}
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         self._late = late
-        self._step_stage = _NONE
+        self.step_stage = _NONE
+        """mjtStage that the last substep ends with, for what is bound."""
         self._forward_stage = _ACC if late else _NONE  # a start state gets what `mj_forward` makes, warm start included
         self._external: Tensor | None = None
         if external_forces:
@@ -192,7 +193,7 @@ class BatchEngine:
             if self._of_substep(name):
                 self._forward_stage = _ACC
             if name not in _NOT_DERIVED and not self._late and not self._of_forces_alone(name):
-                self._step_stage = _VEL
+                self.step_stage = _VEL
                 self._forward_stage = max(self._forward_stage, _VEL)
             if name not in _NOT_DERIVED:
                 self._forward_all()  # a field asked for late holds zeros until then
@@ -227,7 +228,7 @@ class BatchEngine:
     def set_constants(self, selection: Selection | None = None) -> None:
         """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
         try:
-            self._batch.set_const(None if selection is None else _ids(selection).astype(np.int32))
+            self._batch.set_const(None if selection is None else ids_of(selection).astype(np.int32))
         except SimulationError as error:
             raise _engine_error(error) from None
         self._own_constants = True
@@ -236,7 +237,7 @@ class BatchEngine:
         """Advance every world by `nstep` physics steps; without `derive` the derived fields stay behind."""
         self._history.note(nstep)
         try:
-            self._batch.step(nstep=nstep, stage=self._step_stage if derive else _NONE)
+            self._batch.step(nstep=nstep, stage=self.step_stage if derive else _NONE)
         except SimulationError:
             self._failed |= self._batch.status != 0  # their rows are as they were; the others have been stepped
             self._error = " ".join(self._batch.error(int(self._failed.argmax())).split()) or self._error
@@ -264,7 +265,7 @@ class BatchEngine:
         not finite afterwards: the sum of all states then is not, either.
         """
         self.found = []
-        warned = bool(self._warning_words.any())
+        warned = np.count_nonzero(self._warning_words) > 0
         # of whole rows: skipping the columns that nobody writes takes longer
         finite = math.isfinite(self._state.sum().item()) or bool(self._state.isfinite().all())
         if not warned and finite and not self._error:
@@ -329,7 +330,7 @@ class BatchEngine:
         forces = self._forces(selection) if self._reset_stage < self._forward_stage else []
         kept = [field[where].clone() for field, where in forces]
         try:
-            self._batch.forward(_ids(selection).astype(np.int32), stage=min(self._forward_stage, self._reset_stage))
+            self._batch.forward(ids_of(selection).astype(np.int32), stage=min(self._forward_stage, self._reset_stage))
         except SimulationError as error:
             raise _engine_error(error) from None
         for (field, where), values in zip(forces, kept, strict=True):
@@ -337,7 +338,7 @@ class BatchEngine:
 
     def _forces(self, selection: Selection) -> list[tuple[Tensor, Any]]:
         """Bound fields of the acceleration stage, and where in them what belongs to the selected worlds lies."""
-        ids = _ids(selection)
+        ids = ids_of(selection)
         return [
             (field, ids if name in _ACCELERATION else (ids[:, None], self._force_sensors))
             for name, field in self._fields.items()
@@ -346,7 +347,7 @@ class BatchEngine:
 
     def reset(self, selection: Selection) -> None:
         """Put the selected worlds into the default state: the whole row, controls and warm start included."""
-        ids = _ids(selection)
+        ids = ids_of(selection)
         self._batch.state[ids] = self._default
         self._history.forget(ids)
         if not self.forces_after_reset:
@@ -376,7 +377,7 @@ class BatchEngine:
     ) -> Tensor:
         """Distances from points to the first geom along unit directions, -1 where there is none. (rows, rays)"""
         seen = None if groups is None else np.array([g in groups for g in range(mujoco.mjNGROUP)], dtype=np.uint8)
-        ids = None if selection is None else _ids(selection).astype(np.int32)
+        ids = None if selection is None else ids_of(selection).astype(np.int32)
         try:
             distance, _ = self._batch.ray(
                 points.double().numpy(), directions.double().numpy(), geomgroup=seen, bodyexclude=exclude, ids=ids
@@ -489,11 +490,6 @@ class BatchEngine:
 
 
 _MORE_MEMORY = "a larger <size memory=...> in the MJCF mends a full contact arena"
-
-
-def _ids(selection: Selection) -> np.ndarray:
-    assert isinstance(selection, IdSelection)
-    return selection.ids
 
 
 def _engine_error(error: SimulationError) -> DivergedError:

@@ -17,7 +17,7 @@ from rlcli.sim.engine import Engine, computes_body_forces
 from rlcli.sim.names import NameProblem, match
 from rlcli.sim.rotations import atan2, axis_x, length, multiply, rotate, rotate_inverse
 from rlcli.sim.scene import actuator_kind, joint_settings
-from rlcli.sim.selection import ALL, Columns, Selection
+from rlcli.sim.selection import ALL, Columns, Selection, ids_of
 
 if TYPE_CHECKING:
     from rlcli.sim.actuators import ActuatorModel
@@ -39,8 +39,12 @@ class SimData:
         joined = _joined(qpos, qvel)
         self._sources = [qpos, qvel] if joined is None else [joined]
         self._copies = [source.to(torch.float32).contiguous() for source in self._sources]
-        self._stale = [] if self._copies[0] is self._sources[0] else list(zip(self._copies, self._sources, strict=True))
-        self._good = [copy.clone() for copy, _ in self._stale]
+        self._flat = [copy.view(-1) for copy in self._copies]
+        own = self._copies[0] is self._sources[0]
+        # an engine in float64 is on the CPU, where small copies cost numpy half of torch's
+        pairs = [] if own else zip(self._copies, self._sources, strict=True)
+        self._stale = [(copy.numpy(), source.numpy()) for copy, source in pairs]
+        self._good = [copy.copy() for copy, _ in self._stale]
         self.qpos = self._copies[0][:, : qpos.shape[1]]
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
@@ -67,28 +71,31 @@ class SimData:
     def refresh(self) -> None:
         """Copy the state of every world."""
         for copy, source in self._stale:
-            copy.copy_(source)
+            copy[...] = source
         self.stamp += 1
 
     def refresh_rows(self, selection: Selection) -> None:
         """Copy the state of the selected worlds, and drop what was computed from it."""
         for copy, source in self._stale:
-            selection.write(copy, selection.read(source))
+            rows = ids_of(selection)
+            copy[rows] = source[rows]
         self.stamp += 1
 
     def keep(self) -> None:
         """Note that the state as it is here is one to go back to."""
         for good, (copy, _) in zip(self._good, self._stale, strict=True):
-            good.copy_(copy)
+            good[...] = copy
 
     def restore_rows(self, selection: Selection) -> None:
         """Write the last state of the selected worlds that was kept back to the engine."""
         for good, (_, source) in zip(self._good, self._stale, strict=True):
-            selection.write(source, selection.read(good))
+            rows = ids_of(selection)
+            source[rows] = good[rows]
 
     def out_of_bounds(self, limit: float) -> Tensor | None:
         """Worlds with a position or a velocity that is not finite or beyond `limit`; None for none. (num_envs,) bool"""
-        if all(float(copy.abs().amax()) <= limit for copy in self._copies if copy.numel()):
+        # the sum of all squares bounds each of them, is not finite where one is not, and rounds by far less than half
+        if all(float(torch.dot(flat, flat)) <= 0.5 * limit * limit for flat in self._flat):
             return None
         bad = [~(copy.abs() <= limit).all(dim=1) for copy in self._copies]
         return torch.stack(bad).any(dim=0)
@@ -274,6 +281,10 @@ class EntityData:
         soft = torch.stack([middle - half, middle + half], dim=1)
         self.soft_joint_pos_limits = torch.where(limited[:, None], soft, infinite)
         """The limits, drawn in by `soft_joint_pos_limit_factor`. (k, 2) [m or rad]"""
+        self._limits = {
+            soft: tuple(end[None] for end in limits.unbind(dim=1))
+            for soft, limits in ((False, self.joint_pos_limits), (True, self.soft_joint_pos_limits))
+        }
         self._limited = limited
         self._joint_index = as_index(entity.joint_ids.tolist(), device)
         self._infinite = infinite
@@ -425,8 +436,8 @@ class EntityData:
         """
         ranges = self._entity.engine.expanded("jnt_range")
         if ranges is None:
-            low, high = (self.soft_joint_pos_limits if soft else self.joint_pos_limits).unbind(dim=1)
-            return low[None], high[None]
+            low, high = self._limits[soft]
+            return low, high
         low, high = self._once(
             "joint_ranges", lambda: ranges.view(len(ranges), -1, 2)[:, self._joint_index].float()
         ).unbind(dim=2)

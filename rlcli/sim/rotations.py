@@ -142,5 +142,5 @@ def yaw_only(quat: Tensor) -> Tensor:
 
 def wrap_to_pi(angle: Tensor) -> Tensor:
     """The same angle in [-pi, pi] [rad]; one that lies there already is returned bit for bit."""
-    turns = torch.round(angle * (0.5 / math.pi))
+    turns = (angle * (0.5 / math.pi)).round_()
     return torch.sub(angle, turns.mul_(2.0 * math.pi))

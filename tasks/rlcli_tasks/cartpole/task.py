@@ -41,15 +41,15 @@ class CartpoleTask(DirectTask):
         """Look up joints once."""
         self.cart = self.cartpoles.get_dof_index("slider_to_cart")
         self.pole = self.cartpoles.get_dof_index("cart_to_pole")
+        self.position_span, self.velocity_span = torch.empty(2, self.cartpoles.num_dof, device=self.device)
+        self.position_span[self.cart], self.position_span[self.pole] = 1.0, 0.125 * math.pi
+        self.velocity_span[self.cart], self.velocity_span[self.pole] = 0.5, 0.25 * math.pi
 
     def reset_idx(self, env_ids: Tensor) -> None:
         """Cart +-1 m and +-0.5 m/s, pole +-pi/8 and +-pi/4 rad/s."""
         draws = self.draws(env_ids)
-        span = torch.empty(self.cartpoles.num_dof, device=self.device)
-        span[self.cart], span[self.pole] = 1.0, 0.125 * math.pi
-        position = span * draws.uniform(-1.0, 1.0, (self.cartpoles.num_dof,))
-        span[self.cart], span[self.pole] = 0.5, 0.25 * math.pi
-        velocity = span * draws.uniform(-1.0, 1.0, (self.cartpoles.num_dof,))
+        position = self.position_span * draws.uniform(-1.0, 1.0, (self.cartpoles.num_dof,))
+        velocity = self.velocity_span * draws.uniform(-1.0, 1.0, (self.cartpoles.num_dof,))
         self.cartpoles.set_joint_positions(position, indices=env_ids)
         self.cartpoles.set_joint_velocities(velocity, indices=env_ids)
 
