@@ -39,7 +39,7 @@ def command(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Measure a task on this machine's CPU, and recommend sizes and threads."""
+    """Measure a task here, and recommend sizes and threads."""
     from rlcli.config.load import resolve
     from rlcli.machine import wait_calmly
     from rlcli.rl.trust import named_task

@@ -90,7 +90,7 @@ def command(
     verbose: Verbose = False,
     debug: Debug = False,
 ) -> None:
-    """Search settings that learn best; `sweep show` tells how far it is, `sweep compare` what it has brought."""
+    """Search settings that learn best; `sweep show` lists them."""
     from rlcli.cli.sweep_show import draw, find, report
     from rlcli.errors import Stopped, UsageError
     from rlcli.rl.run import default_runs_dir, require_name

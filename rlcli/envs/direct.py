@@ -20,7 +20,7 @@ from rlcli.random import stream
 from rlcli.registry import load_object
 from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import Scene
-from rlcli.sim.selection import IdSelection, Selection, in_place
+from rlcli.sim.selection import IdSelection, Selection
 
 _RESET = stream("direct.reset")
 
@@ -182,7 +182,6 @@ class DirectEnv(VecEnv):
         task = self.task
         self._returns = torch.zeros(self.num_envs, device=self.device)
         self._fresh = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        self._sums, self._begun = in_place(self._returns), in_place(self._fresh)
         self._resets_by_selection = type(task).reset is not DirectTask.reset
         self._resets_by_id = type(task).reset_idx is not DirectTask.reset_idx
         self._reset_hook = task.reset_idx
@@ -300,7 +299,7 @@ class DirectEnv(VecEnv):
 
     def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         return (
-            ended.read(self._sums),
+            ended.read(self._returns),
             {},
             {name: ended.peek(fired) for name, fired in self._causes.items()},
         )
@@ -318,8 +317,8 @@ class DirectEnv(VecEnv):
                 self._reset_hook(ids)
         selection.write(task.progress_buf, 0)
         selection.write(task.reset_buf, 1)
-        selection.write(self._begun, True)
-        selection.write(self._sums, 0.0)
+        selection.write(self._fresh, True)
+        selection.write(self._returns, 0.0)
 
     def _observe(self) -> dict[str, Tensor]:
         """Running environments keep what `_judge` observed; only those just reset take a second look."""

@@ -520,11 +520,11 @@ class VecEnv(ABC):
         timed_out = ended.peek(timed_out)
         success = None
         if self._success is not None:
-            success = timed_out & (ended.peek(self._holds) >= self._hold_steps)
+            success = timed_out & (ended.peek(self._success_hold) >= self._hold_steps)
         return Episodes(
-            ended.peek(self._names),
+            ended.peek(self._ids),
             returns,
-            ended.read(self._lengths),
+            ended.read(self.episode_length_buf),
             terms,
             causes,
             timed_out,
@@ -540,8 +540,8 @@ class VecEnv(ABC):
         for actuator in self._actuators.values():
             actuator.reset(selection)
         self._restart_workflow(selection)
-        selection.write(self._lengths, 0)
-        selection.write(self._holds, 0.0)
+        selection.write(self.episode_length_buf, 0)
+        selection.write(self._success_hold, 0.0)
         self.sim.moved(selection)
         for sensor in self.sensors.values():
             sensor.reset(selection)
@@ -668,7 +668,6 @@ class VecEnv(ABC):
         self._any_aside = False
         self._ids = torch.arange(self.num_envs, device=self.device)
         self._steps: Tensor = torch.zeros((), dtype=torch.int64, device=self.device)
-        self._names = in_place(self._ids)
         self._lengths, self._clock = in_place(self.episode_length_buf), in_place(self._steps)
 
 

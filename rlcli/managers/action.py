@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rlcli.errors import ConfigError, Problem
 from rlcli.managers.term import BoundTerm
-from rlcli.sim.selection import Selection, in_place
+from rlcli.sim.selection import Selection
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,6 @@ class ActionManager:
         """The policy's action of this step. (num_envs, size)"""
         self.prev_action = torch.zeros_like(self.action)
         """That of the step before; zero at the start of an episode. (num_envs, size)"""
-        self._past = in_place(self.action), in_place(self.prev_action)
         self._process = []
         start = 0
         for term in terms:
@@ -74,8 +73,8 @@ class ActionManager:
 
     def reset(self, selection: Selection) -> None:
         """New episodes begin without a past action."""
-        for values in self._past:
-            selection.write(values, 0.0)
+        selection.write(self.action, 0.0)
+        selection.write(self.prev_action, 0.0)
         for term in self.terms:
             term.reset(selection)
 

@@ -34,7 +34,7 @@ class RewardManager:
         weights = [live.get((*term.path, "weight"), term.config.weight) for term in terms]  # type: ignore[attr-defined]
         self._values = torch.zeros(len(terms), num_envs, device=device)
         self._sums = torch.zeros(len(terms), num_envs, device=device)
-        self._sums_by_env = in_place(self._sums.t())
+        self._sums_by_env = self._sums.t()
         self._rows = list(self._values.unbind(0))
         factors = [0.0 if _moves(weight) else weight * dt for weight in weights]
         self._factors = torch.tensor(factors, dtype=torch.float32, device=device)[:, None]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
@@ -54,17 +53,14 @@ class MaskSelection:
 
     def read(self, field: Tensor, columns: Columns = ALL) -> Tensor:
         """All rows of a (num_envs, ...) tensor, copied."""
-        field = _tensor(field)
         return field.clone() if columns is ALL else field[:, columns].clone()
 
     def peek(self, field: Tensor, columns: Columns = ALL) -> Tensor:
         """All rows of a (num_envs, ...) tensor, where possible the tensor itself."""
-        field = _tensor(field)
         return field if columns is ALL else field[:, columns]
 
     def write(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
         """Set the masked rows of a (num_envs, ...) tensor."""
-        field = _tensor(field)
         if isinstance(columns, Tensor):
             part = field[:, columns]
             self.write(part, values)
@@ -79,7 +75,6 @@ class MaskSelection:
 
     def add(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
         """Add to the masked rows of a (num_envs, ...) tensor."""
-        field = _tensor(field)
         part = field if columns is ALL else field[:, columns]
         self.write(field, part + values, columns)
 
@@ -128,8 +123,3 @@ class MaskSelection:
     def _launch(self, kernel: wp.Kernel, inputs: list, out: Tensor) -> None:
         if out.shape[1]:
             wp.launch(kernel, tuple(out.shape), inputs, [wp.from_torch(out)], device=wp.device_from_torch(out.device))
-
-
-def _tensor(field: Any) -> Tensor:
-    """A field as a tensor; Warp's CPU device has numpy arrays too (`in_place`)."""
-    return field if isinstance(field, Tensor) else torch.from_numpy(field)

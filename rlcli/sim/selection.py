@@ -23,7 +23,7 @@ ALL = slice(None)
 def in_place(tensor: Tensor) -> Any:
     """The same memory as what small steps in place cost least on: on a CPU a numpy array, whose calls cost half.
 
-    `+=`, `*=` and `[...] =` read alike on both, and a selection takes either for a field.
+    `+=`, `*=` and `[...] =` read alike on both.
     """
     return tensor.numpy() if tensor.device.type == "cpu" else tensor
 
@@ -100,11 +100,7 @@ class Selection(Protocol):
 def write_rows(field: Tensor, rows: NDArray[np.int64], values: Tensor | float, columns: Columns = ALL) -> None:
     """Set some rows of a (num_envs, ...) tensor on the CPU."""
     where = rows if columns is ALL else _index(rows, columns)
-    _array(field)[where] = values.numpy() if isinstance(values, Tensor) else values
-
-
-def _array(field: Any) -> NDArray:
-    return field if isinstance(field, np.ndarray) else field.numpy()
+    field.numpy()[where] = values.numpy() if isinstance(values, Tensor) else values
 
 
 def _index(rows: NDArray[np.int64], columns: Columns) -> Any:
@@ -167,7 +163,7 @@ class IdSelection:
 
     def read(self, field: Tensor, columns: Columns = ALL) -> Tensor:
         """The rows of a (num_envs, ...) tensor, copied."""
-        return torch.from_numpy(_array(field)[self.ids if columns is ALL else _index(self.ids, columns)])
+        return torch.from_numpy(field.numpy()[self.ids if columns is ALL else _index(self.ids, columns)])
 
     def peek(self, field: Tensor, columns: Columns = ALL) -> Tensor:
         """The rows of a (num_envs, ...) tensor."""
@@ -179,7 +175,7 @@ class IdSelection:
 
     def add(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
         """Add to the rows of a (num_envs, ...) tensor."""
-        _array(field)[self.ids if columns is ALL else _index(self.ids, columns)] += (
+        field.numpy()[self.ids if columns is ALL else _index(self.ids, columns)] += (
             values.numpy() if isinstance(values, Tensor) else values
         )
 

@@ -6,7 +6,7 @@ import torch
 
 from rlcli import random
 from rlcli.sim.mask import MaskSelection
-from rlcli.sim.selection import IdSelection, in_place
+from rlcli.sim.selection import IdSelection
 
 N = 11
 MASK = torch.tensor([i in (0, 3, 4, 9) for i in range(N)])
@@ -238,17 +238,3 @@ def test_joined_selections_hold_the_rows_of_both_and_draw_as_before():
     assert joined_ids.env_ids().tolist() == (MASK | chosen).nonzero()[:, 0].tolist()
     assert joined_mask.env_ids().tolist() == joined_ids.env_ids().tolist()
     assert torch.equal(joined_ids.uniform(0.0, 1.0), joined_mask.uniform(0.0, 1.0)[joined_ids.env_ids()])
-
-
-@pytest.mark.parametrize("kind", ["ids", "mask"])
-def test_either_kind_of_selection_takes_a_field_as_what_is_written_in_place(kind):
-    mask = torch.tensor([True, False, True, False])
-    counters = torch.zeros(4, dtype=torch.int64)
-    ids = mask.numpy().nonzero()[0]
-    selection = IdSelection(ids, 0, counters.numpy()[ids]) if kind == "ids" else MaskSelection(mask, 0, counters)
-    field = torch.arange(8.0).view(4, 2)
-    selection.write(in_place(field), 9.0)
-    selection.add(in_place(field), 1.0, slice(0, 1))
-    assert field.tolist() == [[10.0, 9.0], [2.0, 3.0], [10.0, 9.0], [6.0, 7.0]]
-    assert torch.equal(selection.read(in_place(field)), selection.read(field))
-    assert torch.equal(selection.peek(in_place(field)), selection.peek(field))
