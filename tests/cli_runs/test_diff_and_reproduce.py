@@ -93,8 +93,14 @@ def test_what_was_given_comes_first_with_its_place_and_its_consequences_follow(c
     result = cli("diff", run, other, "--json")
     assert result.code == 9
     first = result.json["first"]
-    assert (first["section"], first["where"], first["left"], first["right"]) == ("configuration", "seed", 42, 5)
+    assert (first["section"], first["where"], first["left"], first["right"]) == (
+        "configuration",
+        "params.chance",
+        0.5,
+        0.25,
+    )
     found = sections(result)
+    assert [(d["where"], d["left"], d["right"]) for d in found["configuration"]][1:] == [("seed", 42, 5)]
     (chance,) = [d for d in found["configuration"] if d["where"] == "params.chance"]
     assert (chance["left"], chance["right"]) == (0.5, 0.25)
     assert chance["left_from"].startswith("config.yaml:")

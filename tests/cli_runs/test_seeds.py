@@ -138,11 +138,12 @@ def test_a_seed_that_goes_wrong_is_named_and_the_others_are_trained(cli):
 
 @pytest.mark.slow
 def test_a_finished_study_is_trained_longer_when_a_new_budget_is_given(cli):
-    done = cli("train", "cartpole", *SMALL, "--max-iterations", 2, "--seeds", "4..5", "--jobs", 5, "--json")
+    steady = (*SMALL, "agent.schedule=constant")  # another schedule knows where its budget ends
+    done = cli("train", "cartpole", *steady, "--max-iterations", 2, "--seeds", "4..5", "--jobs", 5, "--json")
     assert done.code == 0, done.err
     longer = cli("train", "--resume", study_folder(), "--max-iterations", 3, "--logger", "tensorboard", "--json")
     assert longer.code == 0, longer.err
-    alone = cli("train", "cartpole", *SMALL, "--max-iterations", 3, "--seed", 5, "--runs-dir", "alone", "--json")
+    alone = cli("train", "cartpole", *steady, "--max-iterations", 3, "--seed", 5, "--runs-dir", "alone", "--json")
     assert [row["step"] for row in longer.json["runs"]] == [3 * 32 * 16] * 2
     assert rows_of(study_folder() / "seed-5") == rows_of(Path(alone.json["run"]))
     assert list((study_folder() / "seed-5").rglob("events.out.tfevents*")), "further options hold for each"
