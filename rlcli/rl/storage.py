@@ -50,18 +50,19 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
     warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
     name = f"rlcli/{settings['task']}/{settings['name']}"
     median = optuna.pruners.MedianPruner(n_startup_trials=4, n_warmup_steps=30)
+    pruner = median if settings["pruner"] == "median" else optuna.pruners.NopPruner()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             place = _journal(folder, create) if storage is None else _database(storage)
         if not create:
-            return optuna.load_study(study_name=name, storage=place)
+            return optuna.load_study(study_name=name, storage=place, pruner=pruner)
         return optuna.create_study(
             storage=place,
             study_name=name,
             load_if_exists=True,
             direction=settings["direction"],
-            pruner=median if settings["pruner"] == "median" else optuna.pruners.NopPruner(),
+            pruner=pruner,
         )
     except KeyError:
         raise CheckpointError(f"there is no sweep '{name}' in {hidden(storage) if storage else folder}") from None

@@ -282,7 +282,7 @@ def test_a_full_disk_costs_no_trial(cli):
 @pytest.mark.slow
 def test_the_preset_is_the_trial_without_its_budget(cli):
     Path("more.yaml").write_text("rewards: {alive: {weight: 2.0}}\nagent: {gamma: 0.9}\n")
-    words = ("--param", "agent.policy.hidden.0=8:12", "--trials", 1, "--max-iterations", 1, "--episodes", 4)
+    words = ("--param", "agent.actor.hidden.0=8:12", "--trials", 1, "--max-iterations", 1, "--episodes", 4)
     done = cli("sweep", "cartpole", "--num-envs", 16, "--agent", "ppo", "--config", "more.yaml", *words, "--json")
     assert done.code == 0, done.err
     own, plain = (
@@ -295,7 +295,7 @@ def test_the_preset_is_the_trial_without_its_budget(cli):
         assert own["agents"]["ppo"].pop(key) == plain["agents"]["ppo"][key]
         trial["agents"]["ppo"].pop(key)
     assert json.loads(json.dumps(own)) == json.loads(json.dumps(trial))
-    assert own["agents"]["ppo"]["policy"]["hidden"][0] == done.json["best"]["params"]["agent.policy.hidden.0"]
+    assert own["agents"]["ppo"]["actor"]["hidden"][0] == done.json["best"]["params"]["agent.actor.hidden.0"]
 
 
 def test_an_objective_that_is_not_finite_is_no_number():
