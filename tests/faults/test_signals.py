@@ -18,7 +18,7 @@ import rlcli_tasks.cartpole
 
 SHORT = ("episode_length_s=0.3", "agent.n_steps=64", "agent.n_epochs=10", "agent.policy.hidden=[8]", "--logger", "none")
 TRAIN = ("cartpole", *SMALL, *SHORT, "--max-iterations", 4, "--seed", 5)
-STEP, UPDATE = "rlcli.envs.vec_env:VecEnv.step", "torch.optim:Adam.step"
+STEP, UPDATE = "rlcli.envs.vec_env:VecEnv.step", "rlcli.rl.optimizers:Adam.step"
 LONG_FIRST = {"kind": "sleep", "call": STEP, "pattern": "", "nth": 3, "seconds": 0.2}
 """The first iteration takes long, so that the second one can be left."""
 PHASES = {
