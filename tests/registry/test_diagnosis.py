@@ -305,7 +305,7 @@ def test_many_faults_at_once_are_each_named_with_their_mending_line_and_end_it_w
     assert (document["schema"], document["healthy"], document["all_good"]) == (1, False, False)
     found = {check["name"]: check for check in document["checks"]}
     assert {n for n, c in found.items() if c["state"] == "broken"} == {
-        "mujoco packages", "runs folder", "settings", "graphics",
+        "mujoco packages", "runs folder", "settings", "graphics", "task cartpole-camera",
     }  # fmt: skip
     assert found["variables"]["state"] == "warning"
     assert "mujoco-core 3.13.0" in found["mujoco packages"]["found"]
