@@ -58,7 +58,7 @@ def test_a_training_that_keeps_episodes_is_the_one_that_does_not_also_when_cut_a
     kept = train(tmp_path / "kept", case, place, autopsy=KEPT).folder
     assert rows_of(kept) == rows_of(plain)
     assert content(newest(kept)) == content(newest(plain))
-    assert 2 <= len(names(kept)) <= KEPT.keep
+    assert 4 <= len(names(kept)) <= KEPT.keep
     assert not (plain / FOLDER).exists()
     if cut == "within":
         monkeypatch.setattr(loop, "LONG_S", -1.0)

@@ -64,7 +64,8 @@ def test_tensorboard_holds_no_step_twice_after_a_resume(tmp_path):
     events = accumulator.EventAccumulator(str(tmp_path))
     events.Reload()
     # files of one second and one process are read in the order of their names, in which 10 comes before 9
-    assert sorted((e.step, e.value) for e in events.Scalars("Loss/value")) == [(16, 16.0), (32, 32.0), (48, 480.0)]
+    written = sorted(events.Scalars("Loss/value"), key=lambda event: event.wall_time)
+    assert [(e.step, e.value) for e in written] == [(16, 16.0), (32, 32.0), (48, 480.0)]
 
 
 def test_loggers_by_name(monkeypatch):
