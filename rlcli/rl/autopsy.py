@@ -205,6 +205,7 @@ class Keeper:
             )
             self._entries.append(_Entry(name, case.kind, case, ending))
         self._pending.clear()
+        self._entries.sort(key=lambda entry: entry.name)  # as a folder is read: a resumed run makes room alike
         self._evict()
         self._learn()
 
