@@ -106,12 +106,12 @@ class PpoTrainer:
         self._collect = captured(self._roll_out, self.device, env.holders(), self._notes.append)
         self._tf32, self._parts = config.tf32 and self.device.type == "cuda", Parts()
         how = compilation(config, self.device, self.steps_per_iteration)
-        if how:
-            self._parts = fused(self._parts, self._rehearse, self._notes.append, tuned=how == "tuned")
         by_hand = not how and has_closed_form(self.networks)
         written = (self.networks, self._shared, places, max(minibatches), torch_threads)
         self._gradient_of = PpoGradient(*written) if by_hand else None
         """On a CPU, for plain networks: a thread takes whole parts of a minibatch; torch has one within a part."""
+        if how:
+            self._parts = fused(self._parts, self._rehearse, self._notes.append, tuned=how == "tuned")
         self._learn = captured(self._update, self.device, tell=self._notes.append)
 
     def start(self) -> None:
