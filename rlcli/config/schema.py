@@ -344,6 +344,9 @@ class SimConfig(StrictModel):
     external_forces: bool = False
     """Compute `cfrc_ext`, the forces of contacts on bodies, after every step, as `mj_rnePostConstraint` does; they are
     0 in a start state. On a CPU it takes about 15 us for each environment that touches something."""
+    max_velocity: Positive | None = None
+    """Speed of a joint or a free body [m/s, rad/s] beyond which an environment counts as diverged, after an environment
+    step; null: MuJoCo's own bound, 1e10. A contact that throws a body at a finite 1e6 m/s ruins a learner."""
     contacts_per_env: Count | None = None
     """Room for contacts that warp sets aside, an environment; null estimates it from the model."""
     constraints_per_env: Count | None = None

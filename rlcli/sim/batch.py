@@ -15,7 +15,18 @@ from torch import Tensor
 
 from rlcli.errors import DivergedError, did_you_mean
 from rlcli.sim.engine import force_sensors
-from rlcli.sim.guard import ENGINE_ERROR, FIELD_OF, MEMORY, SHOWN, Call, Divergence, History, StateLayout
+from rlcli.sim.guard import (
+    ENGINE_ERROR,
+    FIELD_OF,
+    LIMIT,
+    MEMORY,
+    SHOWN,
+    TOO_FAST,
+    Call,
+    Divergence,
+    History,
+    StateLayout,
+)
 from rlcli.sim.mjcf import quiet_mujoco
 from rlcli.sim.selection import IdSelection, Selection, ids_of
 
@@ -76,6 +87,7 @@ class BatchEngine:
         late: derived fields are left as the last substep made them.
         external_forces: compute `cfrc_ext`, exactly. Batch itself does so for models with certain sensors alone, and
             with RK4 at the wrong one of a substep's stages.
+        max_velocity: a velocity beyond it is a divergence [m/s, rad/s].
     """
 
     asynchronous = False
@@ -89,6 +101,7 @@ class BatchEngine:
         *,
         late: bool = False,
         external_forces: bool = False,
+        max_velocity: float = LIMIT,
     ) -> None:
         quiet_mujoco()
         self.model = model
@@ -106,6 +119,8 @@ class BatchEngine:
         self._error = ""
         self._default = self._default_row()
         self.state_layout = StateLayout(model, {n: self._batch._component(kind) for n, kind in _STATE_FIELDS.items()})
+        self._max_velocity = max_velocity
+        self._qvel = self._batch.state[:, self.state_layout.columns("qvel")]
         self._history = History(self._batch.state, self.state_layout.until("ctrl"), self._default, 1)
         self._fields: dict[str, Tensor] = {}
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
@@ -268,7 +283,7 @@ class BatchEngine:
         warned = np.count_nonzero(self._warning_words) > 0
         # of whole rows: skipping the columns that nobody writes takes longer
         finite = math.isfinite(self._state.sum().item()) or bool(self._state.isfinite().all())
-        if not warned and finite and not self._error:
+        if not warned and finite and not self._error and not self._too_fast().any():
             return None
         bad, causes = self._judge(finite)
         if not bad.any():
@@ -277,6 +292,12 @@ class BatchEngine:
         for name, count in zip(names.tolist(), counts.tolist(), strict=True):
             self.causes[name] = self.causes.get(name, 0) + count
         return torch.from_numpy(bad)
+
+    def _too_fast(self) -> np.ndarray:
+        """Worlds beyond the bound that the task sets; MuJoCo warns of its own. (num_envs,), or (1,) for none"""
+        if self._max_velocity >= LIMIT or not (np.abs(self._qvel) > self._max_velocity).any():
+            return np.zeros(1, dtype=bool)
+        return np.asarray((np.abs(self._qvel) > self._max_velocity).any(axis=1))
 
     def _judge(self, finite: bool) -> tuple[np.ndarray, np.ndarray]:
         """Which worlds went wrong, and the cause of each; the counters are put back to zero."""
@@ -290,6 +311,9 @@ class BatchEngine:
             warned = counts[:, kind] > 0
             causes[warned & (causes == "")] = name
             bad = bad | warned
+        fast = self._too_fast() & ~bad
+        causes[fast] = TOO_FAST
+        bad = bad | fast
         for env in (bad & (causes == "")).nonzero()[0]:
             causes[env] = f"{self._unfit(int(env))} not finite"
         self.found = [self._describe(int(env), causes[env]) for env in bad.nonzero()[0][:SHOWN]]
@@ -315,6 +339,9 @@ class BatchEngine:
         if cause in FIELD_OF:
             index = int(self._batch.warning[env, _DIVERGED[cause], 0])
             place = self.state_layout.place(FIELD_OF[cause], index)
+        elif cause == TOO_FAST:
+            index = int((np.abs(self._qvel[env]) > self._max_velocity).argmax())
+            place = f"{self.state_layout.place('qvel', index)} = {self._qvel[env, index]:g}"
         before = self._history.last(env)
         known = np.concatenate([before, self._default[len(before) :]]) if before is not None else self._default
         unfit = [f"model field {name}" for name in self._unfit_model(env)] + self.state_layout.unfit(known)

@@ -13,7 +13,7 @@ from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DependencyError, Problem
 from rlcli.machine import available_cores, require_device
 from rlcli.sim.capacity import capacity
-from rlcli.sim.guard import MEMORY, Call, Divergence
+from rlcli.sim.guard import LIMIT, MEMORY, Call, Divergence
 from rlcli.sim.selection import Selection
 
 if TYPE_CHECKING:
@@ -192,6 +192,7 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
             config.forces_after_reset,
             late=config.derived_fields == "substep",
             external_forces=config.external_forces,
+            max_velocity=config.max_velocity or LIMIT,
         )
     require_device(device)
     try:
@@ -207,6 +208,7 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
         config.forces_after_reset,
         late=config.derived_fields == "substep",
         external_forces=config.external_forces,
+        max_velocity=config.max_velocity or LIMIT,
     )
 
 

@@ -14,6 +14,8 @@ SHOWN = 4
 """Environments of a divergence that are described one by one."""
 ENGINE_ERROR = "engine error"
 """Cause of an environment that the engine could not step."""
+TOO_FAST = "qvel out of bounds"
+"""Cause of an environment that moves faster than its task allows."""
 MEMORY = 64 * 2**20
 """Bytes that a history may take, if nobody says otherwise."""
 
@@ -25,7 +27,7 @@ class Divergence:
     env: int
     """Environment."""
     cause: str
-    """MuJoCo's warning without its prefix (`BADQACC`), `FIELD not finite`, or `engine error`."""
+    """MuJoCo's warning without its prefix (`BADQACC`), `FIELD not finite`, `qvel out of bounds`, or `engine error`."""
     detail: str = ""
     """Where, as far as it is known at once."""
     index: int = -1

@@ -80,6 +80,7 @@ def guard(
     ctrl: wp.array2d(dtype=float),
     act: wp.array2d(dtype=float),
     overflow: wp.array(dtype=wp.int32),
+    fastest: wp.float32,
     last_qpos: wp.array2d(dtype=float),
     last_qvel: wp.array2d(dtype=float),
     diverged: wp.array(dtype=wp.bool),
@@ -87,7 +88,7 @@ def guard(
     first: wp.array(dtype=wp.int32),
     overflowed: wp.array(dtype=wp.int32),
 ):
-    """Find worlds whose state is not finite or beyond MuJoCo's limit, and put them back to the last good state.
+    """Find worlds whose state is not finite, beyond MuJoCo's limit or too fast; put them back to the last good state.
 
     `counts` has a number for each of `CAUSES`; `first` keeps the number of the first such world ever, counted from 1,
     with its cause and the column. What ran out of room is kept in `overflowed`, unless that was a world on its way to
@@ -101,7 +102,7 @@ def guard(
         if not wp.isfinite(x):
             bad = wp.int32(3)
             column = i
-        elif wp.abs(x) > _TOO_LARGE:
+        elif wp.abs(x) > fastest:
             bad = wp.int32(4)
             column = i
     for i in range(qpos.shape[1]):

@@ -25,7 +25,7 @@ from rlcli.sim import kernels
 from rlcli.sim.capacity import Capacity
 from rlcli.sim.engine import force_sensors
 from rlcli.sim.entity import as_index
-from rlcli.sim.guard import Call, Divergence, StateLayout
+from rlcli.sim.guard import LIMIT, Call, Divergence, StateLayout
 from rlcli.sim.mask import MaskSelection
 from rlcli.sim.mjcf import quiet_mujoco
 from rlcli.sim.saved import require_alike
@@ -99,6 +99,7 @@ class WarpEngine:
         forces_after_reset: whether `forward` computes the acceleration stage, or leaves zeros there.
         late: derived fields are left as the last substep made them.
         external_forces: compute `cfrc_ext`, which MuJoCo Warp does for models with certain sensors alone.
+        max_velocity: a velocity beyond it is a divergence [m/s, rad/s].
 
     Raises:
         ConfigError: for a model that MuJoCo Warp cannot run.
@@ -118,6 +119,7 @@ class WarpEngine:
         *,
         late: bool = False,
         external_forces: bool = False,
+        max_velocity: float = LIMIT,
     ) -> None:
         quiet_mujoco()
         self.model = model
@@ -139,6 +141,7 @@ class WarpEngine:
         self.forces_after_reset = forces_after_reset
         self._late = late
         self._external_forces = external_forces
+        self._max_velocity = max_velocity
         force_columns = force_sensors(model)
         self._sensor_stages = {_FORCE} if force_columns else set()
         if len(force_columns) < model.nsensordata:
@@ -471,7 +474,7 @@ class WarpEngine:
             kernels.guard,
             dim=self.num_envs,
             inputs=[self._arrays[name] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "act")]
-            + [self._data.overflow],
+            + [self._data.overflow, self._max_velocity],
             outputs=[
                 wp.from_torch(self._last_qpos),
                 wp.from_torch(self._last_qvel),

@@ -257,6 +257,8 @@ def _starts_badly(env, who):
         env.episode_length_buf[i] = env.max_episode_length
 
 
+QUICK_TASK = {**TASK, "sim": {"dt": 0.01, "max_velocity": 200.0}}
+
 FAULTS = {
     "nan qpos": Fault(_writes("qpos", math.nan, 0), "BADQPOS", "joint 'robot/swing'"),
     "inf qpos": Fault(_writes("qpos", math.inf, 1), "BADQPOS", "joint 'robot/reach'"),
@@ -285,6 +287,7 @@ FAULTS = {
     "reset writes nan": Fault(
         _starts_badly, "qpos not finite", "a reset", cure=lambda env, who: faults(env).clear(), written=True
     ),
+    "too fast": Fault(_writes("qvel", 900.0, 0), "qvel out of bounds", "joint 'robot/swing' = ", task=QUICK_TASK),
 }
 
 

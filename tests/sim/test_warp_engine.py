@@ -314,6 +314,30 @@ def test_a_diverged_world_is_terminated_and_put_back_and_the_others_are_untouche
     sick.check()
 
 
+@pytest.mark.parametrize("engine", ["batch", "warp"])
+def test_a_world_that_moves_faster_than_its_task_allows_has_diverged_and_is_judged_by_where_it_was(tmp_path, engine):
+    quick, slow = (
+        build(critter(tmp_path), N, f"sim.engine={engine}", f"sim.max_velocity={most}", "episode_length_s=9.0")
+        for most in ("null", 40.0)
+    )
+    action = torch.full((N, 4), 0.2)
+    for env in (quick, slow):
+        env.reset()
+        for _ in range(3):
+            assert not env.step(action).terminated.any()
+        last = env.sim.qpos[1].clone(), env.sim.qvel[1].clone()
+        env.engine.field("qvel")[1, 0] = -400.0  # the root, along x
+    assert not quick.step(action).terminated.any()
+    result = slow.step(action)
+    assert result.terminated.tolist() == [env == 1 for env in range(N)]
+    assert result.episodes.ended().causes["diverged"].tolist() == [True]
+    assert torch.equal(result.final_obs["critic"][1], torch.cat([last[0][7:], last[1][6:]]))
+    assert float(result.reward.abs().max()) < 10.0
+    assert slow.engine.causes == {"qvel out of bounds": 1}
+    assert "root" in slow.engine.found[0].detail
+    assert not slow.step(action).terminated.any()
+
+
 def test_a_world_that_diverges_in_its_first_step_is_judged_by_its_start(tmp_path):
     envs = [build(pendulum(tmp_path), 3, f"sim.engine={engine}") for engine in ("batch", "warp")]
     for env in envs:
