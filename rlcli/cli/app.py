@@ -186,8 +186,9 @@ def _usage(error: UsageError, arguments: list[str]) -> int:
         console.error("usage", 2, "no command", "rlcli --help", []) if console.json else console.info(error.message)
         return 2
     hint = "rlcli --help" if error.ctx is None else f"{error.ctx.command_path} --help"
-    match = re.match(r"No such option: --([A-Za-z_][\w-]*(?:\.[\w-]+)+)", error.format_message())
-    if match:
+    match = re.match(r"No such option: --([A-Za-z_][\w.-]*)", error.format_message())
+    keys = _settings_called(match[1]) if match else []
+    if match and keys:
         key = match[1]
         given = next(
             (a for a in arguments if a.startswith(f"--{key}") or a.startswith(f"--{key.replace('-', '_')}")),
@@ -196,9 +197,28 @@ def _usage(error: UsageError, arguments: list[str]) -> int:
         value = given.partition("=")[2]
         if not value and given in arguments[:-1]:
             value = arguments[arguments.index(given) + 1]
-        hint = f"overrides have no dashes: {given.lstrip('-').partition('=')[0]}={value or 'VALUE'}"
+        value = value or "VALUE"
+        hint = f"overrides have no dashes: {' or '.join(f'{key}={value}' for key in keys)}"
     console.error("usage", 2, error.format_message(), hint, [])
     return 2
+
+
+def _settings_called(option: str) -> list[str]:
+    """The settings that an option's name without its dashes may mean: an address, or the last part of one to three."""
+    name = option.replace("-", "_")
+    if "." in name.strip("."):
+        return [name]
+    from rlcli.config.messages import homes
+    from rlcli.config.schema import TaskConfig
+    from rlcli.rl.ppo_config import PpoConfig
+    from rlcli.rl.sb3_config import Sb3Config
+
+    known = homes({"": TaskConfig, "agent": PpoConfig}) | homes({"agent": Sb3Config})
+    places = known.get(_SHORT_FOR.get(name, name), [])
+    return places if len(places) <= 3 and name != "task" else []  # the task is an argument
+
+
+_SHORT_FOR = {"lr": "learning_rate"}
 
 
 def _machine(error: OSError) -> int:

@@ -91,6 +91,17 @@ def test_an_override_with_dashes_is_answered_with_the_right_form(in_process, arg
     assert f"overrides have no dashes: {key}=2" in err
 
 
+@pytest.mark.parametrize(
+    ("option", "setting"),
+    [("--lr", "agent.learning_rate"), ("--learning-rate", "agent.learning_rate"), ("--decimation", "decimation")],
+)
+def test_a_setting_given_as_an_option_is_answered_with_its_address(in_process, option, setting):
+    code, _, err = in_process("train", "cartpole", option, "2")
+    assert code == 2
+    assert f"overrides have no dashes: {setting}=2" in err
+    assert f"{setting}=2" in in_process("train", "cartpole", f"{option}=2")[2]
+
+
 def test_underscores_are_accepted_for_hyphens(in_process):
     code, out, _ = in_process("show", "cartpole", "--num_envs", "3", "--json")
     assert code == 0
