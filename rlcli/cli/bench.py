@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -11,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rlcli.cli.console import console
+from rlcli.cli.console import console, is_terminal, plain
 from rlcli.cli.options import Agent, ConfigFile, Debug, Json, NumEnvs, Overrides, Quiet, Verbose, flags, tell_notes
-from rlcli.cli.tables import flow
+from rlcli.cli.tables import flow, screen
 
 if TYPE_CHECKING:
     from rlcli.rl.bench import Findings, Stepped, Trained
@@ -204,11 +205,10 @@ class _View:
         self._live: Any = None
 
     def __enter__(self) -> _View:
-        if sys.stderr is not None and sys.stderr.isatty() and not console.quiet:
-            from rich.console import Console as Rich
+        if is_terminal(sys.stderr) and not console.quiet:
             from rich.live import Live
 
-            self._live = Live(console=Rich(stderr=True), refresh_per_second=4, transient=True)
+            self._live = Live(console=screen(sys.stderr), refresh_per_second=4, transient=True)
             self._live.__enter__()
         return self
 
@@ -216,7 +216,8 @@ class _View:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._live is not None:
-            self._live.__exit__(kind, error, trace)
+            with contextlib.suppress(OSError):  # the terminal may be gone
+                self._live.__exit__(kind, error, trace)
 
     def tell(self, doing: str) -> None:
         """What is measured next."""
@@ -244,7 +245,7 @@ class _View:
         width = self._live.console.width
         lines = [line for row in self._lines for line in flow(row, width)]
         room = max(4, self._live.console.height - 4)
-        text = "\n".join([self._title, *lines[-room:], *flow([f"... {self._doing}"], width)])
+        text = "\n".join([plain(self._title), *lines[-room:], *flow([f"... {self._doing}"], width)])
         self._live.update(Text(text))
 
 
