@@ -131,10 +131,16 @@ def test_an_exported_file_is_used_as_the_page_says(tmp_path):
     run = run_commands([train], tmp_path).strip()
     commands, *scripts = [b for b in blocks(DOCS / "export.md") if "pip install" not in b.text]
     output = run_commands([commands], tmp_path, run=run)
-    assert len(output.split()) == 6
+    exports = tmp_path / run / "exports"
+    for name in ("policy.onnx", "policy.pt2", "policy.py", "policy"):
+        assert (exports / name).exists()
+        assert f"{run}/exports/{name}\n" in output, "what was written is printed"
+    assert output.count("policy.onnx\n") == 3
+    assert (tmp_path / "policy.onnx").is_file()
     for kind in ("policy.pt2", "policy.py"):
         (tmp_path / kind).write_bytes((tmp_path / run / "exports" / kind).read_bytes())
-    now = Block("python", None, "import numpy\nnow = numpy.zeros(4, numpy.float32)\n")
+    beside = "import sys, numpy\nsys.path.insert(0, '')\n"  # as a script's own folder is
+    now = Block("python", None, f"{beside}now = numpy.zeros(4, numpy.float32)\n")
     shown = Block("python", None, "print(action.shape, command.shape)\n")
     assert len(scripts) == 3
     for script in scripts:
