@@ -10,6 +10,7 @@ from types import FrameType
 
 import rlcli
 from rlcli.errors import TaskError
+from rlcli.registry import OWN, TASKS, TRAINERS, catalog
 
 
 def own_failure(error: BaseException) -> TaskError | None:
@@ -33,19 +34,18 @@ def _is_own(frame: FrameType) -> bool:
     """Whether a frame is neither rlcli's nor a library's: it lies outside of both, or in an installed plugin."""
     file = frame.f_code.co_filename
     package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
-    if file.startswith("<") or package in ("rlcli", "rlcli_tasks"):
+    offers = _packages().get(package)
+    if file.startswith("<") or package == OWN or offers == OWN:
         return False
-    return package in _plugins() or not any(Path(file).is_relative_to(place) for place in _libraries())
+    return offers is not None or not any(Path(file).is_relative_to(place) for place in _libraries())
 
 
-def _plugins() -> set[str]:
-    """The top-level packages of installed plugins, other than rlcli's own tasks."""
-    from rlcli.registry import OWN, TASKS, TRAINERS, catalog
-
+def _packages() -> dict[str, str]:
+    """The top-level packages of tasks and trainers that are installed, each with its distribution."""
     entries = []
     with contextlib.suppress(Exception):  # what cannot be read has no say here
         entries = [entry for group in (TASKS, TRAINERS) for entry in catalog(group)[0]]
-    return {entry.value.partition(":")[0].partition(".")[0] for entry in entries if entry.distribution != OWN}
+    return {entry.value.partition(":")[0].partition(".")[0]: entry.distribution for entry in entries}
 
 
 def _libraries() -> list[Path]:
