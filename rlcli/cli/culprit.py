@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 import sysconfig
 from pathlib import Path
 from types import FrameType
@@ -15,9 +14,9 @@ from rlcli.registry import OWN, TASKS, TRAINERS, catalog
 
 def own_failure(error: BaseException) -> TaskError | None:
     """What a user is told of an exception that came out of a task's or plugin's own code; None of any other."""
-    traceback, found = error.__traceback__, None
+    traceback, found, packages = error.__traceback__, None, _packages()
     while traceback is not None:
-        if _is_own(traceback.tb_frame):
+        if _is_own(traceback.tb_frame, packages):
             found = traceback
         traceback = traceback.tb_next
     if found is None:
@@ -30,11 +29,11 @@ def own_failure(error: BaseException) -> TaskError | None:
     )
 
 
-def _is_own(frame: FrameType) -> bool:
+def _is_own(frame: FrameType, packages: dict[str, str]) -> bool:
     """Whether a frame is neither rlcli's nor a library's: it lies outside of both, or in an installed plugin."""
     file = frame.f_code.co_filename
     package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
-    offers = _packages().get(package)
+    offers = packages.get(package)
     if file.startswith("<") or package == OWN or offers == OWN:
         return False
     return offers is not None or not any(Path(file).is_relative_to(place) for place in _libraries())
@@ -49,6 +48,6 @@ def _packages() -> dict[str, str]:
 
 
 def _libraries() -> list[Path]:
-    """Where Python, what is installed, and rlcli lie, and the program that was started."""
-    places = [Path(path) for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib", "scripts"))]
-    return [*places, Path(rlcli.__file__).parent, *([Path(sys.argv[0])] if sys.argv else [])]
+    """Where Python, what is installed, and rlcli lie."""
+    places = [Path(path) for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib"))]
+    return [*places, Path(rlcli.__file__).parent]
