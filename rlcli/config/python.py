@@ -276,6 +276,14 @@ def _import_hint(error: BaseException) -> str | None:
             where = f"rlcli.isaaclab{f'.{rest}' if top == 'isaaclab' and rest else ''}"
             return f"import it from {where}: docs/from-isaac-lab.md lists the lines"
         return f"'{top}' is Isaac Sim's: take the import out, and what uses it" if top in _ISAAC_SIM else None
+    if isinstance(error, AttributeError):
+        module = str(getattr(error.obj, "__name__", ""))
+        known = dir(error.obj) if module.startswith("rlcli.isaaclab.") and module != "rlcli.isaaclab.mdp" else []
+        return (
+            (did_you_mean(str(error.name), known) or f"it has {listing([n for n in known if n[0].isupper()], 40)}")
+            if known
+            else None
+        )
     if not isinstance(error, ImportError) or not module.startswith("rlcli.isaaclab"):
         return None
     name = str(error).partition("'")[2].partition("'")[0]

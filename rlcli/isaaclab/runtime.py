@@ -119,6 +119,17 @@ class Asset:
         self.num_instances, self.device = env.num_envs, env.device
         self.is_fixed_base = not entity.is_floating
 
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        known = [n for n in (*dir(type(self)), *vars(self)) if not n.startswith("_")]
+        near = did_you_mean(name, known) or (
+            "there is no PhysX; its numbers are in data and in the events"
+            if "physx" in name
+            else f"it has {listing(known, 40)}"
+        )
+        raise AttributeError(f"an asset has no '{name}'; {near}")
+
     def find_joints(self, name_keys: Any, joint_subset: Any = None, preserve_order: bool = False) -> Any:
         """Ids and names of joints by names or regexes."""
         return _find(name_keys, joint_subset or self.joint_names, self.joint_names, "joint", preserve_order)
@@ -311,7 +322,10 @@ class _Terminations(_Manager):
 
     def get_term(self, name: str) -> Tensor:
         """Where a term fired. (num_envs,) bool"""
-        return self._manager.fired[name]
+        fired = self._manager.fired
+        if name not in fired:
+            raise NameProblem(f"no termination '{name}'; there are {listing(fired)}")
+        return fired[name]
 
 
 class _Commands(_Manager):
@@ -396,6 +410,13 @@ class ManagerBasedRLEnv(gymnasium.Env):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or name in ("managed", "cfg"):
             raise AttributeError(name)
+        if not hasattr(self.managed, name):
+            if name.endswith("_manager") and name in dir(type(self)):
+                raise AttributeError(
+                    f"env has no '{name}' yet: it is made after the terms have given their first values"
+                )
+            known = [n for n in (*dir(type(self)), *dir(self.managed)) if not n.startswith("_")]
+            raise AttributeError(f"env has no '{name}'; {did_you_mean(name, known) or listing(sorted(set(known)), 60)}")
         return getattr(self.managed, name)
 
     @property
@@ -439,6 +460,11 @@ class ManagerBasedRLEnv(gymnasium.Env):
     def reset_terminated(self) -> Tensor:
         """Terminated in this step. (num_envs,) bool"""
         return self.managed.termination_manager.terminated
+
+    @property
+    def reset_buf(self) -> Tensor:
+        """Terminated or timed out in this step. (num_envs,) bool"""
+        return self.reset_terminated | self.reset_time_outs
 
     @property
     def reset_time_outs(self) -> Tensor:
