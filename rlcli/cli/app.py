@@ -144,10 +144,13 @@ def _run(arguments: list[str]) -> int:
     except OSError as error:
         return _machine(error)
     except Exception as error:
+        from rlcli.cli.culprit import own_failure
         from rlcli.sim.gl import unusable_choice
 
         if (unusable := unusable_choice(error)) is not None:
             return _report(unusable)
+        if (failure := own_failure(error)) is not None:
+            return _report(failure)
         traceback.print_exc()
         said = f"this is a bug in rlcli: {type(error).__name__}: {error}"
         console.error("bug", 1, said, "please report it with the lines above", [])
@@ -176,7 +179,7 @@ def _report(error: RlcliError) -> int:
     if isinstance(error, ConfigError):
         problems = [{"where": p.where, "path": p.path, "message": p.message, "hint": p.hint} for p in error.problems]
     if console.debug:
-        traceback.print_exc()
+        traceback.print_exc()  # of what is being handled, which may be another one
     console.error(error.kind, error.exit_code, error.message, error.hint, problems)
     return error.exit_code
 
@@ -199,6 +202,8 @@ def _usage(error: UsageError, arguments: list[str]) -> int:
             value = arguments[arguments.index(given) + 1]
         value = value or "VALUE"
         hint = f"overrides have no dashes: {' or '.join(f'{key}={value}' for key in keys)}"
+    elif match and match[1] in _WRITTEN_OTHERWISE:
+        hint = _WRITTEN_OTHERWISE[match[1]]
     console.error("usage", 2, error.format_message(), hint, [])
     return 2
 
@@ -218,6 +223,12 @@ def _settings_called(option: str) -> list[str]:
     return places if len(places) <= 3 and name != "task" else []  # the task is an argument
 
 
+_WRITTEN_OTHERWISE = {
+    "task": "the task is named without an option, as in: rlcli train cartpole",
+    "load-run": "a run or one of its checkpoints is named by --checkpoint RUN; rlcli train --resume RUN goes on",
+    "enable-cameras": "cameras of a task need no option",
+}
+"""Options of other programs -> what is written here."""
 _SHORT_FOR = {"lr": "learning_rate"}
 
 

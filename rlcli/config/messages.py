@@ -117,7 +117,19 @@ def _said(
     return f"expected {' or '.join(dict.fromkeys(map(_expected, items)))}, found {shown(found)}", hint, path
 
 
+_SAID_ELSEWHERE = {
+    "env": ("scene", "leave 'env.' out: the task's settings stand at the top, as scene.num_envs"),
+    "params": ("func", "the parameters of a term stand beside its 'func'"),
+    "device": ("dt", "it is an option: --device cpu"),
+}
+"""Key -> a key that stands where it is looked for, and what to write instead."""
+
+
 def _right_key(key: str, fields: Iterable[str], homes: Homes) -> str:
+    fields = list(fields)
+    beside, instead = _SAID_ELSEWHERE.get(key, ("", ""))
+    if beside in fields:
+        return instead
     near = did_you_mean(key, fields)
     places = homes.get(key, [])
     home = f"it belongs {' or '.join(map(_inside, places))}" if 0 < len(places) <= 3 else None

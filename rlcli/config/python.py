@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path as FilePath
 from typing import Any
@@ -20,7 +20,7 @@ from pydantic import BaseModel, ValidationError
 from rlcli.config.notes import Note
 from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.terms import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
-from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, listing
+from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, did_you_mean, listing
 from rlcli.registry import TaskSource, import_file, load_object
 
 _OWN = "rlcli.mdp."
@@ -60,10 +60,15 @@ def load(source: TaskSource) -> PythonTask:
             _add_agent(task, name, agent)
     except ValidationError as error:
         raise ConfigError(_problems(error, source.label)) from None
+    except ConfigError as error:
+        raise ConfigError(
+            [replace(p, where=source.label) if p.where == "configuration" else p for p in error.problems]
+        ) from None
     except RlcliError:
         raise
     except Exception as error:
-        raise TaskError(f"{source.python}: {type(error).__name__}: {error}{_place(error)}") from error
+        said = f"{source.python}: {type(error).__name__}: {error}{_place(error)}"
+        raise TaskError(said, hint=_import_hint(error)) from error
     return task
 
 
@@ -256,5 +261,47 @@ def _problems(error: ValidationError, label: str) -> list[Problem]:
 
 
 def _place(error: BaseException) -> str:
-    frames = traceback.extract_tb(error.__traceback__)
-    return f" ({frames[-1].filename}:{frames[-1].lineno})" if frames else ""
+    """The line that the error came from: of the task's own files, if it went through one."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith("<")]
+    own = [frame for frame in frames if not FilePath(frame.filename).is_relative_to(_RLCLI)] or frames
+    return f" ({own[-1].filename}:{own[-1].lineno})" if own else ""
+
+
+def _import_hint(error: BaseException) -> str | None:
+    """What to do about an import of Isaac Lab's or Isaac Sim's, or of a name that `rlcli.isaaclab` does not have."""
+    module = getattr(error, "name", None) or ""
+    top, _, rest = module.partition(".")
+    if isinstance(error, ModuleNotFoundError):
+        if top in _ISAAC_LAB:
+            where = f"rlcli.isaaclab{f'.{rest}' if top == 'isaaclab' and rest else ''}"
+            return f"import it from {where}: docs/from-isaac-lab.md lists the lines"
+        return f"'{top}' is Isaac Sim's: take the import out, and what uses it" if top in _ISAAC_SIM else None
+    if isinstance(error, AttributeError):
+        module = str(getattr(error.obj, "__name__", ""))
+        known = dir(error.obj) if module.startswith("rlcli.isaaclab.") and module != "rlcli.isaaclab.mdp" else []
+        return (
+            (did_you_mean(str(error.name), known) or f"it has {listing([n for n in known if n[0].isupper()], 40)}")
+            if known
+            else None
+        )
+    if not isinstance(error, ImportError) or not module.startswith("rlcli.isaaclab"):
+        return None
+    name = str(error).partition("'")[2].partition("'")[0]
+    if name.removesuffix("Cfg") in _NOT_THERE:
+        return _NOT_THERE[name.removesuffix("Cfg")]
+    near = did_you_mean(name, dir(sys.modules[module]))
+    return near or "docs/from-isaac-lab.md and docs/isaaclab-terms.md say what there is"
+
+
+_RLCLI = FilePath(__file__).parents[1]
+_ISAAC_LAB = ("isaaclab", "isaaclab_tasks", "isaaclab_assets", "isaaclab_rl", "isaaclab_contrib", "isaaclab_mimic")
+_ISAAC_SIM = ("isaacsim", "omni", "pxr", "carb", "usdrt", "Semantics")
+_NOT_THERE = {
+    "DirectRLEnv": "a DirectRLEnv becomes a direct task: docs/from-isaac-lab.md, 'A DirectRLEnv'",
+    "DirectMARLEnv": "rlcli has no tasks of several agents",
+    "ActionTerm": "an action of your own is a class in rlcli's form: docs/from-isaac-lab.md, 'What is what'",
+    "AppLauncher": "there is no app to launch: rlcli train, play and eval take the place of your scripts",
+    "SimulationContext": "rlcli steps the simulation: terms see it as env.scene",
+    "InteractiveScene": "rlcli makes the scene of your InteractiveSceneCfg: terms see it as env.scene",
+}
+"""Names that Isaac Lab has and `rlcli.isaaclab` does not, also with `Cfg` behind them -> what to do."""

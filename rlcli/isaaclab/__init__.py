@@ -19,6 +19,7 @@ from rlcli.isaaclab.configclass import MISSING, configclass
 from rlcli.isaaclab.envs import ManagerBasedEnv, ManagerBasedEnvCfg, ManagerBasedRLEnvCfg, ViewerCfg
 from rlcli.isaaclab.managers import (
     ActionTermCfg,
+    CommandTerm,
     CommandTermCfg,
     CurriculumTermCfg,
     CurrTerm,

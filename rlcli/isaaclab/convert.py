@@ -9,8 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rlcli.isaaclab.configclass import is_missing
 from rlcli.isaaclab.scene_reader import SceneReader
-from rlcli.isaaclab.settings import Node, Report, as_float
+from rlcli.isaaclab.settings import Key, Node, Report, as_float
 from rlcli.isaaclab.term_reader import Terms
 
 
@@ -23,6 +24,8 @@ def task(
 ) -> dict[str, Any]:
     """The task that settings of a `ManagerBasedRLEnvCfg` describe; `models` name an MJCF for entities."""
     top = Node(data, (), report)
+    for section in _TERMS:
+        _check_members(data.get(section), (section,), report)
     made: dict[str, Any] = {
         "decimation": top.need("decimation"),
         "episode_length_s": as_float(top.need("episode_length_s")),
@@ -53,6 +56,20 @@ def task(
     report.stubs = convert.stubs
     report.finish(data, defaults)
     return {key: value for key, value in made.items() if value is not None}
+
+
+_TERMS = ("actions", "observations", "events", "rewards", "terminations", "curriculum")
+
+
+def _check_members(value: Any, key: Key, report: Report) -> None:
+    """Note values that were never given, and functions where a term is wanted."""
+    for name, item in value.items() if isinstance(value, Mapping) else ():
+        if is_missing(item):
+            report.problem(key, f"missing '{name}'")
+        elif callable(item) and (len(key) == 1 or (len(key) == 2 and key[0] == "observations")) and name != "func":
+            report.problem((*key, str(name)), "found a function, expected a term", "write ...TermCfg(func=...)")
+        elif isinstance(item, Mapping):
+            _check_members(item, (*key, str(name)), report)
 
 
 def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:

@@ -127,11 +127,20 @@ def _stubs(report: Report) -> str:
     lines = ['"""Terms to write: their code is not in the files that were imported."""', ""]
     lines += ["from rlcli.task import Bodies, Entity, Joints"]
     for name, (section, params) in report.stubs.items():
-        selection = ", selection" if section == "events" else ""
         given = "".join(f", {key}: {_annotation(key, value)}" for key, value in params.items())
         star = ", *" if given else ""
-        lines += ["", "", f"def {name}(env{selection}{star}{given}):", f'    """A term of {section}, to be written."""']
-        lines += [f'    raise NotImplementedError("{name}")']
+        to_do = [f'    """A term of {section}, to be written."""', f'    raise NotImplementedError("{name}")']
+        if section == "commands":
+            lines += ["", "", f"class {name}:", to_do[0], "", f"    def __init__(self, env{star}{given}):"]
+            lines += ["        # self.command is a tensor (num_envs, k) that stays the same", f"    {to_do[1]}", ""]
+            lines += [
+                "    def resample(self, selection):",
+                '        """selection.write(self.command, selection.uniform(...))"""',
+            ]
+            lines += ["", "    def update(self):", '        """Once a step."""']
+            continue
+        selection = ", selection" if section in ("events", "curriculum") else ""
+        lines += ["", "", f"def {name}(env{selection}{star}{given}):", *to_do]
     return "\n".join(lines) + "\n"
 
 
@@ -141,6 +150,8 @@ def _annotation(key: str, value: Any) -> str:
         return alias
     if isinstance(value, bool | int | float | str):
         return type(value).__name__
+    if isinstance(value, list) and len({type(item) for item in value} & {int, float}) == 2:
+        return "list[float]"
     if isinstance(value, list) and value:
         return f"list[{_annotation('', value[0])}]"
     if isinstance(value, dict) and value:

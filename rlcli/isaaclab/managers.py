@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from rlcli.isaaclab.configclass import MISSING, configclass
 
 
@@ -134,12 +137,48 @@ class ManagerTermBase:
         """Where tensors live."""
         return self._env.device
 
-    def reset(self, env_ids: Any = None) -> None:
+    def reset(self, env_ids: Any = None) -> Any:
         """Called when episodes begin."""
 
     def __call__(self, env: Any, *args: Any, **params: Any) -> Any:
         """The term's value."""
         raise NotImplementedError
+
+
+class CommandTerm(ManagerTermBase):
+    """A command of the user's own; when to draw anew is kept by the environment."""
+
+    def __init__(self, cfg: Any, env: Any) -> None:
+        super().__init__(cfg, env)
+        self.metrics: dict[str, Tensor] = {}
+        self.command_counter = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
+
+    @property
+    def command(self) -> Tensor:
+        """What is asked. (num_envs, k)"""
+        raise NotImplementedError
+
+    def reset(self, env_ids: Any = None) -> dict[str, float]:
+        """Episodes begin; the environment draws their first command after this."""
+        rows = slice(None) if env_ids is None else env_ids
+        self.command_counter[rows] = 0
+        for metric in self.metrics.values():
+            metric[rows] = 0.0
+        return {}
+
+    def set_debug_vis(self, debug_vis: bool) -> bool:
+        """Nothing is drawn."""
+        return False
+
+    def _update_metrics(self) -> None:
+        """Called once a step, before anything is drawn anew."""
+
+    def _resample_command(self, env_ids: Any) -> None:
+        """Draw new commands for some environments."""
+        raise NotImplementedError
+
+    def _update_command(self) -> None:
+        """Called once a step, after the drawing."""
 
 
 ObsTerm, ObsGroup, RewTerm, DoneTerm, EventTerm, CurrTerm = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import gymnasium
@@ -117,6 +118,17 @@ class Asset:
         self.num_joints, self.num_bodies = len(self.joint_names), len(self.body_names)
         self.num_instances, self.device = env.num_envs, env.device
         self.is_fixed_base = not entity.is_floating
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        known = [n for n in (*dir(type(self)), *vars(self)) if not n.startswith("_")]
+        near = did_you_mean(name, known) or (
+            "there is no PhysX; its numbers are in data and in the events"
+            if "physx" in name
+            else f"it has {listing(known, 40)}"
+        )
+        raise AttributeError(f"an asset has no '{name}'; {near}")
 
     def find_joints(self, name_keys: Any, joint_subset: Any = None, preserve_order: bool = False) -> Any:
         """Ids and names of joints by names or regexes."""
@@ -310,17 +322,57 @@ class _Terminations(_Manager):
 
     def get_term(self, name: str) -> Tensor:
         """Where a term fired. (num_envs,) bool"""
-        return self._manager.fired[name]
+        fired = self._manager.fired
+        if name not in fired:
+            raise NameProblem(f"no termination '{name}'; there are {listing(fired)}")
+        return fired[name]
 
 
 class _Commands(_Manager):
     def get_command(self, name: str) -> Tensor:
         """What is asked. (num_envs, k)"""
-        return self.get_term(name).command
+        return _named(self._manager.terms, name, "command").command
 
     def get_term(self, name: str) -> Any:
-        """A command term."""
-        return _named(self._manager.terms, name, "command")
+        """A command term; one of the user's own is the user's object."""
+        found = _named(self._manager.terms, name, "command")
+        return getattr(found, "term", found)
+
+
+class _Rewards(_Manager):
+    def __init__(self, manager: Any, live: Any) -> None:
+        super().__init__(manager)
+        self._live = live
+
+    def get_term_cfg(self, name: str) -> Any:
+        """The settings of a term; a weight that is assigned holds from the next step on."""
+        found = {term.name: term for term in self._manager.terms}
+        if name not in found:
+            raise NameProblem(f"no reward '{name}'", did_you_mean(name, found) or f"there are {listing(found)}")
+        return _RewardSettings(found[name].config, self._live.get((*found[name].path, "weight")))
+
+    def set_term_cfg(self, name: str, cfg: Any) -> None:
+        """Take over the weight of settings."""
+        self.get_term_cfg(name).weight = cfg.weight
+
+
+class _RewardSettings:
+    """The settings of a reward; only the weight can be changed, and only by a curriculum term."""
+
+    def __init__(self, config: Any, weight: Tensor | None) -> None:
+        self._config, self._weight = config, weight
+        self.params: Mapping[str, Any] = MappingProxyType(config.params)
+
+    @property
+    def weight(self) -> float:
+        """The weight that holds now."""
+        return self._config.weight if self._weight is None else float(self._weight)
+
+    @weight.setter
+    def weight(self, value: float) -> None:
+        if self._weight is None:
+            raise AttributeError("the weight of a reward is changed by a curriculum term")
+        self._weight.fill_(value)
 
 
 class ManagerBasedRLEnv(gymnasium.Env):
@@ -358,6 +410,13 @@ class ManagerBasedRLEnv(gymnasium.Env):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or name in ("managed", "cfg"):
             raise AttributeError(name)
+        if not hasattr(self.managed, name):
+            if name.endswith("_manager") and name in dir(type(self)):
+                raise AttributeError(
+                    f"env has no '{name}' yet: it is made after the terms have given their first values"
+                )
+            known = [n for n in (*dir(type(self)), *dir(self.managed)) if not n.startswith("_")]
+            raise AttributeError(f"env has no '{name}'; {did_you_mean(name, known) or listing(sorted(set(known)), 60)}")
         return getattr(self.managed, name)
 
     @property
@@ -385,7 +444,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
     @property
     def reward_manager(self) -> Any:
         """Rewards."""
-        return self._manager("reward_manager", _Manager)
+        return self._manager("reward_manager", lambda manager: _Rewards(manager, self.managed._binder.live))
 
     @property
     def max_episode_length_s(self) -> float:
@@ -401,6 +460,11 @@ class ManagerBasedRLEnv(gymnasium.Env):
     def reset_terminated(self) -> Tensor:
         """Terminated in this step. (num_envs,) bool"""
         return self.managed.termination_manager.terminated
+
+    @property
+    def reset_buf(self) -> Tensor:
+        """Terminated or timed out in this step. (num_envs,) bool"""
+        return self.reset_terminated | self.reset_time_outs
 
     @property
     def reset_time_outs(self) -> Tensor:
@@ -454,6 +518,12 @@ class ManagerBasedRLEnv(gymnasium.Env):
     def close(self) -> None:
         """Let go of the engine."""
         self.managed.close()
+
+    def open_weights(self) -> None:
+        """Let the weights of rewards change; before the reward manager is made."""
+        for name, config in self.managed.config.rewards.items():
+            if config is not None:
+                self.managed._binder.live.open(f"rewards.{name}.weight")
 
     def _manager(self, name: str, kind: Any) -> Any:
         manager = getattr(self.managed, name)

@@ -58,7 +58,7 @@ class SceneReader:
             self._sensor(kind, item)
         made["ground"] = ground
         made["lights"] = lights
-        if not self.entities:
+        if not self.entities and not self.report.problems:
             self.report.problem(node.key, "has no robot or object")
         made["entities"] = self.entities
         if self.sensors:
@@ -79,7 +79,7 @@ class SceneReader:
 
     def ordered(self, entity: str, kind: str, wanted: Any, preserve: bool, key: Key) -> Any:
         """Names or regexes in the order that they are meant in: the model's, unless that written is to be kept."""
-        if isinstance(wanted, str):
+        if wanted is None or isinstance(wanted, str):
             return wanted
         wanted = list(wanted)
         names = self.names(entity, kind)

@@ -86,7 +86,9 @@ class Node:
             self.get(name)
             value = {}
         if not isinstance(value, Mapping):
-            self.report.problem((*self.key, name), f"expected settings, found a {type(value).__name__}")
+            kind = type(value).__name__
+            hint = None if type(value).__module__ == "builtins" else f"write @configclass above the class {kind}"
+            self.report.problem((*self.key, name), f"expected settings, found a {kind}", hint)
             value = {}
         return Node(value, (*self.key, name), self.report)
 

@@ -6,10 +6,10 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from rlcli.config.terms import Signature, builtin_terms
+from rlcli.config.terms import Signature, SignatureError, builtin_terms, snake_case
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli.isaaclab.configclass import is_missing
-from rlcli.isaaclab.managers import SceneEntityCfg
+from rlcli.isaaclab.managers import CommandTerm, SceneEntityCfg
 from rlcli.isaaclab.mdp import MdpFunction
 from rlcli.isaaclab.randomization import EVENTS, translated
 from rlcli.isaaclab.scene_reader import SceneReader
@@ -37,7 +37,8 @@ class Terms:
             entity = str(item.data.get("asset_name"))
             kind = kind_of(item.data.get("class_type"))
             what = next((word for word in ("effort", "velocity") if word in kind.lower()), "position")
-            for pattern in [wanted] if isinstance(wanted, str) else wanted or []:
+            patterns = [wanted] if isinstance(wanted, str) else wanted
+            for pattern in patterns if isinstance(patterns, list | tuple) else ():
                 for joint in self.scene.names(entity, "joint") or []:
                     if re.fullmatch(pattern, joint):
                         self.joints_driven.setdefault(entity, {})[joint] = what
@@ -103,9 +104,7 @@ class Terms:
         kind = kind_of(node.get("class_type"))
         entry = COMMANDS.get(kind)
         if entry is None or entry.name is None:
-            near = did_you_mean(kind, COMMANDS) or f"there are {listing(COMMANDS)}"
-            self.report.problem(node.key, f"no command is known for '{kind}'", near)
-            return {"func": "null_command"}
+            return self._own_command(kind, node)
         made: dict[str, Any] = {"func": entry.name, "resampling_time_s": seconds(node.need("resampling_time_range"))}
         signature = _required(builtin_terms("commands"), entry.name)
         known = {p.name: p for p in signature.parameters}
@@ -128,6 +127,38 @@ class Terms:
             made |= {"mean": _triple(ranges, "mean_vel"), "std": _triple(ranges, "std_vel")}
             made["zero_prob"] = _triple(ranges, "zero_prob")
         return made
+
+    def _own_command(self, kind: str, node: Node) -> dict[str, Any]:
+        """A command of the user's own: its class, or in a file of settings its name."""
+        from rlcli.isaaclab.terms import OwnCommand, key_of
+
+        made: dict[str, Any] = {"resampling_time_s": seconds(node.need("resampling_time_range"))}
+        given = node.data.get("class_type")
+        settings = {key: node.get(key) for key in node.data if key not in _COMMAND_KEYS}
+        node.skip("debug_vis")
+        if isinstance(given, str) and not given.startswith(_THEIRS) and ":" in given:
+            named = {("entity" if key == "asset_name" else key): value for key, value in settings.items()}
+            params = {key: numbers(value) for key, value in named.items() if _is_plain(value)}
+            self.stubs[kind] = ("commands", params)
+            self.report.entries[(*node.key, "class_type")] = ("to do", f"write '{kind}' in terms.py")
+            return {"func": snake_case(kind), **made, **params}
+        if not (isinstance(given, type) and issubclass(given, CommandTerm)):
+            near = did_you_mean(kind, COMMANDS) or f"there are {listing(COMMANDS)}, or a CommandTerm of your own"
+            self.report.problem(node.key, f"no command is known for '{kind}'", near)
+            return {"func": "null_command"}
+        self._need_all(node.data, node.key)
+        plain = {key: value for key, value in settings.items() if _is_plain(value)}
+        for key in settings.keys() - plain.keys():
+            node.say("ignored", key, "only numbers, text, lists and mappings can be written to a file")
+        own = OwnCommand(given, node.key[-1], tuple(plain))
+        return {"func": own, **made, **{key_of(key): numbers(value) for key, value in plain.items()}}
+
+    def _need_all(self, value: Mapping[str, Any], key: Key) -> None:
+        for name, item in value.items():
+            if is_missing(item):
+                self.report.problem(key, f"missing '{name}'")
+            elif isinstance(item, Mapping):
+                self._need_all(item, (*key, str(name)))
 
     def group(self, node: Node) -> dict[str, Any]:
         """A group of observations."""
@@ -332,6 +363,16 @@ class Terms:
         if isinstance(function, str):
             return {"func": self._stub(section, function, values, node)} | common | self.stubs[_short(function)][1]
         entities = frozenset(key for key, value in values.items() if is_entity(value))
+        try:
+            own = own_term(function, section, entities, tuple(values))
+        except SignatureError as error:
+            self.report.problem((*node.key, "func"), f"'{function.__name__}': {error}")
+            return {"func": "missing", **common}
+        known = [own.original[parameter.name] for parameter in own.parameters]
+        for key in [key for key in values if key not in known]:
+            takes = did_you_mean(key, known) or f"'{own.__name__}' takes {listing(known)}"
+            self.report.problem((*params.key, key), f"unknown key '{key}'", takes)
+            del values[key]
         made: dict[str, Any] = {}
         for key, value in values.items():
             if key in entities:
@@ -341,7 +382,7 @@ class Terms:
                     self.report.problem((*params.key, key), str(error))
             else:
                 made[key_of(key)] = numbers(value)
-        return {"func": own_term(function, section, entities, tuple(values)), **common, **made}
+        return {"func": own, **common, **made}
 
     def _stub(self, section: str, function: str, values: Mapping[str, Any], node: Node) -> str:
         """Note a function whose code is not here, with parameters in rlcli's form."""
@@ -362,6 +403,18 @@ class Terms:
         self.stubs[short] = (section, made)
         self.report.entries[(*node.key, "func")] = ("to do", f"write '{short}' in terms.py")
         return short
+
+
+_COMMAND_KEYS = ("class_type", "resampling_time_range", "debug_vis")
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether a setting can be written to a file."""
+    if isinstance(value, Mapping):
+        return all(map(_is_plain, value.values()))
+    return (
+        all(map(_is_plain, value)) if isinstance(value, list | tuple) else isinstance(value, str | float | int | None)
+    )
 
 
 def is_entity(value: Any) -> bool:

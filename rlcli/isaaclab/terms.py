@@ -6,6 +6,7 @@ import functools
 import inspect
 import typing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -86,6 +87,30 @@ class OwnTerm:
         return Parameter(key_of(p.name), kind, default, required, None)
 
 
+class OwnCommand:
+    """A class of the user's that draws a command, `Name(cfg, env)`, as the command term of one name."""
+
+    def __init__(self, function: Any, name: str, settings: tuple[str, ...]) -> None:
+        self.function, self.name = function, name
+        self.__name__, self.__module__ = function.__name__, function.__module__
+        self.target = functools.partial(_bind_command, self)
+        self.original = {key_of(key): key for key in settings}
+
+    def __deepcopy__(self, memo: Any) -> OwnCommand:
+        return self
+
+    def __call__(self, *args: Any) -> Any:
+        """The class's object."""
+        return self.function(*args)
+
+    def __rlcli_term__(self, name: str) -> Signature:
+        """The signature of the term under a name: the settings of its configuration."""
+        file = Path(inspect.getsourcefile(self.function) or "?")
+        summary = (inspect.getdoc(self.function) or "").split("\n")[0]
+        parameters = tuple(Parameter(key, Any, None, True, None) for key in self.original)
+        return Signature(name, self.__name__, True, file, 1, summary, parameters, target=self.target)
+
+
 def key_of(name: str) -> str:
     """The key of a parameter: its name, unless all terms of some section have a key of that name."""
     return f"{name}_" if name in _RESERVED else name
@@ -142,18 +167,85 @@ class _BoundClass(_Bound):
 
     def state_dict(self) -> dict[str, Tensor]:
         """The object's tensors."""
-        return {name: value.clone() for name, value in vars(self.term).items() if isinstance(value, Tensor)}
+        return _tensors_of(self.term)
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take back what `state_dict` gave."""
-        for name, value in state.items():
-            setattr(self.term, name, value.clone())
+        _take_back(self.term, state)
+
+
+class _BoundCommand:
+    """A command of the user's in its environment."""
+
+    def __init__(self, term: Any) -> None:
+        self.term = term
+        self.command = term.command.clone().float()
+        self._begun = False
+
+    def resample(self, selection: Selection) -> None:
+        """Draw new commands."""
+        env_ids = selection.env_ids()
+        self.term._resample_command(env_ids)
+        self.term.command_counter[env_ids] += 1
+        self.command.copy_(self.term.command)
+        self._begun = True
+
+    def update(self) -> None:
+        """Once a step."""
+        self.term._update_command()
+        self.command.copy_(self.term.command)
+
+    def metrics(self) -> dict[str, Tensor]:
+        """What the command measures of itself. (num_envs,) each"""
+        if self._begun:
+            self.term._update_metrics()
+        return dict(self.term.metrics)
+
+    def reset(self, selection: Selection) -> None:
+        """Episodes begin."""
+        self.term.reset(selection.env_ids())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The object's tensors."""
+        return _tensors_of(self.term)
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take back what `state_dict` gave."""
+        _take_back(self.term, state)
+        self._begun = True
+
+
+def _bind_command(term: OwnCommand, env: Any, **params: Any) -> _BoundCommand:
+    from rlcli.isaaclab.runtime import facade_of
+
+    settings = {term.original[key]: _settings(value) for key, value in params.items()}
+    times = list(env.config.commands[term.name].resampling_time_s)
+    cfg = SimpleNamespace(class_type=term.function, debug_vis=False, resampling_time_range=times, **settings)
+    return _BoundCommand(term.function(cfg, facade_of(env)))
+
+
+def _settings(value: Any) -> Any:
+    """Nested mappings whose keys are names as objects with members; any other as it is."""
+    if isinstance(value, dict) and all(str(key).isidentifier() for key in value):
+        return SimpleNamespace(**{key: _settings(item) for key, item in value.items()})
+    return value
+
+
+def _tensors_of(term: Any) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in vars(term).items() if isinstance(value, Tensor)}
+
+
+def _take_back(term: Any, state: dict[str, Tensor]) -> None:
+    for name, value in state.items():
+        setattr(term, name, value.clone())
 
 
 def _bind(term: OwnTerm, env: Any, **params: Any) -> _Bound:
     from rlcli.isaaclab.runtime import facade_of
 
     facade = facade_of(env)
+    if term.section == "curriculum":
+        facade.open_weights()  # it may change them, and what reads them is made after this
     values: dict[str, Any] = {}
     for key, value in params.items():
         if isinstance(value, EntityModel):

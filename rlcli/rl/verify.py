@@ -125,11 +125,13 @@ def verify(
     """
     space: dict[str, Any] = {"__name__": "run_policy"}
     exec(compile(code, "run_policy.py", "exec"), space)  # what has just been written, not what lies there
+    fresh = env.state_dict()
     seed_generators(task_seed)
     evaluated = evaluate(env, acting(env, policy), episodes)
     controller, own = space["Controller"](file), open_model(model)
 
     def drive(beside: bool) -> tuple[_Driver, Evaluation]:
+        env.load_state_dict(fresh)  # a curriculum, too, is where it was
         seed_generators(task_seed)
         driver = _Driver(env, policy, controller, own, beside)
         env.instead_of_physics = driver.physics

@@ -193,3 +193,59 @@ def test_text_that_the_terminal_cannot_show_is_escaped(rlcli, small):
     done = rlcli("show", small(("a small task", "größer →")), PYTHONIOENCODING="ascii")
     assert done.returncode == 0
     assert r"gr\xf6\xdfer \u2192" in done.stdout
+
+
+FAILING = """
+from rlcli.config.schema import EntityConfig, ObservationConfig, RewardConfig, SceneConfig, SimConfig, TaskConfig
+from rlcli.config.schema import ActionConfig, TerminationConfig
+from rlcli.task import Entity
+
+
+def uprightness(env, *, entity: Entity = "robot"):
+    return entity.data.joint_poss[:, 0]
+
+
+TASK = TaskConfig(
+    sim=SimConfig(dt=0.01), decimation=1, episode_length_s=1.0,
+    scene=SceneConfig(num_envs=2, entities={"robot": EntityConfig(model="cartpole:cartpole.xml")}),
+    actions={"push": ActionConfig(func="joint_effort", joints=["slider_to_cart"])},
+    observations={"policy": {"pos": ObservationConfig(func="joint_pos")}},
+    rewards={"upright": RewardConfig(func=uprightness, weight=1.0)},
+    terminations={"time_out": TerminationConfig(func="time_out", time_out=True)},
+)
+"""
+
+
+@pytest.mark.parametrize("flags", [[], ["--debug"]])
+def test_a_term_that_raises_is_named_with_its_line_and_is_no_bug_of_rlcli(in_process, tmp_path, flags):
+    (tmp_path / "task.py").write_text(FAILING, encoding="utf-8")
+    code, _, err = in_process("validate", "--deep", str(tmp_path), *flags)
+    line = FAILING.split("\n").index("    return entity.data.joint_poss[:, 0]") + 1
+    assert code == 4
+    assert f"task.py:{line}: uprightness: AttributeError: 'EntityData' object has no attribute 'joint_poss'" in err
+    assert "a bug in rlcli" not in err
+    assert ("Traceback" in err) is bool(flags)
+
+
+def test_what_rlcli_itself_raises_is_a_bug_with_its_traceback(in_process, monkeypatch):
+    monkeypatch.setattr("rlcli.cli.validate.find_task", None)
+    code, _, err = in_process("validate", "--deep", "cartpole")
+    assert code == 1
+    assert "this is a bug in rlcli: TypeError" in err
+    assert "Traceback" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["train", "--task", "cartpole"], "rlcli train cartpole"),
+        (["play", "--load_run", "x"], "--checkpoint RUN"),
+        (["train", "cartpole", "env.scene.num_envs=8"], "leave 'env.' out"),
+        (["train", "cartpole", "sim.device=cpu"], "it is an option: --device cpu"),
+        (["train", "cartpole", "events.reset_cart.params.position=[0,1]"], "stand beside its 'func'"),
+    ],
+)
+def test_habits_of_other_programs_are_answered_with_what_is_written_here(in_process, arguments, said):
+    code, _, err = in_process(*arguments)
+    assert code in (2, 3)
+    assert said in err

@@ -39,6 +39,8 @@ events:
 rewards:
   near: {func: joint_pos_target_l2, weight: -1.0, joints: [slide], target: 0.3}
   alive: {func: is_alive, weight: 0.1}
+curriculum:
+  dearer: {func: dearer, address: rewards.near.weight}
 terminations:
   time_out: {func: time_out, time_out: true}
   far: {func: joint_pos_out_of_manual_limit, joints: [slide], bounds: [-0.9, 0.9]}
@@ -50,7 +52,7 @@ TERMS = '''
 """Terms that no formula stands for."""
 import torch
 
-from rlcli.task import Entity, Joints
+from rlcli.task import Address, Entity, Joints
 
 
 def doubled(env, *, entity: Entity = "robot", joints: Joints = ".*"):
@@ -61,6 +63,11 @@ def doubled(env, *, entity: Entity = "robot", joints: Joints = ".*"):
 def kick(env, selection, *, entity: Entity = "robot"):
     """A push."""
     selection.add(env.engine.field("qvel"), selection.uniform(-2.0, 2.0, (1,)))
+
+
+def dearer(env, selection, *, address: Address):
+    """What an episode costs grows with the episodes before it."""
+    address.sub_(0.1)
 
 
 class wanted:

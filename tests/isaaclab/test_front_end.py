@@ -1,5 +1,6 @@
 """Configuration written for Isaac Lab is a task here: the same numbers, the same steps, and its own terms run."""
 
+import itertools
 import json
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from rlcli.config.load import resolve
 from rlcli.envs.vec_env import make_env
 from rlcli.errors import ConfigError, TaskError
 from rlcli.registry import find_task
+from rlcli.sim.names import NameProblem
 
 torch.set_num_threads(1)
 
@@ -292,13 +294,145 @@ def test_what_a_class_term_carries_is_part_of_the_state(cfg):
     assert torch.equal(env.step(torch.ones(3, 1)).reward, first)
 
 
+COMMANDED = (
+    ("    RewTerm, SceneEntityCfg,", "    CommandTerm, CommandTermCfg, CurrTerm, MISSING, RewTerm, SceneEntityCfg,"),
+    ("\n\n\ndef seen", """
+
+
+class Place(CommandTerm):
+    \'\'\'Where the cart shall be.\'\'\'
+
+    def __init__(self, cfg, env):
+        super().__init__(cfg, env)
+        self.robot, self.place = env.scene[cfg.asset_name], torch.zeros(self.num_envs, 1, device=self.device)
+        self.metrics["error"] = torch.zeros(self.num_envs, device=self.device)
+
+    @property
+    def command(self):
+        return self.place
+
+    def _update_metrics(self):
+        assert self.cfg.resampling_time_range[1] == 0.06
+        self.metrics["error"] = (self.place[:, 0] - self.robot.data.joint_pos[:, 0]).abs()
+
+    def _resample_command(self, env_ids):
+        self.place[env_ids, 0] = torch.empty(len(env_ids)).uniform_(*self.cfg.ranges.x)
+
+    def _update_command(self):
+        pass
+
+
+@configclass
+class PlaceCfg(CommandTermCfg):
+    class_type: type = Place
+    asset_name: str = MISSING
+
+    @configclass
+    class Ranges:
+        x: tuple[float, float] = MISSING
+
+    ranges: Ranges = MISSING
+
+
+@configclass
+class Commands:
+    place = PlaceCfg(asset_name="robot", resampling_time_range=(0.06, 0.06), ranges=PlaceCfg.Ranges(x=(1.0, 2.0)))
+
+
+def off(env, command_name: str):
+    assert env.command_manager.get_term(command_name).robot is env.scene["robot"]
+    return env.command_manager.get_command(command_name)[:, 0]
+
+
+def heavier(env, env_ids, term_name: str, weight: float):
+    cfg = env.reward_manager.get_term_cfg(term_name)
+    cfg.weight = weight
+    env.reward_manager.set_term_cfg(term_name, cfg)
+    return cfg.weight
+
+
+@configclass
+class Curriculum:
+    heavier = CurrTerm(func=heavier, params={"term_name": "place", "weight": -3.0})
+
+
+def seen"""),
+    ("        actions = ObsTerm(func=acted)", """        actions = ObsTerm(func=acted)
+        asked = ObsTerm(func=mdp.generated_commands, params={"command_name": "place"})"""),
+    ("    counter = RewTerm(func=Counter, weight=1.0", """    place = RewTerm(
+        func=off, weight=1.0, params={"command_name": "place"})
+    counter = RewTerm(func=Counter, weight=0.0"""),
+    ("func=rel, weight=2.0", "func=rel, weight=0.0"),
+    ("    terminations: Terminations = Terminations()", """    terminations: Terminations = Terminations()
+    commands: Commands = Commands()
+    curriculum: Curriculum = Curriculum()"""),
+)  # fmt: skip
+
+
+def test_a_command_of_the_users_own_is_drawn_measured_and_kept(cfg):
+    env = make_env(resolve(cfg(*COMMANDED), flags={"commands.place.ranges.x": [3.0, 4.0]}))
+    torch.manual_seed(0)
+    asked = [env.reset(seed=0)["policy"][:, -1].clone()]
+    assert bool(((asked[0] >= 3.0) & (asked[0] <= 4.0)).all())
+    asked += [env.step(torch.zeros(3, 1)).obs["policy"][:, -1].clone() for _ in range(4)]
+    changed = [bool((a != b).all()) for a, b in itertools.pairwise(asked)]
+    assert changed == [False, False, True, False]  # 0.06 s are three steps
+    state = env.state_dict()
+    first = env.step(torch.ones(3, 1))
+    first_obs, first_reward = first.obs["policy"].clone(), first.reward.clone()
+    env.reset(seed=1)
+    env.load_state_dict(state)
+    again = env.step(torch.ones(3, 1))
+    assert torch.equal(first_obs, again.obs["policy"])
+    assert torch.equal(first_reward, again.reward)
+    ended = env.step(torch.zeros(3, 1)).episodes.ended()
+    assert bool((ended.metrics["place/error"] > 2.5).all())
+
+
+def test_a_curriculum_of_the_users_own_changes_the_weight_of_a_reward(cfg):
+    env = make_env(resolve(cfg(*COMMANDED)))
+    env.reset(seed=0)
+    for number in range(1, 9):
+        asked = env.command_manager.get_command("place")[:, 0].clone()
+        step = env.step(torch.zeros(3, 1))
+        weight = 1.0 if number <= 6 else -3.0  # the first episodes end after six steps
+        assert torch.allclose(step.reward, 0.02 * weight * asked)
+    assert env.curriculum_manager.values() == {"Curriculum/heavier": -3.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (('place = PlaceCfg(asset_name="robot", ', "place = PlaceCfg("), "commands.place: missing 'asset_name'"),
+        (("x=(1.0, 2.0)", ""), r"commands\.place\.ranges: missing 'x'"),
+        (("class_type: type = Place", "class_type: type = int"), "or a CommandTerm of your own"),
+        (('"term_name": "place"', '"term_name": "plaice"'), "no reward 'plaice'"),
+    ],
+)
+def test_mistakes_in_own_commands_are_said_with_what_there_is(cfg, change, said):
+    def live():
+        env = make_env(resolve(cfg(*COMMANDED, change)))
+        env.reset(seed=0)
+        for _ in range(7):
+            env.step(torch.zeros(3, 1))
+
+    with pytest.raises((ConfigError, NameProblem), match=said):
+        live()
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         (('"robot", joint_names=".*pole"', '"robot", joint_names="pol"'), "no joint matches 'pol'"),
         (('"robot", joint_names=".*pole"', '"robot", joint_names=[".*pole", "cart.*"]'), "matched twice"),
         (('"robot", joint_names=".*pole"', '"robo", joint_names=".*pole"'), "no 'robo' in the scene; did you mean"),
-        (('{"steps": 5}', '{"step": 5}'), r"unknown key 'step'"),
+        (('{"steps": 5}', '{"step": 5}'), r"too_late\.params\.step: unknown key 'step'; did you mean 'steps'"),
+        (('"span": 0.1', '"span": 0.1, "mu": 2'), "params.mu: unknown key 'mu'; 'start' takes span, asset_cfg"),
+        (("func=start", "func=lambda env: 1"), r"events\.begin\.func: .* takes \(env, env_ids, \.\.\.\)"),
+        (('joint_names=["slider_to_cart"], ', ""), "actions.effort: missing 'joint_names'"),
+        (("func=rel, weight=2.0", "func=rel"), "other/own_0.py.*: rewards.away: missing 'weight'"),
+        (("@configclass\nclass Rewards", "class Rewards"), "write @configclass above the class Rewards"),
+        (("    too_late = ", "    x = mdp.time_out\n    too_late = "), "terminations.x: found a function"),
         (('{"steps": 5}', "{}"), "missing key 'steps'"),
         (
             ("    too_late = DoneTerm(func=late", "    late = DoneTerm(func=late)\n    two = DoneTerm(func=late"),
@@ -314,6 +448,24 @@ def test_what_a_class_term_carries_is_part_of_the_state(cfg):
 def test_mistakes_are_said_with_what_there_is(cfg, change, said):
     with pytest.raises((ConfigError, TaskError), match=said):
         make_env(resolve(cfg(change)))
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("import isaaclab.sim as sim_utils", "import it from rlcli.isaaclab.sim"),
+        ("from isaaclab_tasks.utils import parse_env_cfg", "import it from rlcli.isaaclab:"),
+        ("import omni.usd", "'omni' is Isaac Sim's"),
+        ("from rlcli.isaaclab.envs import DirectRLEnvCfg", "becomes a direct task"),
+        ("from rlcli.isaaclab.managers import RewardTermConfig", "did you mean 'RewardTermCfg'"),
+        ("from rlcli.isaaclab import sim\nsim.CubeCfg", "did you mean 'CuboidCfg'"),
+        ("import no_such_module", None),
+    ],
+)
+def test_an_import_that_is_not_there_is_answered_with_the_line_and_what_to_write(cfg, line, said):
+    with pytest.raises(TaskError, match=r"own_0\.py:[23]\)") as caught:
+        resolve(cfg(("\nimport torch\n", f"\n{line}\nimport torch\n")))
+    assert caught.value.hint is None if said is None else said in caught.value.hint
 
 
 def test_a_usd_file_is_mapped_by_the_table_or_refused_with_it(cfg):

@@ -105,6 +105,28 @@ def test_a_function_that_only_its_author_has_becomes_a_stub(imported):
     assert resolve(folder_task(folder)).task.rewards["alive"].params == {"strength": 2.0}
 
 
+def test_a_command_and_a_curriculum_that_only_their_author_has_become_stubs_that_load(imported):
+    own = """commands:
+  place:
+    class_type: my_robots.mdp:PlaceCommand
+    resampling_time_range: !!python/tuple [2.0, 4.0]
+    asset_name: robot
+    debug_vis: true
+    ranges: {x: [-1, 1.0]}
+curriculum:
+  ramp: {func: 'my_robots.mdp:ramp', params: {term_name: alive, weight: 2.0}}
+"""
+    lines = [line for line in ENV.read_text().split("\n") if not line.startswith(("commands:", "curriculum:"))]
+    code, _, err, folder = imported("\n".join(lines) + own)
+    assert code == 0
+    assert "commands.place.class_type: to do: write 'PlaceCommand' in terms.py" in err
+    text = (folder / "terms.py").read_text()
+    assert "def __init__(self, env, *, entity: Entity, ranges: dict[str, list[float]]):" in text
+    assert "def ramp(env, selection, *, term_name: str, weight: float):" in text
+    task = resolve(folder_task(folder)).task
+    assert task.commands["place"].params == {"entity": "robot", "ranges": {"x": [-1.0, 1.0]}}
+
+
 def test_an_own_model_stands_for_a_usd_file_that_is_not_known(imported, tmp_path):
     text = ENV.read_text().replace("Classic/Cartpole/cartpole.usd", "Own/wobbly.usd")
     code, document, _, folder = imported(text)

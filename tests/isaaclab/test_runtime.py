@@ -96,6 +96,11 @@ def test_the_scene_is_a_mapping_that_names_what_it_has(env):
         env.scene["terrain"]
     with pytest.raises(AttributeError, match=r"data has no 'joint_poss'; did you mean 'joint_pos"):
         env.scene["robot"].data.joint_poss  # noqa: B018
+    with pytest.raises(AttributeError, match="an asset has no 'root_physx_view'; there is no PhysX"):
+        env.scene["robot"].root_physx_view  # noqa: B018
+    with pytest.raises(AttributeError, match="env has no 'step_dtt'; did you mean 'step_dt'"):
+        env.step_dtt  # noqa: B018
+    assert not hasattr(env.scene["robot"], "actuators")
 
 
 def test_managers_say_what_they_did_in_the_step(env):
@@ -108,6 +113,7 @@ def test_managers_say_what_they_did_in_the_step(env):
     assert torch.equal(env.termination_manager.dones, terminated | truncated)
     assert torch.equal(env.reset_terminated, terminated)
     assert torch.equal(env.reset_time_outs, truncated)
+    assert torch.equal(env.reset_buf, terminated | truncated)
     assert extras["log"]["Episode_Termination/tilt"] == 1
     assert env.common_step_counter == before + 1
     assert env.termination_manager.active_terms == ["time_out", "tilt", "low"]
@@ -115,6 +121,8 @@ def test_managers_say_what_they_did_in_the_step(env):
     assert env.max_episode_length_s == 0.6
     with pytest.raises(runtime.NameProblem, match="no action 'arms'; there are legs"):
         env.action_manager.get_term("arms")
+    with pytest.raises(runtime.NameProblem, match="no termination 'tlit'; there are time_out"):
+        env.termination_manager.get_term("tlit")
 
 
 def test_the_spaces_are_those_of_the_batch(env):
