@@ -218,8 +218,9 @@ def _settings_called(option: str) -> list[str]:
     from rlcli.rl.ppo_config import PpoConfig
     from rlcli.rl.sb3_config import Sb3Config
 
-    known = homes({"": TaskConfig, "agent": PpoConfig}) | homes({"agent": Sb3Config})
-    places = known.get(_SHORT_FOR.get(name, name), [])
+    key = _SHORT_FOR.get(name, name)
+    both: tuple[dict[str, Any], ...] = ({"": TaskConfig, "agent": PpoConfig}, {"agent": Sb3Config})
+    places = list(dict.fromkeys(place for models in both for place in homes(models).get(key, [])))
     return places if len(places) <= 3 and name != "task" else []  # the task is an argument
 
 

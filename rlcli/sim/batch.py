@@ -283,7 +283,8 @@ class BatchEngine:
         warned = np.count_nonzero(self._warning_words) > 0
         # of whole rows: skipping the columns that nobody writes takes longer
         finite = math.isfinite(self._state.sum().item()) or bool(self._state.isfinite().all())
-        if not warned and finite and not self._error and not self._too_fast().any():
+        fast = self._max_velocity < LIMIT and bool((np.abs(self._qvel) > self._max_velocity).any())
+        if not warned and finite and not self._error and not fast:
             return None
         bad, causes = self._judge(finite)
         if not bad.any():
@@ -292,12 +293,6 @@ class BatchEngine:
         for name, count in zip(names.tolist(), counts.tolist(), strict=True):
             self.causes[name] = self.causes.get(name, 0) + count
         return torch.from_numpy(bad)
-
-    def _too_fast(self) -> np.ndarray:
-        """Worlds beyond the bound that the task sets; MuJoCo warns of its own. (num_envs,), or (1,) for none"""
-        if self._max_velocity >= LIMIT or not (np.abs(self._qvel) > self._max_velocity).any():
-            return np.zeros(1, dtype=bool)
-        return np.asarray((np.abs(self._qvel) > self._max_velocity).any(axis=1))
 
     def _judge(self, finite: bool) -> tuple[np.ndarray, np.ndarray]:
         """Which worlds went wrong, and the cause of each; the counters are put back to zero."""
@@ -311,7 +306,7 @@ class BatchEngine:
             warned = counts[:, kind] > 0
             causes[warned & (causes == "")] = name
             bad = bad | warned
-        fast = self._too_fast() & ~bad
+        fast = np.asarray((np.abs(self._qvel) > self._max_velocity).any(axis=1)) & ~bad
         causes[fast] = TOO_FAST
         bad = bad | fast
         for env in (bad & (causes == "")).nonzero()[0]:
@@ -342,6 +337,7 @@ class BatchEngine:
         elif cause == TOO_FAST:
             index = int((np.abs(self._qvel[env]) > self._max_velocity).argmax())
             place = f"{self.state_layout.place('qvel', index)} = {self._qvel[env, index]:g}"
+            place += f", beyond {self._max_velocity:g}"
         before = self._history.last(env)
         known = np.concatenate([before, self._default[len(before) :]]) if before is not None else self._default
         unfit = [f"model field {name}" for name in self._unfit_model(env)] + self.state_layout.unfit(known)
