@@ -29,6 +29,16 @@ def total(values: Tensor) -> Tensor:
     return values[:, 0] if values.shape[1] == 1 else values.sum(dim=1)
 
 
+def some(masks: Tensor) -> Tensor:
+    """Where some column holds; as `total`, without a reduction where there is one column. (n, k) -> (n,) bool"""
+    return masks[:, 0] if masks.shape[1] == 1 else masks.any(dim=1)
+
+
+def every(masks: Tensor) -> Tensor:
+    """Where every column holds, likewise. (n, k) -> (n,) bool"""
+    return masks[:, 0] if masks.shape[1] == 1 else masks.all(dim=1)
+
+
 def only(values: Tensor, what: str) -> Tensor:
     """The single element of (num_envs, 1, ...).
 

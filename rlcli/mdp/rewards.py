@@ -9,6 +9,7 @@ from torch import Tensor
 
 from rlcli.mdp.measures import (
     asked_speed,
+    every,
     goal_in_world,
     goal_quat_in_world,
     only,
@@ -553,7 +554,7 @@ def undesired_contacts(env: ManagedEnv, *, sensor: ContactSensor, threshold: flo
 
 def desired_contacts(env: ManagedEnv, *, sensor: ContactSensor, threshold: float = 1.0) -> Tensor:
     """1 where no body of the sensor felt more than `threshold` [N] within its history: a penalty. (num_envs,)"""
-    return (strongest_force(sensor) <= threshold).all(dim=1)
+    return every(strongest_force(sensor) <= threshold)
 
 
 def contact_forces(env: ManagedEnv, *, sensor: ContactSensor, threshold: float) -> Tensor:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from rlcli.mdp.measures import cosine, goal_in_world, goal_quat_in_world, only, vector
+from rlcli.mdp.measures import cosine, every, goal_in_world, goal_quat_in_world, only, vector
 from rlcli.sim.rotations import length, turn_between, wrap_to_pi
 from rlcli.task import Bodies, Command, Entity, Joints, Sites
 
@@ -20,7 +20,7 @@ def joints_near(
 ) -> Tensor:
     """Every joint is within `tolerance` of `target` [m or rad], the difference wrapped to [-pi, pi]. (num_envs,)"""
     position = entity.data.joint_pos[:, joints]
-    return (wrap_to_pi(position - target if target else position).abs_() < tolerance).all(dim=1)
+    return every(wrap_to_pi(position - target if target else position).abs_() < tolerance)
 
 
 def root_moves(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rlcli.mdp.measures import cosine, goal_in_world, strongest_force
+from rlcli.mdp.measures import cosine, goal_in_world, some, strongest_force
 from rlcli.sim.rotations import length
 from rlcli.task import Command, ContactSensor, Entity, Joints, Range
 
@@ -25,21 +25,21 @@ def joint_pos_out_of_manual_limit(
 ) -> Tensor:
     """Some joint is outside `bounds` [m or rad]. (num_envs,)"""
     position = entity.data.joint_pos[:, joints]
-    return ((position < bounds[0]) | (position > bounds[1])).any(dim=1)
+    return some((position < bounds[0]) | (position > bounds[1]))
 
 
 def joint_pos_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Some joint is outside its soft limits. (num_envs,)"""
     position = entity.data.joint_pos[:, joints]
     low, high = (limit[:, joints] for limit in entity.data.joint_limits(soft=True))
-    return ((position < low) | (position > high)).any(dim=1)
+    return some((position < low) | (position > high))
 
 
 def joint_vel_out_of_manual_limit(
     env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", max_velocity: float
 ) -> Tensor:
     """Some joint moves faster than `max_velocity` [m/s or rad/s]. (num_envs,)"""
-    return (entity.data.joint_vel[:, joints].abs() > max_velocity).any(dim=1)
+    return some(entity.data.joint_vel[:, joints].abs() > max_velocity)
 
 
 def bad_orientation(env: ManagedEnv, *, entity: Entity = "robot", limit_angle: float) -> Tensor:
@@ -57,7 +57,7 @@ def root_height_below_minimum(env: ManagedEnv, *, entity: Entity = "robot", mini
 
 def joint_vel_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Some joint moves faster than its `velocity_limit`. (num_envs,)"""
-    return (entity.data.joint_vel[:, joints].abs() > entity.data.joint_vel_limits[joints]).any(dim=1)
+    return some(entity.data.joint_vel[:, joints].abs() > entity.data.joint_vel_limits[joints])
 
 
 def joint_effort_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
@@ -65,12 +65,12 @@ def joint_effort_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", join
 
     MuJoCo's own actuators by the present state and controls. Isaac Lab: explicit actuators only, of the last substep.
     """
-    return (entity.data.withheld_effort[:, joints] > 0.0).any(dim=1)
+    return some(entity.data.withheld_effort[:, joints] > 0.0)
 
 
 def illegal_contact(env: ManagedEnv, *, sensor: ContactSensor, threshold: float = 1.0) -> Tensor:
     """Some body of the sensor has felt a contact force above `threshold` [N], within its history. (num_envs,)"""
-    return (strongest_force(sensor) > threshold).any(dim=1)
+    return some(strongest_force(sensor) > threshold)
 
 
 def out_of_bound(
@@ -92,7 +92,7 @@ def out_of_bound(
 
 def abnormal_robot_state(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Some joint moves faster than twice its `velocity_limit`. (num_envs,)"""
-    return (entity.data.joint_vel[:, joints].abs() > 2.0 * entity.data.joint_vel_limits[joints]).any(dim=1)
+    return some(entity.data.joint_vel[:, joints].abs() > 2.0 * entity.data.joint_vel_limits[joints])
 
 
 def object_reached_goal(

@@ -10,7 +10,11 @@ from rlcli.rl.capture import Recording
 from rlcli.rl.ppo import PpoTrainer
 from rlcli.rl.ppo_loss import Parts
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU, and there is none here")
+pytestmark = [
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU, and there is none here"),
+    # torch says so once a process, of the very mode that the tests ask for
+    pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype feature"),
+]
 
 
 def environment(task, **flags):
