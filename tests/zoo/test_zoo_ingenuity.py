@@ -10,9 +10,13 @@ from worlds import build
 LOWER_X, LOWER_Y, LOWER, UPPER_X, UPPER_Y, UPPER = range(6)
 
 
+UPSTREAM = ("params.steadiness=0", "params.max_distance=20")
+"""The task as it is; the CPU's agent trains with others."""
+
+
 @pytest.fixture
 def env():
-    env = build("ingenuity", 4)
+    env = build("ingenuity", 4, *UPSTREAM)
     env.reset()
     return env
 
@@ -155,6 +159,15 @@ def test_leaning_costs_whichever_way(env, axis, tilt):
 def test_spinning_costs_either_way(env, spin):
     at_target(env, angular=(0, 0, spin))
     assert pay(env)[0] == pytest.approx(2.0 + 1.0 / (1.0 + 10.0 * spin**2), rel=1e-5)
+
+
+def test_steadiness_pays_for_rest_near_the_target():
+    env = build("ingenuity", 4, "params.steadiness=2")
+    env.reset()
+    at_target(env, (0.0, 1.0, 0.0))
+    assert pay(env)[0] == pytest.approx(5.0 / 3.5, rel=1e-5)
+    at_target(env, (0.0, 1.0, 0.0), linear=(0.3, 0.0, -0.4))
+    assert pay(env)[0] == pytest.approx((3.0 + 2.0 / 3.5) / 3.5, rel=1e-5)
 
 
 @pytest.mark.parametrize(

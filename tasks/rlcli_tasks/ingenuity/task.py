@@ -39,6 +39,9 @@ class IngenuityTask(FlightTask):
         start_offset: float = Field(0.5, ge=0, description="Start: offset from the default position +- [m].")
         max_distance: float = Field(20.0, gt=0, description="Distance to the target beyond which it fails [m].")
         min_height: float = Field(0.5, description="Height below which it fails [m].")
+        steadiness: float = Field(
+            0.0, ge=0, description="Weight of nearness / (1 + 10 speed^2) in the reward, which upstream's lacks [1]."
+        )
 
     params: Params
 
@@ -72,7 +75,7 @@ class IngenuityTask(FlightTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Nearness; and near the target, uprightness and not to spin."""
+        """Nearness; and near the target, uprightness, not to spin, and `steadiness`."""
         data = self.robot.data
         self.distance.copy_(length(self.target - data.root_pos_w))
         _, x, y, _ = data.root_quat_w.unbind(dim=1)
@@ -81,6 +84,9 @@ class IngenuityTask(FlightTask):
         near = 1.0 / (1.0 + 2.5 * self.distance.square())
         posture = 1.0 / (1.0 + 30.0 * tilt.square()) + 1.0 / (1.0 + 10.0 * spin.square())
         self.rew_buf.copy_(near + near * posture)
+        if self.params.steadiness:  # a sway of 10 cm costs upstream's reward 2 %, so that what it trains may sway
+            rest = 1.0 / (1.0 + 10.0 * data.root_lin_vel_w.square().sum(dim=1))
+            self.rew_buf.addcmul_(near, rest, value=self.params.steadiness)
 
     def is_done(self) -> None:
         """Too far or too low; the framework adds the time-out."""
