@@ -169,7 +169,7 @@ class VecEnv(ABC):
             reward, terminated, truncated = reward.masked_fill(begin, 0.0), terminated & ~begin, truncated & ~begin
         final_obs, episodes = None, None
         finished = terminated | truncated
-        self.episode_index += finished  # before the selection: what begins now draws from its own counter
+        self._indices += in_place(finished)  # before the selection: what begins now draws from its own counter
         ended = self._select(finished)
         if ended is not None:
             timed_out = truncated & ~terminated
@@ -513,7 +513,7 @@ class VecEnv(ABC):
     def _hold_success(self) -> None:
         if self._success is not None:
             self._holds += 1.0
-            self._success_hold *= self._success()
+            self._holds *= in_place(self._success())
 
     def _episodes(self, ended: Selection, finished: Tensor, timed_out: Tensor) -> Episodes:
         returns, terms, causes = self._terms_of(ended)
@@ -669,6 +669,7 @@ class VecEnv(ABC):
         self._ids = torch.arange(self.num_envs, device=self.device)
         self._steps: Tensor = torch.zeros((), dtype=torch.int64, device=self.device)
         self._lengths, self._clock = in_place(self.episode_length_buf), in_place(self._steps)
+        self._indices = in_place(self.episode_index)
 
 
 def grid(num_envs: int, spacing: float) -> Tensor:

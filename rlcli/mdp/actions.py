@@ -203,7 +203,7 @@ class RelativeJointPosition(_JointAction):
         super().__init__(env, entity, joints, scale, clip)
 
     def _target(self, action: Tensor) -> None:
-        torch.add(self._entity.data.joint_pos[:, self._joints], action * self._scale, out=self.command)
+        torch.add(self._entity.data.joint_pos_of(self._joints), action * self._scale, out=self.command)
 
 
 class JointPositionToLimits(_JointAction):
@@ -270,7 +270,7 @@ class EmaJointPositionToLimits(JointPositionToLimits):
 
     def _target(self, action: Tensor) -> None:
         low, high = self._entity.data.soft_joint_pos_limits[self._joints].unbind(-1)
-        before = torch.where(self._fresh[:, None], self._entity.data.joint_pos[:, self._joints], self._before)
+        before = torch.where(self._fresh[:, None], self._entity.data.joint_pos_of(self._joints), self._before)
         self._before.copy_((self._alpha * self._asked(action) + (1.0 - self._alpha) * before).clamp(low, high))
         self.command.copy_(self._before)
         self._fresh.zero_()
@@ -389,7 +389,7 @@ class DifferentialInverseKinematics(_JointAction):
         error = self._error(action * self._scale, position, quat)
         jacobian = self._jacobian(position)[:, : error.shape[1]]
         square = jacobian @ jacobian.mT + self._damping**2 * torch.eye(error.shape[1], device=error.device)
-        joints, wanted = data.joint_pos[:, self._joints], error[:, :, None]
+        joints, wanted = data.joint_pos_of(self._joints), error[:, :, None]
         if not self._posture:
             step = jacobian.mT @ torch.linalg.solve_ex(square, wanted)[0]
         else:

@@ -28,27 +28,27 @@ if TYPE_CHECKING:
 
 def joint_pos(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Joint positions [m or rad]. (num_envs, k)"""
-    return entity.data.joint_pos[:, joints]
+    return entity.data.joint_pos_of(joints)
 
 
 def joint_vel(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Joint velocities [m/s or rad/s]. (num_envs, k)"""
-    return entity.data.joint_vel[:, joints]
+    return entity.data.joint_vel_of(joints)
 
 
 def joint_pos_rel(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Joint positions less their defaults [m or rad]. (num_envs, k)"""
-    return entity.data.joint_pos[:, joints] - entity.data.default_joint_pos[:, joints]
+    return entity.data.joint_pos_of(joints) - entity.data.default_joint_pos_of(joints)
 
 
 def joint_vel_rel(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Joint velocities less their defaults [m/s or rad/s]. (num_envs, k)"""
-    return entity.data.joint_vel[:, joints] - entity.data.default_joint_vel[:, joints]
+    return entity.data.joint_vel_of(joints) - entity.data.default_joint_vel_of(joints)
 
 
 def joint_angle(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Joint positions wrapped to [-pi, pi], for hinges that turn all the way round [rad]. (num_envs, k)"""
-    return wrap_to_pi(entity.data.joint_pos[:, joints])
+    return entity.data.joint_angle_of(joints)
 
 
 def joint_angle_sum(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints) -> Tensor:
@@ -56,7 +56,7 @@ def joint_angle_sum(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints
 
     (num_envs, 1)
     """
-    position = entity.data.joint_pos[:, joints]
+    position = entity.data.joint_pos_of(joints)
     total = position[:, :1]
     for column in position.split(1, dim=1)[1:]:  # one after the other: a sum rounds differently for other sizes
         total = total + column
@@ -66,7 +66,7 @@ def joint_angle_sum(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints
 def joint_pos_limit_normalized(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Joint positions, -1 at the lower and 1 at the upper soft limit; 0 for a joint without limits. (num_envs, k)"""
     low, high = entity.data.soft_joint_pos_limits[joints].unbind(dim=1)
-    scaled = (2.0 * entity.data.joint_pos[:, joints] - low - high) / (high - low)
+    scaled = (2.0 * entity.data.joint_pos_of(joints) - low - high) / (high - low)
     return torch.where(high - low < torch.inf, scaled, 0.0)
 
 

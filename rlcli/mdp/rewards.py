@@ -18,7 +18,7 @@ from rlcli.mdp.measures import (
     total,
     vector,
 )
-from rlcli.sim.rotations import axis_x, axis_y, axis_z, length, roll_pitch_yaw, turn_between, wrap_to_pi
+from rlcli.sim.rotations import axis_x, axis_y, axis_z, length, roll_pitch_yaw, turn_between
 from rlcli.sim.selection import Columns, Selection
 from rlcli.task import Bodies, Command, ContactSensor, Entity, Joints, RaySensor, Sensors, Sites, reads_body_forces
 
@@ -38,19 +38,19 @@ def is_terminated(env: ManagedEnv) -> Tensor:
 
 def joint_pos_target_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", target: float) -> Tensor:
     """Squared joint deviation from `target` [rad^2], positions wrapped to [-pi, pi]. (num_envs,)"""
-    position = wrap_to_pi(entity.data.joint_pos[:, joints])
-    deviation = position - target if isinstance(target, Tensor) or target else position
-    return total(deviation.square_())
+    angle = entity.data.joint_angle_of(joints)
+    deviation = angle - target if isinstance(target, Tensor) or target else angle
+    return total(deviation.square())
 
 
 def joint_vel_l1(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Sum of absolute joint velocities [rad/s]. (num_envs,)"""
-    return total(entity.data.joint_vel[:, joints].abs())
+    return total(entity.data.joint_vel_of(joints).abs())
 
 
 def joint_vel_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Sum of squared joint velocities [rad^2/s^2]. (num_envs,)"""
-    return total(entity.data.joint_vel[:, joints].square())
+    return total(entity.data.joint_vel_of(joints).square())
 
 
 def joint_acc_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
@@ -65,7 +65,7 @@ def joint_torques_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joint
 
 def joint_pos_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """How far joints are outside their soft limits, summed [rad]. (num_envs,)"""
-    position = entity.data.joint_pos[:, joints]
+    position = entity.data.joint_pos_of(joints)
     low, high = (limit[:, joints] for limit in entity.data.joint_limits(soft=True))
     return ((low - position).clamp_(min=0.0) + (position - high).clamp_(min=0.0)).sum(dim=1)
 
@@ -91,7 +91,7 @@ class JointPosLimitsPenaltyRatio:
     def __call__(self) -> Tensor:
         """(num_envs,)"""
         low, high = (limit[:, self._joints] for limit in self._entity.data.joint_limits())
-        scaled = ((2.0 * self._entity.data.joint_pos[:, self._joints] - low - high) / (high - low)).abs()
+        scaled = ((2.0 * self._entity.data.joint_pos_of(self._joints) - low - high) / (high - low)).abs()
         violation = (scaled - self._threshold) / (1.0 - self._threshold)
         # a joint without limits has no scale (nan), and is never beyond it
         return torch.where(scaled > self._threshold, violation * self._ratio, 0.0).sum(dim=1)
@@ -105,7 +105,7 @@ def joints_at_limit(
     A joint without limits never is.
     """
     low, high = (limit[:, joints] for limit in entity.data.joint_limits(soft=True))
-    scaled = (2.0 * entity.data.joint_pos[:, joints] - low - high) / (high - low)
+    scaled = (2.0 * entity.data.joint_pos_of(joints) - low - high) / (high - low)
     return (scaled.abs_() > threshold).sum(dim=1).float()
 
 
@@ -128,7 +128,7 @@ class PowerConsumption:
 
     def __call__(self) -> Tensor:
         """(num_envs,)"""
-        action, velocity = self._env.action_manager.action, self._entity.data.joint_vel[:, self._joints]
+        action, velocity = self._env.action_manager.action, self._entity.data.joint_vel_of(self._joints)
         if action.shape != velocity.shape:
             raise ValueError(f"selects {velocity.shape[1]} joints, the action has {action.shape[1]} columns")
         return (action * velocity * self._ratio).abs().sum(dim=1)
@@ -367,7 +367,7 @@ def joint_vel_limits(
 
     [m/s or rad/s]
     """
-    excess = entity.data.joint_vel[:, joints].abs() - entity.data.joint_vel_limits[joints] * soft_ratio
+    excess = entity.data.joint_vel_of(joints).abs() - entity.data.joint_vel_limits[joints] * soft_ratio
     return excess.clamp_(0.0, 1.0).sum(dim=1)
 
 
@@ -378,7 +378,7 @@ def joint_velocity_hinge_penalty(
 
     mjlab: `joint_velocity_hinge_penalty`.
     """
-    return (entity.data.joint_vel[:, joints].abs() - max_velocity).clamp_(min=0.0).square_().sum(dim=1)
+    return (entity.data.joint_vel_of(joints).abs() - max_velocity).clamp_(min=0.0).square_().sum(dim=1)
 
 
 def applied_torque_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
@@ -394,7 +394,7 @@ def electrical_power_cost(env: ManagedEnv, *, entity: Entity = "robot", joints: 
 
     mjlab: `electrical_power_cost`.
     """
-    power = entity.data.applied_effort[:, joints] * entity.data.joint_vel[:, joints]
+    power = entity.data.applied_effort[:, joints] * entity.data.joint_vel_of(joints)
     return power.clamp_(min=0.0).sum(dim=1)
 
 
@@ -410,7 +410,7 @@ def joint_torques_penalty(env: ManagedEnv, *, entity: Entity = "robot", joints: 
 
 def joint_velocity_penalty(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Size of the joints' velocities [rad/s]. (num_envs,)"""
-    return length(entity.data.joint_vel[:, joints])
+    return length(entity.data.joint_vel_of(joints))
 
 
 def joint_position_penalty(
@@ -958,13 +958,13 @@ class GraspHandle(_Handle):
 
     def __call__(self) -> Tensor:
         """(num_envs,)"""
-        closed = (self._open - self._entity.data.joint_pos[:, self._joints]).sum(dim=1)
+        closed = (self._open - self._entity.data.joint_pos_of(self._joints)).sum(dim=1)
         return closed * (self._distance() <= self._threshold)
 
 
 def open_drawer_bonus(env: ManagedEnv, *, entity: Entity = "cabinet", joints: Joints) -> Tensor:
     """How far joints of a cabinet are open, summed [m]. (num_envs,)  Isaac Lab: doubled while the handle is held."""
-    return entity.data.joint_pos[:, joints].sum(dim=1)
+    return entity.data.joint_pos_of(joints).sum(dim=1)
 
 
 def multi_stage_open_drawer(env: ManagedEnv, *, entity: Entity = "cabinet", joints: Joints) -> Tensor:
@@ -972,7 +972,7 @@ def multi_stage_open_drawer(env: ManagedEnv, *, entity: Entity = "cabinet", join
 
     Isaac Lab: the last two while the handle is held.
     """
-    opening = only(entity.data.joint_pos[:, joints], "joint")
+    opening = only(entity.data.joint_pos_of(joints), "joint")
     return 0.5 * (opening > 0.01) + (opening > 0.2) + (opening > 0.3)
 
 
@@ -985,7 +985,7 @@ def _near(distance: Tensor, std: float) -> Tensor:
 
 
 def _off_default(entity: Entity, joints: Joints) -> Tensor:
-    return entity.data.joint_pos[:, joints] - entity.data.default_joint_pos[:, joints]
+    return entity.data.joint_pos_of(joints) - entity.data.default_joint_pos_of(joints)
 
 
 def _on_the_move(entity: Entity, command: Command, velocity_threshold: float) -> Tensor:

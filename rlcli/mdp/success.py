@@ -19,8 +19,9 @@ def joints_near(
     env: VecEnv, *, entity: Entity = "robot", joints: Joints = ".*", target: float = 0.0, tolerance: float
 ) -> Tensor:
     """Every joint is within `tolerance` of `target` [m or rad], the difference wrapped to [-pi, pi]. (num_envs,)"""
-    position = entity.data.joint_pos[:, joints]
-    return every(wrap_to_pi(position - target if target else position).abs_() < tolerance)
+    data = entity.data
+    angle = wrap_to_pi(data.joint_pos_of(joints) - target) if target else data.joint_angle_of(joints)
+    return every(angle.abs() < tolerance)
 
 
 def root_moves(

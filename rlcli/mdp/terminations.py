@@ -24,13 +24,13 @@ def joint_pos_out_of_manual_limit(
     env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", bounds: Range
 ) -> Tensor:
     """Some joint is outside `bounds` [m or rad]. (num_envs,)"""
-    position = entity.data.joint_pos[:, joints]
+    position = entity.data.joint_pos_of(joints)
     return some((position < bounds[0]) | (position > bounds[1]))
 
 
 def joint_pos_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Some joint is outside its soft limits. (num_envs,)"""
-    position = entity.data.joint_pos[:, joints]
+    position = entity.data.joint_pos_of(joints)
     low, high = (limit[:, joints] for limit in entity.data.joint_limits(soft=True))
     return some((position < low) | (position > high))
 
@@ -39,7 +39,7 @@ def joint_vel_out_of_manual_limit(
     env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", max_velocity: float
 ) -> Tensor:
     """Some joint moves faster than `max_velocity` [m/s or rad/s]. (num_envs,)"""
-    return some(entity.data.joint_vel[:, joints].abs() > max_velocity)
+    return some(entity.data.joint_vel_of(joints).abs() > max_velocity)
 
 
 def bad_orientation(env: ManagedEnv, *, entity: Entity = "robot", limit_angle: float) -> Tensor:
@@ -57,7 +57,7 @@ def root_height_below_minimum(env: ManagedEnv, *, entity: Entity = "robot", mini
 
 def joint_vel_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Some joint moves faster than its `velocity_limit`. (num_envs,)"""
-    return some(entity.data.joint_vel[:, joints].abs() > entity.data.joint_vel_limits[joints])
+    return some(entity.data.joint_vel_of(joints).abs() > entity.data.joint_vel_limits[joints])
 
 
 def joint_effort_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
@@ -92,7 +92,7 @@ def out_of_bound(
 
 def abnormal_robot_state(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Some joint moves faster than twice its `velocity_limit`. (num_envs,)"""
-    return some(entity.data.joint_vel[:, joints].abs() > 2.0 * entity.data.joint_vel_limits[joints])
+    return some(entity.data.joint_vel_of(joints).abs() > 2.0 * entity.data.joint_vel_limits[joints])
 
 
 def object_reached_goal(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
 import mujoco
@@ -15,7 +15,7 @@ from rlcli.config.schema import EntityConfig
 from rlcli.errors import TaskError
 from rlcli.sim.engine import Engine, computes_body_forces
 from rlcli.sim.names import NameProblem, match
-from rlcli.sim.rotations import atan2, axis_x, length, multiply, rotate, rotate_inverse
+from rlcli.sim.rotations import atan2, axis_x, length, multiply, rotate, rotate_inverse, wrap_to_pi
 from rlcli.sim.scene import actuator_kind, joint_settings
 from rlcli.sim.selection import ALL, Columns, Selection, ids_of
 
@@ -260,7 +260,8 @@ class EntityData:
     def __init__(self, entity: Entity, sim: SimData) -> None:
         self._entity = entity
         self._sim = sim
-        self._cache: dict[str, tuple[int, Tensor]] = {}
+        self._cache: dict[Hashable, tuple[int, Tensor]] = {}
+        self._views: dict[tuple[str, int | None, int | None], Tensor] = {}
         model, num_envs = entity.engine.model, entity.engine.num_envs
         device = entity.engine.device
         self._qpos_index = as_index(entity.qpos_columns.tolist(), device)
@@ -325,6 +326,27 @@ class EntityData:
         if self._joint_vel is not None:
             return self._joint_vel
         return self._once("joint_vel", lambda: self._sim.qvel[:, self._dof_index])
+
+    def joint_pos_of(self, joints: Columns) -> Tensor:
+        """`joint_pos[:, joints]`, for what is read in every step: a view is made once. (num_envs, k) [m or rad]"""
+        return self._part("pos", self.joint_pos, self._joint_pos is not None, joints)
+
+    def joint_vel_of(self, joints: Columns) -> Tensor:
+        """`joint_vel[:, joints]`, likewise. (num_envs, k) [m/s or rad/s]"""
+        return self._part("vel", self.joint_vel, self._joint_vel is not None, joints)
+
+    def default_joint_pos_of(self, joints: Columns) -> Tensor:
+        """`default_joint_pos[:, joints]`, likewise. (num_envs, k) [m or rad]"""
+        return self._part("default_pos", self.default_joint_pos, True, joints)
+
+    def default_joint_vel_of(self, joints: Columns) -> Tensor:
+        """`default_joint_vel[:, joints]`, likewise. (num_envs, k) [m/s or rad/s]"""
+        return self._part("default_vel", self.default_joint_vel, True, joints)
+
+    def joint_angle_of(self, joints: Columns) -> Tensor:
+        """`joint_pos[:, joints]` wrapped to [-pi, pi], computed once a step. (num_envs, k) [rad]"""
+        key = (joints.start, joints.stop) if isinstance(joints, slice) else id(joints)
+        return self._once(("angle", key), lambda: wrap_to_pi(self.joint_pos_of(joints)))
 
     @property
     def joint_acc(self) -> Tensor:
@@ -575,7 +597,16 @@ class EntityData:
             )
         return self._sim.derived(name)
 
-    def _once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
+    def _part(self, name: str, values: Tensor, lasting: bool, joints: Columns) -> Tensor:
+        if not lasting or not isinstance(joints, slice):
+            return values[:, joints]
+        key = (name, joints.start, joints.stop)
+        view = self._views.get(key)
+        if view is None:
+            view = self._views[key] = values[:, joints]
+        return view
+
+    def _once(self, name: Hashable, compute: Callable[[], Tensor]) -> Tensor:
         stamp, value = self._cache.get(name, (-1, None))
         if stamp != self._sim.stamp or value is None:
             value = compute()
