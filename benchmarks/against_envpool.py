@@ -2,7 +2,8 @@
 
 Same models (compared field by field), frame skip, threads and range of random actions, automatic restarts; both begin
 together and take blocks of equally many steps in turn, so that their episodes are equally old. EnvPool has MuJoCo 3.6
-built in: how much of a ratio is MuJoCo's own is what a bare loop of `mj_step` does on both versions.
+built in: how much of a ratio is MuJoCo's own is what a bare loop of `mj_step` does on both versions. What the ratio
+would be if everything besides the call of the engine cost nothing is its limit.
 """
 
 from __future__ import annotations
@@ -56,8 +57,10 @@ def one(task: str, num_envs: int, ours: Side, theirs: Side, repeats: int, second
     warm = alternate(blocks, dict.fromkeys(blocks, 32), 2)
     steps = max(4, round(seconds / warm["ours"][-1]))
     found = alternate(blocks, dict.fromkeys(blocks, steps), repeats)
+    compared = ratio(found["theirs"], found["ours"])
     return {
-        **ratio(found["theirs"], found["ours"]),
+        **compared,
+        "limit": compared["ratio"] / ours("physics"),
         "ours": num_envs / statistics.median(found["ours"]),
         "envpool": num_envs / statistics.median(found["theirs"]),
         "steps": steps,
@@ -111,7 +114,8 @@ def measure(quick: bool) -> dict[str, Any]:
         return {"failed": rows[0]["failed"]}
     versions = "EnvPool {} with MuJoCo {}".format(*whole[0]["versions"])
     means = {key: geometric_mean([row[key]["ratio"] for row in whole]) for key in ("64", "1024", "mujoco")}
-    return {"envpool": versions, "rows": rows, "means": means}
+    limits = {key: geometric_mean([row[key]["limit"] for row in whole]) for key in ("64", "1024")}
+    return {"envpool": versions, "rows": rows, "means": means, "limits": limits}
 
 
 def markdown(result: dict[str, Any]) -> str:
@@ -120,20 +124,22 @@ def markdown(result: dict[str, Any]) -> str:
         return f"{stands(result)}\n\nEnvPool: {result['failed']}"
     heads = ["task"]
     for num_envs in (64, 1024):
-        heads += [f"{num_envs:,}: of EnvPool", "min .. max", "environment steps/s", "EnvPool"]
+        heads += [f"{num_envs:,}: of EnvPool", "min .. max", "limit", "environment steps/s", "EnvPool"]
     rows = []
     for row in result["rows"]:
         name = f"`{row['task']}`" + (" *" if row["task"] in FORCES else "")
         if "failed" in row:
-            rows.append([name, f"failed: {row['failed']}", *[""] * 8])
+            rows.append([name, f"failed: {row['failed']}", *[""] * 10])
             continue
         cells = [name]
         for column in (row["64"], row["1024"]):
-            cells += [f"**{column['ratio']:.2f}**", spread(column), rate(column["ours"]), rate(column["envpool"])]
+            cells += [f"**{column['ratio']:.2f}**", spread(column), f"{column['limit']:.2f}"]
+            cells += [rate(column["ours"]), rate(column["envpool"])]
         rows.append([*cells, f"{row['mujoco']['ratio']:.2f}"])
-    means = result["means"]
-    rows.append(["geometric mean", f"**{means['64']:.2f}**", "", "", "", f"**{means['1024']:.2f}**", "", "", "",
-                 f"{means['mujoco']:.2f}"])  # fmt: skip
+    last = ["geometric mean"]
+    for key in ("64", "1024"):
+        last += [f"**{result['means'][key]:.2f}**", "", f"{result['limits'][key]:.2f}", "", ""]
+    rows.append([*last, f"{result['means']['mujoco']:.2f}"])
     return f"{stands(result, result['envpool'])}\n\n{table([*heads, 'of it MuJoCo'], rows)}"
 
 

@@ -76,7 +76,8 @@ def waits(repeats: int, cold: bool) -> dict[str, Any]:
                         (first(0, "first step", folder), first(1, "first step", folder, WARP_CACHE_PATH=empty))
                     )
             found["first step, nothing compiled yet"] = columns(rounds)
-    lists = [[str(here.with_name("rlcli")), "list-tasks"], [str(there.with_name("list-envs"))]]
+    # mjlab's own `list-envs` exits with the number of its tasks
+    lists = [[str(here.with_name("rlcli")), "list-tasks"], [str(there), "-m", "mjlab.scripts.list_envs"]]
     for command in lists:
         wall(command, quietly())
     found["list of tasks"] = columns([(wall(lists[0]), wall(lists[1], quietly())) for _ in range(repeats)])

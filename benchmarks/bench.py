@@ -38,6 +38,7 @@ TABLES = [*SCRIPTS, *MODULES]
 HEADS = {
     "num_envs": "environments",
     "ratio": "of bare `Batch`",
+    "ratio_stage_none": "of stage NONE",
     "stock_sb3_ratio": "stock SB3 on the same task",
     "env_steps_per_s": "environment steps/s",
     "bare_steps_per_s": "bare steps/s",
@@ -54,7 +55,9 @@ def shown(key: str, row: dict[str, Any]) -> str:
         return ""
     if isinstance(value, dict):
         return " ".join(f"{name} {part:.0f}" for name, part in value.items())
-    if not isinstance(value, int | float):
+    if isinstance(value, int):
+        return f"{value:,}"
+    if not isinstance(value, float):
         return str(value)
     if f"{key}_min" in row:
         return f"**{value:.3f}** ({row[f'{key}_min']:.3f} .. {row[f'{key}_max']:.3f})"
@@ -83,6 +86,8 @@ def readme(kept: dict[str, Any]) -> str:
     }
     if "dummy" in times:
         said.append(f"training is {times['dummy']:.1f} times as fast as SB3's on a plain Gymnasium cartpole")
+    if len(said) > 1:
+        said[-1] = f"and {said[-1]}"
     return f"{', '.join(said)}\n([figures](docs/benchmarks.md))."
 
 

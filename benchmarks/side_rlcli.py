@@ -60,6 +60,11 @@ def step(steps: int) -> float:
     return clock() - begin
 
 
+def physics() -> float:
+    """The engine's share of the time of the environment's steps so far."""
+    return ours["env"].seconds["physics"] / ours["env"].seconds["step"]
+
+
 def differs(path: str) -> list[str]:
     """Fields that physics reads in which a model file, once compiled, is not the environment's model."""
     import mujoco
@@ -145,6 +150,18 @@ if __name__ == "__main__":
     serve(
         {
             f.__name__: f
-            for f in (machine, open_env, step, differs, open_bare, step_bare, open_trainer, train, memory_mb, close)
+            for f in (
+                machine,
+                open_env,
+                step,
+                physics,
+                differs,
+                open_bare,
+                step_bare,
+                open_trainer,
+                train,
+                memory_mb,
+                close,
+            )
         }
     )

@@ -41,7 +41,7 @@ def commands(folder: Path) -> dict[str, tuple[str, list[str]]]:
         "empty": ("rlcli", ["python", str(folder / "empty.py"), "--help"]),
         "help": ("rlcli", ["rlcli", "--help"]),
         "list": ("rlcli", ["rlcli", "list-tasks"]),
-        "mjlab-list": ("mjlab", ["list-envs"]),
+        "mjlab-list": ("mjlab", ["python", "-m", "mjlab.scripts.list_envs"]),  # `list-envs` exits with their number
         "zoo-help": ("rl-zoo3", ["python", "-m", "rl_zoo3.train", "--help"]),
         "step": ("rlcli", ["python", FIRST, "rlcli.envs.vec_env:VecEnv.step", *train]),
         "update": ("rlcli", ["python", FIRST, "rlcli.rl.sb3:Sb3Trainer.iterate", *train]),

@@ -57,14 +57,15 @@ TIMES = {"ratio": 9.87, "ratio_min": 9.0, "ratio_max": 11.0}
 
 
 def test_a_peer_that_failed_is_a_row_with_its_reason_among_the_others():
-    column = {**TIMES, "ours": 2e6, "envpool": 1e5, "steps": 4}
+    column = {**TIMES, "limit": 2.5, "ours": 2e6, "envpool": 1e5, "steps": 4}
     rows = [
         {"task": "gym-ant", "64": column, "1024": column, "mujoco": TIMES},
         {"task": "gym-hopper", "failed": "the models differ in body_mass"},
     ]
     means = {"64": 9.87, "1024": 9.87, "mujoco": 9.87}
-    text = against_envpool.markdown({"machine": "M", "envpool": "EnvPool 1", "rows": rows, "means": means})
-    assert "| `gym-ant` * | **9.87** | 9.00 .. 11.00 | 2 M | 100,000 |" in text
+    result = {"machine": "M", "envpool": "EnvPool 1", "rows": rows, "means": means, "limits": means}
+    text = against_envpool.markdown(result)
+    assert "| `gym-ant` * | **9.87** | 9.00 .. 11.00 | 2.50 | 2 M | 100,000 |" in text
     assert "the models differ in body_mass" in text
     lines = [line for line in text.splitlines() if line.startswith("|")]
     assert len({line.count("|") for line in lines}) == 1
