@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import mujoco
 import numpy as np
@@ -233,7 +233,7 @@ class Entity:
         return as_index(positions, self.engine.device)
 
     def _columns(self, of: Tensor, joints: Columns) -> Columns:
-        key = (id(of), joints.start, joints.stop) if isinstance(joints, slice) else (id(of), id(joints), None)
+        key = (id(of), joints.start, joints.stop, joints.step) if isinstance(joints, slice) else (id(of), id(joints))
         if key not in self._column_cache:
             # the joints stay referenced, so that their id is not given to another tensor
             self._column_cache[key] = (joints, self._index(of[joints].tolist()))
@@ -261,7 +261,7 @@ class EntityData:
         self._entity = entity
         self._sim = sim
         self._cache: dict[Hashable, tuple[int, Tensor]] = {}
-        self._views: dict[tuple[str, int | None, int | None], Tensor] = {}
+        self._views: dict[tuple[Any, ...], tuple[Tensor, Tensor]] = {}
         model, num_envs = entity.engine.model, entity.engine.num_envs
         device = entity.engine.device
         self._qpos_index = as_index(entity.qpos_columns.tolist(), device)
@@ -329,24 +329,26 @@ class EntityData:
 
     def joint_pos_of(self, joints: Columns) -> Tensor:
         """`joint_pos[:, joints]`, for what is read in every step: a view is made once. (num_envs, k) [m or rad]"""
-        return self._part("pos", self.joint_pos, self._joint_pos is not None, joints)
+        return self._part("pos", self.joint_pos, joints)
 
     def joint_vel_of(self, joints: Columns) -> Tensor:
         """`joint_vel[:, joints]`, likewise. (num_envs, k) [m/s or rad/s]"""
-        return self._part("vel", self.joint_vel, self._joint_vel is not None, joints)
+        return self._part("vel", self.joint_vel, joints)
 
     def default_joint_pos_of(self, joints: Columns) -> Tensor:
         """`default_joint_pos[:, joints]`, likewise. (num_envs, k) [m or rad]"""
-        return self._part("default_pos", self.default_joint_pos, True, joints)
+        return self._part("default_pos", self.default_joint_pos, joints)
 
     def default_joint_vel_of(self, joints: Columns) -> Tensor:
         """`default_joint_vel[:, joints]`, likewise. (num_envs, k) [m/s or rad/s]"""
-        return self._part("default_vel", self.default_joint_vel, True, joints)
+        return self._part("default_vel", self.default_joint_vel, joints)
 
     def joint_angle_of(self, joints: Columns) -> Tensor:
-        """`joint_pos[:, joints]` wrapped to [-pi, pi], computed once a step. (num_envs, k) [rad]"""
-        key = (joints.start, joints.stop) if isinstance(joints, slice) else id(joints)
-        return self._once(("angle", key), lambda: wrap_to_pi(self.joint_pos_of(joints)))
+        """`joint_pos[:, joints]` wrapped to [-pi, pi], computed once a step: do not write to it. (num_envs, k) [rad]"""
+        if not isinstance(joints, slice):  # whose id another index may have next
+            return wrap_to_pi(self.joint_pos[:, joints])
+        key = ("angle", joints.start, joints.stop, joints.step)
+        return self._once(key, lambda: wrap_to_pi(self.joint_pos_of(joints)))
 
     @property
     def joint_acc(self) -> Tensor:
@@ -597,13 +599,15 @@ class EntityData:
             )
         return self._sim.derived(name)
 
-    def _part(self, name: str, values: Tensor, lasting: bool, joints: Columns) -> Tensor:
-        if not lasting or not isinstance(joints, slice):
+    def _part(self, name: str, values: Tensor, joints: Columns) -> Tensor:
+        """`values[:, joints]`; of the same tensor and slice, the same view."""
+        if not isinstance(joints, slice):
             return values[:, joints]
-        key = (name, joints.start, joints.stop)
-        view = self._views.get(key)
-        if view is None:
-            view = self._views[key] = values[:, joints]
+        key = (name, joints.start, joints.stop, joints.step)
+        of, view = self._views.get(key, (None, values))
+        if of is not values:
+            view = values[:, joints]
+            self._views[key] = values, view
         return view
 
     def _once(self, name: Hashable, compute: Callable[[], Tensor]) -> Tensor:
