@@ -172,7 +172,7 @@ class VecEnv(ABC):
         self._indices += in_place(finished)  # before the selection: what begins now draws from its own counter
         ended = self._select(finished)
         if ended is not None:
-            timed_out = truncated & ~terminated
+            timed_out = truncated > terminated  # and not terminated
             if self.final_obs_of == "finished" or self._maybe(timed_out):
                 final_obs = self._final()
             episodes = self._episodes(ended, finished, timed_out)
@@ -541,7 +541,8 @@ class VecEnv(ABC):
             actuator.reset(selection)
         self._restart_workflow(selection)
         selection.write(self.episode_length_buf, 0)
-        selection.write(self._success_hold, 0.0)
+        if self._success is not None:
+            selection.write(self._success_hold, 0.0)
         self.sim.moved(selection)
         for sensor in self.sensors.values():
             sensor.reset(selection)

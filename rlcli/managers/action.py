@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import ConfigError, Problem
-from rlcli.managers.term import BoundTerm
+from rlcli.managers.term import BoundTerm, resets
 from rlcli.sim.selection import Selection
 
 
@@ -54,9 +54,12 @@ class ActionManager:
         self.terms = terms
         _refuse_shared(terms)
         self.size = sum(term.instance.size for term in terms)
-        self.action = torch.zeros(num_envs, self.size, device=device)
+        self._forget = resets(terms)
+        both = torch.zeros(2, num_envs, self.size, device=device)
+        self._both_by_env = both.transpose(0, 1)
+        self.action = both[0]
         """The policy's action of this step. (num_envs, size)"""
-        self.prev_action = torch.zeros_like(self.action)
+        self.prev_action = both[1]
         """That of the step before; zero at the start of an episode. (num_envs, size)"""
         self._process = []
         start = 0
@@ -73,10 +76,9 @@ class ActionManager:
 
     def reset(self, selection: Selection) -> None:
         """New episodes begin without a past action."""
-        selection.write(self.action, 0.0)
-        selection.write(self.prev_action, 0.0)
-        for term in self.terms:
-            term.reset(selection)
+        selection.write(self._both_by_env, 0.0)
+        for reset in self._forget:
+            reset(selection)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Both actions."""

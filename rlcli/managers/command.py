@@ -14,7 +14,7 @@ from torch import Tensor
 
 from rlcli.errors import UsageError, did_you_mean, listing
 from rlcli.managers.live import LiveValues
-from rlcli.managers.term import BoundTerm
+from rlcli.managers.term import BoundTerm, resets
 from rlcli.sim.selection import Selection
 
 Select = Callable[[Tensor], Selection | None]
@@ -60,6 +60,7 @@ class CommandManager:
         self, terms: list[BoundTerm], num_envs: int, step_dt: float, device: torch.device, live: LiveValues
     ) -> None:
         self.terms = terms
+        self._forget = [resets([term]) for term in terms]
         self._by_name = {term.name: term for term in terms}
         self._step_dt = step_dt
         self._times = [
@@ -149,8 +150,9 @@ class CommandManager:
         if self._measured:
             selection.write(self._sums, 0.0)
             selection.write(self._steps, 0.0)
-        for number, term in enumerate(self.terms):
-            term.reset(selection)
+        for number, term_resets in enumerate(self._forget):
+            for reset in term_resets:
+                reset(selection)
             self._resample(number, selection, _FIRST)
 
     def compute(self, select: Select, running: Tensor) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm
+from rlcli.managers.term import BoundTerm, resets
 from rlcli.sim.selection import Selection
 
 Select = Callable[[Tensor], Selection | None]
@@ -48,6 +48,7 @@ class EventManager:
         self._resets = list(zip(self._reset, self._fired_at.unbind(0), strict=True))
         self._intervals = list(zip(self._interval, self._steps_left.unbind(0), strict=True))
         self._resets_derive = any(map(_derives, self._reset))
+        self._forget = resets(terms)
 
     @property
     def derives(self) -> bool:
@@ -74,8 +75,8 @@ class EventManager:
 
     def reset(self, selection: Selection, step: Tensor) -> None:
         """Fire the reset events of new episodes at a `step` since the start, and start their interval timers."""
-        for term in self.terms:
-            term.reset(selection)
+        for reset in self._forget:
+            reset(selection)
         for term, fired_at in self._resets:
             apart = term.config.min_steps_between  # type: ignore[attr-defined]
             due = selection.where(step - fired_at >= apart) if apart else selection

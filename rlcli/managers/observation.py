@@ -62,6 +62,9 @@ class ObservationManager:
         self._final = {name: torch.zeros_like(group.buffers[0]) for name, group in self.groups.items()}
         self._final_views = {name: _split(self._final[name], group.pipelines) for name, group in self.groups.items()}
         self._fresh: Selection | None = None
+        self._forget = [
+            reset for group in self.groups.values() for pipeline in group.pipelines for reset in pipeline.resets
+        ]
 
     def compute(self) -> dict[str, Tensor]:
         """Observations of the state as it is. (num_envs, d) each"""
@@ -94,10 +97,8 @@ class ObservationManager:
     def reset(self, selection: Selection) -> None:
         """New episodes begin: histories and delays start from their first value."""
         self._fresh = selection
-        for group in self.groups.values():
-            for pipeline in group.pipelines:
-                pipeline.term.reset(selection)
-                pipeline.reset(selection)
+        for reset in self._forget:
+            reset(selection)
 
     def pipelines(self, group: str) -> list[Pipeline]:
         """The terms of a group with what is done to them."""

@@ -28,7 +28,7 @@ from rlcli.config.schema import (
     UniformNoiseConfig,
 )
 from rlcli.managers.live import LiveValues
-from rlcli.managers.term import BoundTerm
+from rlcli.managers.term import BoundTerm, resets
 from rlcli.sim.selection import Selection
 
 Draws = Callable[[np.uint64], Selection]
@@ -125,10 +125,10 @@ class Pipeline:
             if advance:
                 self._frames.copy_(view)
 
-    def reset(self, selection: Selection) -> None:
-        """New episodes begin."""
-        for stage in self._stages:
-            stage.reset(selection)
+    @property
+    def resets(self) -> list[Callable[[Selection], None]]:
+        """What to call with the environments that start a new episode."""
+        return [*resets([self.term]), *(stage.reset for stage in self._stages if type(stage).reset is not _Stage.reset)]
 
     def tensors(self) -> dict[str, Tensor]:
         """What it carries from step to step, by name."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from rlcli.errors import DivergedError
 from rlcli.managers.live import LiveValues
-from rlcli.managers.term import BoundTerm, check_shape, first_value
+from rlcli.managers.term import BoundTerm, check_shape, first_value, resets
 from rlcli.managers.termination import DIVERGED
 from rlcli.sim.selection import Selection, in_place
 
@@ -30,9 +31,12 @@ class RewardManager:
         divergence_reward: float | None = None,
     ) -> None:
         self.terms = terms
+        self._forget = resets(terms)
         self._dt = dt
         weights = [live.get((*term.path, "weight"), term.config.weight) for term in terms]  # type: ignore[attr-defined]
-        self._values = torch.zeros(len(terms), num_envs, device=device)
+        # for one environment a second column: numpy adds the only one up in another order than it does several
+        table = torch.zeros(len(terms), max(num_envs, 2), device=device)
+        self._values = table[:, :num_envs]
         self._sums = torch.zeros(len(terms), num_envs, device=device)
         self._sums_by_env = self._sums.t()
         self._rows = list(self._values.unbind(0))
@@ -52,12 +56,12 @@ class RewardManager:
             for term, row, weight in zip(terms, self._rows, weights, strict=True)
             if _moves(weight) or weight * dt != 0.0
         ]
-        self._totals = [torch.zeros(num_envs, device=device) for _ in range(3)]
+        totals = [torch.zeros(table.shape[1], device=device) for _ in range(3)]
+        self._totals = [total[:num_envs] for total in totals]
         self._next = 0
         self._fused = device.type == "cuda"
         self._paid, self._owed = in_place(self._values), in_place(self._sums)
-        self._added = [in_place(row) for row in self._rows]
-        self._added_to = [in_place(total) for total in self._totals]
+        self._added, self._added_to = in_place(table), [in_place(total) for total in totals]
         for term, weight in zip(terms, weights, strict=True):
             if _moves(weight) or weight != 0.0:
                 check_shape(term, first_value(term), (num_envs,), "rewards")
@@ -70,7 +74,7 @@ class RewardManager:
         On a CPU a term that is not finite where the simulation diverged pays nothing there.
 
         On a CPU the terms are added one after the other: torch's own sum over rows rounds differently for different
-        numbers of environments. On a GPU nothing is bit-identical, and one launch is cheaper than many.
+        numbers of environments, and numpy's where there is one. On a GPU nothing is bit-identical.
         """
         for call, row in self._active:
             row.copy_(call())
@@ -85,10 +89,8 @@ class RewardManager:
         if self._fused:
             total = torch.sum(self._values, dim=0, out=self._totals[self._next])
         else:
-            total, added_to = self._totals[self._next], self._added_to[self._next]
-            added_to[...] = self._added[0]
-            for row in self._added[1:]:
-                added_to += row
+            total = self._totals[self._next]
+            np.add.reduce(self._added, axis=0, out=self._added_to[self._next])
         return total
 
     def add_up(self) -> None:
@@ -141,8 +143,8 @@ class RewardManager:
         selection.write(self._sums_by_env, 0.0)
         if self._divergence_reward is not None:
             selection.write(self._divergence_sums, 0.0)
-        for term in self.terms:
-            term.reset(selection)
+        for reset in self._forget:
+            reset(selection)
 
     def state_dict(self) -> dict[str, Tensor]:
         """The running sums."""

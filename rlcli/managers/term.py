@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -54,11 +54,6 @@ class BoundTerm:
     def error(self, message: str, *keys: str) -> ConfigError:
         """What is wrong with the term, or with a key of it."""
         return ConfigError([Problem(str(self.path[0]), ".".join(map(str, (*self.path, *keys))), message)])
-
-    def reset(self, selection: Any) -> None:
-        """Tell a term with memory that these environments start a new episode."""
-        if hasattr(self.call, "reset"):
-            self.call.reset(selection)
 
     def state_dict(self) -> dict[str, Tensor]:
         """What a term with memory carries from step to step."""
@@ -229,6 +224,11 @@ class Binder:
 
     def _problem(self, path: Path, parameter: str, message: str, hint: str | None) -> None:
         self.problems.append(self.resolved.problem((*path, parameter), message, hint))
+
+
+def resets(terms: Iterable[BoundTerm]) -> list[Callable[[Any], None]]:
+    """What to call with the environments that start a new episode: the `reset` of every term that has one."""
+    return [term.instance.reset for term in terms if hasattr(term.instance, "reset")]
 
 
 def first_value(term: BoundTerm) -> Any:

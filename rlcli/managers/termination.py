@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm, check_shape, first_value
+from rlcli.managers.term import BoundTerm, check_shape, first_value, resets
 from rlcli.sim.selection import Selection
 
 DIVERGED = "diverged"
@@ -26,6 +26,7 @@ class TerminationManager:
         """(num_envs,) bool"""
         self.fired: dict[str, Tensor] = {term.name: self._none for term in terms}
         """Term -> where it fired in this step. (num_envs,) bool each"""
+        self._forget = resets(terms)
         self._calls = [(term, bool(term.config.time_out)) for term in terms]  # type: ignore[attr-defined]
         for term in terms:
             check_shape(term, first_value(term), (num_envs,), "terminations")
@@ -52,5 +53,5 @@ class TerminationManager:
 
     def reset(self, selection: Selection) -> None:
         """Tell terms with memory."""
-        for term in self.terms:
-            term.reset(selection)
+        for reset in self._forget:
+            reset(selection)

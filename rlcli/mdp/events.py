@@ -279,14 +279,14 @@ def _defaults(entity: Entity, selection: Selection, joints: Joints) -> tuple[Ten
 
 
 def _write_joints(entity: Entity, selection: Selection, joints: Joints, position: Tensor, velocity: Tensor) -> None:
-    low, high = (_rows(selection, limit)[:, joints] for limit in entity.data.joint_limits(soft=True))
+    low, high = (_rows(selection, limit) for limit in entity.data.joint_limits_of(joints, soft=True))
     entity.write_joint_positions(selection, position.clamp_(low, high), joints)
     entity.write_joint_velocities(selection, velocity, joints)
 
 
 def _rows(selection: Selection, values: Tensor) -> Tensor:
     """The selected rows of what may be the same for all environments and then has one row. (rows or 1, k)"""
-    return values if len(values) == 1 else selection.peek(values)
+    return values if values.shape[0] == 1 else selection.peek(values)
 
 
 def _host(index: Columns) -> Columns:

@@ -66,7 +66,7 @@ def joint_torques_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joint
 def joint_pos_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """How far joints are outside their soft limits, summed [rad]. (num_envs,)"""
     position = entity.data.joint_pos_of(joints)
-    low, high = (limit[:, joints] for limit in entity.data.joint_limits(soft=True))
+    low, high = entity.data.joint_limits_of(joints, soft=True)
     return ((low - position).clamp_(min=0.0) + (position - high).clamp_(min=0.0)).sum(dim=1)
 
 
@@ -104,7 +104,7 @@ def joints_at_limit(
 
     A joint without limits never is.
     """
-    low, high = (limit[:, joints] for limit in entity.data.joint_limits(soft=True))
+    low, high = entity.data.joint_limits_of(joints, soft=True)
     scaled = (2.0 * entity.data.joint_pos_of(joints) - low - high) / (high - low)
     return (scaled.abs_() > threshold).sum(dim=1).float()
 

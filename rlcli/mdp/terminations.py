@@ -31,7 +31,7 @@ def joint_pos_out_of_manual_limit(
 def joint_pos_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Some joint is outside its soft limits. (num_envs,)"""
     position = entity.data.joint_pos_of(joints)
-    low, high = (limit[:, joints] for limit in entity.data.joint_limits(soft=True))
+    low, high = entity.data.joint_limits_of(joints, soft=True)
     return some((position < low) | (position > high))
 
 

@@ -204,7 +204,7 @@ class BatchEngine:
                 raise ValueError(f"'{name}' is not an MjData field; {did_you_mean(name, DATA_FIELDS) or ''}")
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # torch has no read-only tensors; derived views must only be read
-                bound = torch.from_numpy(self._batch.bind(name))
+                bound = self._bind(name)
             if self._of_substep(name):
                 self._forward_stage = _ACC
             if name not in _NOT_DERIVED and not self._late and not self._of_forces_alone(name):
@@ -216,6 +216,14 @@ class BatchEngine:
             if name in _NOT_DERIVED:
                 self._keep(name)
         return self._fields[name]
+
+    def _bind(self, name: str) -> Tensor:
+        """A field as a tensor; what is part of the state as a view of that, so that neighbours can be one view."""
+        values, state = self._batch.bind(name), self._batch.state
+        start = (values.ctypes.data - state.ctypes.data) // state.itemsize
+        if values.dtype != state.dtype or not 0 <= start < self._batch.nstate:
+            return torch.from_numpy(values)
+        return self._state.as_strided(values.shape, [step // values.itemsize for step in values.strides], start)
 
     def _keep(self, name: str) -> None:
         """Have the history hold a field that somebody may write to from now on."""

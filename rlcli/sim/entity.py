@@ -95,7 +95,10 @@ class SimData:
     def out_of_bounds(self, limit: float) -> Tensor | None:
         """Worlds with a position or a velocity that is not finite or beyond `limit`; None for none. (num_envs,) bool"""
         # the sum of all squares bounds each of them, is not finite where one is not, and rounds by far less than half
-        if all(float(torch.dot(flat, flat)) <= 0.5 * limit * limit for flat in self._flat):
+        squares = 0.0
+        for flat in self._flat:
+            squares += torch.dot(flat, flat).item()
+        if squares <= 0.5 * limit * limit:
             return None
         bad = [~(copy.abs() <= limit).all(dim=1) for copy in self._copies]
         return torch.stack(bad).any(dim=0)
@@ -342,6 +345,11 @@ class EntityData:
     def default_joint_vel_of(self, joints: Columns) -> Tensor:
         """`default_joint_vel[:, joints]`, likewise. (num_envs, k) [m/s or rad/s]"""
         return self._part("default_vel", self.default_joint_vel, joints)
+
+    def joint_limits_of(self, joints: Columns, soft: bool = False) -> tuple[Tensor, Tensor]:
+        """`joint_limits` of some joints, likewise. (num_envs or 1, k) each"""
+        low, high = self.joint_limits(soft)
+        return self._part(f"low{soft}", low, joints), self._part(f"high{soft}", high, joints)
 
     def joint_angle_of(self, joints: Columns) -> Tensor:
         """`joint_pos[:, joints]` wrapped to [-pi, pi], computed once a step: do not write to it. (num_envs, k) [rad]"""

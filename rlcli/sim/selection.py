@@ -144,22 +144,23 @@ class IdSelection:
 
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Uniform in [low, high). (rows, *shape)"""
-        unit = random.uniform(*self._next(shape))
-        if isinstance(low, Tensor) or isinstance(high, Tensor):
-            return self._tensor(unit, shape).mul_(high - low).add_(low)
-        unit *= high - low  # in numpy: the arrays are short, and its calls cost half of torch's
-        unit += low
-        return self._tensor(unit, shape)
+        unit = self._shaped(random.uniform(*self._next(shape)), shape)
+        # in numpy: the arrays are short, and its calls cost half of torch's
+        least = low.numpy(force=True) if isinstance(low, Tensor) else low
+        most = high.numpy(force=True) if isinstance(high, Tensor) else high
+        unit *= most - least
+        unit += least
+        return self._tensor(unit)
 
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Gaussian. (rows, *shape)"""
         size = math.prod(shape)
         keys, stream, index, _ = self._next((2 * size,))
-        return self._tensor(random.normal(keys, stream, index, size), shape).mul_(std).add_(mean)
+        return self._tensor(self._shaped(random.normal(keys, stream, index, size), shape)).mul_(std).add_(mean)
 
     def choice(self, options: int, shape: tuple[int, ...] = ()) -> Tensor:
         """Whole numbers in [0, options), each as likely. (rows, *shape)"""
-        return self._tensor(random.integers(*self._next(shape), options), shape)
+        return self._tensor(self._shaped(random.integers(*self._next(shape), options), shape))
 
     def read(self, field: Tensor, columns: Columns = ALL) -> Tensor:
         """The rows of a (num_envs, ...) tensor, copied."""
@@ -210,8 +211,11 @@ class IdSelection:
         other._keys = self._row_keys()
         return other
 
-    def _tensor(self, drawn: NDArray, shape: tuple[int, ...]) -> Tensor:
-        values = torch.from_numpy(drawn if len(shape) == 1 else drawn.reshape(self.count, *shape))
+    def _shaped(self, drawn: NDArray, shape: tuple[int, ...]) -> NDArray:
+        return drawn if len(shape) == 1 else drawn.reshape(len(self.ids), *shape)
+
+    def _tensor(self, drawn: NDArray) -> Tensor:
+        values = torch.from_numpy(drawn)
         return values if self._device is None else values.to(self._device)
 
     def _row_keys(self) -> random.Keys:
