@@ -6,7 +6,8 @@ into a page. It needs the plugin `plugins/rlcli-gymnasium`. What is finished in 
 
 rl-zoo3 publishes v3 tasks. What they count differently from v5 is computed by a second evaluation, of the same policy:
 v3 pays `healthy_reward` in the step that fails too, so an episode that fails is worth so much more; mujoco-py, which
-simulated v3, leaves the ant's contact forces at 0, so they cost nothing; v3's walker has one foot of friction 0.9.
+simulated v3, leaves the ant's contact forces at 0, so they cost nothing; v3's walker has one foot of friction 0.9, and
+is trained with it.
 """
 
 from __future__ import annotations
@@ -42,10 +43,14 @@ THEIRS = {
     "gym-ant": Score(1327.158, 451.577, 175),
     "gym-swimmer": Score(281.561, 9.671, 150),
 }
+ASSETS = "package:gymnasium/envs/mujoco/assets"
 V3_OVERRIDES = {
-    "gym-walker2d": ["scene.entities.robot.model=package:gymnasium/envs/mujoco/assets/walker2d.xml"],
+    "gym-walker2d": [f"scene.entities.robot.model={ASSETS}/walker2d.xml"],
     "gym-ant": ["params.contact_cost_weight=0"],
 }
+V5_OVERRIDES = {"gym-walker2d": [f"scene.entities.robot.model={ASSETS}/walker2d_v5.xml"]}
+TRAINED_AS_V3 = ("gym-walker2d",)
+"""Tasks whose v3 is another one to learn; the others learn v5."""
 V3_FAILURE_PAYS = {"gym-walker2d": 1.0, "gym-hopper": 1.0, "gym-ant": 1.0}
 """`healthy_reward` of the tasks that can fail."""
 
@@ -78,7 +83,8 @@ def train(task: str, seed: int, options: argparse.Namespace) -> Path:
         how = ["--agent", AGENT, "--seed", str(seed)]
         if options.steps is not None:
             how += ["--max-steps", str(options.steps)]
-        rlcli("train", task, *how, *where, f"sim.engine_threads={options.threads}", *options.overrides,
+        what = V3_OVERRIDES[task] if task in TRAINED_AS_V3 else []
+        rlcli("train", task, *how, *where, f"sim.engine_threads={options.threads}", *what, *options.overrides,
               threads=options.threads)  # fmt: skip
         run = finished(options.runs_dir, task, name)
         assert run is not None
@@ -90,7 +96,7 @@ def evaluate(task: str, run: Path, options: argparse.Namespace) -> dict[str, Any
     """Returns of the final policy, as v5 counts and as v3 does."""
     common = ["--checkpoint", str(run), "--episodes", str(options.episodes), "--num-envs", str(options.episodes)]
     common += ["--json", "--quiet", f"sim.engine_threads={options.threads}"]
-    v5 = json.loads(rlcli("eval", *common, threads=options.threads))
+    v5 = json.loads(rlcli("eval", *common, *V5_OVERRIDES.get(task, []), threads=options.threads))
     v3 = v5
     if task in V3_OVERRIDES:
         v3 = json.loads(rlcli("eval", *common, *V3_OVERRIDES[task], threads=options.threads))
