@@ -1,4 +1,5 @@
 import pytest
+import torch
 import yaml
 from worlds import CRITTER_TASK, build, critter, dump, edited, life, run, same
 
@@ -87,3 +88,15 @@ def test_the_draws_of_an_interval_event_do_not_depend_on_other_environments(tmp_
     task = critter(tmp_path, edited(CRITTER_TASK, episode_length_s=5.0))
     few, many = run(build(task, 2), 60), run(build(task, 16), 60)
     assert same(life(few, 1), life(many, 1))
+
+
+def test_a_long_sum_of_rewards_is_added_alike_for_one_environment_and_for_several(tmp_path):
+    hips = ("hip_fl", "hip_fr", "hip_bl", "hip_br")
+    many = {
+        f"term_{n}": {"func": "joint_vel_l1", "weight": (-1) ** n * 3.0 ** (n % 7), "joints": [hips[n % 4]]}
+        for n in range(40)
+    }
+    task = critter(tmp_path, edited(CRITTER_TASK, rewards=many))
+    rewards = [torch.stack([result.reward[0] for result in run(build(task, n), 60)]) for n in (1, 2, 5)]
+    assert torch.equal(rewards[0], rewards[1])
+    assert torch.equal(rewards[0], rewards[2])

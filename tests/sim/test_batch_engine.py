@@ -9,6 +9,7 @@ from worlds import CRITTER, PENDULUM
 from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DeviceError
 from rlcli.sim.engine import open_engine
+from rlcli.sim.entity import SimData
 from rlcli.sim.selection import IdSelection
 
 XML = CRITTER.replace("<worldbody>", '<worldbody><geom type="plane" size="5 5 1"/>').replace(
@@ -290,3 +291,30 @@ def test_dropped_contacts_are_counted_and_are_no_divergence():
     assert engine.warnings["contact_full"] == 1
     assert engine.diverged() is None
     assert engine.warnings["contact_full"] == 1
+
+
+def test_positions_and_velocities_are_neighbours_and_copied_as_one():
+    engine = engine_of(model_of(), N)
+    scatter(engine)
+    sim = SimData(engine)
+    assert sim.qpos.untyped_storage().data_ptr() == sim.qvel.untyped_storage().data_ptr(), "one copy, not two"
+    engine.field("qpos")[2, 0], engine.field("qvel")[N - 1, 9] = 7.0, -3.0
+    sim.refresh()
+    for name, copied in (("qpos", sim.qpos), ("qvel", sim.qvel)):
+        assert torch.equal(copied, engine.field(name).float()), name
+    before = sim.qvel.clone()
+    engine.field("qvel")[:] = 5.0
+    sim.refresh_rows(some(1, 4))
+    assert torch.equal(sim.qvel[[1, 4]], torch.full((2, 10), 5.0))
+    assert torch.equal(sim.qvel[[0, 2, 3, 5]], before[[0, 2, 3, 5]])
+
+
+@pytest.mark.parametrize("name", ["qpos", "qvel", "ctrl", "qfrc_applied", "xfrc_applied"])
+def test_a_field_of_the_state_is_the_state_itself(name):
+    engine = engine_of(model_of(), N)
+    field = engine.field(name)
+    field.copy_(torch.arange(field.numel(), dtype=torch.float64).view(field.shape))
+    for world in range(N):
+        data = mujoco.MjData(engine.model)
+        mujoco.mj_setState(engine.model, data, engine.row(world), int(mujoco.mjtState.mjSTATE_INTEGRATION))
+        assert np.array_equal(getattr(data, name), field[world].numpy()), world

@@ -34,6 +34,20 @@ def test_columns_follow_the_state_and_a_tensor_that_is_replaced(data):
     assert torch.equal(data.default_joint_pos_of(slice(0, 3)), data.default_joint_pos[:, :3])
 
 
+def test_limits_of_columns_are_those_of_now(data):
+    engine = data._entity.engine
+    for _ in range(2):  # as configured, and of every environment's own
+        for soft in (False, True):
+            for index in INDICES:
+                for part, whole in zip(data.joint_limits_of(index, soft), data.joint_limits(soft), strict=True):
+                    assert torch.equal(part, whole[:, index])
+        engine.expand("jnt_range")[1] *= 0.5
+        data._sim.stamp += 1
+    low = data.joint_limits_of(slice(0, 3))[0]
+    assert low.shape == (2, 3)
+    assert bool((low[1] > low[0]).any())
+
+
 def test_angles_are_wrapped_and_those_of_the_step(data):
     turn = 2.0 * math.pi
     for index in INDICES:
