@@ -17,6 +17,7 @@ from rlcli.cli.console import console, discard
 from rlcli.cli.options import CHOOSE
 from rlcli.config.settings import applied, read_settings, settings_file
 from rlcli.errors import ConfigError, RlcliError
+from rlcli.machine import collect_seldom
 from rlcli.registry import malformed_metadata_ignored
 
 COMMANDS = {
@@ -94,6 +95,8 @@ def build(only: str | None = None) -> typer.Typer:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     console.owns_process = arguments is None
+    if console.owns_process:
+        collect_seldom()
     arguments = sys.argv[1:] if arguments is None else arguments
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
     console.told = False  # what an earlier command of this process was told

@@ -1,0 +1,46 @@
+"""Garbage in cycles: looked for seldom while a command starts, as usual once it runs; a library's caller decides itself."""
+
+import gc
+import subprocess
+import sys
+
+from rlcli.cli.app import main
+
+PROBE = """
+import gc, sys
+from rlcli import machine
+usual = gc.get_threshold()
+as_usual, seen = machine.collect_as_usual, []
+def told():
+    seen.append(gc.get_threshold())
+    as_usual()
+    seen.append(gc.get_threshold())
+machine.collect_as_usual = told
+from rlcli.cli.app import main
+code = main()
+assert code == 0, code
+assert len(seen) == 2, seen
+assert seen[0][0] > 50 * usual[0], seen
+assert seen[1] == usual, seen
+print("as usual again")
+"""
+
+
+def started(*words, folder):
+    done = subprocess.run([sys.executable, "-c", PROBE, *words], capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_training_and_evaluating_collect_as_usual_once_they_run(tmp_path):
+    small = ["--num-envs", "8", "--quiet"]
+    assert "as usual again" in started(
+        "train", "cartpole", "--max-iterations", "1", *small, "--runs-dir", "runs", folder=tmp_path
+    )
+    assert "as usual again" in started("eval", "cartpole", "--episodes", "8", *small, folder=tmp_path)
+
+
+def test_a_program_that_calls_the_command_line_keeps_its_own_settings():
+    before = gc.get_threshold()
+    assert main(["show", "cartpole"]) == 0
+    assert gc.get_threshold() == before
