@@ -1,4 +1,4 @@
-"""Garbage in cycles: looked for seldom while a command starts, as usual once it runs; a library's caller decides itself."""
+"""Garbage in cycles: looked for seldom while a command starts, as usual once it runs."""
 
 import gc
 import subprocess
