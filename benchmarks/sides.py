@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import select
+import signal
 import statistics
 import subprocess
 import sys
@@ -64,6 +65,7 @@ class Side:
                 text=True,
                 bufsize=1,
                 env=child_environment(environment),
+                start_new_session=True,
             )
 
     def __call__(self, method: str, *, timeout: float | None = None, **arguments: Any) -> Any:
@@ -86,8 +88,9 @@ class Side:
         return answer["result"]
 
     def close(self) -> None:
-        """End the child, and wait for it."""
-        self._process.kill()
+        """End the child and what it has started, and wait for it."""
+        if self._process.returncode is None:  # not waited for yet: its number is still its group's
+            os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:

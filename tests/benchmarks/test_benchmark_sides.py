@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,11 @@ def end():
     print("I am leaving", file=sys.stderr)
     raise SystemExit(3)
 
-serve({{"double": double, "fail": fail, "sleep": sleep, "end": end}})
+def start():
+    import subprocess
+    return subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]).pid
+
+serve({{"double": double, "fail": fail, "sleep": sleep, "end": end, "start": start}})
 """
 
 
@@ -49,6 +54,25 @@ def child(tmp_path, monkeypatch):
     script.write_text(CHILD)
     with sides.opened(sides.Side("child", [sys.executable, str(script)])) as (side,):
         yield side
+
+
+def test_a_closed_child_leaves_nothing_behind_that_it_has_started(child):
+    started = child("start")
+    assert Path(f"/proc/{started}").exists()
+    child.close()
+    child.close()
+    deadline = time.monotonic() + 10
+    while running(started) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not running(started)
+
+
+def running(process):
+    """Whether it lives; one that nobody has waited for does not."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def test_a_side_answers_and_what_it_prints_is_not_an_answer(child):
