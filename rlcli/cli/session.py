@@ -241,11 +241,9 @@ def actor(subject: Subject) -> Callable[[Any], Any]:
 
 def _build(subject: Subject) -> Session:
     from rlcli.envs.vec_env import make_env
-    from rlcli.machine import collect_as_usual
     from rlcli.random import derive
     from rlcli.rl.rng import seed_generators
 
-    collect_as_usual()
     put = actor(subject)
     # evaluation sees other episodes than training did
     seed_generators(derive(subject.seed, "task"))  # some tasks draw from them

@@ -227,12 +227,10 @@ def _train(job: Job, device: str, stop: StopRequest) -> None:
     run = job.run
     try:
         with stop.before_training(prompt=not distributed.launched()):
-            from rlcli.machine import collect_as_usual
             from rlcli.rl.build import build
             from rlcli.rl.conduct import conduct
             from rlcli.rl.dump import Watch
 
-            collect_as_usual()
             trainer, env = build(job, device, console.info)
     except BaseException:
         if job.created and job.writes:

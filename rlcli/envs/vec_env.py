@@ -23,7 +23,7 @@ from rlcli.config.schema import InitialStateConfig, TaskConfig
 from rlcli.envs.layout import Layout
 from rlcli.envs.step import Episodes, Lived, StepResult
 from rlcli.errors import DivergedError
-from rlcli.machine import require_device
+from rlcli.machine import collect_as_usual, require_device
 from rlcli.managers.term import Binder
 from rlcli.sim.actuators import ActuatorModel
 from rlcli.sim.engine import open_engine
@@ -688,6 +688,7 @@ def make_env(
 
     `task` is a resolved one, or a `TaskConfig` built in Python, whose models lie in `root` (by default here).
     """
+    collect_as_usual()  # what is large has been imported; from here on a command runs
     resolved = task if isinstance(task, Resolved) else resolve(source_of(task, root))
     if resolved.source.task is None:
         from rlcli.envs.managed import ManagedEnv

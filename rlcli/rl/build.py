@@ -37,10 +37,10 @@ def build(job: Job, device: str, say: Callable[[str], None] = lambda _: None) ->
     if saved is not None:  # what a stranger's files hold shows before anything is built
         require_trainer(saved, resolved.agent.trainer)
         state = saved.state()
+    make = load_object(resolved.trainer.trainer)
     seed_generators(peers.seed(derive(record["seed"], "task"), "task"))  # some tasks draw from them as they are built
     env = make_env(resolved, seed=peers.seed(record["seed"], "environments"), device=device)
     torch_threads = int(record.get("torch_threads") or threads(resolved)[1])
-    make = load_object(resolved.trainer.trainer)
     trainer = make(env, resolved.agent, seed=record["seed"], device=device, torch_threads=torch_threads)
     if saved is None or state is None:
         if job.init_from is not None:
