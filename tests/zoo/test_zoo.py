@@ -24,6 +24,7 @@ from rlcli.registry import find_task  # noqa: E402
 from rlcli.rl.bundle import open_bundle  # noqa: E402
 from rlcli.rl.checkpoint import open_checkpoint  # noqa: E402
 from rlcli.rl.load import require_fit  # noqa: E402
+from rlcli.testing import check_task, lint_task  # noqa: E402
 
 ENTRIES = zoo.entries()
 TASKS = zoo_pages.built_in()
@@ -44,6 +45,17 @@ def test_a_built_in_task_has_a_page_a_bar_a_summary_and_a_success(task):
     text = page.read_text(encoding="utf-8")
     assert [name for name in zoo_pages.BLOCKS if zoo_pages.block(text, name) is None] == []
     assert text.startswith("# ")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_linter_has_nothing_to_remark_on_a_built_in_task(task):
+    assert lint_task(task) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_a_built_in_task_keeps_the_contract(task):
+    assert check_task(task) == []
 
 
 @pytest.mark.parametrize("task", TASKS)
