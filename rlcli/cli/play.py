@@ -28,6 +28,8 @@ from rlcli.cli.options import (
 )
 
 _FALLBACK_VIDEO = Path("play.mp4")
+_SHORTEST_S = 5.0
+"""Of a video that begins with an episode that is terminated."""
 
 
 def command(
@@ -49,7 +51,9 @@ def command(
     video: Annotated[
         Path | None,
         typer.Option(
-            "--video", help="Write one episode to FILE.mp4 or FILE.gif, offscreen; without FILE into the run."
+            "--video",
+            help="Write one episode to FILE.mp4 or FILE.gif, offscreen; without FILE into the run. If it is terminated"
+            " within 5 s, the next ones too.",
         ),
     ] = None,
     viewer: Annotated[
@@ -184,7 +188,8 @@ def _video(session: Any, file: Path, together: int) -> None:
 
         def note_end(step: Any) -> None:
             nonlocal ended
-            ended = ended or bool(step.terminated[0] | step.truncated[0])
+            shown_s = writer.frames * stride * env.step_dt
+            ended = ended or bool(step.truncated[0] | (step.terminated[0] & (shown_s >= _SHORTEST_S)))
 
         summary = evaluate(env, act, env.num_envs, note_end).summary()
     frames, fps, backend = writer.frames, writer.fps, renderer.backend

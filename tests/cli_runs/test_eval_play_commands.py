@@ -276,6 +276,15 @@ def test_a_video_shows_every_step_at_the_control_rate(cli, trained, start):
 
 
 @pytest.mark.slow
+def test_a_video_goes_on_where_the_first_episode_soon_fails(cli):
+    play = ("play", "cartpole-direct", "--policy", "random", "--json", "viewer.width=160", "viewer.height=120")
+    first = cli(*play, "--video", "first.mp4", "--num-envs", 1).json
+    more = cli(*play, "--video", "more.mp4", "--num-envs", 16).json
+    assert first["frames"] == first["length"]["mean"] < more["frames"]
+    assert read_video("more.mp4")["frames"] == more["frames"]
+
+
+@pytest.mark.slow
 def test_a_gif_plays_in_real_time(cli, trained):
     result = cli("play", "cartpole", "--video", "x.gif", "--num-envs", 1, "--json").json
     assert result["fps"] == pytest.approx(20)
