@@ -2,8 +2,9 @@
 
 Same models (compared field by field), frame skip, threads and range of random actions, automatic restarts; both begin
 together and take blocks of equally many steps in turn, so that their episodes are equally old. EnvPool has MuJoCo 3.6
-built in: how much of a ratio is MuJoCo's own is what a bare loop of `mj_step` does on both versions. What the ratio
-would be if everything besides the call of the engine cost nothing is its limit.
+built in: how much of a ratio is MuJoCo's own is what a bare loop of `mj_step` does on both versions. Its calls that
+reset an environment, and simulate nothing, are not counted as steps. What the ratio would be if everything besides the
+call of the engine cost nothing is its limit.
 """
 
 from __future__ import annotations
