@@ -39,14 +39,12 @@ def open_env(task: str, num_envs: int, threads: int) -> dict[str, Any]:
 def step(steps: int) -> float:
     """Seconds of so many environment steps, with its own auto-reset.
 
-    After an episode's end EnvPool resets an environment in the place of a step: it leaves the action alone and simulates
-    nothing. Such calls are no steps: the time is that of as many as were asked for.
+    After an episode's end EnvPool resets an environment in the place of a step, and simulates nothing. Such calls are
+    no steps: the time is that of as many as were asked for.
     """
     pool, actions = theirs["pool"], theirs["actions"]
-    ages = []
     begin = clock()
-    for index in range(steps):
-        ages.append(pool.step(actions[index % len(actions)])[4]["elapsed_step"])
+    ages = [pool.step(actions[index % len(actions)])[4]["elapsed_step"] for index in range(steps)]
     seconds = clock() - begin
     simulated = sum(int((age > 0).sum()) for age in ages)
     return seconds * steps * len(ages[0]) / simulated
