@@ -14,6 +14,9 @@ from rlcli.sim.gl import open_context
 from rlcli.viewer.crowd import Crowd
 
 
+_PARALLEL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+
+
 def free_camera(viewer: ViewerConfig, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> mujoco.MjvCamera:
     """A camera at `eye` that looks at `lookat`, both from an environment's origin."""
     camera = mujoco.MjvCamera()
@@ -62,11 +65,16 @@ class Renderer:
         With a crowd it is environment 0.
         """
         self._camera.lookat[:] = np.add(self._lookat, origin)
+        away = np.zeros(3)
         if self._followed is not None:
             body, start = self._followed
-            self._camera.lookat[:] += data.xpos[body] - start - origin
+            away = data.xpos[body] - start - origin
+            self._camera.lookat[:] += away
         everything = int(mujoco.mjtCatBit.mjCAT_ALL)
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self._scene)
+        for light in self._scene.lights[: self._scene.nlight]:
+            if light.type == _PARALLEL:  # its place is where shadows are drawn
+                light.pos[:2] += away[:2]
         if self._crowd is not None:
             self._crowd.add(self._scene, 0, self._option)
         mujoco.mjr_render(self._rect, self._scene, self._mjr)

@@ -78,6 +78,20 @@ def test_the_camera_goes_along_with_the_entity_that_it_follows():
     assert drawn["robot"] < 1.0 < drawn[None]
 
 
+@pytest.mark.slow
+def test_what_walks_away_keeps_its_light_and_shadow():
+    env = make_env(resolve(find_task("ant-direct"), overrides=["scene.num_envs=1"]))
+    env.reset(seed=1)
+    model, data = env.world(0)
+    pictures = []
+    with Renderer(model, env.config.viewer) as renderer:
+        for place in (0.0, 100.0):  # whole squares of the ground
+            data.qpos[:2] = place
+            mujoco.mj_forward(model, data)
+            pictures.append(renderer.draw(model, data)[240:].astype(int))  # below the horizon
+    assert (np.abs(pictures[0] - pictures[1]).max(axis=2) > 20).mean() < 0.01
+
+
 def test_what_is_followed_must_be_in_the_scene():
     with pytest.raises(ConfigError, match=r"there is no entity 'rover' in the scene; entities: robot"):
         resolve(find_task("cartpole"), overrides=["viewer.follow=rover"])
