@@ -13,7 +13,6 @@ from rlcli.config.schema import ViewerConfig
 from rlcli.sim.gl import open_context
 from rlcli.viewer.crowd import Crowd
 
-
 _PARALLEL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
