@@ -182,6 +182,8 @@ class DirectEnv(VecEnv):
         task = self.task
         self._returns = torch.zeros(self.num_envs, device=self.device)
         self._fresh = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self._begun: Selection | None = None  # the same, as the step's resets selected them
+        self._earned, self._marked = self.engine.as_field(self._returns), self.engine.as_field(self._fresh)
         self._resets_by_selection = type(task).reset is not DirectTask.reset
         self._resets_by_id = type(task).reset_idx is not DirectTask.reset_idx
         self._reset_hook = task.reset_idx
@@ -262,6 +264,7 @@ class DirectEnv(VecEnv):
         self.task.pre_physics_step(action.clamp(-bound, bound) if bound is not None else action)
         self.task.reset_buf.zero_()
         self._fresh.zero_()
+        self._begun = None
 
     def _judge(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         task = self.task
@@ -299,7 +302,7 @@ class DirectEnv(VecEnv):
 
     def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         return (
-            ended.read(self._returns),
+            ended.read(self._earned),
             {},
             {name: ended.peek(fired) for name, fired in self._causes.items()},
         )
@@ -315,10 +318,15 @@ class DirectEnv(VecEnv):
             ids = selection.env_ids()
             if len(ids):
                 self._reset_hook(ids)
-        selection.write(task.progress_buf, 0)
-        selection.write(task.reset_buf, 1)
-        selection.write(self._fresh, True)
-        selection.write(self._returns, 0.0)
+        self._begin(selection)
+
+    def _begin(self, selection: Selection) -> None:
+        """Note the episodes that begin."""
+        selection.write(self.task.progress_buf, 0)
+        selection.write(self.task.reset_buf, 1)
+        selection.write(self._marked, True)
+        selection.write(self._earned, 0.0)
+        self._begun = selection if self._begun is None else self._begun.joined(selection)
 
     def _observe(self) -> dict[str, Tensor]:
         """Running environments keep what `_judge` observed; only those just reset take a second look."""
@@ -328,11 +336,10 @@ class DirectEnv(VecEnv):
         looked = [(task.obs_buf, obs), (task.states_buf, states)][: 2 if task.num_states else 1]
         for buffer, kept in looked:
             kept.copy_(buffer)
-        fresh = self._select(self._fresh) if self._observed and not self._settled else None
-        if fresh is not None:
+        if self._begun is not None and self._observed and not self._settled:
             self._fill()
             for buffer, kept in looked:
-                fresh.write(kept, fresh.peek(buffer))
+                self._begun.write(kept, self._begun.peek(buffer))
                 buffer.copy_(kept)
         self._observed, self._settled = False, False
         self._require_finite(obs, "the observation", self._observation_columns)

@@ -67,14 +67,16 @@ class ManagedEnv(VecEnv):
         self._everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         n, device, live = self.num_envs, self.device, self._binder.live
         self.command_manager = CommandManager(self._commands, n, self.step_dt, device, live)
-        self.action_manager = ActionManager(self._actions, n, device)
+        self.action_manager = ActionManager(self._actions, n, device, self.engine.as_field)
         self.termination_manager = TerminationManager(self._terminations, n, device)
         self.event_manager = EventManager(self._events, n, self.step_dt, device, self.engine.set_constants)
         if self.event_manager.derives:
             self.engine.set_constants()  # makes room for them; from here on all of them are derived in one way
         self.event_manager.startup(self._everyone())
         reward_dt = self.step_dt if self.config.reward_dt_scaling else 1.0
-        self.reward_manager = RewardManager(self._rewards, n, reward_dt, device, live, self.config.divergence_reward)
+        self.reward_manager = RewardManager(
+            self._rewards, n, reward_dt, device, live, self.engine.as_field, self.config.divergence_reward
+        )
         self.observation_manager = ObservationManager(
             self._observations,
             self.config.observations,

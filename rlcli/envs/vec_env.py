@@ -33,7 +33,7 @@ from rlcli.sim.names import NameProblem
 from rlcli.sim.rotations import rotate_inverse
 from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import Scene
-from rlcli.sim.selection import Selection, in_place
+from rlcli.sim.selection import Field, Selection, in_place
 from rlcli.sim.sensors import Sensor, make_sensors
 from rlcli.sim.terrain import Terrain
 
@@ -89,8 +89,6 @@ class VecEnv(ABC):
         self._success = self._binder.success()
         self._binder.raise_problems()
         self._build()
-        self._success_hold = torch.zeros(self.num_envs, device=self.device)
-        self._holds = in_place(self._success_hold)
         self._hold_steps = math.ceil(self.config.success.hold_s / self.step_dt - 1e-6) if self.config.success else 0
         self.layout = self._layout()
         self._action_shape = (self.num_envs, self.layout.action_size)
@@ -168,11 +166,12 @@ class VecEnv(ABC):
         if begin is not None:
             reward, terminated, truncated = reward.masked_fill(begin, 0.0), terminated & ~begin, truncated & ~begin
         final_obs, episodes = None, None
-        finished = terminated | truncated
-        self._indices += in_place(finished)  # before the selection: what begins now draws from its own counter
+        failed, late = self.engine.as_field(terminated), self.engine.as_field(truncated)
+        finished = failed | late
+        self._indices += finished  # before the selection: what begins now draws from its own counter
         ended = self._select(finished)
         if ended is not None:
-            timed_out = truncated > terminated  # and not terminated
+            timed_out = late > failed  # and not terminated
             if self.final_obs_of == "finished" or self._maybe(timed_out):
                 final_obs = self._final()
             episodes = self._episodes(ended, finished, timed_out)
@@ -436,17 +435,21 @@ class VecEnv(ABC):
                 self.compute_efforts()
                 self.engine.step(1, derive=left == 0)
         self.seconds["physics"] += time.perf_counter() - start
-        diverged = self.engine.diverged()
-        if not self.engine.asynchronous:
-            if diverged is not None:
-                self._tell_divergence(self.engine.found, False)
-            if self._any_aside:
-                diverged = self._aside.clone() if diverged is None else diverged | self._aside
-                self._aside.zero_()
-                self._any_aside = False
-            if diverged is not None:
-                self._put_back(diverged)
+        if self.engine.asynchronous:
+            diverged = self.engine.diverged()
+            self.sim.refresh()
+            return diverged
         self.sim.refresh()
+        diverged = self.engine.diverged(self.sim.is_finite())
+        if diverged is not None:
+            self._tell_divergence(self.engine.found, False)
+        if self._any_aside:
+            diverged = self._aside.clone() if diverged is None else diverged | self._aside
+            self._aside.zero_()
+            self._any_aside = False
+        if diverged is not None:
+            self._put_back(diverged)
+            self.sim.refresh()
         self.sim.keep()
         return diverged
 
@@ -513,24 +516,24 @@ class VecEnv(ABC):
     def _hold_success(self) -> None:
         if self._success is not None:
             self._holds += 1.0
-            self._holds *= in_place(self._success())
+            self._holds *= self.engine.as_field(self._success())
 
-    def _episodes(self, ended: Selection, finished: Tensor, timed_out: Tensor) -> Episodes:
+    def _episodes(self, ended: Selection, finished: Field, late: Field) -> Episodes:
         returns, terms, causes = self._terms_of(ended)
-        timed_out = ended.peek(timed_out)
+        timed_out = ended.peek(late)
         success = None
         if self._success is not None:
-            success = timed_out & (ended.peek(self._success_hold) >= self._hold_steps)
+            success = timed_out & (ended.peek(self._holds) >= self._hold_steps)
         return Episodes(
-            ended.peek(self._ids),
+            ended.peek(self._numbers),
             returns,
-            ended.read(self.episode_length_buf),
+            ended.read(self._lengths),
             terms,
             causes,
             timed_out,
             success,
             self._metrics_of(ended),
-            finished if self.engine.asynchronous else None,
+            finished if isinstance(finished, Tensor) else None,
         )
 
     def _restart(self, selection: Selection) -> None:
@@ -540,9 +543,9 @@ class VecEnv(ABC):
         for actuator in self._actuators.values():
             actuator.reset(selection)
         self._restart_workflow(selection)
-        selection.write(self.episode_length_buf, 0)
+        selection.write(self._lengths, 0)
         if self._success is not None:
-            selection.write(self._success_hold, 0.0)
+            selection.write(self._holds, 0.0)
         self.sim.moved(selection)
         for sensor in self.sensors.values():
             sensor.reset(selection)
@@ -557,15 +560,15 @@ class VecEnv(ABC):
                 place = default[:, :3] + selection.peek(self.origins)
                 entity.write_root_pose(selection, place, default[:, 3:7])
 
-    def _select(self, mask: Tensor) -> Selection | None:
-        return self.engine.select(mask, self.seed, self.episode_index)
+    def _select(self, mask: Field) -> Selection | None:
+        return self.engine.select(mask, self.seed, self._indices)
 
     def _everyone(self) -> Selection:
         everyone = self._select(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
         assert everyone is not None
         return everyone
 
-    def _maybe(self, mask: Tensor) -> bool:
+    def _maybe(self, mask: Field) -> bool:
         """Whether a mask holds anywhere, as far as that is known without waiting for a device."""
         return self.engine.asynchronous or bool(mask.any())
 
@@ -605,7 +608,9 @@ class VecEnv(ABC):
         model = scene.compile()
         self.engine = open_engine(model, self.num_envs, config.sim, device=str(self.device))
         self.engine.lives = self._lives
-        self.sim = SimData(self.engine)
+        counters = (self.episode_length_buf, self.episode_index, self._ids, self._success_hold)
+        self._lengths, self._indices, self._numbers, self._holds = map(self.engine.as_field, counters)
+        self.sim: SimData = SimData(self.engine)
         self.entities: dict[str, Entity] = {}
         for name, entity in scene.config.entities.items():  # a direct task may have added some
             try:
@@ -665,12 +670,12 @@ class VecEnv(ABC):
         # the first reset of a new environment begins episode 0, as a reset with a seed does
         self.episode_index = torch.full((self.num_envs,), -1, dtype=torch.int64, device=self.device)
         """Episodes begun before the running one; random streams are keyed by it. (num_envs,)"""
+        self._success_hold = torch.zeros(self.num_envs, device=self.device)
         self._aside = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._any_aside = False
         self._ids = torch.arange(self.num_envs, device=self.device)
         self._steps: Tensor = torch.zeros((), dtype=torch.int64, device=self.device)
-        self._lengths, self._clock = in_place(self.episode_length_buf), in_place(self._steps)
-        self._indices = in_place(self.episode_index)
+        self._clock = in_place(self._steps)
 
 
 def grid(num_envs: int, spacing: float) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rlcli.errors import ConfigError, Problem
 from rlcli.managers.term import BoundTerm, resets
-from rlcli.sim.selection import Selection
+from rlcli.sim.selection import Field, Selection, in_place
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,17 +50,20 @@ class ActionTerm(Protocol):
 class ActionManager:
     """Keeps the raw actions of this step and the last, and hands each term its columns."""
 
-    def __init__(self, terms: list[BoundTerm], num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self, terms: list[BoundTerm], num_envs: int, device: torch.device, as_field: Callable[[Tensor], Field]
+    ) -> None:
         self.terms = terms
         _refuse_shared(terms)
         self.size = sum(term.instance.size for term in terms)
         self._forget = resets(terms)
         both = torch.zeros(2, num_envs, self.size, device=device)
-        self._both_by_env = both.transpose(0, 1)
+        self._both_by_env = as_field(both.transpose(0, 1))
         self.action = both[0]
         """The policy's action of this step. (num_envs, size)"""
         self.prev_action = both[1]
         """That of the step before; zero at the start of an episode. (num_envs, size)"""
+        self._last, self._now = in_place(self.prev_action), in_place(self.action)
         self._process = []
         start = 0
         for term in terms:
@@ -69,7 +72,7 @@ class ActionManager:
 
     def process(self, action: Tensor) -> None:
         """Take one step's action."""
-        self.prev_action.copy_(self.action)
+        self._last[...] = self._now
         self.action.copy_(action)
         for process, columns in self._process:
             process(columns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from rlcli.errors import DivergedError
 from rlcli.managers.live import LiveValues
 from rlcli.managers.term import BoundTerm, check_shape, first_value, resets
 from rlcli.managers.termination import DIVERGED
-from rlcli.sim.selection import Selection, in_place
+from rlcli.sim.selection import Field, Selection, in_place
 
 
 class RewardManager:
@@ -28,6 +28,7 @@ class RewardManager:
         dt: float,
         device: torch.device,
         live: LiveValues,
+        as_field: Callable[[Tensor], Field],
         divergence_reward: float | None = None,
     ) -> None:
         self.terms = terms
@@ -38,7 +39,6 @@ class RewardManager:
         table = torch.zeros(len(terms), max(num_envs, 2), device=device)
         self._values = table[:, :num_envs]
         self._sums = torch.zeros(len(terms), num_envs, device=device)
-        self._sums_by_env = self._sums.t()
         self._rows = list(self._values.unbind(0))
         factors = [0.0 if _moves(weight) else weight * dt for weight in weights]
         self._factors = torch.tensor(factors, dtype=torch.float32, device=device)[:, None]
@@ -61,6 +61,7 @@ class RewardManager:
         self._next = 0
         self._fused = device.type == "cuda"
         self._paid, self._owed = in_place(self._values), in_place(self._sums)
+        self._sums_by_env = as_field(self._sums.t())
         self._added, self._added_to = in_place(table), [in_place(total) for total in totals]
         for term, weight in zip(terms, weights, strict=True):
             if _moves(weight) or weight != 0.0:

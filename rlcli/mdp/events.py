@@ -30,7 +30,7 @@ def reset_joints_by_offset(
     velocity: Range = (0.0, 0.0),
 ) -> None:
     """Default joint state plus uniform offsets [m or rad, m/s or rad/s], positions kept within the soft limits."""
-    default_pos, default_vel = _defaults(entity, selection, joints)
+    default_pos, default_vel = entity.data.read_default_joints(selection, joints)
     offset = selection.uniform(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
     _write_joints(entity, selection, joints, default_pos + offset[:, 0], default_vel + offset[:, 1])
 
@@ -45,7 +45,7 @@ def reset_joints_by_scale(
     velocity: Range = (1.0, 1.0),
 ) -> None:
     """Default joint state times uniform factors, positions kept within the soft limits."""
-    default_pos, default_vel = _defaults(entity, selection, joints)
+    default_pos, default_vel = entity.data.read_default_joints(selection, joints)
     factor = selection.uniform(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
     _write_joints(entity, selection, joints, default_pos * factor[:, 0], default_vel * factor[:, 1])
 
@@ -60,7 +60,7 @@ def reset_joints_by_gaussian(
     velocity: tuple[float, float] = (0.0, 0.0),
 ) -> None:
     """Default joint state plus gaussian offsets [mean, std] [m or rad, m/s or rad/s], within the soft limits."""
-    default_pos, default_vel = _defaults(entity, selection, joints)
+    default_pos, default_vel = entity.data.read_default_joints(selection, joints)
     offset = selection.normal(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
     _write_joints(entity, selection, joints, default_pos + offset[:, 0], default_vel + offset[:, 1])
 
@@ -251,9 +251,10 @@ def _drawn_wrench(env: ManagedEnv, selection: Selection, bodies: int, force: Pai
 
 def _bounds(env: ManagedEnv, *pairs: Pair) -> tuple[Tensor, Tensor]:
     """Lower and upper ends of several ranges, for draws of shape (rows, ranges, k). (ranges, 1) each"""
-    if any(isinstance(pair, Tensor) for pair in pairs):
-        low, high = Ranges(env.device, *pairs).now()
-        return low[:, None], high[:, None]
+    for pair in pairs:
+        if isinstance(pair, Tensor):
+            low, high = Ranges(env.device, *pairs).now()
+            return low[:, None], high[:, None]
     return _fixed_bounds(env.device, *map(tuple, pairs))
 
 
@@ -271,11 +272,6 @@ def _wrench_columns(entity: Entity, bodies: Bodies) -> Tensor:
         ids = torch.as_tensor(entity.body_ids, device=device)[bodies]
         cache[id(bodies)] = bodies, (ids[:, None] * 6 + torch.arange(6, device=device)).flatten()
     return cache[id(bodies)][1]
-
-
-def _defaults(entity: Entity, selection: Selection, joints: Joints) -> tuple[Tensor, Tensor]:
-    data = entity.data
-    return selection.peek(data.default_joint_pos, joints), selection.peek(data.default_joint_vel, joints)
 
 
 def _write_joints(entity: Entity, selection: Selection, joints: Joints, position: Tensor, velocity: Tensor) -> None:

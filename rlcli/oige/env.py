@@ -208,7 +208,7 @@ class OigeEnv(DirectEnv):
         return self._group(*self._clipped(self._final_obs, self._final_states))
 
     def _restart_workflow(self, selection: Selection) -> None:
-        task, ids = self.task, selection.env_ids()
+        ids = selection.env_ids()
         for view in self.handle.world.scene.views.values():
             if isinstance(view, ArticulationView):
                 view.forget(ids)
@@ -216,10 +216,7 @@ class OigeEnv(DirectEnv):
         if len(ids):
             self._reset_hook(ids)
             self._noise.after_reset(ids)
-        selection.write(task.progress_buf, 0)
-        selection.write(task.reset_buf, 1)
-        selection.write(self._fresh, True)
-        selection.write(self._returns, 0.0)
+        self._begin(selection)
 
     def _observe(self) -> dict[str, Tensor]:
         obs = super()._observe()["policy"]

@@ -14,7 +14,7 @@ from rlcli.errors import ConfigError, DependencyError, Problem
 from rlcli.machine import available_cores, require_device
 from rlcli.sim.capacity import capacity
 from rlcli.sim.guard import LIMIT, MEMORY, Call, Divergence
-from rlcli.sim.selection import Selection
+from rlcli.sim.selection import Field, Selection
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -100,10 +100,13 @@ class Engine(Protocol):
         """Advance every world by `nstep` physics steps; without `derive` the derived fields stay behind."""
         ...
 
-    def diverged(self) -> Tensor | None:
+    def diverged(self, moves_finitely: bool = False) -> Tensor | None:
         """Worlds in which the last `step` went wrong, (num_envs,) bool; None for none. Asked once a step.
 
         An `asynchronous` engine has put them back into the state before by itself.
+
+        Args:
+            moves_finitely: whether the caller has looked at all positions and velocities, and found finite numbers.
         """
         ...
 
@@ -119,7 +122,11 @@ class Engine(Protocol):
         """The joint state that `reset` restores. (nq,), (nv,)"""
         ...
 
-    def select(self, mask: Tensor, seed: int, counters: Tensor) -> Selection | None:
+    def as_field(self, tensor: Tensor) -> Field:
+        """The memory of a tensor in the form that `select` and its selections read and write at least cost."""
+        ...
+
+    def select(self, mask: Field, seed: int, counters: Field) -> Selection | None:
         """The worlds where `mask` holds, with their random streams; None where that is known to be nobody."""
         ...
 

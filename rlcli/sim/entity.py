@@ -17,7 +17,7 @@ from rlcli.sim.engine import Engine, computes_body_forces
 from rlcli.sim.names import NameProblem, match
 from rlcli.sim.rotations import atan2, axis_x, length, multiply, rotate, rotate_inverse, wrap_to_pi
 from rlcli.sim.scene import actuator_kind, joint_settings
-from rlcli.sim.selection import ALL, Columns, Selection, ids_of
+from rlcli.sim.selection import ALL, Columns, Field, Selection, ids_of
 
 if TYPE_CHECKING:
     from rlcli.sim.actuators import ActuatorModel
@@ -92,16 +92,20 @@ class SimData:
             rows = ids_of(selection)
             source[rows] = good[rows]
 
+    def is_finite(self) -> bool:
+        """Whether every position and velocity is a finite number, as the last `refresh` found them."""
+        return math.isfinite(self._squares()) or all(bool(flat.isfinite().all()) for flat in self._flat)
+
     def out_of_bounds(self, limit: float) -> Tensor | None:
         """Worlds with a position or a velocity that is not finite or beyond `limit`; None for none. (num_envs,) bool"""
         # the sum of all squares bounds each of them, is not finite where one is not, and rounds by far less than half
-        squares = 0.0
-        for flat in self._flat:
-            squares += torch.dot(flat, flat).item()
-        if squares <= 0.5 * limit * limit:
+        if self._squares() <= 0.5 * limit * limit:
             return None
         bad = [~(copy.abs() <= limit).all(dim=1) for copy in self._copies]
         return torch.stack(bad).any(dim=0)
+
+    def _squares(self) -> float:
+        return sum([torch.dot(flat, flat).item() for flat in self._flat])
 
     def derived(self, name: str) -> Tensor:
         """A derived field as float32, cast once a step. (num_envs, ...)"""
@@ -150,7 +154,7 @@ class Entity:
         self.mocap = int(model.body_mocapid[self.root_body])
         """Number of the mocap body that the root is; -1: none."""
         self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
-        self._column_cache: dict[tuple, tuple[Columns, Columns]] = {}
+        self._places: dict[tuple, tuple[Columns, Field, Columns]] = {}
         self.data = EntityData(self, sim)
         self.actuators: list[ActuatorModel] = []
         """Models that drive joints between physics steps; filled once the entity stands."""
@@ -193,11 +197,13 @@ class Entity:
 
     def write_joint_positions(self, selection: Selection, values: Tensor, joints: Columns = ALL) -> None:
         """Set joint positions of the selected environments. values (rows, k) [m or rad]"""
-        selection.write(self._qpos, values, self._columns(self.qpos_columns, joints))
+        field, columns = self._place(self._qpos, self.qpos_columns, joints)
+        selection.write(field, values, columns)
 
     def write_joint_velocities(self, selection: Selection, values: Tensor, joints: Columns = ALL) -> None:
         """Set joint velocities of the selected environments. values (rows, k) [m/s or rad/s]"""
-        selection.write(self._qvel, values, self._columns(self.dof_columns, joints))
+        field, columns = self._place(self._qvel, self.dof_columns, joints)
+        selection.write(field, values, columns)
 
     def write_root_pose(self, selection: Selection, position: Tensor, quat: Tensor) -> None:
         """Set the pose of a free or mocap root in its world. position (rows, 3) [m], quat (rows, 4) w, x, y, z"""
@@ -235,12 +241,19 @@ class Entity:
     def _index(self, positions: Sequence[int]) -> Columns:
         return as_index(positions, self.engine.device)
 
-    def _columns(self, of: Tensor, joints: Columns) -> Columns:
+    def _place(self, field: Tensor, of: Tensor, joints: Columns) -> tuple[Field, Columns]:
+        """Where in a field of the engine joints lie: of consecutive columns the part that is these alone."""
         key = (id(of), joints.start, joints.stop, joints.step) if isinstance(joints, slice) else (id(of), id(joints))
-        if key not in self._column_cache:
+        if key not in self._places:
+            columns = self._index(of[joints].tolist())
+            part = (
+                (self.engine.as_field(field[:, columns]), ALL)
+                if isinstance(columns, slice)
+                else (self.engine.as_field(field), columns)
+            )
             # the joints stay referenced, so that their id is not given to another tensor
-            self._column_cache[key] = (joints, self._index(of[joints].tolist()))
-        return self._column_cache[key][1]
+            self._places[key] = (joints, *part)
+        return self._places[key][1:]
 
     def _sensor_columns(self, positions: Sequence[int]) -> list[int]:
         model = self.engine.model
@@ -265,6 +278,7 @@ class EntityData:
         self._sim = sim
         self._cache: dict[Hashable, tuple[int, Tensor]] = {}
         self._views: dict[tuple[Any, ...], tuple[Tensor, Tensor]] = {}
+        self._defaults: dict[tuple[Any, ...], tuple[Tensor, Tensor, Field, Field]] = {}
         model, num_envs = entity.engine.model, entity.engine.num_envs
         device = entity.engine.device
         self._qpos_index = as_index(entity.qpos_columns.tolist(), device)
@@ -345,6 +359,19 @@ class EntityData:
     def default_joint_vel_of(self, joints: Columns) -> Tensor:
         """`default_joint_vel[:, joints]`, likewise. (num_envs, k) [m/s or rad/s]"""
         return self._part("default_vel", self.default_joint_vel, joints)
+
+    def read_default_joints(self, selection: Selection, joints: Columns = ALL) -> tuple[Tensor, Tensor]:
+        """Default positions and velocities of some joints, for a moment as `peek`. (rows, k) each"""
+        if not isinstance(joints, slice):
+            return selection.peek(self.default_joint_pos, joints), selection.peek(self.default_joint_vel, joints)
+        position, velocity = self.default_joint_pos, self.default_joint_vel
+        key = (joints.start, joints.stop, joints.step)
+        known = self._defaults.get(key)
+        if known is None or known[0] is not position or known[1] is not velocity:
+            as_field = self._entity.engine.as_field
+            known = position, velocity, as_field(position[:, joints]), as_field(velocity[:, joints])
+            self._defaults[key] = known
+        return selection.peek(known[2]), selection.peek(known[3])
 
     def joint_limits_of(self, joints: Columns, soft: bool = False) -> tuple[Tensor, Tensor]:
         """`joint_limits` of some joints, likewise. (num_envs or 1, k) each"""

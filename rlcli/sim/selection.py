@@ -17,6 +17,9 @@ from torch import Tensor
 from rlcli import random
 
 Columns: TypeAlias = slice | Tensor
+Field: TypeAlias = Any
+"""A (num_envs, ...) tensor, or what the engine's `as_field` gives for it: to make that costs as much as to read some
+rows of it, so whoever reads in every step keeps it."""
 ALL = slice(None)
 
 
@@ -60,19 +63,19 @@ class Selection(Protocol):
         """Whole numbers in [0, options), each as likely. (rows, *shape)"""
         ...
 
-    def read(self, field: Tensor, columns: Columns = ALL) -> Tensor:
+    def read(self, field: Field, columns: Columns = ALL) -> Tensor:
         """The rows of a (num_envs, ...) tensor."""
         ...
 
-    def peek(self, field: Tensor, columns: Columns = ALL) -> Tensor:
+    def peek(self, field: Field, columns: Columns = ALL) -> Tensor:
         """The same for a moment: it may be the tensor itself, so do not write to it, nor keep it past a write there."""
         ...
 
-    def write(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
+    def write(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
         """Set the rows of a (num_envs, ...) tensor."""
         ...
 
-    def add(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
+    def add(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
         """Add to the rows of a (num_envs, ...) tensor."""
         ...
 
@@ -80,7 +83,7 @@ class Selection(Protocol):
         """Mean of a (num_envs,) tensor over the rows. ()"""
         ...
 
-    def where(self, mask: Tensor) -> Selection | None:
+    def where(self, mask: Field) -> Selection | None:
         """Those of the rows where `mask` (num_envs,) holds; None where that is known to be nobody."""
         ...
 
@@ -97,10 +100,10 @@ class Selection(Protocol):
         ...
 
 
-def write_rows(field: Tensor, rows: NDArray[np.int64], values: Tensor | float, columns: Columns = ALL) -> None:
+def write_rows(field: Field, rows: NDArray[np.int64], values: Tensor | float, columns: Columns = ALL) -> None:
     """Set some rows of a (num_envs, ...) tensor on the CPU."""
-    where = rows if columns is ALL else _index(rows, columns)
-    field.numpy()[where] = values.numpy() if isinstance(values, Tensor) else values
+    into = field if isinstance(field, np.ndarray) else field.numpy()
+    into[rows if columns is ALL else _index(rows, columns)] = values.numpy() if isinstance(values, Tensor) else values
 
 
 def _index(rows: NDArray[np.int64], columns: Columns) -> Any:
@@ -144,39 +147,37 @@ class IdSelection:
 
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Uniform in [low, high). (rows, *shape)"""
-        unit = self._shaped(random.uniform(*self._next(shape)), shape)
-        # in numpy: the arrays are short, and its calls cost half of torch's
         least = low.numpy(force=True) if isinstance(low, Tensor) else low
         most = high.numpy(force=True) if isinstance(high, Tensor) else high
-        unit *= most - least
-        unit += least
-        return self._tensor(unit)
+        return self._placed(random.uniform(*self._next(math.prod(shape))), most - least, least, shape)
 
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Gaussian. (rows, *shape)"""
         size = math.prod(shape)
-        keys, stream, index, _ = self._next((2 * size,))
-        return self._tensor(self._shaped(random.normal(keys, stream, index, size), shape)).mul_(std).add_(mean)
+        keys, stream, index, _ = self._next(2 * size)
+        scale = std.numpy(force=True) if isinstance(std, Tensor) else std
+        offset = mean.numpy(force=True) if isinstance(mean, Tensor) else mean
+        return self._placed(random.normal(keys, stream, index, size), scale, offset, shape)
 
     def choice(self, options: int, shape: tuple[int, ...] = ()) -> Tensor:
         """Whole numbers in [0, options), each as likely. (rows, *shape)"""
-        return self._tensor(self._shaped(random.integers(*self._next(shape), options), shape))
+        return self._tensor(self._shaped(random.integers(*self._next(math.prod(shape)), options), shape))
 
-    def read(self, field: Tensor, columns: Columns = ALL) -> Tensor:
+    def read(self, field: Field, columns: Columns = ALL) -> Tensor:
         """The rows of a (num_envs, ...) tensor, copied."""
-        return torch.from_numpy(field.numpy()[self.ids if columns is ALL else _index(self.ids, columns)])
+        values = field if isinstance(field, np.ndarray) else field.numpy()
+        return torch.from_numpy(values[self.ids if columns is ALL else _index(self.ids, columns)])
 
-    def peek(self, field: Tensor, columns: Columns = ALL) -> Tensor:
-        """The rows of a (num_envs, ...) tensor."""
-        return self.read(field, columns)
+    peek = read
 
-    def write(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
+    def write(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
         """Set the rows of a (num_envs, ...) tensor."""
         write_rows(field, self.ids, values, columns)
 
-    def add(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
+    def add(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
         """Add to the rows of a (num_envs, ...) tensor."""
-        field.numpy()[self.ids if columns is ALL else _index(self.ids, columns)] += (
+        into = field if isinstance(field, np.ndarray) else field.numpy()
+        into[self.ids if columns is ALL else _index(self.ids, columns)] += (
             values.numpy() if isinstance(values, Tensor) else values
         )
 
@@ -184,9 +185,9 @@ class IdSelection:
         """Mean of a (num_envs,) tensor over the rows. ()"""
         return self.read(values).float().mean()
 
-    def where(self, mask: Tensor) -> IdSelection | None:
+    def where(self, mask: Field) -> IdSelection | None:
         """Those of the rows where `mask` (num_envs,) holds; None for nobody."""
-        chosen = mask.numpy()[self.ids]
+        chosen = (mask if isinstance(mask, np.ndarray) else mask.numpy())[self.ids]
         if chosen.all():
             return self
         if not chosen.any():
@@ -211,6 +212,15 @@ class IdSelection:
         other._keys = self._row_keys()
         return other
 
+    def _placed(
+        self, drawn: NDArray, scale: float | NDArray, offset: float | NDArray, shape: tuple[int, ...]
+    ) -> Tensor:
+        # in numpy: the arrays are short, and its calls cost half of torch's
+        values = drawn if len(shape) == 1 else drawn.reshape(len(self.ids), *shape)
+        values *= scale
+        values += offset
+        return self._tensor(values)
+
     def _shaped(self, drawn: NDArray, shape: tuple[int, ...]) -> NDArray:
         return drawn if len(shape) == 1 else drawn.reshape(len(self.ids), *shape)
 
@@ -224,7 +234,6 @@ class IdSelection:
             self._keys = random.row_keys(self._seed, names, self._counters)
         return self._keys
 
-    def _next(self, shape: tuple[int, ...]) -> tuple[random.Keys, np.uint64, int, int]:
-        count = math.prod(shape)
+    def _next(self, count: int) -> tuple[random.Keys, np.uint64, int, int]:
         index, self._drawn = self._drawn, self._drawn + count
         return self._row_keys(), self._stream, index, count

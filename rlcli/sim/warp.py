@@ -29,7 +29,7 @@ from rlcli.sim.guard import LIMIT, Call, Divergence, StateLayout
 from rlcli.sim.mask import MaskSelection
 from rlcli.sim.mjcf import quiet_mujoco
 from rlcli.sim.saved import require_alike
-from rlcli.sim.selection import ALL, Selection
+from rlcli.sim.selection import ALL, Field, Selection
 
 _STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
 """What every world carries from step to step, and every reset restores."""
@@ -277,7 +277,7 @@ class WarpEngine:
                 self._advance(nstep, derive)  # compiles
                 self._graphs[nstep, derive] = self._capture(nstep, derive)
 
-    def diverged(self) -> Tensor:
+    def diverged(self, moves_finitely: bool = False) -> Tensor:
         """Worlds that the last step drove out of bounds; they are back in the state before it, at rest. (num_envs,)
 
         What is bound of the derived fields is that of the state before, too: terms judge by it.
@@ -328,8 +328,14 @@ class WarpEngine:
         self._default_qpos.copy_(qpos)
         self._default_qvel.copy_(qvel)
 
-    def select(self, mask: Tensor, seed: int, counters: Tensor) -> MaskSelection:
+    def as_field(self, tensor: Tensor) -> Tensor:
+        """The tensor itself."""
+        return tensor
+
+    def select(self, mask: Field, seed: int, counters: Field) -> MaskSelection:
         """The worlds where `mask` holds; whether there are any is known to the device alone."""
+        assert isinstance(mask, Tensor)
+        assert isinstance(counters, Tensor)
         return MaskSelection(mask, seed, counters, lives=self.lives)
 
     def rays(
