@@ -570,7 +570,7 @@ class VecEnv(ABC):
 
     def _maybe(self, mask: Field) -> bool:
         """Whether a mask holds anywhere, as far as that is known without waiting for a device."""
-        return self.engine.asynchronous or bool(mask.any())
+        return self.engine.asynchronous or len(mask.nonzero()[0]) > 0
 
     def _require_finite(self, values: Tensor, what: str, columns: Sequence[str] = ()) -> None:
         """Stop with the environments, and the first of `columns` that is not finite."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -22,6 +23,8 @@ from rlcli.sim.selection import ALL, Columns, Field, Selection, ids_of
 if TYPE_CHECKING:
     from rlcli.sim.actuators import ActuatorModel
 
+_MOST_PARTS = 256
+"""Indices of which an entity's views are kept: those of a configuration are few."""
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 Value = TypeVar("Value")
 
@@ -48,6 +51,7 @@ class SimData:
         self.qpos = self._copies[0][:, : qpos.shape[1]]
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
+        self._kept_at, self._summed = -1, (-1, 0.0)
         self._moved: Selection | None = None
         self._derived: dict[str, tuple[int, Tensor]] = {}
 
@@ -83,6 +87,9 @@ class SimData:
 
     def keep(self) -> None:
         """Note that the state as it is here is one to go back to."""
+        if self._kept_at == self.stamp:
+            return
+        self._kept_at = self.stamp
         for good, (copy, _) in zip(self._good, self._stale, strict=True):
             good[...] = copy
 
@@ -105,7 +112,13 @@ class SimData:
         return torch.stack(bad).any(dim=0)
 
     def _squares(self) -> float:
-        return sum([torch.dot(flat, flat).item() for flat in self._flat])
+        at, total = self._summed
+        if at != self.stamp:
+            total = 0.0
+            for flat in self._flat:
+                total += torch.dot(flat, flat).item()
+            self._summed = self.stamp, total
+        return total
 
     def derived(self, name: str) -> Tensor:
         """A derived field as float32, cast once a step. (num_envs, ...)"""
@@ -277,7 +290,9 @@ class EntityData:
         self._entity = entity
         self._sim = sim
         self._cache: dict[Hashable, tuple[int, Tensor]] = {}
-        self._views: dict[tuple[Any, ...], tuple[Tensor, Tensor]] = {}
+        self._pos, self._vel, self._default_pos, self._default_vel = _Parts(), _Parts(), _Parts(), _Parts()
+        self._limit_parts = {soft: (_Parts(), _Parts()) for soft in (False, True)}
+        self._angles: dict[int, tuple[Columns, int, Tensor]] = {}
         self._defaults: dict[tuple[Any, ...], tuple[Tensor, Tensor, Field, Field]] = {}
         model, num_envs = entity.engine.model, entity.engine.num_envs
         device = entity.engine.device
@@ -346,19 +361,19 @@ class EntityData:
 
     def joint_pos_of(self, joints: Columns) -> Tensor:
         """`joint_pos[:, joints]`, for what is read in every step: a view is made once. (num_envs, k) [m or rad]"""
-        return self._part("pos", self.joint_pos, joints)
+        return self._pos.of(self.joint_pos if self._joint_pos is None else self._joint_pos, joints)
 
     def joint_vel_of(self, joints: Columns) -> Tensor:
         """`joint_vel[:, joints]`, likewise. (num_envs, k) [m/s or rad/s]"""
-        return self._part("vel", self.joint_vel, joints)
+        return self._vel.of(self.joint_vel if self._joint_vel is None else self._joint_vel, joints)
 
     def default_joint_pos_of(self, joints: Columns) -> Tensor:
         """`default_joint_pos[:, joints]`, likewise. (num_envs, k) [m or rad]"""
-        return self._part("default_pos", self.default_joint_pos, joints)
+        return self._default_pos.of(self.default_joint_pos, joints)
 
     def default_joint_vel_of(self, joints: Columns) -> Tensor:
         """`default_joint_vel[:, joints]`, likewise. (num_envs, k) [m/s or rad/s]"""
-        return self._part("default_vel", self.default_joint_vel, joints)
+        return self._default_vel.of(self.default_joint_vel, joints)
 
     def read_default_joints(self, selection: Selection, joints: Columns = ALL) -> tuple[Tensor, Tensor]:
         """Default positions and velocities of some joints, for a moment as `peek`. (rows, k) each"""
@@ -376,14 +391,19 @@ class EntityData:
     def joint_limits_of(self, joints: Columns, soft: bool = False) -> tuple[Tensor, Tensor]:
         """`joint_limits` of some joints, likewise. (num_envs or 1, k) each"""
         low, high = self.joint_limits(soft)
-        return self._part(f"low{soft}", low, joints), self._part(f"high{soft}", high, joints)
+        lows, highs = self._limit_parts[soft]
+        return lows.of(low, joints), highs.of(high, joints)
 
     def joint_angle_of(self, joints: Columns) -> Tensor:
         """`joint_pos[:, joints]` wrapped to [-pi, pi], computed once a step: do not write to it. (num_envs, k) [rad]"""
-        if not isinstance(joints, slice):  # whose id another index may have next
-            return wrap_to_pi(self.joint_pos[:, joints])
-        key = ("angle", joints.start, joints.stop, joints.step)
-        return self._once(key, lambda: wrap_to_pi(self.joint_pos_of(joints)))
+        stamp, known = self._sim.stamp, self._angles.get(id(joints))
+        if known is not None and known[0] is joints and known[1] == stamp:
+            return known[2]
+        angle = wrap_to_pi(self.joint_pos_of(joints))
+        if len(self._angles) >= _MOST_PARTS:
+            self._angles.clear()
+        self._angles[id(joints)] = joints, stamp, angle
+        return angle
 
     @property
     def joint_acc(self) -> Tensor:
@@ -634,17 +654,6 @@ class EntityData:
             )
         return self._sim.derived(name)
 
-    def _part(self, name: str, values: Tensor, joints: Columns) -> Tensor:
-        """`values[:, joints]`; of the same tensor and slice, the same view."""
-        if not isinstance(joints, slice):
-            return values[:, joints]
-        key = (name, joints.start, joints.stop, joints.step)
-        of, view = self._views.get(key, (None, values))
-        if of is not values:
-            view = values[:, joints]
-            self._views[key] = values, view
-        return view
-
     def _once(self, name: Hashable, compute: Callable[[], Tensor]) -> Tensor:
         stamp, value = self._cache.get(name, (-1, None))
         if stamp != self._sim.stamp or value is None:
@@ -667,6 +676,26 @@ class EntityData:
                 f"entity '{entity.name}' has no free root", "lin_vel and ang_vel are those of a free root"
             )
         return torch.tensor([*pose, *velocity], dtype=torch.float32)
+
+
+class _Parts:
+    """`values[:, joints]` of what is read in every step: of the same tensor and the same slice, the same view."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[Columns, Tensor, Tensor]] = {}
+
+    def of(self, values: Tensor, joints: Columns) -> Tensor:
+        """`values[:, joints]`."""
+        known = self._known.get(id(joints))
+        if known is not None and known[0] is joints and known[1] is values:
+            return known[2]
+        part = values[:, joints]
+        if isinstance(joints, slice):  # what another index gives is a copy
+            if len(self._known) >= _MOST_PARTS:
+                self._known.clear()
+            # the index stays referenced, so that its id is not given to another
+            self._known[id(joints)] = joints, values, part
+        return part
 
 
 class _Drives:
@@ -790,8 +819,14 @@ def as_index(positions: Sequence[int], device: torch.device | None = None) -> Co
     """Column positions as a slice where they are consecutive (a view, not a copy), else as a tensor."""
     first = positions[0] if len(positions) else 0
     if list(positions) == list(range(first, first + len(positions))):
-        return slice(first, first + len(positions))
+        return _consecutive(first, first + len(positions))
     return torch.tensor(list(positions), dtype=torch.int64, device=device)
+
+
+@functools.lru_cache(maxsize=4096)
+def _consecutive(first: int, stop: int) -> slice:
+    """One object for all who ask, so that what they read of it is made once for all."""
+    return slice(first, stop)
 
 
 def is_finite(values: Tensor) -> bool:
