@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 Keys = NDArray[np.uint64]
 
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-_MIX1 = np.uint64(0xBF58476D1CE4E5B9)
-_MIX2 = np.uint64(0x94D049BB133111EB)
-_S30, _S27, _S31, _S40 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(40)
-_TO_UNIT = np.float32(2.0**-24)
+# arrays without axes: numpy makes one of every scalar that it meets, which takes as long as the operation
+_GOLDEN = np.array(0x9E3779B97F4A7C15, np.uint64)
+_MIX1 = np.array(0xBF58476D1CE4E5B9, np.uint64)
+_MIX2 = np.array(0x94D049BB133111EB, np.uint64)
+_S30, _S27, _S31, _S40 = (np.array(shift, np.uint64) for shift in (30, 27, 31, 40))
+_TO_UNIT = np.array(2.0**-24, np.float32)
 
 
 @functools.lru_cache(maxsize=4096)

@@ -24,7 +24,7 @@ from rlcli.envs.layout import Layout
 from rlcli.envs.step import Episodes, Lived, StepResult
 from rlcli.errors import DivergedError
 from rlcli.machine import collect_as_usual, require_device
-from rlcli.managers.term import Binder
+from rlcli.managers.term import Binder, check_shape, first_value
 from rlcli.sim.actuators import ActuatorModel
 from rlcli.sim.engine import open_engine
 from rlcli.sim.entity import Entity, SimData, is_finite
@@ -86,9 +86,12 @@ class VecEnv(ABC):
         self._counters()
         self._open(resolved)
         self._bind()
-        self._success = self._binder.success()
+        success = self._binder.success()
+        self._success = None if success is None else success.call
         self._binder.raise_problems()
         self._build()
+        if success is not None:
+            check_shape(success, first_value(success), (self.num_envs,), "success")
         self._hold_steps = math.ceil(self.config.success.hold_s / self.step_dt - 1e-6) if self.config.success else 0
         self.layout = self._layout()
         self._action_shape = (self.num_envs, self.layout.action_size)

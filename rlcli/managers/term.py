@@ -114,11 +114,10 @@ class Binder:
         bound = [self.bind("observations", ("observations", group, name), c) for name, c in configs.items() if c]
         return [term for term in bound if term is not None]
 
-    def success(self) -> Callable[[], Tensor] | None:
+    def success(self) -> BoundTerm | None:
         """The task's success condition."""
         config = self.resolved.task.success
-        term = self.bind("success", ("success",), config) if config is not None else None
-        return term.call if term is not None else None
+        return self.bind("success", ("success",), config) if config is not None else None
 
     def load(self, signature: Signature) -> Any:
         """Import a term.

@@ -37,31 +37,34 @@ def captured(work: Work, device: torch.device, holders: Iterable[Any] = (), tell
 
 
 class Recording:
-    """Runs the work once as it is, records it at the second call, and replays it from then on."""
+    """Runs the work as it is until a run shows nothing against it, records it at the next, and replays it from then on.
+
+    The first run may make what the later ones use, and wait for the device to do so; a second one may not.
+    """
 
     def __init__(self, work: Work, device: torch.device, holders: list[Any], tell: Tell) -> None:
         self._work, self._holders, self._tell = work, holders, tell
         self._device = torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
         self._graph: torch.cuda.CUDAGraph | None = None
         self._kept: Any = None  # what Warp allocated while recording lives as long as this
-        self._runs = 0
+        self._rehearsals, self._ready = 0, False
         self.refusal: str | None = None
         """Why it is not recorded."""
 
     def __call__(self) -> None:
         """Do the work."""
-        self._runs += 1
         if self._graph is not None:
             self._graph.replay()
         elif self.refusal is not None:
             self._work()
-        elif self._runs == 1:
-            self._rehearse()
-        else:
+        elif self._ready:
             self._record()
+        else:
+            self._rehearse()
 
     def _rehearse(self) -> None:
-        """The first run: compiles, makes buffers, and shows what waits for the device."""
+        """A run that compiles, makes buffers, and shows what waits for the device."""
+        self._rehearsals += 1
         before = torch.cuda.get_sync_debug_mode()
         numbers = self._numbers()
         with warnings.catch_warnings(record=True) as caught:
@@ -72,12 +75,13 @@ class Recording:
             finally:
                 torch.cuda.set_sync_debug_mode(before)
         waits = [w for w in caught if "synchronizing CUDA operation" in str(w.message)]
-        if waits:
+        if waits and self._rehearsals > 1:
             where = sorted({f"{w.filename}:{w.lineno}" for w in waits})
             self._refuse(f"{where[0]} waits for the GPU{f' (and {len(where) - 1} more places)' if where[1:] else ''}")
         changed = [name for name, value in self._numbers().items() if numbers.get(name, value) != value]
         if changed and not waits:
             self._refuse(f"{changed[0]} is a number that changes from step to step; keep it in a tensor")
+        self._ready = not waits and not changed
 
     def _record(self) -> None:
         import warp as wp

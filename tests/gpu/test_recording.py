@@ -96,6 +96,22 @@ def test_work_that_waits_for_the_device_is_named_and_runs_as_it_is():
     assert "test_recording.py" in said[0]
 
 
+def test_work_that_waits_in_its_first_run_alone_is_recorded():
+    holder, made, said = Counter(), [], []
+
+    def work():
+        if not made:  # as a constant that is made when it is first asked for
+            made.append(torch.tensor(2.0, device="cuda"))
+        holder.total += made[0]
+
+    run = Recording(work, torch.device("cuda"), [holder], said.append)
+    for _ in range(5):
+        run()
+    assert holder.total.item() == 10.0
+    assert said == []
+    assert run._graph is not None
+
+
 def test_a_number_that_changes_from_step_to_step_is_named():
     holder, said = Counter(), []
 

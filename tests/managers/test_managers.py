@@ -153,6 +153,7 @@ class Fussy:
             {"rewards": {"bad": {"func": "column", "weight": 1.0}}},
             "rewards.bad: 'column' gave {}(3, 1), expected {}(3,)",
         ),
+        ({"success": {"func": "column"}}, "success: 'column' gave {}(3, 1), expected {}(3,)"),
         ({"terminations": {"bad": {"func": "column"}}}, "terminations.bad: 'column' gave {}(3, 1), expected {}(3,)"),
         ({"observations": {"policy": {"bad": {"func": "flat"}}}}, "observations.policy.bad: 'flat' gave {}(3,)"),
         ({"observations": {"policy": {"bad": {"func": "cube"}}}}, "observations.policy.bad: 'cube' gave {}(3, 1, 1)"),

@@ -25,6 +25,7 @@ from rlcli.rl.bundle import open_bundle  # noqa: E402
 from rlcli.rl.checkpoint import open_checkpoint  # noqa: E402
 from rlcli.rl.load import require_fit  # noqa: E402
 from rlcli.testing import check_task, lint_task  # noqa: E402
+from rlcli.testing.host import NoHost  # noqa: E402
 
 ENTRIES = zoo.entries()
 TASKS = zoo_pages.built_in()
@@ -50,6 +51,14 @@ def test_a_built_in_task_has_a_page_a_bar_a_summary_and_a_success(task):
 @pytest.mark.parametrize("task", TASKS)
 def test_the_linter_has_nothing_to_remark_on_a_built_in_task(task):
     assert lint_task(task) == []
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_success_asks_nothing_of_the_host_when_it_is_first_judged_in_a_step(task):
+    env = make_env(resolve(find_task(task), flags={"scene.num_envs": 2}))
+    env.reset()
+    with NoHost():
+        assert env.succeeding().shape == (2,)
 
 
 @pytest.mark.slow

@@ -28,6 +28,8 @@ class GymnasiumTask(DirectTask):
     motors = False
     reads: ClassVar[tuple[str, ...]] = ()
     """Derived fields of the engine that the task reads."""
+    moves: ClassVar[bool] = False
+    """Whether `speed` counts."""
 
     def set_up_scene(self, scene) -> None:
         """On MuJoCo Warp, which has no PGS solver, Newton stands in."""
@@ -54,7 +56,8 @@ class GymnasiumTask(DirectTask):
         """The actions are the controls."""
         self.actions.copy_(actions)
         self.field.ctrl.copy_(actions)
-        self.before.copy_(self.progress())
+        if self.moves:
+            self.before.copy_(self.progress())
 
     def get_observations(self) -> None:
         """Fill obs_buf."""
@@ -74,8 +77,8 @@ class GymnasiumTask(DirectTask):
     def reset(self, selection: Selection) -> None:
         """Write the start state."""
         qpos, qvel = self.start(selection)
-        selection.write(self.field.qpos, qpos.to(self.dtype))
-        selection.write(self.field.qvel, qvel.to(self.dtype))
+        selection.write(self.field.qpos, qpos)
+        selection.write(self.field.qvel, qvel)
 
     # --- what each task says ---
 
@@ -101,7 +104,8 @@ class GymnasiumTask(DirectTask):
     # --- what several use ---
 
     def speed(self) -> Tensor:
-        """Change of `progress` over the step. (num_envs,) [m/s]"""
+        """Change of `progress` over the step, for a task that `moves`. (num_envs,) [m/s]"""
+        assert self.moves
         return (self.progress() - self.before) / self.step_dt
 
     def action_cost(self, weight: float) -> Tensor:

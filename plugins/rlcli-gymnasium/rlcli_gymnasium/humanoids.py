@@ -61,6 +61,8 @@ class _Humanoid(GymnasiumTask):
 class Humanoid(_Humanoid):
     """Humanoid-v5: walk along x."""
 
+    moves = True
+
     class Params(StrictModel):
         """The task's settings, by Gymnasium's names."""
 

@@ -36,9 +36,8 @@ class InvertedPendulum(GymnasiumTask):
         return (~self.ended).to(self.dtype)
 
     def judge(self) -> None:
-        """The pole leans by more than 0.2 rad, or the state, which the observation is, is not finite."""
-        upright = self.observation.isfinite().all(dim=1) & (self.observation[:, 1].abs() <= 0.2)
-        torch.logical_not(upright, out=self.ended)
+        """The pole leans by more than 0.2 rad. A state that is not finite ends the episode before it gets here."""
+        torch.logical_not(self.observation[:, 1].abs() <= 0.2, out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Uniform."""

@@ -15,6 +15,7 @@ from .base import GymnasiumTask, square_sum, within
 class Ant(GymnasiumTask):
     """Ant-v5: a four-legged walker, which feels the forces of contacts."""
 
+    moves = True
     num_observations = 105
     num_actions = 8
     observation_names = (
@@ -83,6 +84,7 @@ class Ant(GymnasiumTask):
 class HalfCheetah(GymnasiumTask):
     """HalfCheetah-v5: a planar runner that cannot fail."""
 
+    moves = True
     num_observations = 17
     num_actions = 6
     observation_names = (*(f"qpos_{i}" for i in range(1, 9)), *(f"qvel_{i}" for i in range(9)))
@@ -142,6 +144,7 @@ class Swimmer(HalfCheetah):
 class Walker2d(GymnasiumTask):
     """Walker2d-v5: two legs in a plane."""
 
+    moves = True
     num_observations = 17
     num_actions = 6
     observation_names = (*(f"qpos_{i}" for i in range(1, 9)), *(f"qvel_{i}" for i in range(9)))
