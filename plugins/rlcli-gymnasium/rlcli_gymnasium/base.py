@@ -112,6 +112,17 @@ class GymnasiumTask(DirectTask):
         """Sum of squared actions times weight, in their float32. (num_envs,)"""
         return weight * float32_sum(self.actions.square())
 
+    def uniform_start(self, selection: Selection, scale: float) -> tuple[Tensor, Tensor]:
+        """The model's positions and no velocities, uniform in +-scale of these. (rows, nq), (rows, nv)"""
+        positions = self.model.nq
+        noise = self.noise(selection, scale, positions + self.model.nv)
+        return self.start_pos + noise[:, :positions], noise[:, positions:]
+
+    def gaussian_start(self, selection: Selection, scale: float) -> tuple[Tensor, Tensor]:
+        """Likewise, but velocities that are Gaussian. (rows, nq), (rows, nv)"""
+        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
+        return qpos, selection.normal(0.0, scale, (self.model.nv,))
+
     def noise(self, selection: Selection, scale: float, size: int) -> Tensor:
         """Uniform in +-scale. (rows, size)"""
         return selection.uniform(-scale, scale, (size,))

@@ -44,9 +44,7 @@ class _Humanoid(GymnasiumTask):
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Uniform."""
-        scale = self.params.reset_noise_scale
-        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
-        return qpos, self.noise(selection, scale, self.model.nv)
+        return self.uniform_start(selection, self.params.reset_noise_scale)
 
     def control_cost(self) -> Tensor:
         """Of the controls as the engine holds them. (num_envs,)"""

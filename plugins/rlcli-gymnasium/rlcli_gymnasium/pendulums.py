@@ -33,17 +33,15 @@ class InvertedPendulum(GymnasiumTask):
 
     def score(self) -> Tensor:
         """1 unless it fell."""
-        return (~self.ended).to(self.dtype)
+        return ~self.ended
 
     def judge(self) -> None:
         """The pole leans by more than 0.2 rad. A state that is not finite ends the episode before it gets here."""
-        torch.logical_not(self.observation[:, 1].abs() <= 0.2, out=self.ended)
+        torch.gt(self.observation[:, 1].abs(), 0.2, out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Uniform."""
-        scale = self.params.reset_noise_scale
-        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
-        return qpos, self.noise(selection, scale, self.model.nv)
+        return self.uniform_start(selection, self.params.reset_noise_scale)
 
 
 class InvertedDoublePendulum(GymnasiumTask):
@@ -86,9 +84,7 @@ class InvertedDoublePendulum(GymnasiumTask):
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Uniform positions, Gaussian velocities."""
-        scale = self.params.reset_noise_scale
-        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
-        return qpos, selection.normal(0.0, scale, (self.model.nv,))
+        return self.gaussian_start(selection, self.params.reset_noise_scale)
 
 
 __all__ = ["InvertedDoublePendulum", "InvertedPendulum"]

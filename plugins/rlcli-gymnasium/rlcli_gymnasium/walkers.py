@@ -76,9 +76,7 @@ class Ant(GymnasiumTask):
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Uniform positions, Gaussian velocities."""
-        scale = self.params.reset_noise_scale
-        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
-        return qpos, selection.normal(0.0, scale, (self.model.nv,))
+        return self.gaussian_start(selection, self.params.reset_noise_scale)
 
 
 class HalfCheetah(GymnasiumTask):
@@ -109,9 +107,7 @@ class HalfCheetah(GymnasiumTask):
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Uniform positions, Gaussian velocities."""
-        scale = self.params.reset_noise_scale
-        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
-        return qpos, selection.normal(0.0, scale, (self.model.nv,))
+        return self.gaussian_start(selection, self.params.reset_noise_scale)
 
 
 class Swimmer(HalfCheetah):
@@ -136,9 +132,7 @@ class Swimmer(HalfCheetah):
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Uniform."""
-        scale = self.params.reset_noise_scale
-        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
-        return qpos, self.noise(selection, scale, self.model.nv)
+        return self.uniform_start(selection, self.params.reset_noise_scale)
 
 
 class Walker2d(GymnasiumTask):
@@ -184,9 +178,7 @@ class Walker2d(GymnasiumTask):
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Uniform."""
-        scale = self.params.reset_noise_scale
-        qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
-        return qpos, self.noise(selection, scale, self.model.nv)
+        return self.uniform_start(selection, self.params.reset_noise_scale)
 
 
 class Hopper(Walker2d):
