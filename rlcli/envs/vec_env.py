@@ -90,8 +90,6 @@ class VecEnv(ABC):
         self._success = None if success is None else success.call
         self._binder.raise_problems()
         self._build()
-        if success is not None:
-            check_shape(success, first_value(success), (self.num_envs,), "success")
         self._hold_steps = math.ceil(self.config.success.hold_s / self.step_dt - 1e-6) if self.config.success else 0
         self.layout = self._layout()
         self._action_shape = (self.num_envs, self.layout.action_size)
@@ -100,6 +98,8 @@ class VecEnv(ABC):
             for term in self.layout.actions
             for index in range(term.size)
         ]
+        if success is not None:
+            check_shape(success, first_value(success), (self.num_envs,), "success")
 
     # --- what callers use ---
 

@@ -131,6 +131,8 @@ class BatchEngine:
         self._qvel = self._batch.state[:, self.state_layout.columns("qvel")]
         self._history = History(self._batch.state, self.state_layout.until("ctrl"), self._default, 1)
         self._fields: dict[str, Tensor] = {}
+        self._given: list[NDArray] = []
+        """Bound parts of the state but for positions and velocities: what somebody may write to."""
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         self._late = late
         self.step_stage = _NONE
@@ -223,6 +225,8 @@ class BatchEngine:
             self._fields[name] = bound
             if name in _NOT_DERIVED:
                 self._keep(name)
+                if name not in ("qpos", "qvel"):
+                    self._given.append(bound.numpy())
         return self._fields[name]
 
     def _bind(self, name: str) -> Tensor:
@@ -293,13 +297,15 @@ class BatchEngine:
 
         MuJoCo resets a diverging world by itself, to finite values, and clears its counters as it does: so they are
         read after every step and put back to zero, and the state alone would show nothing. What gives no warning is
-        not finite afterwards: the sum of all states then is not, either. Where nothing but
-        positions and velocities moves, and the caller has looked at these, that sum, which takes longer than all other
-        looks at a state, need not be made: a control or a force that is not finite gives a warning.
+        not finite afterwards: the sum of all states then is not, either. That sum takes longer than all other looks at
+        a state. Where nothing but positions and velocities moves, and the caller has looked at these, what else
+        somebody may have written to is summed instead.
         """
         self.found = []
         warned = np.count_nonzero(self._warning_words) > 0
-        finite = moves_finitely and self._moves_alone
+        finite = False
+        if moves_finitely and self._moves_alone:
+            finite = all([math.isfinite(np.add.reduce(given, axis=None)) for given in self._given])
         # of whole rows: skipping the columns that nobody writes takes longer
         finite = finite or math.isfinite(self._state.sum().item()) or bool(self._state.isfinite().all())
         fast = self._max_velocity < LIMIT and bool((np.abs(self._qvel) > self._max_velocity).any())

@@ -1,10 +1,13 @@
 """The history of engine calls and the names of what diverged."""
 
+import math
+
 import mujoco
 import numpy as np
 import pytest
 
 from rlcli.sim import guard
+from rlcli.sim.batch import BatchEngine
 from rlcli.sim.guard import Divergence, History, StateLayout
 
 MODEL = """
@@ -182,3 +185,34 @@ def test_positions_are_named_before_velocities_and_the_first_of_several(layout):
 )
 def test_a_place_is_named_by_what_it_belongs_to(layout, name, index, place):
     assert layout.place(name, index) == place
+
+
+LIMITED = """
+<mujoco><worldbody><body pos="0 0 1"><joint name="swing" damping="0.1"/><geom size="0.1" pos="0.1 0 0"/></body>
+</worldbody><actuator><motor joint="swing" ctrlrange="-1 1" ctrllimited="true"/></actuator></mujoco>
+"""
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    ("field", "place", "found"),
+    [
+        ("ctrl", (1, 0), True),  # MuJoCo clips an infinite one to its range
+        ("qfrc_applied", (1, 0), True),
+        ("xfrc_applied", (1, 1, 0), True),
+        ("xfrc_applied", (1, 0, 1), True),  # on the world itself: nobody reads it
+        ("time", (1,), True),
+        ("qacc_warmstart", (1, 0), False),  # the step writes its own
+    ],
+)
+def test_what_is_given_to_a_world_and_is_not_finite_is_found_though_its_positions_are(field, place, found, value):
+    verdicts = []
+    for looked_at in (False, True):
+        engine = BatchEngine(mujoco.MjModel.from_xml_string(LIMITED), 3, 1)
+        engine.field(field)[place] = value
+        engine.step(2)
+        finite = bool(engine.field("qpos").isfinite().all()) and bool(engine.field("qvel").isfinite().all())
+        diverged = engine.diverged(looked_at and finite)
+        verdicts.append((None if diverged is None else diverged.tolist(), engine.causes))
+    assert verdicts[0] == verdicts[1]
+    assert (verdicts[1][0] == [False, True, False]) == found
