@@ -216,7 +216,7 @@ class IdSelection:
         self, drawn: NDArray, scale: float | NDArray, offset: float | NDArray, shape: tuple[int, ...]
     ) -> Tensor:
         # in numpy: the arrays are short, and its calls cost half of torch's
-        values = drawn if len(shape) == 1 else drawn.reshape(len(self.ids), *shape)
+        values = self._shaped(drawn, shape)
         values *= scale
         values += offset
         return self._tensor(values)
