@@ -103,8 +103,12 @@ class Side:
 
 
 def child_environment(changes: Mapping[str, str] | None = None) -> dict[str, str]:
-    """This process' environment without what is set for rlcli alone, so that every side runs as its users run it."""
-    kept = {k: v for k, v in os.environ.items() if k not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "PYTHONPATH")}
+    """This process' environment without what is set for rlcli alone, so that every side runs as its users run it.
+
+    The peers were compiled to bytecode when they were installed; this checkout must be allowed to keep its own.
+    """
+    own = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "PYTHONPATH", "PYTHONDONTWRITEBYTECODE")
+    kept = {name: value for name, value in os.environ.items() if name not in own}
     return {**kept, **(changes or {})}
 
 

@@ -115,7 +115,7 @@ def json_schema(vocabulary: Vocabulary, params: type[BaseModel] | None = None) -
             term = {"type": "object", "properties": settings, "additionalProperties": term}
         if section != "success":
             term = {"type": "object", "additionalProperties": term}
-        schema["properties"][section] = {**term, "description": TaskConfig.model_fields[section].description}
+        schema["properties"][section] = {**term, "description": schema["properties"][section]["description"]}
     if params is not None:
         schema["properties"]["params"] = standing_alone(params)
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"

@@ -88,11 +88,20 @@ Range = Annotated[tuple[Number, Number], AfterValidator(_ordered)]
 Names = str | Annotated[list[str], Field(min_length=1)]
 
 
+def _described(schema: dict[str, Any], model: type[BaseModel]) -> None:
+    """Read the sources only when somebody asks for a schema: pydantic would while the models are made, which then takes
+    half as long again.
+    """
+    from rlcli.config.docstrings import describe
+
+    describe(schema, model)
+
+
 class StrictModel(BaseModel):
     """Base of every configuration model: unknown keys, wrong types, NaN and later changes are refused."""
 
     model_config = ConfigDict(
-        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
+        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, json_schema_extra=_described
     )
 
 

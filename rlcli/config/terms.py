@@ -252,8 +252,7 @@ def annotation_type(node: ast.expr) -> Any:
 def _model(name: str, base: type[StrictModel], fields: dict[str, Any]) -> type[Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a parameter may have the name of a pydantic method
-        # these have no docstrings, and to look for them takes a walk over all loaded modules
-        return create_model(name, __base__=base, __cls_kwargs__={"use_attribute_docstrings": False}, **fields)
+        return create_model(name, __base__=base, **fields)
 
 
 @functools.cache

@@ -1,0 +1,54 @@
+"""The JSON Schema says what the source says below a setting."""
+
+from __future__ import annotations
+
+from rlcli.config.dump import json_schema
+from rlcli.config.schema import StrictModel
+from rlcli.config.terms import Vocabulary
+
+
+class Outer:
+    class Settings(StrictModel):
+        gain: float = 1.0
+        """Of the motors [N m / rad].
+
+        Its sign is kept.
+        """
+        bare: int = 0
+
+
+class Further(Outer.Settings):
+    gain: float = 2.0
+    more: str = ""
+    """Whatever else."""
+
+
+def described(model):
+    return {name: field.get("description") for name, field in model.model_json_schema()["properties"].items()}
+
+
+def test_texts_below_settings_are_their_descriptions():
+    assert described(Outer.Settings) == {"gain": "Of the motors [N m / rad].\n\nIts sign is kept.", "bare": None}
+
+
+def test_what_is_inherited_is_described_by_whoever_says_it_first():
+    gain = "Of the motors [N m / rad].\n\nIts sign is kept."
+    assert described(Further) == {"gain": gain, "bare": None, "more": "Whatever else."}
+
+
+def test_a_class_inside_a_function_is_read_too():
+    class Inner(StrictModel):
+        size: int = 1
+        """In metres."""
+
+    assert described(Inner) == {"size": "In metres."}
+
+
+def test_a_class_without_source_has_no_descriptions():
+    scope = {"StrictModel": StrictModel, "__name__": "typed"}
+    exec('class Typed(StrictModel):\n    size: int = 1\n    """In metres."""\n', scope)
+    assert described(scope["Typed"]) == {"size": None}
+
+
+def test_every_section_of_a_task_is_described():
+    assert all(section.get("description") for section in json_schema(Vocabulary())["properties"].values())
