@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import gc
 import importlib.util
@@ -101,33 +102,31 @@ def resident(report: Path = Path("/proc/self/statm")) -> int | None:
         return None
 
 
-_AHEAD = "torch"
+def wait_calmly() -> None:
+    """Threads of OpenMP spin briefly while they wait, unless somebody said how long; before torch is loaded.
+
+    On a busy machine libgomp's long spinning makes an update ten times slower.
+    """
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 
 def load_torch_ahead() -> None:
-    """Begin to load torch's libraries, beside whatever is imported before torch.
+    """Begin to load torch's libraries beside whatever is imported before torch; for a process of our own that starts.
 
     An import holds up all other threads until it ends; a C function called through ctypes does not, and these libraries
-    hold no Python. Where this fails, torch says why when it is imported. libgomp is among them, and reads here how long
-    waiting threads spin: on a busy machine its long spinning makes an update ten times slower.
+    hold no Python. The process does not end before they are loaded. Where it fails, torch says why when it is imported.
     """
-    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     if "torch" in sys.modules or sys.platform != "linux":
         return
-    torch = importlib.util.find_spec("torch")
-    if torch is None or torch.origin is None:
-        return
-    import ctypes
+    with contextlib.suppress(ImportError, OSError, RuntimeError, ValueError):
+        import ctypes
 
-    library = Path(torch.origin).parent / "lib" / "libtorch.so"
-    load = ctypes.CDLL(None).dlopen
-    load.argtypes, load.restype = (ctypes.c_char_p, ctypes.c_int), ctypes.c_void_p
-    threading.Thread(target=load, args=(os.fsencode(library), os.RTLD_LAZY), name=_AHEAD).start()
-
-
-def torch_is_loading() -> bool:
-    """Whether what `load_torch_ahead` began goes on; a process that ends as usual waits for it."""
-    return any(thread.name == _AHEAD for thread in threading.enumerate())
+        torch = importlib.util.find_spec("torch")
+        if torch is not None and torch.origin is not None:
+            load = ctypes.CDLL(None).dlopen
+            load.argtypes, load.restype = (ctypes.c_char_p, ctypes.c_int), ctypes.c_void_p
+            library = os.fsencode(Path(torch.origin).parent / "lib" / "libtorch.so")
+            threading.Thread(target=load, args=(library, os.RTLD_LAZY), name="torch").start()
 
 
 _SELDOM = (100_000, 10, 10)

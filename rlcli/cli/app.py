@@ -17,7 +17,7 @@ from rlcli.cli.console import console, discard
 from rlcli.cli.options import CHOOSE
 from rlcli.config.settings import applied, read_settings, settings_file
 from rlcli.errors import ConfigError, RlcliError
-from rlcli.machine import collect_seldom, torch_is_loading
+from rlcli.machine import collect_seldom
 from rlcli.registry import malformed_metadata_ignored
 
 COMMANDS = {
@@ -107,8 +107,6 @@ def main(arguments: list[str] | None = None) -> int:
             sys.stdout.flush()
     except OSError:
         discard(sys.stdout)
-    if console.owns_process and torch_is_loading():  # refused before anything was begun: nothing to wait for
-        os._exit(code)
     return code
 
 

@@ -42,10 +42,10 @@ def command(
 ) -> None:
     """Measure a task here, and recommend sizes and threads."""
     from rlcli.config.load import resolve
-    from rlcli.machine import load_torch_ahead
+    from rlcli.machine import wait_calmly
     from rlcli.rl.trust import named_task
 
-    load_torch_ahead()
+    wait_calmly()
     file = None if save_preset is None else _preset_file(save_preset, overwrite)
     source = named_task(task)
 

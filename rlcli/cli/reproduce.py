@@ -31,12 +31,12 @@ def command(
     """Train a run again, and compare."""
     from rlcli.cli.diff import report
     from rlcli.cli.live import TrainingView
-    from rlcli.machine import available_cores, load_torch_ahead
+    from rlcli.machine import available_cores, wait_calmly
     from rlcli.rl.environment import environment_record
     from rlcli.rl.load import resolve_run
     from rlcli.rl.run import default_runs_dir, find_run
 
-    load_torch_ahead()  # as in training
+    wait_calmly()  # as in training
     runs = runs_dir or default_runs_dir()
     original, why = find_run(reference, runs)
     console.info(f"reproducing {original.folder} ({why})")

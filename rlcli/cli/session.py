@@ -71,10 +71,8 @@ def find_subject(
     """
     from rlcli.config.load import resolve
     from rlcli.errors import UsageError
-    from rlcli.machine import load_torch_ahead
     from rlcli.rl.run import default_runs_dir
 
-    load_torch_ahead()
     require_policy(policy)
     if task is not None and "=" in task:
         overrides, task = [task, *overrides], None

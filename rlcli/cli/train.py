@@ -99,14 +99,14 @@ def command(
     from rlcli.cli.jobs import agree, created, fitting_device, process_device, require_parallel, resumed
     from rlcli.config.load import resolve
     from rlcli.errors import Stopped, UsageError
-    from rlcli.machine import load_torch_ahead
+    from rlcli.machine import load_torch_ahead, wait_calmly
     from rlcli.rl import distributed
     from rlcli.rl.run import default_runs_dir
     from rlcli.rl.stop import StopRequest
     from rlcli.rl.trust import named_task
 
     on_leash()
-    load_torch_ahead()
+    wait_calmly()
     console.follows = not distributed.leads()
     runs, budget = runs_dir or default_runs_dir(), _budget(max_iterations, max_steps)
     several = _several(seeds, jobs, seed, gpus, resume, runs)
@@ -137,6 +137,8 @@ def command(
                 flags={**flags(scene__num_envs=num_envs), **budget},
             )
         tell_notes(resolved)
+        if console.owns_process:
+            load_torch_ahead()
         require_parallel(resolved, gpus or 1)
         device = fitting_device(resolved, device, wanted)
     if gpus is not None and gpus > 1 and not distributed.launched():

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Annotated, Any, Literal
+import sys
+from types import ModuleType
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     AfterValidator,
@@ -88,21 +90,26 @@ Range = Annotated[tuple[Number, Number], AfterValidator(_ordered)]
 Names = str | Annotated[list[str], Field(min_length=1)]
 
 
-def _described(schema: dict[str, Any], model: type[BaseModel]) -> None:
-    """Read the sources only when somebody asks for a schema: pydantic would while the models are made, which then takes
-    half as long again.
-    """
-    from rlcli.config.docstrings import describe
-
-    describe(schema, model)
-
-
 class StrictModel(BaseModel):
     """Base of every configuration model: unknown keys, wrong types, NaN and later changes are refused."""
 
-    model_config = ConfigDict(
-        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, json_schema_extra=_described
-    )
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+    _defined_in: ClassVar[ModuleType | None]
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        cls._defined_in = sys.modules.get(cls.__module__)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """Read docstrings only when somebody asks for a schema: pydantic would while the models are made, which then
+        takes half as long again.
+        """
+        from rlcli.config.docstrings import describe
+
+        described = super().__get_pydantic_json_schema__(schema, handler)
+        describe(handler.resolve_ref_schema(described), cls)
+        return described
 
 
 class TermConfig(StrictModel):

@@ -67,7 +67,10 @@ class StopRequest:
                 yield
             if self.signal is not None:
                 raise Interrupted
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, Exception) as error:
+            # an extension that is being imported makes an error of its own of the interrupt
+            if self.signal is None and not isinstance(error, KeyboardInterrupt):
+                raise
             raise Stopped("stopped before training began", exit_code=self.exit_code) from None
 
     def check(self) -> None:

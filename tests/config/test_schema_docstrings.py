@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
+
+from pydantic import ConfigDict, Field
+
 from rlcli.config.dump import json_schema
 from rlcli.config.schema import StrictModel
 from rlcli.config.terms import Vocabulary
@@ -42,6 +47,45 @@ def test_a_class_inside_a_function_is_read_too():
         """In metres."""
 
     assert described(Inner) == {"size": "In metres."}
+
+
+def test_a_model_may_have_an_alias_and_a_say_of_its_own_in_the_schema():
+    class Own(StrictModel):
+        model_config = ConfigDict(json_schema_extra={"title": "Mine"})
+
+        size: int = Field(1, alias="Size")
+        """In metres."""
+
+    assert described(Own) == {"Size": "In metres."}
+    assert Own.model_json_schema()["title"] == "Mine"
+
+
+FOUND = """
+from rlcli.config.schema import StrictModel
+try:
+    import nosuch
+except ImportError:
+    class Instead(StrictModel):
+        size: int = 1
+        'Of what is there.'
+if True:
+    class Twice(StrictModel):
+        size: int = 1
+        'One.'
+else:
+    class Twice(StrictModel):
+        size: int = 1
+        'The other.'
+"""
+
+
+def test_the_source_of_a_module_that_is_imported_no_more_is_read(tmp_path, monkeypatch):
+    (tmp_path / "found_once.py").write_text(FOUND)
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("found_once")
+    del sys.modules["found_once"]
+    assert described(module.Instead) == {"size": "Of what is there."}
+    assert described(module.Twice) == {"size": None}  # nothing rather than the wrong one
 
 
 def test_a_class_without_source_has_no_descriptions():
