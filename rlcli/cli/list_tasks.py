@@ -8,8 +8,9 @@ import typer
 
 from rlcli.cli.console import console
 from rlcli.cli.options import Debug, Json, Quiet, Verbose
+from rlcli.errors import did_you_mean
 from rlcli.probe import TIMEOUT_S, Details, cached, probe
-from rlcli.registry import OWN, catalog, plugins_chosen_by, unknown_wanted
+from rlcli.registry import OWN, Entry, catalog, plugins_chosen_by, unknown_wanted
 
 
 def command(
@@ -28,6 +29,7 @@ def command(
 ) -> None:
     """List installed tasks."""
     entries, broken = catalog()
+    names = [e.name for e in entries]
     shared = {e.name for e in entries if sum(other.name == e.name for other in entries) > 1}
     built_in = {e.name for e in entries if e.distribution == OWN}
     details = cached(entries)
@@ -38,23 +40,11 @@ def command(
     if probe_all:
         details.update(probe(entries, timeout))
     rows = [(entry, details.get(entry.qualified, Details())) for entry in entries]
-    console.table(
-        ["TASK", "PLUGIN", "WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "STATUS", "SUMMARY"],
-        [
-            [
-                entry.qualified if entry.name in shared and entry.distribution != OWN else entry.name,
-                f"{entry.distribution} {entry.version}",
-                known.workflow or "?",
-                _number(known.observation_size),
-                _number(known.action_size),
-                _number(known.num_envs),
-                known.agent or "",
-                known.status,
-                known.summary or ("" if known.broken else "(rlcli list-tasks --probe tells more)"),
-            ]
-            for entry, known in rows
-        ],
-    )
+    if rows or not pattern:
+        _show(rows, shared)
+    else:
+        near = did_you_mean(pattern.lower(), names)
+        console.info(f"no task's name or summary contains '{pattern}'; {near or 'rlcli list-tasks shows all'}")
     for bad in broken:
         console.warn(f"{bad.distribution}: {bad.reason}; its tasks are not listed")
     for name in unknown_wanted():
@@ -74,6 +64,26 @@ def command(
             for entry, known in rows
         ],
         broken=[{"distribution": bad.distribution, "reason": bad.reason} for bad in broken],
+    )
+
+
+def _show(rows: list[tuple[Entry, Details]], shared: set[str]) -> None:
+    console.table(
+        ["TASK", "PLUGIN", "WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "STATUS", "SUMMARY"],
+        [
+            [
+                entry.qualified if entry.name in shared and entry.distribution != OWN else entry.name,
+                f"{entry.distribution} {entry.version}",
+                known.workflow or "?",
+                _number(known.observation_size),
+                _number(known.action_size),
+                _number(known.num_envs),
+                known.agent or "",
+                known.status,
+                known.summary or ("" if known.broken else "(rlcli list-tasks --probe tells more)"),
+            ]
+            for entry, known in rows
+        ],
     )
 
 

@@ -147,8 +147,9 @@ def _expected(item: Any) -> str:
     kind, context = item["type"], item.get("ctx", {})
     if kind in _BOUNDS:
         sign, key = _BOUNDS[kind]
-        whole = "whole " if isinstance(item["input"], int) and not isinstance(context[key], float) else ""
-        return f"a {whole}number {sign} {context[key]:g}"
+        bound = context[key]
+        whole = "whole " if isinstance(item["input"], int) and not isinstance(bound, float) else ""
+        return f"a {whole}number {sign} {bound if isinstance(bound, int) else f'{bound:g}'}"
     if kind == "literal_error":
         return context["expected"]
     if kind in ("too_short", "too_long"):

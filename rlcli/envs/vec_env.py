@@ -99,7 +99,7 @@ class VecEnv(ABC):
             for index in range(term.size)
         ]
         if success is not None:
-            check_shape(success, first_value(success), (self.num_envs,), "success")
+            check_shape(success, first_value(success), (self.num_envs,))
 
     # --- what callers use ---
 

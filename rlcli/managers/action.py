@@ -9,7 +9,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from rlcli.errors import ConfigError, Problem
 from rlcli.managers.term import BoundTerm, resets
 from rlcli.sim.selection import Field, Selection, in_place
 
@@ -104,5 +103,4 @@ def _refuse_shared(terms: list[BoundTerm]) -> None:
         for sink, element in zip(getattr(term.instance, "sinks", ()), term.instance.elements, strict=False):
             first = owner.setdefault(sink, term)
             if first is not term:
-                path = ".".join(map(str, term.path))
-                raise ConfigError([Problem("actions", path, f"'{element}' is driven by '{first.name}' already")])
+                raise term.error(f"'{element}' is driven by '{first.name}' already")

@@ -149,7 +149,7 @@ class ObservationManager:
             value = first_value(term)
             dims = value.dim() if isinstance(value, Tensor) else 0
             shape = tuple(value.shape[1:]) if dims in (2, 4) else (1,)  # columns, or a picture
-            check_shape(term, value, (self.num_envs, *shape), "observations")
+            check_shape(term, value, (self.num_envs, *shape))
             pipelines.append(Pipeline(term, shape, config, self.num_envs, self._step_dt, self._device, self._live))
         size = sum(pipeline.size for pipeline in pipelines)
         buffers = [torch.zeros(self.num_envs, size, device=self._device) for _ in range(3)]

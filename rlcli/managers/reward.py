@@ -65,7 +65,7 @@ class RewardManager:
         self._added, self._added_to = in_place(table), [in_place(total) for total in totals]
         for term, weight in zip(terms, weights, strict=True):
             if _moves(weight) or weight != 0.0:
-                check_shape(term, first_value(term), (num_envs,), "rewards")
+                check_shape(term, first_value(term), (num_envs,))
 
     def compute(self, diverged: Tensor | None = None, terminated: Tensor | None = None) -> Tensor:
         """This step's reward; `add_up` takes it into the episode's sums. (num_envs,)

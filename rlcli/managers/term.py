@@ -38,6 +38,8 @@ class BoundTerm:
     name: str
     path: Path
     config: TermConfig
+    resolved: Resolved
+    """The configuration that the term is of."""
     call: Callable[..., Any]
     elements: dict[str, list[str]]
     """Selector parameter -> the names it resolved to."""
@@ -53,7 +55,7 @@ class BoundTerm:
 
     def error(self, message: str, *keys: str) -> ConfigError:
         """What is wrong with the term, or with a key of it."""
-        return ConfigError([Problem(str(self.path[0]), ".".join(map(str, (*self.path, *keys))), message)])
+        return ConfigError([self.resolved.problem((*self.path, *keys), message)])
 
     def state_dict(self) -> dict[str, Tensor]:
         """What a term with memory carries from step to step."""
@@ -97,7 +99,8 @@ class Binder:
         name = str(path[-1])
         own = signature.is_class and not hasattr(call, "state_dict") and not type(call).__module__.startswith("rlcli.")
         memory = Memory(call) if own else None
-        return BoundTerm(name, path, config, call, elements, stream(".".join(str(step) for step in path)), memory)
+        draws = stream(".".join(str(step) for step in path))
+        return BoundTerm(name, path, config, self.resolved, call, elements, draws, memory)
 
     def bind_all(self, section: str) -> list[BoundTerm]:
         """The terms of a section, in order."""
@@ -239,25 +242,17 @@ def first_value(term: BoundTerm) -> Any:
     try:
         return term.call()
     except ValueError as error:
-        raise ConfigError([Problem(str(term.path[0]), ".".join(map(str, term.path)), str(error))]) from None
+        raise term.error(str(error)) from None
 
 
-def check_shape(term: BoundTerm, value: Any, expected: tuple[int, ...], what: str) -> None:
+def check_shape(term: BoundTerm, value: Any, expected: tuple[int, ...]) -> None:
     """A term's first value must be a tensor of the expected shape.
 
     Raises:
-        ConfigError: naming manager, term, what was found and what was expected.
+        ConfigError: with the term's place, what was found and what was expected.
     """
     shape = tuple(value.shape) if isinstance(value, Tensor) else None
     if shape == expected:
         return
     found = f"a tensor of shape {shape}" if shape is not None else f"a {type(value).__name__}"
-    raise ConfigError(
-        [
-            Problem(
-                what,
-                ".".join(map(str, term.path)),
-                f"'{term.config.func}' gave {found}, expected a tensor of shape {expected}",
-            )
-        ]
-    )
+    raise term.error(f"'{term.config.func}' gave {found}, expected a tensor of shape {expected}")

@@ -29,7 +29,7 @@ class TerminationManager:
         self._forget = resets(terms)
         self._calls = [(term, bool(term.config.time_out)) for term in terms]  # type: ignore[attr-defined]
         for term in terms:
-            check_shape(term, first_value(term), (num_envs,), "terminations")
+            check_shape(term, first_value(term), (num_envs,))
 
     def compute(self, diverged: Tensor | None) -> tuple[Tensor, Tensor]:
         """Judge this step. (num_envs,) bool each"""

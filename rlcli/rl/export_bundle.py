@@ -10,7 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from rlcli.errors import MachineError, UsageError
+from rlcli.errors import UsageError
 from rlcli.rl.export_numpy import literal
 from rlcli.rl.files import disk_error, write_atomic
 
@@ -101,16 +101,7 @@ def write_model(spec: mujoco.MjSpec, model: mujoco.MjModel, folder: Path) -> Pat
     """
     text = _as_text(spec, model)
     file = folder / (MODEL if text is not None else "model.mjb")
-    try:
-        if text is not None:
-            write_atomic(file, _MARK + text)
-        else:
-            temporary = file.with_name(f".{file.name}.tmp")
-            temporary.unlink(missing_ok=True)
-            mujoco.mj_saveModel(model, str(temporary))
-            temporary.replace(file)
-    except (OSError, MachineError) as error:
-        raise disk_error(folder, error) if isinstance(error, OSError) else error from error
+    write_atomic(file, _MARK + text if text is not None else _as_bytes(model))
     return file
 
 
@@ -118,6 +109,13 @@ def open_model(file: Path) -> mujoco.MjModel:
     """A model that was written here."""
     read = mujoco.MjModel.from_xml_path if file.suffix == ".xml" else mujoco.MjModel.from_binary_path
     return read(str(file))
+
+
+def _as_bytes(model: mujoco.MjModel) -> bytes:
+    """A compiled model as MuJoCo reads it from a file."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
 
 
 def _as_text(spec: mujoco.MjSpec, model: mujoco.MjModel) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -14,7 +15,8 @@ from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rlcli.errors import DivergedError, did_you_mean
+from rlcli import machine
+from rlcli.errors import DeviceError, DivergedError, did_you_mean
 from rlcli.sim.engine import force_sensors
 from rlcli.sim.guard import (
     ENGINE_ERROR,
@@ -94,6 +96,9 @@ class BatchEngine:
         external_forces: compute `cfrc_ext`, exactly. Batch itself does so for models with certain sensors alone, and
             with RK4 at the wrong one of a substep's stages.
         max_velocity: a velocity beyond it is a divergence [m/s, rad/s].
+
+    Raises:
+        DeviceError: for more worlds than the machine's memory holds.
     """
 
     asynchronous = False
@@ -110,6 +115,7 @@ class BatchEngine:
         max_velocity: float = LIMIT,
     ) -> None:
         quiet_mujoco()
+        _require_memory(model, num_envs)
         self.model = model
         self.num_envs = num_envs
         self.lives = 0
@@ -544,6 +550,26 @@ class BatchEngine:
         row = np.empty(self._batch.nstate)
         mujoco.mj_getState(self.model, data, row, int(_STATE.mjSTATE_INTEGRATION))
         return row
+
+
+_STATES_AN_ENV = 3
+"""What an environment takes at the least, in states of its world; the built-in tasks take 3.3 to 16."""
+
+
+def _require_memory(model: mujoco.MjModel, num_envs: int) -> None:
+    """Refuse what memory cannot hold: a kernel that promises more than it has ends the process later, without a word.
+
+    Raises:
+        DeviceError: if it does not fit.
+    """
+    each = _STATES_AN_ENV * 8 * mujoco.mj_stateSize(model, int(_STATE.mjSTATE_INTEGRATION))
+    free = min(machine.memory(), machine.memory_limit() or sys.maxsize)
+    if each * num_envs > free:
+        raise DeviceError(
+            f"{num_envs} environments need {each * num_envs / 2**30:.1f} GiB at the least,"
+            f" {free / 2**30:.1f} GiB are free on this machine",
+            hint="fewer environments: --num-envs",
+        )
 
 
 _MORE_MEMORY = "a larger <size memory=...> in the MJCF mends a full contact arena"

@@ -46,6 +46,32 @@ def test_mistakes_in_a_file_are_all_reported_with_line_and_column(here, small):
     ]
 
 
+COLUMN = """\
+from rlcli.task import Entity
+
+
+def column(env, *, entity: Entity = "robot"):
+    return entity.data.joint_pos
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place"),
+    [
+        ("  alive: {func: is_alive, weight: 1.0}", "  bad:\n    weight: 1.0\n    func: column", "15:3: rewards.bad"),
+        ("rewards:", "terminations: {bad: {func: column}}\nrewards:", "14:16: terminations.bad"),
+        ("rewards:", "success:\n  func: column\nrewards:", "14:1: success"),
+    ],
+)
+def test_a_term_that_gives_another_shape_is_reported_once_with_line_and_column(in_process, small, old, new, place):
+    task = small((old, new), terms=COLUMN)
+    told = "'column' gave a tensor of shape (4, 2), expected a tensor of shape (4,)"
+    for command in (["play", task, "--policy", "zero", "--viewer", "none"], ["train", task]):
+        code, _, err = in_process(*command)
+        assert code == 3
+        assert [line for line in err.splitlines() if "error" in line] == [f"error: small/task.yaml:{place}: {told}"]
+
+
 def test_a_task_without_an_agent_cannot_be_trained_and_says_so(in_process, small):
     task = small(("agents:\n  default: small\n  small: {trainer: sb3, algorithm: ppo, max_iterations: 1}\n", ""))
     code, _, err = in_process("train", task)

@@ -31,6 +31,7 @@ TYPOS = [
     ("sim.gravity=[0, 0, down]", "sim.gravity.2: expected a number, found 'down'", None),
     ("episode_length_s=0.001", "episode_length_s: 0.001 s is shorter than one step", None),
     ("scene.num_envs=0", "scene.num_envs: expected a whole number >= 1, found 0", None),
+    ("scene.num_envs=99999999", "scene.num_envs: expected a whole number <= 16777216, found 99999999", None),
     ("scene.entities={}", "scene.entities: expected at least 1 item", None),
     ("scene.entities.robot.modle=x.xml", "unknown key 'modle'", "did you mean 'model'?"),
     ("scene.entities.robot.quat=[0, 0, 0, 0]", "scene.entities.robot.quat: a quaternion must not be zero", None),

@@ -149,6 +149,16 @@ def test_a_function_is_a_term_and_its_parameters_are_checked(root):
         make_env(cartpole(rewards={"own": RewardConfig(func=cart_vel, weight=1.0, factr=1.0)}), root=root)
 
 
+def test_a_function_that_gives_another_shape_is_named_by_its_key(root):
+    def column(env, *, entity: Entity = "robot"):
+        return entity.data.joint_pos
+
+    message = r"rewards\.own: 'column' gave a tensor of shape \(8, 2\), expected a tensor of shape \(8,\)"
+    with pytest.raises(ConfigError, match=message) as refusal:
+        make_env(cartpole(rewards={"own": RewardConfig(func=column, weight=1.0)}), root=root)
+    assert str(refusal.value).count("own") == 1
+
+
 def test_two_functions_of_one_name_stay_two(root):
     def other():
         def cart_vel(env):

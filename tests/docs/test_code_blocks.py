@@ -24,9 +24,11 @@ from rlcli.registry import find_task
 DOCS = REPOSITORY / "docs"
 PAGES = [*sorted(DOCS.glob("*.md")), *sorted((DOCS / "zoo").glob("*.md"))]
 PAGES += [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"]
+PAGES += sorted((REPOSITORY / "plugins").glob("*/README.md"))
 
 HERE = "tests/docs/test_code_blocks.py"
 OF_PAGES = "tests/packaging/test_pages.py"
+OF_WHEELS = "tests/packaging/test_wheels.py"
 RUN_BY = {
     "README.md": f"{OF_PAGES}::test_the_readmes_task_of_your_own_works_as_written",
     "README.md: What it is": f"{HERE}::test_the_mistake_of_the_readme_is_answered_as_it_says",
@@ -57,8 +59,7 @@ RUN_BY = {
     "trainers.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
     "watching.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
     "write-a-direct-task.md": f"{OF_PAGES}::test_the_task_of_a_page_checks_trains_and_learns",
-    "write-a-plugin.md": "tests/packaging/test_wheels.py::"
-    "test_the_plugins_of_the_page_are_made_installed_and_learned_as_written",
+    "write-a-plugin.md": f"{OF_WHEELS}::test_the_plugins_of_the_page_are_made_installed_and_learned_as_written",
     "write-a-task.md": f"{OF_PAGES}::test_the_task_of_a_page_checks_trains_and_learns",
     "write-a-task.md: Scenes": f"{OF_PAGES}::test_the_scenes_of_the_page_build_and_run",
     "write-a-task.md: Events and randomisation": f"{HERE}::test_randomised_models_of_the_page_differ",
@@ -66,9 +67,14 @@ RUN_BY = {
         (f"write-a-task.md: {part}" for part in ("What the policy sees", "Commands", "Actuators", "Curriculum")),
         f"{OF_PAGES}::test_the_sections_on_what_is_seen_asked_driven_and_changed_work_together",
     ),
-    "write-a-trainer.md": "tests/packaging/test_wheels.py::test_the_trainer_of_the_page_works_as_written",
+    "write-a-trainer.md": f"{OF_WHEELS}::test_the_trainer_of_the_page_works_as_written",
+    "rlcli-example-acrobot/README.md": f"{OF_WHEELS}::test_every_command_of_the_plugins_readme_runs",
+    "rlcli-gymnasium/README.md": "tests/packaging/test_gymnasium_plugin.py::test_the_commands_of_its_readme_run",
+    "rlcli-menagerie/README.md": f"{OF_WHEELS}::test_the_commands_of_menageries_readme_run_on_a_stand_in",
+    "rlcli-rl-games/README.md": f"{OF_WHEELS}::test_the_readme_of_a_trainer_plugin_works_as_written",
+    "rlcli-rsl-rl/README.md": f"{OF_WHEELS}::test_the_readme_of_a_trainer_plugin_works_as_written",
 }
-"""Page, or page and heading -> the test that runs what stands there."""
+"""Page, or page and heading -> the test that runs what stands there; a plugin's README has the plugin's name."""
 
 NEED_A_RUN = {"autopsy.md": 12, "play.md": 2, "security.md": 2, "watching.md": 2}
 """Pages that speak of a run that is there already -> its iterations."""
@@ -81,13 +87,18 @@ def is_code(block):
     return not block.language.startswith("{")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def called(page):
+    """`export.md`, or `rlcli-gymnasium/README.md` for a plugin's."""
+    return f"{page.parent.name}/{page.name}" if page.parent.parent.name == "plugins" else page.name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=called)
 def test_every_block_of_code_is_run_or_says_why_not(page):
     for block in filter(is_code, all_blocks(page)):
         if block.not_run is not None:
             assert len(block.not_run.split()) > 3, f"{page.name}: a reason is a sentence: {block.not_run}"
             continue
-        place = RUN_BY.get(f"{page.name}: {block.section}", RUN_BY.get(page.name))
+        place = RUN_BY.get(f"{called(page)}: {block.section}", RUN_BY.get(called(page)))
         assert place, f"{page.name}, {block.section}: nothing runs\n{block.text}\n(or <!-- not run: WHY --> above it)"
 
 
@@ -101,7 +112,7 @@ def test_what_is_said_to_run_a_page_is_a_test_that_names_it(place):
     for page in {key.partition(":")[0] for key, value in RUN_BY.items() if value == place}:
         said = [*tests[name].decorator_list, tests[name]]
         named = "".join(ast.unparse(part) for part in said) + outside
-        assert page in named or "SHELL_PAGES" in named, f"{name} does not name {page}"
+        assert page.removesuffix("/README.md") in named or "SHELL_PAGES" in named, f"{name} does not name {page}"
 
 
 SHELL_PAGES = sorted(

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from rlcli.cli.app import main
+from rlcli.rl import export_bundle
 from rlcli.rl.run import find_checkpoint
 
 PUSHED = """
@@ -325,6 +326,24 @@ def test_the_model_that_is_written_is_the_one_that_was_trained_on(newest, tmp_pa
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
     assert [model.actuator(i).name for i in range(model.nu)] == ["robot/m", "robot/p", "robot/w"]
     np.testing.assert_allclose(model.actuator_gainprm[1, 0], 5.0)
+
+
+def test_a_model_with_meshes_from_files_is_written_compiled_and_whole(tmp_path):
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "part.obj").write_text(corners)
+    text = """<mujoco><asset><mesh name="part" file="part.obj"/></asset><worldbody>
+      <body><joint name="turn"/><geom type="mesh" mesh="part"/></body></worldbody></mujoco>"""
+    (tmp_path / "source.xml").write_text(text)
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "source.xml"))
+    folder = tmp_path / "written"
+    folder.mkdir()
+    model = spec.compile()
+    file = export_bundle.write_model(spec, model, folder)
+    assert list(folder.iterdir()) == [file]
+    assert file.name == "model.mjb"
+    again = export_bundle.open_model(file)
+    assert again.joint(0).name == "turn"
+    np.testing.assert_array_equal(again.mesh_vert, model.mesh_vert)
 
 
 @pytest.mark.slow

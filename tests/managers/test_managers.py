@@ -163,8 +163,9 @@ class Fussy:
         ),
     ],
 )
-def test_a_term_of_the_wrong_shape_is_named_with_what_was_expected(tmp_path, changes, message):
-    with pytest.raises(ConfigError, match=re.escape(message.replace("{}", "a tensor of shape "))):
+def test_a_term_of_the_wrong_shape_is_named_with_its_place_and_what_was_expected(tmp_path, changes, message):
+    said = re.escape(message.replace("{}", "a tensor of shape "))
+    with pytest.raises(ConfigError, match=rf"task\.yaml:\d+:\d+: {said}"):
         build(pendulum(tmp_path, edited(PENDULUM_TASK, **changes), terms_py=SHAPES))
 
 

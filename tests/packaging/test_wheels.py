@@ -2,14 +2,26 @@
 
 import json
 import os
+import runpy
 import shutil
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from email.parser import Parser
 
 import pytest
-from fenced import REPOSITORY, blocks, run_commands, success_rate, success_rates, write_files
+import yaml
+from fenced import (
+    REPOSITORY,
+    Block,
+    blocks,
+    run_commands,
+    shortened,
+    success_rate,
+    success_rates,
+    write_files,
+)
 
 import rlcli
 
@@ -180,6 +192,54 @@ def test_the_tests_of_a_trainer_plugin_pass_against_the_wheels(name, site, tmp_p
     where = [sys.executable, "-c", f"import {name.replace('-', '_')} as package; print(package.__file__)"]
     place = subprocess.run(where, cwd=folder, env=environment, capture_output=True, text=True, check=True).stdout
     assert place.startswith(str(own))
+
+
+def with_plugin_left_out(name, site, folder):
+    """A copy of the plugin in `folder`, and of `site` beside it; there its README says how to install it."""
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(REPOSITORY / "plugins" / name, folder / name, ignore=ignored)
+    shutil.copytree(site, folder / "site")
+    found = [shortened(block) for block in blocks(folder / name / "README.md")]
+    return folder / name, [block for block in found if "pytest" not in block.text]  # its tests have a test here
+
+
+@pytest.mark.parametrize(
+    ("name", "trained"),
+    [
+        ("rlcli-rsl-rl", ["cartpole", "ball-balance"]),
+        ("rlcli-rl-games", ["cartpole-direct", "ant-direct", "ball-balance"]),
+    ],
+)
+def test_the_readme_of_a_trainer_plugin_works_as_written(name, trained, site, tmp_path):
+    folder, found = with_plugin_left_out(name, site, tmp_path)
+    (agents,) = [block.text for block in found if block.language == "yaml"]
+    (folder / "agents.yaml").write_text(agents)
+    (agent,) = yaml.safe_load(agents)["agents"]
+    train = f"rlcli train ball-balance --config agents.yaml --agent {agent} --num-envs 512 --max-iterations 2\n"
+    found = [replace(block, text=block.text.replace("learn(10)", "learn(1)")) for block in found]
+    output = run_commands(
+        [*found, Block("sh", None, train)], folder, site=tmp_path / "site", languages=("sh", "python")
+    )
+    assert 0.0 <= success_rate(output) <= 1.0
+    for task in trained:
+        (run,) = (folder / "runs" / task).iterdir()
+        assert json.loads((run / "run.json").read_text())["state"] == "finished"
+
+
+def test_the_commands_of_menageries_readme_run_on_a_stand_in(site, tmp_path):
+    folder, found = with_plugin_left_out("rlcli-menagerie", site, tmp_path)
+    robot = runpy.run_path(str(folder / "tests" / "conftest.py"))["go1"](driven=True)
+    for file in ("unitree_go1/go1.xml", "my_go1/scene_free.xml"):
+        place = folder / "home" / "mujoco_menagerie" / file
+        place.parent.mkdir(parents=True)
+        place.write_text(robot)
+    few = "rlcli train go1-velocity --num-envs 64"
+    texts = [block.text.replace(" --device cuda", "").replace("rlcli train go1-velocity", few) for block in found]
+    found = [replace(block, text=text) for block, text in zip(found, texts, strict=True)]
+    output = run_commands(found, folder, site=tmp_path / "site")
+    assert "go1-velocity: 0 errors" in output
+    assert 0.0 <= success_rate(output) <= 1.0
+    assert len(list((folder / "runs" / "go1-velocity").iterdir())) == 2
 
 
 def test_the_trainer_of_the_page_works_as_written(site, tmp_path):

@@ -71,6 +71,21 @@ def test_a_pattern_shows_only_names_and_summaries_that_contain_it(cli):
     assert rows(cli("list-tasks", "no such thing", "--json")) == {}
 
 
+@pytest.mark.parametrize(
+    ("pattern", "advice"),
+    [
+        ("cartpol-", "did you mean 'cartpole'"),
+        ("Cart-pole", "did you mean 'cartpole'"),
+        ("zzz", "rlcli list-tasks shows all"),
+    ],
+)
+def test_a_pattern_that_nothing_contains_is_answered_with_what_to_do(cli, pattern, advice):
+    done = cli("list-tasks", pattern)
+    assert (done.returncode, done.stdout) == (0, "")
+    assert done.stderr.startswith(f"no task's name or summary contains '{pattern}'; {advice}")
+    assert json.loads(cli("list-tasks", pattern, "--json").stdout)["tasks"] == []
+
+
 def test_shared_names_are_shown_with_their_distribution(plugins, spec, cli):
     plugins("a", spec, task="walk")
     plugins("b", spec, task="walk")

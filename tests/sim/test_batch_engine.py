@@ -43,6 +43,14 @@ def scatter(engine, seed=0):
     engine.field("ctrl")[:] = torch.from_numpy(random.uniform(-1, 1, (engine.num_envs, 4)))
 
 
+def test_more_worlds_than_memory_holds_are_refused_before_any_is_made(monkeypatch):
+    monkeypatch.setattr("rlcli.machine.memory", lambda: 2**30)
+    with pytest.raises(DeviceError, match=r"^1000000 environments need \d\.\d GiB at the least, 1\.0 GiB are") as no:
+        engine_of(model_of(), 1_000_000)
+    assert no.value.hint == "fewer environments: --num-envs"
+    assert engine_of(model_of(), 1000).num_envs == 1000
+
+
 @pytest.mark.parametrize("threads", [1, 3])
 def test_it_steps_like_a_loop_of_mj_step_bit_for_bit(threads):
     model = model_of()

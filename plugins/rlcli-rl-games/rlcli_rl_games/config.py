@@ -227,7 +227,7 @@ class PpoSettings(_Settings):
     critic_coef: NotNegative
     """Weight of the value loss, of which rl_games takes half."""
     bounds_loss_coef: NotNegative | None = None
-    """Weight of the bounds loss."""
+    """Weight of the bounds loss; null: none."""
     bound_loss_type: Literal["bound", "regularisation"] = "bound"
     """The square of what the mean action exceeds 1.1 by, or of the mean action."""
     use_smooth_clamp: bool = False

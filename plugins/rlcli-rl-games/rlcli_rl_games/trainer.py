@@ -344,6 +344,7 @@ class PpoTrainer(RlGamesTrainer):
                 message = f"minibatches of {wanted} samples do not divide a rollout of horizon_length x num_envs ="
                 message += f" {config.horizon_length} x {self.env.num_envs} = {self.steps_per_iteration}"
                 raise self._problem(key, message, f"{self.steps_per_iteration}, or a divisor of it")
+        parameters["config"] = {**_NEEDED, **parameters["config"]}
         agent = A2CAgent("rlcli", parameters)
         if agent.has_central_value:
             agent.central_value_net.writter = _Silent()
@@ -570,6 +571,10 @@ def make_trainer(env: VecEnv, config: RlGamesConfig, *, seed: int, device: str, 
 
 def _mean(values: list[Any]) -> float:
     return float(torch.stack([torch.as_tensor(value).detach().float().mean() for value in values]).mean())
+
+
+_NEEDED = {"lr_schedule": None, "bounds_loss_coef": 0.0}
+"""What rl_games' PPO fails without: the values that do nothing."""
 
 
 def _nones(value: Any) -> Any:

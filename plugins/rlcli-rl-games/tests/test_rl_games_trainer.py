@@ -253,7 +253,13 @@ def resumed(make):
 
 
 @pytest.mark.parametrize(
-    "extra", [(), ("agent.params.config.lr_schedule=linear",), ("agent.params.config.schedule_type=standard",)]
+    "extra",
+    [
+        (),
+        ("agent.params.config.lr_schedule=linear",),
+        ("agent.params.config.lr_schedule=null", "agent.params.config.bounds_loss_coef=null"),
+        ("agent.params.config.schedule_type=standard",),
+    ],
 )
 def test_a_resumed_run_goes_on_with_the_same_bits(extra):
     resumed(lambda seed: trainer_of(*extra, seed=seed))
