@@ -109,7 +109,7 @@ def test_four_poles_are_in_the_picture(env, monkeypatch):
     pictures = {}
     for count in (1, 4):
         with Renderer(env.engine.model, env.config.viewer, Crowd(env, count)) as renderer:
-            pictures[count] = renderer.draw(*env.world(0)).astype(int)
+            pictures[count] = renderer.picture(env).astype(int)
     blue = {count: (seen[..., 2] - seen[..., 0] > 60) & (seen[..., 1] < 120) for count, seen in pictures.items()}
     columns = {count: np.flatnonzero(found[120:].any(axis=0)) for count, found in blue.items()}
     groups = {count: 1 + int((np.diff(found) > 20).sum()) for count, found in columns.items()}
