@@ -76,6 +76,8 @@ def _put(geom: mujoco.MjvGeom, part: _Part, start: NDArray[np.float64], end: NDA
     )
     if part.kind != _SPHERE:
         mujoco.mjv_connector(geom, part.kind, part.radius, start, end)
+    if part.kind == _ARROW:
+        geom.size[2] *= 2.0  # MuJoCo's renderers draw half of it
     # left as they were by what is called above
     geom.category, geom.objtype = int(mujoco.mjtCatBit.mjCAT_DECOR), int(mujoco.mjtObj.mjOBJ_UNKNOWN)
     geom.objid, geom.segid = -1, -1
