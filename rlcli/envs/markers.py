@@ -6,8 +6,7 @@ in the world as `entity.data.root_pos_w` is, one row an environment; where one i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from torch import Tensor
 
@@ -19,51 +18,37 @@ ACTUAL: Color = (0.1, 0.3, 1.0, 1.0)
 """Blue: what there is instead."""
 
 
-@dataclass(frozen=True, slots=True)
-class Arrow:
-    """An arrow; where it is no longer than its radius it is not drawn.
-
-    Args:
-        start: where it begins. (num_envs, 3) [m]
-        end: where its tip is. (num_envs, 3) [m]
-        color: of all of it.
-        radius: of its shaft [m].
-    """
+class Arrow(NamedTuple):
+    """An arrow; where it is no longer than its radius it is not drawn."""
 
     start: Tensor
+    """Where it begins. (num_envs, 3) [m]"""
     end: Tensor
+    """Where its tip is. (num_envs, 3) [m]"""
     color: Color = ASKED
     radius: float = 0.015
+    """Of its shaft [m]."""
 
 
-@dataclass(frozen=True, slots=True)
-class Sphere:
-    """A sphere.
-
-    Args:
-        center: where it is. (num_envs, 3) [m]
-        color: of all of it.
-        radius: of it [m].
-    """
+class Sphere(NamedTuple):
+    """A sphere."""
 
     center: Tensor
+    """Where it is. (num_envs, 3) [m]"""
     color: Color = ASKED
     radius: float = 0.02
+    """In metres."""
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """The axes of a pose: x red, y green, z blue.
-
-    Args:
-        position: where it is. (num_envs, 3) [m]
-        quat: its orientation (w, x, y, z), of length 1. (num_envs, 4)
-        length: of each axis [m].
-    """
+class Frame(NamedTuple):
+    """The axes of a pose: x red, y green, z blue."""
 
     position: Tensor
+    """Where it is. (num_envs, 3) [m]"""
     quat: Tensor
+    """Its orientation (w, x, y, z), of length 1. (num_envs, 4)"""
     length: float = 0.1
+    """Of each axis [m]."""
 
 
 Marker: TypeAlias = Arrow | Sphere | Frame

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +19,8 @@ from rlcli.managers.term import BoundTerm, resets
 from rlcli.sim.selection import Selection
 
 Select = Callable[[Tensor], Selection | None]
+_COLUMNS = {"start": 3, "end": 3, "center": 3, "position": 3, "quat": 4}
+"""Of what a marker says in every environment."""
 
 
 class CommandTerm(Protocol):
@@ -215,11 +217,11 @@ class CommandManager:
 def _require_rows(term: BoundTerm, marker: Marker, num_envs: int) -> None:
     if not isinstance(marker, Arrow | Sphere | Frame):
         raise term.error(f"markers() gave a {type(marker).__name__}, expected an Arrow, a Sphere or a Frame")
-    for field in fields(marker):
-        value, expected = getattr(marker, field.name), (num_envs, 4 if field.name == "quat" else 3)
-        if field.type == "Tensor" and (not isinstance(value, Tensor) or value.shape != expected):
+    for name, value in marker._asdict().items():
+        expected = (num_envs, _COLUMNS.get(name, 0))
+        if name in _COLUMNS and (not isinstance(value, Tensor) or value.shape != expected):
             found = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
-            what = f"{type(marker).__name__}.{field.name}"
+            what = f"{type(marker).__name__}.{name}"
             raise term.error(f"markers() gave {what} {found}, expected a tensor of shape {expected}")
 
 

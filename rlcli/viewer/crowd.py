@@ -68,9 +68,9 @@ class Crowd:
                 else:
                     geom.pos[:] += offset
 
-    def geoms(self, shown: int, option: mujoco.MjvOption, most: int) -> Iterator[mujoco.MjvGeom]:
-        """The markers and the geoms of the others, each a copy of its own, as many as allowed."""
-        scene = mujoco.MjvScene(self.env.engine.model, maxgeom=most)
+    def geoms(self, scene: mujoco.MjvScene, shown: int, option: mujoco.MjvOption) -> Iterator[mujoco.MjvGeom]:
+        """What `add` draws, each a copy of its own, as many as a scene that is overwritten has room for."""
+        scene.ngeom = 0
         self.add(scene, shown, option)
         for source in scene.geoms[: scene.ngeom]:
             geom = mujoco.MjvGeom()

@@ -56,18 +56,19 @@ def test_the_one_shown_comes_first_and_numbers_wrap_around(env):
 
 
 def test_geoms_for_the_browser_are_copies_that_stay(env):
-    crowd = Crowd(env, 3)
-    first = list(crowd.geoms(0, mujoco.MjvOption(), 1000))
+    crowd, scene = Crowd(env, 3), mujoco.MjvScene(env.engine.model, maxgeom=1000)
+    first = list(crowd.geoms(scene, 0, mujoco.MjvOption()))
     kept = [geom.pos.copy() for geom in first]
     env.step(torch.ones(6, env.layout.action_size))
-    list(crowd.geoms(0, mujoco.MjvOption(), 1000))
+    list(crowd.geoms(scene, 0, mujoco.MjvOption()))
     assert [geom.pos.tolist() for geom in first] == [pos.tolist() for pos in kept]
     assert len(first) > 0
-    assert list(Crowd(env, 1).geoms(0, mujoco.MjvOption(), 1000)) == []
+    assert list(Crowd(env, 1).geoms(scene, 0, mujoco.MjvOption())) == []
 
 
 def test_of_too_many_geoms_as_many_as_allowed_are_drawn(env, monkeypatch):
-    assert len(list(Crowd(env, 6).geoms(0, mujoco.MjvOption(), 4))) <= 4
+    scene = mujoco.MjvScene(env.engine.model, maxgeom=4)
+    assert len(list(Crowd(env, 6).geoms(scene, 0, mujoco.MjvOption()))) <= 4
 
 
 def test_the_camera_stands_back_until_all_are_seen(env):

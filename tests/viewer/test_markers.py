@@ -101,6 +101,7 @@ def coloured(seen, bare, color):
     return np.stack([columns, rows], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_the_goal_of_reach_is_seen_where_it_is(number):
     env = build("reach", 2)
@@ -119,6 +120,7 @@ def test_the_goal_of_reach_is_seen_where_it_is(number):
         assert np.linalg.norm(coloured(seen, bare, color) - tip, axis=1).min() < 2.0, color
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("vx", "vy"), [(0.8, 0.0), (-0.8, 0.0), (0.0, 0.8), (0.5, -0.5)])
 def test_green_points_where_the_velocity_is_asked_and_blue_where_it_is(tmp_path, vx, vy):
     above = "viewer.eye=[-0.05,0.0,3.5]"  # else an arrow's head may hide its tip
@@ -140,6 +142,7 @@ def test_green_points_where_the_velocity_is_asked_and_blue_where_it_is(tmp_path,
         assert np.linalg.norm(found - end, axis=1).min() < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wz", [0.7, -0.7])
 def test_a_point_ahead_shows_how_fast_to_turn(tmp_path, wz):
     env = asking(tmp_path, 1, still=False, walk=VELOCITY)
@@ -168,6 +171,7 @@ def test_a_place_on_the_ground_is_a_ball_with_an_arrow(tmp_path):
     assert float((heading(env.entities["robot"].data.root_quat_w) - term._target[:, 3]).abs().min()) > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "commands",
     [
@@ -185,6 +189,7 @@ def test_nothing_is_drawn_where_nothing_is_asked(tmp_path, commands):
     assert bare.std() > 5
 
 
+@pytest.mark.slow
 def test_a_term_of_ones_own_is_drawn_and_asked_by_pictures_alone(tmp_path):
     env = asking(tmp_path, 2, own={"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9})
     term = env.command_manager.get_term("own")
@@ -198,6 +203,7 @@ def test_a_term_of_ones_own_is_drawn_and_asked_by_pictures_alone(tmp_path):
     assert (np.minimum(magenta[:, 0], magenta[:, 2]) - magenta[:, 1] > 60).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_cameras_that_are_sensors_see_no_markers(tmp_path):
     front = {"kind": "camera", "data": "rgb", "width": 64, "height": 48, "eye": [-2, 0, 0.9], "lookat": [0, 0, 0.9]}
     own = {"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9}
@@ -216,6 +222,7 @@ def test_cameras_that_are_sensors_see_no_markers(tmp_path):
     assert torch.equal(images["asked"][0], images["alone"][0])
 
 
+@pytest.mark.slow
 def test_pictures_change_nothing_of_what_is_simulated(tmp_path):
     commands = {"walk": VELOCITY, "pose": POSE, "place": PLACE}
     lives = {}
@@ -253,6 +260,7 @@ def test_in_a_crowd_each_has_its_own_at_its_place(tmp_path):
     assert np.abs(crowd.offsets()[1:]).max(axis=1).min() > 0.5
 
 
+@pytest.mark.slow
 def test_a_crowds_picture_shows_them_all(tmp_path):
     env = asking(tmp_path, 4, "scene.env_spacing=2", own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
     crowd, counts = Crowd(env, 4), {}
@@ -273,7 +281,8 @@ def test_a_crowds_picture_shows_them_all(tmp_path):
 
 def test_the_browser_gets_them_as_copies(tmp_path):
     env = asking(tmp_path, 2, pose=POSE)
-    found = list(Crowd(env, 1).geoms(1, mujoco.MjvOption(), 1024))
+    scene = mujoco.MjvScene(env.engine.model, maxgeom=1024)
+    found = list(Crowd(env, 1).geoms(scene, 1, mujoco.MjvOption()))
     kinds = [int(geom.type) for geom in found]
     assert kinds.count(int(mujoco.mjtGeom.mjGEOM_SPHERE)) == 1
     assert len(kinds) == 4
@@ -296,6 +305,7 @@ def test_the_window_gets_them_too(tmp_path):
         assert len(shapes(scene)) == scene.ngeom == 4
 
 
+@pytest.mark.slow
 def test_a_film_shows_what_is_asked(tmp_path):
     from PIL import Image
 
