@@ -377,8 +377,7 @@ def picture(task: str) -> None:
         obs = env.reset(seed=env.seed)["policy"]
         for step in range(last + 1):
             if step in wanted:
-                model, data = env.world(0)
-                shown.append(renderer.draw(model, data, env.origins[0].tolist()))
+                shown.append(renderer.picture(env))
             result = env.step(session.act(obs))
             if bool((result.terminated | result.truncated).any()):
                 break

@@ -27,6 +27,7 @@ MODULES = (
     "rlcli.envs.direct",
     "rlcli.envs.articulation",
     "rlcli.envs.step",
+    "rlcli.envs.markers",
     "rlcli.sim.selection",
     "rlcli.sim.rotations",
     "rlcli.rl.trainer",

@@ -301,7 +301,7 @@ class _Camera:
             from rlcli.viewer.video import Renderer
 
             self._renderer = Renderer(self._env.engine.model, self._env.config.viewer)
-        return self._renderer.draw(*self._env.world(0))
+        return self._renderer.picture(self._env)
 
     def close(self) -> None:
         if self._renderer is not None:

@@ -117,8 +117,7 @@ def _filmed(session: Any, begun: Begun, who: int, file: Path) -> tuple[Any, int]
 
         def act(obs: Any) -> Any:
             if int(env.episode_length_buf[who]) % stride == 0:
-                model, data = env.world(who)
-                writer.add(renderer.draw(model, data, env.origins[who].tolist()))
+                writer.add(renderer.picture(env, who))
             return session.act(obs)
 
         last = live_episode(env, act, begun.obs, who)

@@ -182,8 +182,7 @@ def _video(session: Any, file: Path, together: int) -> None:
         def act(obs: Any) -> Any:
             # a picture of the states that the policy acts in, the first one too
             if not ended and int(env.episode_length_buf[0]) % stride == 0:
-                model, data = env.world(0)
-                writer.add(renderer.draw(model, data, env.origins[0].tolist()))
+                writer.add(renderer.picture(env))
             return session.act(obs)
 
         def note_end(step: Any) -> None:

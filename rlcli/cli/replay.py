@@ -168,7 +168,7 @@ def _replay(recording: Any, named: Any, chosen: list[int], video: Path | None) -
 
         def draw(step: int) -> None:
             if shown.begin <= step < shown.begin + shown.length and (step - shown.begin) % stride == 0:
-                writer.add(renderer.draw(*env.world(shown.env)))
+                writer.add(renderer.picture(env, shown.env))
 
         difference = replay(recording, env, chosen, draw)
     return difference, writer.frames

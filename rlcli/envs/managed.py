@@ -14,6 +14,7 @@ from torch import Tensor
 from rlcli.config.schema import ObservationConfig
 from rlcli.config.terms import SELECTORS
 from rlcli.envs.layout import Layout, TermLayout
+from rlcli.envs.markers import Marker
 from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.action import ActionManager, CommandMap
 from rlcli.managers.command import CommandManager
@@ -266,6 +267,10 @@ class ManagedEnv(VecEnv):
             ),
         ]
         return {**parts, **{"term." + ".".join(map(str, t.path)): t for t in terms}}
+
+    def markers(self) -> list[Marker]:
+        """What the commands ask for."""
+        return self.command_manager.markers()
 
     def unsaved(self) -> list[str]:
         """What class terms keep that cannot be saved."""

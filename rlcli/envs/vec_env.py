@@ -21,6 +21,7 @@ from rlcli.config.load import Resolved, resolve
 from rlcli.config.python import source_of
 from rlcli.config.schema import InitialStateConfig, TaskConfig
 from rlcli.envs.layout import Layout
+from rlcli.envs.markers import Marker
 from rlcli.envs.step import Episodes, Lived, StepResult
 from rlcli.errors import DivergedError
 from rlcli.machine import collect_as_usual, require_device
@@ -288,6 +289,10 @@ class VecEnv(ABC):
     def world(self, env: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """One environment as MuJoCo's own structures."""
         return self.engine.world(env)
+
+    def markers(self) -> list[Marker]:
+        """What is drawn beside the bodies, as things are; a viewer asks, no step does."""
+        return []
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copies of everything that the next steps depend on, at a step boundary."""

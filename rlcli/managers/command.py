@@ -12,12 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rlcli.envs.markers import Arrow, Frame, Marker, Sphere
 from rlcli.errors import UsageError, did_you_mean, listing
 from rlcli.managers.live import LiveValues
 from rlcli.managers.term import BoundTerm, resets
 from rlcli.sim.selection import Selection
 
 Select = Callable[[Tensor], Selection | None]
+_COLUMNS = {"start": 3, "end": 3, "center": 3, "position": 3, "quat": 4}
+"""Of what a marker says in every environment."""
 
 
 class CommandTerm(Protocol):
@@ -27,6 +30,11 @@ class CommandTerm(Protocol):
     over an episode are logged. And `reset(selection)`, `state_dict`, `load_state_dict` for what else it carries;
     `elements`, names of the columns of `command` that a person may set ("" for the others), and `limits`, the [low,
     high] that they usually have.
+
+    A method `markers() -> list[Marker]` gives what is asked as arrows, spheres and frames (`rlcli.envs.markers`), with
+    places in the world as `entity.data.root_pos_w` is, (num_envs, 3) [m], and orientations (w, x, y, z), (num_envs, 4).
+    It is called once a picture, never in a step. It changes nothing. It reads the state of roots and joints, and beyond
+    that only what `metrics` or `update` reads too: the engine computes other fields from the first look at them on.
     """
 
     command: Tensor
@@ -117,6 +125,20 @@ class CommandManager:
         else:
             self.held[knob.name], self._holds[knob.name] = value, knob
 
+    def markers(self) -> list[Marker]:
+        """What the terms ask for, to be drawn.
+
+        Raises:
+            ConfigError: for what is no marker of every environment.
+        """
+        found: list[Marker] = []
+        for term in self.terms:
+            given = list(term.instance.markers()) if hasattr(term.instance, "markers") else []
+            for marker in given:
+                _require_rows(term, marker, len(self._steps))
+            found += given
+        return found
+
     def get_command(self, name: str) -> Tensor:
         """The command of a term. (num_envs, k)"""
         return self._by_name[name].instance.command
@@ -190,6 +212,17 @@ class CommandManager:
         steps = drawn.uniform(low, high).double() / self._step_dt
         selection.write(self._steps_left[number], (steps * (1.0 - 1e-6)).ceil_().long())
         term.instance.resample(drawn)
+
+
+def _require_rows(term: BoundTerm, marker: Marker, num_envs: int) -> None:
+    if not isinstance(marker, Arrow | Sphere | Frame):
+        raise term.error(f"markers() gave a {type(marker).__name__}, expected an Arrow, a Sphere or a Frame")
+    for name, value in marker._asdict().items():
+        expected = (num_envs, _COLUMNS.get(name, 0))
+        if name in _COLUMNS and (not isinstance(value, Tensor) or value.shape != expected):
+            found = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+            what = f"{type(marker).__name__}.{name}"
+            raise term.error(f"markers() gave {what} {found}, expected a tensor of shape {expected}")
 
 
 # Two streams: an episode's first command is drawn by the episode's number, the later ones by the step's.

@@ -7,12 +7,16 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rlcli.sim.rotations import atan2, from_euler, heading, multiply, rotate, unique, wrap_to_pi
+from rlcli.envs.markers import ACTUAL, ASKED, Arrow, Color, Frame, Marker, Sphere
+from rlcli.sim.rotations import atan2, from_euler, heading, multiply, rotate, unique, wrap_to_pi, yaw_only
 from rlcli.sim.selection import Selection, one_column
 from rlcli.task import Bodies, Entity, Range
 
 if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
+
+_ARM = 0.5
+"""How far ahead of the root the point is that shows how it turns [m]."""
 
 
 class NullCommand:
@@ -72,6 +76,25 @@ class _VelocityCommand:
             "error_vel_xy": (dx.square() + dy.square()).sqrt(),
             "error_vel_yaw": (self.command[:, 2] - data.root_ang_vel_b[:, 2]).abs(),
         }
+
+    def markers(self) -> list[Marker]:
+        """Above the root, green what is asked, blue what is: its way in a second, and that of its nose in turning."""
+        data = self._entity.data
+        actual = torch.cat([data.root_lin_vel_b[:, :2], data.root_ang_vel_b[:, 2:]], dim=1)
+        return [*self._arrows(self.command, ASKED, 0.5), *self._arrows(actual, ACTUAL, 0.45)]
+
+    def _arrows(self, velocity: Tensor, color: Color, height: float) -> list[Marker]:
+        """Arrows of a velocity (vx, vy, wz), so much above the root [m]."""
+        data = self._entity.data
+        vx, vy, wz = velocity.unbind(1)
+        zero = torch.zeros_like(vx)
+
+        def in_world(x: Tensor, y: Tensor) -> Tensor:
+            return rotate(data.root_quat_w, torch.stack([x, y, zero], dim=1))
+
+        above = data.root_pos_w + torch.tensor([0.0, 0.0, height], device=velocity.device)
+        ahead = above + in_world(zero + _ARM, zero)
+        return [Arrow(above, above + in_world(vx, vy), color), Arrow(ahead, ahead + in_world(zero, wz * _ARM), color)]
 
     def state_dict(self) -> dict[str, Tensor]:
         """What was drawn."""
@@ -223,6 +246,11 @@ class UniformPose:
             "orientation_error": 2.0 * torch.acos(cosine),
         }
 
+    def markers(self) -> list[Marker]:
+        """A green sphere with the axes of the pose."""
+        position, quat = self.pose_w
+        return [Sphere(position), Frame(position, quat)]
+
 
 class UniformPose2d:
     """A place and a heading on the ground, relative to where an environment starts. (num_envs, 4)
@@ -269,6 +297,14 @@ class UniformPose2d:
         """Horizontal distance [m] and turn [rad] that are left. (num_envs,) each"""
         x, y, _, turn = self.command.unbind(1)
         return {"error_pos_2d": (x.square() + y.square()).sqrt(), "error_heading": turn.abs()}
+
+    def markers(self) -> list[Marker]:
+        """A green sphere at the place, with an arrow towards the heading."""
+        upright = yaw_only(self._entity.data.root_quat_w)
+        place = self._entity.data.root_pos_w + rotate(upright, self.command[:, :3])
+        turn = self.command[:, 3]
+        towards = torch.stack([torch.cos(turn), torch.sin(turn), torch.zeros_like(turn)], dim=1)
+        return [Sphere(place, radius=0.05), Arrow(place, place + rotate(upright, 0.5 * towards))]
 
     def state_dict(self) -> dict[str, Tensor]:
         """The place and the heading."""

@@ -40,8 +40,7 @@ def film(
         obs = env.reset(seed=env.seed)["policy"]
         for number in range(steps):
             if number % stride == 0:
-                model, data = env.world(0)
-                writer.add(renderer.draw(model, data, env.origins[0].tolist()))
+                writer.add(renderer.picture(env))
             with torch.no_grad():
                 step = env.step(act(obs))
             obs = step.obs["policy"]

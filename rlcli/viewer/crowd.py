@@ -1,4 +1,4 @@
-"""Several environments in one picture: the others stand beside the one shown, on the grid of `env_spacing`."""
+"""What is drawn beside the environment shown: the others, on the grid of `env_spacing`, and the markers of all."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlcli.envs.vec_env import VecEnv, grid
+from rlcli.viewer.markers import add_markers
 
 _GROUND = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 _MOVING = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
@@ -52,7 +53,8 @@ class Crowd:
         return camera
 
     def add(self, scene: mujoco.MjvScene, shown: int, option: mujoco.MjvOption) -> None:
-        """Append the others to a scene that holds the one shown; the ground is there already."""
+        """Append the others, and the markers of all, to a scene that holds the one shown and with it the ground."""
+        add_markers(scene, self.env.markers(), [shown, *self.others(shown)], self.offsets())
         category = _MOVING if self.env.terrain is not None else _MOVING | _FIXED
         for number, offset in zip(self.others(shown), self.offsets()[1:], strict=True):
             model, data = self.env.world(number)
@@ -66,11 +68,9 @@ class Crowd:
                 else:
                     geom.pos[:] += offset
 
-    def geoms(self, shown: int, option: mujoco.MjvOption, most: int) -> Iterator[mujoco.MjvGeom]:
-        """The geoms of the others, each a copy of its own, as many as allowed."""
-        if self.count == 1:
-            return
-        scene = mujoco.MjvScene(self.env.engine.model, maxgeom=most)
+    def geoms(self, scene: mujoco.MjvScene, shown: int, option: mujoco.MjvOption) -> Iterator[mujoco.MjvGeom]:
+        """What `add` draws, each a copy of its own, as many as a scene that is overwritten has room for."""
+        scene.ngeom = 0
         self.add(scene, shown, option)
         for source in scene.geoms[: scene.ngeom]:
             geom = mujoco.MjvGeom()

@@ -154,8 +154,7 @@ def _draw(window: Any, player: Player, crowd: Crowd, model: mujoco.MjModel, data
     with window.lock():
         mujoco.mj_copyData(data, model, now)
         window.user_scn.ngeom = 0
-        if crowd.count > 1:
-            crowd.add(window.user_scn, player.shown, window.opt)
+        crowd.add(window.user_scn, player.shown, window.opt)
     names, values = captions(player.view)
     window.set_texts((mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos.mjGRID_TOPLEFT, names, values))
     window.sync()

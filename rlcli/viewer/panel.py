@@ -36,7 +36,7 @@ class Panel(plugin.ViewerPlugin):
 
     def __init__(self, player: Player, title: str, camera: mujoco.MjvCamera, places: np.ndarray) -> None:
         self.ghosts: Sequence[mujoco.MjvGeom] = ()
-        """Geoms of further environments, set by the simulation's thread."""
+        """Markers, and geoms of further environments, set by the simulation's thread."""
         self._player, self._title, self._begin, self._places = player, title, camera, places
         self._shown = player.view.shown
         self._ux = ux.UxState()

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlcli.config.schema import ViewerConfig
+from rlcli.envs.vec_env import VecEnv
 from rlcli.sim.gl import open_context
 from rlcli.viewer.crowd import Crowd
 
@@ -41,28 +42,35 @@ class Renderer:
     """
 
     def __init__(self, model: mujoco.MjModel, viewer: ViewerConfig, crowd: Crowd | None = None) -> None:
-        self._crowd = crowd if crowd is not None and crowd.count > 1 else None
+        self._crowd = crowd
         self._width, self._height = viewer.width, viewer.height
         self._context, self.backend = open_context(viewer.width, viewer.height)
-        count = 1 if self._crowd is None else self._crowd.count
+        count = 1 if crowd is None else crowd.count
         self._scene = mujoco.MjvScene(model, maxgeom=10_000 + (count - 1) * (model.ngeom + model.nsite))
         self._option = mujoco.MjvOption()
         self._camera = free_camera(viewer)
-        if self._crowd is not None:
-            self._crowd.stand_back(self._camera)
+        if crowd is not None:
+            crowd.stand_back(self._camera)
         self._lookat = self._camera.lookat.copy()
         self._followed = _root(model, viewer.follow)
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
         self._rect = mujoco.MjrRect(0, 0, viewer.width, viewer.height)
 
-    def draw(
-        self, model: mujoco.MjModel, data: mujoco.MjData, origin: Sequence[float] = (0.0, 0.0, 0.0)
-    ) -> NDArray[np.uint8]:
-        """A picture of a forwarded state, of an environment whose origin is there. (height, width, 3)
+    def picture(self, env: VecEnv, number: int = 0) -> NDArray[np.uint8]:
+        """An environment as it is, with the rest of the crowd and with what its commands ask for. (height, width, 3)"""
+        self._compose(*env.world(number), env.origins[number].tolist())
+        crowd = Crowd(env, 1) if self._crowd is None else self._crowd
+        crowd.add(self._scene, number, self._option)
+        return self._pixels()
 
-        With a crowd it is environment 0.
-        """
+    def draw(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
+        """A forwarded state, and nothing else. (height, width, 3)"""
+        self._compose(model, data, (0.0, 0.0, 0.0))
+        return self._pixels()
+
+    def _compose(self, model: mujoco.MjModel, data: mujoco.MjData, origin: Sequence[float]) -> None:
+        """Put a state into the scene, and the camera before the environment whose origin is there."""
         self._camera.lookat[:] = np.add(self._lookat, origin)
         away = np.zeros(3)
         if self._followed is not None:
@@ -74,8 +82,8 @@ class Renderer:
         for light in self._scene.lights[: self._scene.nlight]:
             if light.type == _PARALLEL:  # its place is where shadows are drawn
                 light.pos[:2] += away[:2]
-        if self._crowd is not None:
-            self._crowd.add(self._scene, 0, self._option)
+
+    def _pixels(self) -> NDArray[np.uint8]:
         mujoco.mjr_render(self._rect, self._scene, self._mjr)
         pixels = np.empty((self._height, self._width, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, self._rect, self._mjr)

@@ -86,6 +86,7 @@ class _Stage:
         camera = self.crowd.stand_back(free_camera(env.config.viewer))
         self.panel = Panel(player, title, camera, env.origins.double().cpu().numpy())
         self._shown = player.shown
+        self._beside = mujoco.MjvScene(env.engine.model, maxgeom=studio.state_payload.MAX_EXTRA_GEOMS)
         model = copy.deepcopy(env.world(player.shown)[0])
         config = studio.viewer_protocol.ViewerConfig(title="rlcli", gfx="web", http_port=0)
         self._thread = threading.Thread(target=self._watch, args=(config, model), name="viewer", daemon=True)
@@ -124,8 +125,7 @@ class _Stage:
         state = np.empty(mujoco.mj_stateSize(model, kind))
         mujoco.mj_getState(model, data, state, kind)
         self._near.send_to_viewer(self._studio.messages.StateSnapshot(state=state, state_sig=kind))
-        most = self._studio.state_payload.MAX_EXTRA_GEOMS
-        self.panel.ghosts = list(self.crowd.geoms(self.player.shown, mujoco.MjvOption(), most))
+        self.panel.ghosts = list(self.crowd.geoms(self._beside, self.player.shown, mujoco.MjvOption()))
 
     def close(self) -> None:
         """End the viewer; its server is gone when this returns."""

@@ -93,6 +93,7 @@ def test_the_scenes_of_the_page_build_and_run(number, tmp_path):
 def test_the_sections_on_what_is_seen_asked_driven_and_changed_work_together(tmp_path):
     found = blocks(DOCS / "write-a-task.md", "## What the policy sees", "## Check it")
     parts = [yaml.safe_load(block.text) for block in found if block.language == "yaml"]
+    (terms,) = [block.text for block in found if block.language == "python"]
     assert [list(part) for part in parts] == [
         ["observations"],
         ["commands", "observations", "rewards"],
@@ -106,7 +107,9 @@ def test_the_sections_on_what_is_seen_asked_driven_and_changed_work_together(tmp
         task = merged(task, part)
     task["curriculum"]["smooth"] |= {"begin": 0, "end": 10}
     task["scene"]["entities"]["robot"]["joints"] = {}
-    env = build(write(tmp_path / "task", yaml.safe_dump(task, sort_keys=False), critter_xml=CRITTER), 3)
+    task["commands"]["high"] = {"func": "root_height", "resampling_time_s": [9, 9], "height": [0.4, 0.5]}
+    folder = write(tmp_path / "task", yaml.safe_dump(task, sort_keys=False), critter_xml=CRITTER, terms_py=terms)
+    env = build(folder, 3)
     obs = env.reset()
     assert obs["policy"].shape == (3, 3 + 3 + 3 * 4 + 4 + 4 + 3 + 3)
     assert obs["critic"].shape == (3, 3 + 4)
@@ -114,6 +117,7 @@ def test_the_sections_on_what_is_seen_asked_driven_and_changed_work_together(tmp
         step = env.step(torch.zeros(3, 4))
     assert step.obs["policy"].isfinite().all()
     assert env.extras()["Curriculum/smooth"] == pytest.approx(-0.1)
+    assert torch.equal(env.markers()[-1].center[:, 2], env.command_manager.get_command("high")[:, 0])
     assert [actuator.joints for actuator in env.entities["robot"].actuators] == [[0, 1], [2, 3]]
 
 

@@ -56,18 +56,19 @@ def test_the_one_shown_comes_first_and_numbers_wrap_around(env):
 
 
 def test_geoms_for_the_browser_are_copies_that_stay(env):
-    crowd = Crowd(env, 3)
-    first = list(crowd.geoms(0, mujoco.MjvOption(), 1000))
+    crowd, scene = Crowd(env, 3), mujoco.MjvScene(env.engine.model, maxgeom=1000)
+    first = list(crowd.geoms(scene, 0, mujoco.MjvOption()))
     kept = [geom.pos.copy() for geom in first]
     env.step(torch.ones(6, env.layout.action_size))
-    list(crowd.geoms(0, mujoco.MjvOption(), 1000))
+    list(crowd.geoms(scene, 0, mujoco.MjvOption()))
     assert [geom.pos.tolist() for geom in first] == [pos.tolist() for pos in kept]
     assert len(first) > 0
-    assert list(Crowd(env, 1).geoms(0, mujoco.MjvOption(), 1000)) == []
+    assert list(Crowd(env, 1).geoms(scene, 0, mujoco.MjvOption())) == []
 
 
 def test_of_too_many_geoms_as_many_as_allowed_are_drawn(env, monkeypatch):
-    assert len(list(Crowd(env, 6).geoms(0, mujoco.MjvOption(), 4))) <= 4
+    scene = mujoco.MjvScene(env.engine.model, maxgeom=4)
+    assert len(list(Crowd(env, 6).geoms(scene, 0, mujoco.MjvOption()))) <= 4
 
 
 def test_the_camera_stands_back_until_all_are_seen(env):
@@ -109,7 +110,7 @@ def test_four_poles_are_in_the_picture(env, monkeypatch):
     pictures = {}
     for count in (1, 4):
         with Renderer(env.engine.model, env.config.viewer, Crowd(env, count)) as renderer:
-            pictures[count] = renderer.draw(*env.world(0)).astype(int)
+            pictures[count] = renderer.picture(env).astype(int)
     blue = {count: (seen[..., 2] - seen[..., 0] > 60) & (seen[..., 1] < 120) for count, seen in pictures.items()}
     columns = {count: np.flatnonzero(found[120:].any(axis=0)) for count, found in blue.items()}
     groups = {count: 1 + int((np.diff(found) > 20).sum()) for count, found in columns.items()}

@@ -1,0 +1,341 @@
+"""What commands ask for, in pictures: where it is drawn, in which colour, and where it is not."""
+
+from contextlib import nullcontext
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import yaml
+from worlds import CRITTER_TASK, build, critter, dump, run
+
+from rlcli.envs.markers import ACTUAL, ASKED, Arrow, Frame, Sphere
+from rlcli.errors import ConfigError
+from rlcli.rl.rollout import zero_policy
+from rlcli.sim.rotations import heading, rotate
+from rlcli.viewer import native
+from rlcli.viewer.clip import film
+from rlcli.viewer.crowd import Crowd
+from rlcli.viewer.markers import add_markers
+from rlcli.viewer.player import Player
+from rlcli.viewer.video import Renderer
+
+VIEWER = {"eye": [-1.8, -1.0, 2.2], "lookat": [0.0, 0.0, 0.5], "width": 480, "height": 360}
+VELOCITY = {"func": "uniform_velocity", "resampling_time_s": [9, 9], "lin_vel_x": [-1, 1], "ang_vel_z": [-1, 1]}
+POSE = {"func": "uniform_pose", "resampling_time_s": [9, 9], "bodies": "torso", "x": [0.2, 0.4], "y": [-0.3, 0.3],
+        "z": [0.3, 0.5], "pitch": [-1.0, 1.0]}  # fmt: skip
+PLACE = {"func": "uniform_pose2d", "resampling_time_s": [9, 9], "x": [-1, 1], "y": [-1, 1]}
+OWN = """
+import torch
+from rlcli.envs.markers import Arrow, Frame, Sphere
+
+class Beacon:
+    \"\"\"A ball at so high a place, and nothing in environment 0.\"\"\"
+
+    def __init__(self, env, *, height: float):
+        self.command, self.calls = torch.full((env.num_envs, 1), height), 0
+
+    def resample(self, selection):
+        pass
+
+    def update(self):
+        pass
+
+    def markers(self):
+        self.calls += 1
+        center = torch.zeros(len(self.command), 3)
+        center[:, 2] = self.command[:, 0]
+        center[0] = torch.nan
+        return [Sphere(center, (1.0, 0.0, 1.0, 1.0), 0.15)]
+
+class Given(Beacon):
+    \"\"\"Markers that a test puts there.\"\"\"
+
+    def markers(self):
+        return self.given
+"""
+
+
+@pytest.fixture(autouse=True)
+def _headless(monkeypatch):
+    for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def asking(folder, num_envs=2, *overrides, still=True, sensors=None, **commands):
+    """Critters that are asked for something; unless still, they begin anywhere and move."""
+    task = yaml.safe_load(CRITTER_TASK) | {"commands": commands, "viewer": VIEWER}
+    task["scene"]["sensors"] = sensors or {}
+    if still:
+        task["events"] = {}
+    env = build(critter(folder, dump(task), terms_py=OWN), num_envs, *overrides)
+    env.reset(seed=1)
+    return env
+
+
+def pictures(env, number=0):
+    """With what is asked, and without."""
+    with Renderer(env.engine.model, env.config.viewer) as renderer:
+        return renderer.picture(env, number).astype(int), renderer.draw(*env.world(number)).astype(int)
+
+
+def pixel(env, place):
+    """Column and row at which a place of the world is seen."""
+    viewer = env.config.viewer
+    eye, ahead = np.array(viewer.eye), np.subtract(viewer.lookat, viewer.eye)
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    away = np.asarray(place, dtype=float) - eye
+    focal = viewer.height / 2 / np.tan(np.radians(env.engine.model.vis.global_.fovy) / 2)
+    x, y = (away @ axis / (away @ ahead) for axis in (right, np.cross(right, ahead)))
+    return np.array([viewer.width / 2 + focal * x, viewer.height / 2 - focal * y])
+
+
+def coloured(seen, bare, color):
+    """Columns and rows of what has been added in a colour. (n, 2)"""
+    channel = int(np.argmax(color[:3]))
+    rest = np.delete(seen, channel, axis=2).max(axis=2)
+    rows, columns = np.nonzero((seen != bare).any(axis=2) & (seen[..., channel] - rest > 60))
+    return np.stack([columns, rows], axis=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [0, 1])
+def test_the_goal_of_reach_is_seen_where_it_is(number):
+    env = build("reach", 2)
+    env.reset(seed=3)
+    seen, bare = pictures(env, number)
+    position, quat = (value[number] for value in env.command_manager.get_term("ee_pose").pose_w)
+    center = pixel(env, position)
+    rows, columns = np.nonzero((seen != bare).any(axis=2))
+    away = np.hypot(columns - center[0], rows - center[1])
+    assert len(away) > 150
+    assert away.max() < 40  # axes of 0.1 m
+    ball = coloured(seen, bare, ASKED)
+    assert (np.linalg.norm(ball - center, axis=1) < 6).sum() > 50
+    for color, axis in zip(np.eye(3), torch.eye(3), strict=True):
+        tip = pixel(env, position + 0.09 * rotate(quat, axis))
+        assert np.linalg.norm(coloured(seen, bare, color) - tip, axis=1).min() < 2.0, color
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("vx", "vy"), [(0.8, 0.0), (-0.8, 0.0), (0.0, 0.8), (0.5, -0.5)])
+def test_green_points_where_the_velocity_is_asked_and_blue_where_it_is(tmp_path, vx, vy):
+    above = "viewer.eye=[-0.05,0.0,3.5]"  # else an arrow's head may hide its tip
+    env = asking(tmp_path, 1, above, still=False, walk=VELOCITY)
+    for name, value in {"vx": vx, "vy": vy, "wz": 0.0}.items():
+        env.command_manager.hold(name, value)
+    env.step(torch.zeros(1, 4))
+    seen, bare = pictures(env)
+    data = env.entities["robot"].data
+    root = data.root_pos_w[0]
+    asked = rotate(data.root_quat_w, torch.tensor([[vx, vy, 0.0]]))[0]
+    actual = rotate(data.root_quat_w, data.root_lin_vel_b * torch.tensor([1.0, 1.0, 0.0]))[0]
+    for color, velocity, height in ((ASKED, asked, 0.5), (ACTUAL, actual, 0.45)):
+        start = root + torch.tensor([0.0, 0.0, height])
+        begin, end = pixel(env, start), pixel(env, start + velocity)
+        found = coloured(seen, bare, color)
+        along = (found - begin) @ (end - begin) / np.linalg.norm(end - begin)
+        assert along.max() == pytest.approx(np.linalg.norm(end - begin), abs=4.0)
+        assert np.linalg.norm(found - end, axis=1).min() < 4.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wz", [0.7, -0.7])
+def test_a_point_ahead_shows_how_fast_to_turn(tmp_path, wz):
+    env = asking(tmp_path, 1, still=False, walk=VELOCITY)
+    for name, value in {"vx": 0.0, "vy": 0.0, "wz": wz}.items():
+        env.command_manager.hold(name, value)
+    env.step(torch.zeros(1, 4))
+    still, turns = [marker for marker in env.markers() if marker.color == ASKED]
+    assert torch.equal(still.start, still.end)
+    data = env.entities["robot"].data
+    ahead, aside = (rotate(data.root_quat_w, torch.tensor([way])) for way in ([0.5, 0.0, 0.0], [0.0, 0.5 * wz, 0.0]))
+    torch.testing.assert_close(turns.start, still.start + ahead)
+    torch.testing.assert_close(turns.end, turns.start + aside)
+    seen, bare = pictures(env)
+    assert len(coloured(seen, bare, ASKED)) > 20
+
+
+def test_a_place_on_the_ground_is_a_ball_with_an_arrow(tmp_path):
+    env = asking(tmp_path, 3, still=False, place=PLACE)
+    run(env, 3, reset=False)
+    ball, arrow = env.markers()
+    term = env.command_manager.get_term("place")
+    torch.testing.assert_close(ball.center, term._target[:, :3])
+    way = arrow.end - arrow.start
+    torch.testing.assert_close(torch.atan2(way[:, 1], way[:, 0]), term._target[:, 3])
+    torch.testing.assert_close(way.norm(dim=1), torch.full((3,), 0.5))
+    assert float((heading(env.entities["robot"].data.root_quat_w) - term._target[:, 3]).abs().min()) > 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "commands",
+    [
+        {},
+        {"nothing": {"func": "null_command", "resampling_time_s": [9, 9]}},
+        {"stand": VELOCITY | {"lin_vel_x": [0, 0], "ang_vel_z": [0, 0]}},
+        {"own": {"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9}},
+    ],
+    ids=["no command", "a command without markers", "no velocity, asked or actual", "not finite"],
+)
+def test_nothing_is_drawn_where_nothing_is_asked(tmp_path, commands):
+    env = asking(tmp_path, 2, **commands)
+    seen, bare = pictures(env)
+    np.testing.assert_array_equal(seen, bare)
+    assert bare.std() > 5
+
+
+@pytest.mark.slow
+def test_a_term_of_ones_own_is_drawn_and_asked_by_pictures_alone(tmp_path):
+    env = asking(tmp_path, 2, own={"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9})
+    term = env.command_manager.get_term("own")
+    run(env, 3)
+    assert term.calls == 0
+    seen, bare = pictures(env, 1)
+    assert term.calls == 1
+    rows, columns = np.nonzero((seen != bare).any(axis=2))
+    assert [columns.mean(), rows.mean()] == pytest.approx(pixel(env, [0.0, 0.0, 0.9]), abs=2.0)
+    magenta = seen[rows, columns]
+    assert (np.minimum(magenta[:, 0], magenta[:, 2]) - magenta[:, 1] > 60).mean() > 0.9
+
+
+@pytest.mark.slow
+def test_cameras_that_are_sensors_see_no_markers(tmp_path):
+    front = {"kind": "camera", "data": "rgb", "width": 64, "height": 48, "eye": [-2, 0, 0.9], "lookat": [0, 0, 0.9]}
+    own = {"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9}
+    images = {}
+    for name, commands in {"asked": {"own": own}, "alone": {}}.items():
+        env = asking(tmp_path / name, 2, sensors={"front": front}, **commands)
+        seen, bare = pictures(env, 1)
+        before = env.sensors["front"].image.clone()
+        env.sensors["front"].update(0.0)
+        pictures(env, 1)
+        assert torch.equal(env.sensors["front"].image, before)
+        images[name] = before, (seen != bare).any()
+        env.close()
+    assert images["asked"][1]
+    assert not images["alone"][1]
+    assert torch.equal(images["asked"][0], images["alone"][0])
+
+
+@pytest.mark.slow
+def test_pictures_change_nothing_of_what_is_simulated(tmp_path):
+    commands = {"walk": VELOCITY, "pose": POSE, "place": PLACE}
+    lives = {}
+    for drawn in (False, True):
+        env = asking(tmp_path / str(drawn), 3, still=False, **commands)
+        results = []
+        with Renderer(env.engine.model, env.config.viewer, Crowd(env, 3)) if drawn else nullcontext() as renderer:
+            for _ in range(20):
+                if drawn:
+                    renderer.picture(env)
+                results += run(env, 2, reset=False)
+        state = env.state_dict()
+        lives[drawn] = [*(value for result in results for value in (*result.obs.values(), result.reward)), state]
+    states = [lives[drawn].pop() for drawn in (False, True)]
+    assert all(torch.equal(one, other) for one, other in zip(*lives.values(), strict=True))
+    assert states[0].keys() == states[1].keys()
+    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
+
+
+def shapes(scene):
+    """Kind and place of every marker of a scene."""
+    decor = [geom for geom in scene.geoms[: scene.ngeom] if geom.category == mujoco.mjtCatBit.mjCAT_DECOR]
+    return [(int(geom.type), geom.pos.copy()) for geom in decor]
+
+
+def test_in_a_crowd_each_has_its_own_at_its_place(tmp_path):
+    env = asking(tmp_path, 5, still=False, pose=POSE)
+    scene = mujoco.MjvScene(env.engine.model, maxgeom=1000)
+    crowd = Crowd(env, 3)
+    crowd.add(scene, 3, mujoco.MjvOption())
+    centers = env.command_manager.get_term("pose").pose_w[0][[3, 4, 0]].double().numpy() + crowd.offsets()
+    balls = [place for kind, place in shapes(scene) if kind == mujoco.mjtGeom.mjGEOM_SPHERE]
+    np.testing.assert_allclose(balls, centers, atol=1e-5)
+    assert len(shapes(scene)) == 3 * 4
+    assert np.abs(crowd.offsets()[1:]).max(axis=1).min() > 0.5
+
+
+@pytest.mark.slow
+def test_a_crowds_picture_shows_them_all(tmp_path):
+    env = asking(tmp_path, 4, "scene.env_spacing=2", own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
+    crowd, counts = Crowd(env, 4), {}
+    env.command_manager.get_term("own").given = []
+    with Renderer(env.engine.model, env.config.viewer, crowd) as renderer:
+        bare = renderer.picture(env).astype(int)
+        env.command_manager.get_term("own").given = [Sphere(torch.tensor([[0.0, 0.0, 1.0]] * 4), radius=0.1)]
+        seen = renderer.picture(env).astype(int)
+    rows, columns = np.nonzero((seen != bare).any(axis=2))
+    labels = np.zeros(len(rows), int)
+    for index in range(len(rows)):  # each pixel to the first found within a ball's width of it
+        near = np.hypot(rows[:index] - rows[index], columns[:index] - columns[index]) < 25
+        labels[index] = labels[:index][near][0] if near.any() else labels[:index].max(initial=0) + 1
+        counts[labels[index]] = counts.get(labels[index], 0) + 1
+    assert len(counts) == 4
+    assert min(counts.values()) > 20
+
+
+def test_the_browser_gets_them_as_copies(tmp_path):
+    env = asking(tmp_path, 2, pose=POSE)
+    scene = mujoco.MjvScene(env.engine.model, maxgeom=1024)
+    found = list(Crowd(env, 1).geoms(scene, 1, mujoco.MjvOption()))
+    kinds = [int(geom.type) for geom in found]
+    assert kinds.count(int(mujoco.mjtGeom.mjGEOM_SPHERE)) == 1
+    assert len(kinds) == 4
+    assert found[0].pos == pytest.approx(env.command_manager.get_term("pose").pose_w[0][1].numpy())
+    assert found[0].rgba == pytest.approx(ASKED)
+    assert {int(geom.objid) for geom in found} == {-1}  # of no body
+    assert {geom.castshadow for geom in found} == {0}
+
+
+def test_the_window_gets_them_too(tmp_path):
+    env = asking(tmp_path, 2, pose=POSE)
+    player = Player(env, zero_policy(env))
+    model, _ = env.world(0)
+    scene = mujoco.MjvScene(model, maxgeom=100)
+    window = SimpleNamespace(
+        lock=nullcontext, user_scn=scene, opt=mujoco.MjvOption(), set_texts=lambda *_: None, sync=lambda: None
+    )
+    for _ in range(2):  # anew in each frame, not more and more
+        native._draw(window, player, Crowd(env, 1), model, mujoco.MjData(model))
+        assert len(shapes(scene)) == scene.ngeom == 4
+
+
+@pytest.mark.slow
+def test_a_film_shows_what_is_asked(tmp_path):
+    from PIL import Image
+
+    env = asking(tmp_path, 1, pose=POSE)
+    film(env, zero_policy(env), tmp_path / "x.gif", longest_s=0.1)
+    with Image.open(tmp_path / "x.gif") as image:
+        last = np.asarray(image.convert("RGB")).astype(int)
+    assert ((last[..., 1] - np.maximum(last[..., 0], last[..., 2])) > 60).sum() > 20
+
+
+def test_of_more_than_a_scene_holds_as_many_as_it_holds_are_drawn(tmp_path):
+    env = asking(tmp_path, 4, pose=POSE)
+    scene = mujoco.MjvScene(env.engine.model, maxgeom=6)
+    add_markers(scene, env.markers(), range(4), np.zeros((4, 3)))
+    assert scene.ngeom == 6
+
+
+WRONG = {
+    "gave a dict, expected an Arrow, a Sphere or a Frame": lambda n: {},
+    r"gave Sphere.center of shape \(3,\), expected a tensor of shape \(4, 3\)": lambda n: Sphere(torch.zeros(3)),
+    r"gave Arrow.end a list, expected a tensor of shape \(4, 3\)": lambda n: Arrow(torch.zeros(n, 3), [0, 0, 1]),
+    r"gave Frame.quat of shape \(4, 3\), expected a tensor of shape \(4, 4\)": lambda n: Frame(
+        torch.zeros(n, 3), torch.zeros(n, 3)
+    ),
+}
+
+
+@pytest.mark.parametrize("said", WRONG)
+def test_what_is_no_marker_of_every_environment_is_refused_by_the_terms_name(tmp_path, said):
+    env = asking(tmp_path, 4, own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
+    env.command_manager.get_term("own").given = [WRONG[said](4)]
+    with pytest.raises(ConfigError, match=f"commands.own: markers\\(\\) {said}"):
+        env.markers()
