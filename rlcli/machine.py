@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import gc
-import importlib.util
 import os
 import stat
-import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -103,30 +99,11 @@ def resident(report: Path = Path("/proc/self/statm")) -> int | None:
 
 
 def wait_calmly() -> None:
-    """Threads of OpenMP spin briefly while they wait, unless somebody said how long; before torch is loaded.
+    """Threads of OpenMP spin briefly while they wait, unless somebody said how long; before torch is imported.
 
     On a busy machine libgomp's long spinning makes an update ten times slower.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-
-
-def load_torch_ahead() -> None:
-    """Begin to load torch's libraries beside whatever is imported before torch; for a process of our own that starts.
-
-    An import holds up all other threads until it ends; a C function called through ctypes does not, and these libraries
-    hold no Python. The process does not end before they are loaded. Where it fails, torch says why when it is imported.
-    """
-    if "torch" in sys.modules or sys.platform != "linux":
-        return
-    with contextlib.suppress(ImportError, OSError, RuntimeError, ValueError):
-        import ctypes
-
-        torch = importlib.util.find_spec("torch")
-        if torch is not None and torch.origin is not None:
-            load = ctypes.CDLL(None).dlopen
-            load.argtypes, load.restype = (ctypes.c_char_p, ctypes.c_int), ctypes.c_void_p
-            library = os.fsencode(Path(torch.origin).parent / "lib" / "libtorch.so")
-            threading.Thread(target=load, args=(library, os.RTLD_LAZY), name="torch").start()
 
 
 _SELDOM = (100_000, 10, 10)

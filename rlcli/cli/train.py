@@ -99,7 +99,7 @@ def command(
     from rlcli.cli.jobs import agree, created, fitting_device, process_device, require_parallel, resumed
     from rlcli.config.load import resolve
     from rlcli.errors import Stopped, UsageError
-    from rlcli.machine import load_torch_ahead, wait_calmly
+    from rlcli.machine import wait_calmly
     from rlcli.rl import distributed
     from rlcli.rl.run import default_runs_dir
     from rlcli.rl.stop import StopRequest
@@ -137,8 +137,6 @@ def command(
                 flags={**flags(scene__num_envs=num_envs), **budget},
             )
         tell_notes(resolved)
-        if console.owns_process:
-            load_torch_ahead()
         require_parallel(resolved, gpus or 1)
         device = fitting_device(resolved, device, wanted)
     if gpus is not None and gpus > 1 and not distributed.launched():
