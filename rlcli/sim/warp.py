@@ -23,8 +23,8 @@ from torch import Tensor
 from rlcli.errors import ConfigError, DeviceError, DivergedError, Problem, did_you_mean
 from rlcli.sim import kernels
 from rlcli.sim.capacity import Capacity
+from rlcli.sim.columns import as_index
 from rlcli.sim.engine import force_sensors
-from rlcli.sim.entity import as_index
 from rlcli.sim.guard import LIMIT, Call, Divergence, StateLayout
 from rlcli.sim.mask import MaskSelection
 from rlcli.sim.mjcf import quiet_mujoco
