@@ -21,7 +21,7 @@ from rlcli.mdp.ranges import Pair, Ranges
 from rlcli.sim.model_fields import FIELDS, ModelField
 from rlcli.sim.names import NameProblem, match
 from rlcli.sim.rotations import from_euler, multiply
-from rlcli.sim.scene import actuator_kind
+from rlcli.sim.scene_joints import actuator_kind
 from rlcli.sim.selection import Columns, Selection
 from rlcli.task import Actuators, Bodies, Entity, Geoms, Joints, Pairs, Sites, Tendons
 

@@ -18,7 +18,7 @@ from rlcli.config.schema import CameraSensorConfig
 from rlcli.errors import ConfigError, MachineError, Problem
 from rlcli.sim.batch import BatchEngine
 from rlcli.sim.gl import open_context
-from rlcli.sim.scene import CameraMount
+from rlcli.sim.mounts import CameraMount
 from rlcli.sim.selection import IdSelection, Selection
 from rlcli.sim.state import SimData
 

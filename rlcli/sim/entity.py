@@ -18,7 +18,7 @@ from rlcli.sim.engine import Engine
 from rlcli.sim.entity_data import EntityData
 from rlcli.sim.names import match
 from rlcli.sim.rotations import rotate, rotate_inverse
-from rlcli.sim.scene import actuator_kind
+from rlcli.sim.scene_joints import actuator_kind
 from rlcli.sim.selection import ALL, Columns, Field, Selection
 from rlcli.sim.state import SimData
 

@@ -15,7 +15,7 @@ from rlcli.sim.defaults import default_joint_state, default_root_state
 from rlcli.sim.drives import Drives
 from rlcli.sim.engine import computes_body_forces
 from rlcli.sim.rotations import atan2, axis_x, length, multiply, rotate, rotate_inverse, wrap_to_pi
-from rlcli.sim.scene import joint_settings
+from rlcli.sim.scene_joints import joint_settings
 from rlcli.sim.selection import ALL, Columns, Field, Selection
 from rlcli.sim.state import SimData
 

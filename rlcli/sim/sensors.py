@@ -14,8 +14,8 @@ from rlcli.sim.camera import CameraSensor, make_cameras
 from rlcli.sim.columns import as_index
 from rlcli.sim.entity import Entity
 from rlcli.sim.heights import HeightTable
+from rlcli.sim.mounts import CameraMount, ContactSlots, RayMount
 from rlcli.sim.rotations import rotate
-from rlcli.sim.scene import CameraMount, ContactSlots, RayMount
 from rlcli.sim.selection import Columns, Selection
 from rlcli.sim.state import SimData
 
