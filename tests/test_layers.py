@@ -149,7 +149,7 @@ def test_training_on_the_cpu_loads_nothing_of_the_gpu_engine(tmp_path):
     words += ["--logger", "none", "-q", "--runs-dir", str(tmp_path)]
     program = (
         f"import sys; from rlcli.cli.app import main; code = main({words!r}); "
-        "gpu = {'warp', 'mujoco_warp', 'rlcli.sim.warp', 'rlcli.sim.mask', 'rlcli.sim.kernels'}; "
+        "gpu = {'warp', 'mujoco_warp', *(f'rlcli.sim.{m}' for m in ('warp', 'room', 'stages', 'mask', 'kernels'))}; "
         "print(code, 'torch' in sys.modules, sorted(gpu & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -27,7 +27,8 @@ from rlcli.managers.term import BoundTerm
 from rlcli.managers.termination import TerminationManager
 from rlcli.sim.engine import add_body_forces
 from rlcli.sim.saved import require_alike
-from rlcli.sim.scene import ActuatorNeed, Scene
+from rlcli.sim.scene import Scene
+from rlcli.sim.scene_joints import ActuatorNeed
 from rlcli.sim.selection import Selection
 
 _STATELESS = ("functools", "rlcli.mdp.")

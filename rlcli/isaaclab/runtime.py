@@ -39,7 +39,7 @@ _DATA = {
 
 
 class Data:
-    """The state of an asset under Isaac Lab's names; those of `rlcli.sim.entity.EntityData` work too."""
+    """The state of an asset under Isaac Lab's names; those of `rlcli.sim.entity_data.EntityData` work too."""
 
     def __init__(self, env: VecEnv, entity: Entity) -> None:
         self._env, self._entity, self._data = env, entity, entity.data

@@ -227,8 +227,8 @@ class SceneReader:
         import mujoco
 
         from rlcli.registry import model_file
+        from rlcli.sim.entity_model import name_all
         from rlcli.sim.mjcf import model_roots, read_mjcf
-        from rlcli.sim.scene import name_all
 
         try:
             spec = read_mjcf(model_file(self.root, model), model_roots(self.root, model))

@@ -9,7 +9,6 @@ them one draw. What cannot be negative is kept from it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import mujoco
@@ -17,11 +16,10 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import listing
-from rlcli.mdp.ranges import Pair, Ranges
+from rlcli.mdp.draws import Draw, Randomization, Turn
 from rlcli.sim.model_fields import FIELDS, ModelField
 from rlcli.sim.names import NameProblem, match
-from rlcli.sim.rotations import from_euler, multiply
-from rlcli.sim.scene import actuator_kind
+from rlcli.sim.scene_joints import actuator_kind
 from rlcli.sim.selection import Columns, Selection
 from rlcli.task import Actuators, Bodies, Entity, Geoms, Joints, Pairs, Sites, Tendons
 
@@ -32,93 +30,7 @@ _SMALLEST = 1e-9
 """What must be positive is at least this."""
 
 
-class _Draw:
-    """Values about the original ones, by distribution and operation.
-
-    Raises:
-        ValueError: for a range that the distribution cannot have.
-    """
-
-    def __init__(
-        self,
-        env: ManagedEnv,
-        range: Pair | Sequence[Pair],
-        distribution: str,
-        operation: str,
-        shape: tuple[int, int],
-        *,
-        shared: bool = False,
-        lowest: float | None = None,
-    ) -> None:
-        many = range.dim() == 2 if isinstance(range, Tensor) else isinstance(range, list)
-        pairs: list[Pair] = list(range) if many else [range]  # type: ignore
-        if len(pairs) not in (1, shape[1]):
-            raise NameProblem(f"range has {len(pairs)} pairs for {shape[1]} axes", "one pair for all, or one for each")
-        _check(pairs, distribution)
-        self._ranges = Ranges(env.device, *pairs)
-        self._distribution, self._operation = distribution, operation
-        self._shape = shape
-        self._drawn = (1 if shared else shape[0], shape[1])
-        self._lowest = lowest
-
-    def __call__(self, selection: Selection, original: Tensor) -> Tensor:
-        """New values of the selected environments. original (elements, axes) -> (rows, elements, axes)"""
-        drawn = self.sample(selection)
-        if self._operation == "set":
-            new = drawn.expand(-1, *self._shape)
-        else:
-            new = original + drawn if self._operation == "add" else original * drawn
-        return new if self._lowest is None else new.clamp(min=self._lowest)
-
-    def sample(self, selection: Selection) -> Tensor:
-        """The draws alone. (rows, elements or 1, axes)"""
-        first, second = self._ranges.now()
-        if self._distribution == "gaussian":
-            return selection.normal(first, second, self._drawn)
-        if self._distribution == "uniform":
-            return selection.uniform(first, second, self._drawn)
-        return torch.exp(selection.uniform(torch.log(first), torch.log(second), self._drawn))
-
-
-def _check(pairs: list[Pair], distribution: str) -> None:
-    for pair in (pair.tolist() if isinstance(pair, Tensor) else pair for pair in pairs):
-        for first, second in (pair,):
-            if distribution == "gaussian" and second < 0:
-                raise NameProblem(f"gaussian: the standard deviation {second:g} is negative", "range is [mean, std]")
-            if distribution != "gaussian" and first > second:
-                raise NameProblem(f"the lower end {first:g} is above the upper end {second:g}", "range is [low, high]")
-            if distribution == "loguniform" and first <= 0:
-                raise NameProblem(f"loguniform needs a range above 0, not one from {first:g}", "uniform takes any")
-
-
-class _Randomization:
-    """Draws for some elements of one model field."""
-
-    def __init__(
-        self,
-        env: ManagedEnv,
-        entity: Any,
-        field: str,
-        elements: Columns | None,
-        range: Pair | Sequence[Pair],
-        distribution: str,
-        operation: str,
-        shared: bool = False,
-        axes: list[int] | None = None,
-        lowest: float | None = None,
-        alike: bool = False,
-    ) -> None:
-        self.field = ModelField(entity, field, elements, axes)
-        self.derives = self.field.derives
-        shape = (self.field.shape[0], 1) if alike else self.field.shape
-        self.draw = _Draw(env, range, distribution, operation, shape, shared=shared, lowest=lowest)
-
-    def __call__(self, selection: Selection) -> None:
-        """Draw anew for the selected environments."""
-        self.field.write(selection, self.draw(selection, self.field.original))
-
-
-class RandomizeBodyMass(_Randomization):
+class RandomizeBodyMass(Randomization):
     """Masses of bodies [kg]; their inertias are scaled alike, unless `with_inertia` is false."""
 
     def __init__(
@@ -148,7 +60,7 @@ class RandomizeBodyMass(_Randomization):
             self._inertia.write(selection, self._inertia.original * (mass / self.field.original))
 
 
-class RandomizeBodyCom(_Randomization):
+class RandomizeBodyCom(Randomization):
     """Centres of mass of bodies, in the body's frame [m]."""
 
     def __init__(
@@ -172,7 +84,7 @@ class RandomizeBodyCom(_Randomization):
             body.simple = 0
 
 
-class RandomizeBodyInertia(_Randomization):
+class RandomizeBodyInertia(Randomization):
     """Principal moments of inertia of bodies [kg m^2], the three of a body by one factor."""
 
     def __init__(
@@ -189,7 +101,7 @@ class RandomizeBodyInertia(_Randomization):
         super().__init__(env, entity, field, bodies, range, distribution, scale, shared, lowest=_SMALLEST, alike=True)
 
 
-class RandomizeBodyPos(_Randomization):
+class RandomizeBodyPos(Randomization):
     """Positions of bodies, in the frame of their parent [m]; a floating root's is its reset's."""
 
     def __init__(
@@ -207,31 +119,7 @@ class RandomizeBodyPos(_Randomization):
         super().__init__(env, entity, "body_pos", bodies, range, distribution, operation, shared, axes)
 
 
-class _Turn:
-    """Draws for some elements of a field of quaternions."""
-
-    def __init__(
-        self,
-        env: ManagedEnv,
-        entity: Any,
-        field: str,
-        elements: Columns,
-        angles: list[Pair],
-        distribution: str,
-        shared: bool,
-    ) -> None:
-        self.field = ModelField(entity, field, elements)
-        self.derives = self.field.derives
-        self._draw = _Draw(env, angles, distribution, "set", (self.field.shape[0], 3), shared=shared)
-
-    def __call__(self, selection: Selection) -> None:
-        """Draw anew for the selected environments."""
-        turn = from_euler(*self._draw.sample(selection).to(self.field.original.dtype).unbind(2))
-        original = self.field.original.expand(len(turn), -1, -1)
-        self.field.write(selection, multiply(original, turn.expand(-1, original.shape[1], -1)))
-
-
-class RandomizeBodyQuat(_Turn):
+class RandomizeBodyQuat(Turn):
     """Orientations of bodies, turned about their own axes by roll, pitch and yaw [rad]."""
 
     def __init__(
@@ -249,7 +137,7 @@ class RandomizeBodyQuat(_Turn):
         super().__init__(env, entity, "body_quat", bodies, [roll, pitch, yaw], distribution, shared)
 
 
-class RandomizeGeomFriction(_Randomization):
+class RandomizeGeomFriction(Randomization):
     """Friction of geoms: axis 0 slides, 1 spins [m], 2 rolls [m]; it prevails over that of what they touch.
 
     MuJoCo takes the larger friction of two geoms of equal priority, so that a lower one would change nothing: the
@@ -284,7 +172,7 @@ class RandomizeGeomFriction(_Randomization):
                 geom.priority = max(int(geom.priority), others + 1)
 
 
-class RandomizeGeomSize(_Randomization):
+class RandomizeGeomSize(Randomization):
     """Sizes of geoms [m], the values of a geom by one draw; meshes, height fields and planes have none."""
 
     def __init__(
@@ -305,7 +193,7 @@ class RandomizeGeomSize(_Randomization):
         )
 
 
-class RandomizeGeomPos(_Randomization):
+class RandomizeGeomPos(Randomization):
     """Positions of geoms, in the frame of the body they belong to [m]."""
 
     def __init__(
@@ -323,7 +211,7 @@ class RandomizeGeomPos(_Randomization):
         super().__init__(env, entity, "geom_pos", geoms, range, distribution, operation, shared, axes)
 
 
-class RandomizeGeomQuat(_Turn):
+class RandomizeGeomQuat(Turn):
     """Orientations of geoms, turned about their own axes by roll, pitch and yaw [rad]."""
 
     def __init__(
@@ -341,7 +229,7 @@ class RandomizeGeomQuat(_Turn):
         super().__init__(env, entity, "geom_quat", geoms, [roll, pitch, yaw], distribution, shared)
 
 
-class RandomizeSitePos(_Randomization):
+class RandomizeSitePos(Randomization):
     """Positions of sites, in the frame of the body they belong to [m]."""
 
     def __init__(
@@ -359,7 +247,7 @@ class RandomizeSitePos(_Randomization):
         super().__init__(env, entity, "site_pos", sites, range, distribution, operation, shared, axes)
 
 
-class RandomizeSiteQuat(_Turn):
+class RandomizeSiteQuat(Turn):
     """Orientations of sites, turned about their own axes by roll, pitch and yaw [rad]."""
 
     def __init__(
@@ -377,7 +265,7 @@ class RandomizeSiteQuat(_Turn):
         super().__init__(env, entity, "site_quat", sites, [roll, pitch, yaw], distribution, shared)
 
 
-class _JointNumber(_Randomization):
+class _JointNumber(Randomization):
     """A number of each joint that cannot be negative."""
 
     number: ClassVar[str]
@@ -443,7 +331,7 @@ class RandomizeJointRange:
         self._field = ModelField(entity, "jnt_range", joints)
         shape = (self._field.shape[0], 1)
         self._draws = [
-            None if pair is None else _Draw(env, pair, distribution, operation, shape, shared=shared)
+            None if pair is None else Draw(env, pair, distribution, operation, shape, shared=shared)
             for pair in (lower, upper)
         ]
 
@@ -477,7 +365,7 @@ class RandomizeDefaultJointPos:
         self._joints = joints
         self._original = self._default[0, joints].clone()[:, None]
         shape = (len(self._original), 1)
-        self._draw = _Draw(env, range, distribution, operation, shape, shared=shared)
+        self._draw = Draw(env, range, distribution, operation, shape, shared=shared)
 
     def __call__(self, selection: Selection) -> None:
         """Draw anew for the selected environments."""
@@ -524,7 +412,7 @@ class RandomizeActuatorGains:
         self._is_position = is_position[:, None].to(env.device)
         shape = (self._gain.shape[0], 1)
         self._kp, self._kv = (
-            None if pair is None else _Draw(env, pair, distribution, operation, shape, shared=shared, lowest=0.0)
+            None if pair is None else Draw(env, pair, distribution, operation, shape, shared=shared, lowest=0.0)
             for pair in (kp, kv)
         )
 
@@ -570,7 +458,7 @@ class RandomizePdGains:
         for name, pair in pairs.items():
             if pair is not None:
                 own = [getattr(model, name)[0, place] for model, place, _ in self._parts]
-                draw = _Draw(env, pair, distribution, operation, (len(chosen), 1), shared=shared, lowest=0.0)
+                draw = Draw(env, pair, distribution, operation, (len(chosen), 1), shared=shared, lowest=0.0)
                 self._draws.append((name, torch.stack(own)[:, None], draw))
 
     def __call__(self, selection: Selection) -> None:
@@ -605,7 +493,7 @@ class RandomizeEffortLimit:
         self._gear = torch.where(chosen > 0, chosen, 1.0)[:, None].to(env.device, self._field.original.dtype)
         self._effort = self._field.original[:, 1:] * self._gear
         shape = (self._field.shape[0], 1)
-        self._draw = _Draw(env, range, distribution, operation, shape, shared=shared, lowest=0.0)
+        self._draw = Draw(env, range, distribution, operation, shape, shared=shared, lowest=0.0)
 
     def __call__(self, selection: Selection) -> None:
         """Draw anew for the selected environments."""
@@ -613,7 +501,7 @@ class RandomizeEffortLimit:
         self._field.write(selection, torch.cat([-force, force], dim=2))
 
 
-class RandomizeGravity(_Randomization):
+class RandomizeGravity(Randomization):
     """Gravity, world frame [m/s^2]; the direction that observations see follows."""
 
     def __init__(
@@ -629,7 +517,7 @@ class RandomizeGravity(_Randomization):
         super().__init__(env, entity, "opt.gravity", None, range, distribution, operation, axes=axes)
 
 
-class _TendonNumber(_Randomization):
+class _TendonNumber(Randomization):
     """A number of each tendon that cannot be negative."""
 
     number: ClassVar[str]
@@ -673,7 +561,7 @@ class RandomizeTendonArmature(_TendonNumber):
     number = "tendon_armature"
 
 
-class RandomizePairFriction(_Randomization):
+class RandomizePairFriction(Randomization):
     """Friction of contact pairs that the MJCF names: axes 0 and 1 slide, 2 spins [m], 3 and 4 roll [m]."""
 
     def __init__(
@@ -691,7 +579,7 @@ class RandomizePairFriction(_Randomization):
         super().__init__(env, entity, "pair_friction", pairs, range, distribution, operation, shared, axes, lowest=0.0)
 
 
-class RandomizeModelField(_Randomization):
+class RandomizeModelField(Randomization):
     """Any number of the model that may differ between environments, by its name in MuJoCo's MjModel."""
 
     def __init__(

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from rlcli.config.schema import ActuatorConfig
 from rlcli.random import stream
-from rlcli.sim.entity import Entity, as_index
+from rlcli.sim.columns import as_index
+from rlcli.sim.entity import Entity
 from rlcli.sim.names import NameProblem, match, match_values
 from rlcli.sim.saved import require_within
 from rlcli.sim.selection import Selection

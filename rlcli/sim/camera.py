@@ -17,10 +17,10 @@ from torch import Tensor
 from rlcli.config.schema import CameraSensorConfig
 from rlcli.errors import ConfigError, MachineError, Problem
 from rlcli.sim.batch import BatchEngine
-from rlcli.sim.entity import SimData
 from rlcli.sim.gl import open_context
-from rlcli.sim.scene import CameraMount
+from rlcli.sim.mounts import CameraMount
 from rlcli.sim.selection import IdSelection, Selection
+from rlcli.sim.state import SimData
 
 _CHANNELS = {"rgb": 3, "depth": 1, "distance": 1}
 _OFF = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_HAZE", "mjRND_FOG")

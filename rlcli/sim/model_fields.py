@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import did_you_mean, listing
+from rlcli.sim.columns import as_index
 from rlcli.sim.engine import Engine
-from rlcli.sim.entity import Entity, as_index
+from rlcli.sim.entity import Entity
 from rlcli.sim.names import NameProblem
 from rlcli.sim.selection import Columns, Selection
 

@@ -11,11 +11,13 @@ from torch import Tensor
 
 from rlcli.config.schema import GridPatternConfig, RaySensorConfig
 from rlcli.sim.camera import CameraSensor, make_cameras
-from rlcli.sim.entity import Entity, SimData, as_index
+from rlcli.sim.columns import as_index
+from rlcli.sim.entity import Entity
 from rlcli.sim.heights import HeightTable
+from rlcli.sim.mounts import CameraMount, ContactSlots, RayMount
 from rlcli.sim.rotations import rotate
-from rlcli.sim.scene import CameraMount, ContactSlots, RayMount
 from rlcli.sim.selection import Columns, Selection
+from rlcli.sim.state import SimData
 
 _TIMES = ("air_time", "contact_time", "last_air_time", "last_contact_time")
 _FLAGS = ("first_contact", "first_air", "found")

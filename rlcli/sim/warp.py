@@ -9,8 +9,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
-import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -20,58 +19,19 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from rlcli.errors import ConfigError, DeviceError, DivergedError, Problem, did_you_mean
+from rlcli.errors import did_you_mean
 from rlcli.sim import kernels
 from rlcli.sim.capacity import Capacity
+from rlcli.sim.columns import as_index
 from rlcli.sim.engine import force_sensors
-from rlcli.sim.entity import as_index
 from rlcli.sim.guard import LIMIT, Call, Divergence, StateLayout
 from rlcli.sim.mask import MaskSelection
 from rlcli.sim.mjcf import quiet_mujoco
+from rlcli.sim.room import FULL, overflow, put
 from rlcli.sim.saved import require_alike
 from rlcli.sim.selection import ALL, Field, Selection
+from rlcli.sim.stages import FORCE, INPUTS, KINEMATICS, STATE, VELOCITY, Stages
 
-_STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
-"""What every world carries from step to step, and every reset restores."""
-_INPUTS = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
-"""Further state, as the model has it unless somebody binds it."""
-_KINEMATIC = frozenset(
-    [
-        *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos"),
-        *("site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir", "subtree_com", "ten_length", "cinert"),
-    ]
-)
-"""Derived fields of the position stage that kinematics alone give."""
-_ACCELERATION = frozenset(
-    [
-        *("qacc", "qacc_smooth", "actuator_force", "qfrc_actuator", "qfrc_smooth", "qfrc_constraint", "qfrc_inverse"),
-        *("act_dot", "cacc", "cfrc_int", "cfrc_ext"),
-    ]
-)
-"""Fields of the acceleration stage: read as the last substep left them."""
-_MOTION = frozenset(["cvel", "cdof", "cdof_dot"])
-"""Fields of the velocity stage that the motion of bodies alone gives: no inertias, no contacts, no constraints."""
-_SENSORS_OF_MOTION = frozenset(
-    int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
-    for name in (
-        *("MAGNETOMETER", "CAMPROJECTION", "RANGEFINDER", "JOINTPOS", "TENDONPOS", "BALLQUAT", "FRAMEPOS", "FRAMEQUAT"),
-        *("FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS", "SUBTREECOM", "CLOCK", "INSIDESITE", "VELOCIMETER", "GYRO"),
-        *("JOINTVEL", "BALLANGVEL", "FRAMELINVEL", "FRAMEANGVEL", "SUBTREELINVEL", "SUBTREEANGMOM"),
-    )
-)
-"""Sensors before the acceleration stage that read nothing else."""
-_KINEMATICS, _VELOCITY, _FORCE = range(3)
-"""Groups of derived fields."""
-_FULL = {
-    mjw.OverflowType.NEFC: "constraints_per_env",
-    mjw.OverflowType.NJMAX_NNZ: "constraints_per_env",
-    mjw.OverflowType.BROADPHASE: "contacts_per_env",
-    mjw.OverflowType.NARROWPHASE: "contacts_per_env",
-    mjw.OverflowType.CCD: "contacts_per_env",
-    mjw.OverflowType.HFIELD: "contacts_per_env",
-    mjw.OverflowType.EPA_HORIZON: "contacts_per_env",
-}
-"""Capacities that a step may exceed -> the setting that raises them. Solver iterations are no capacity."""
 _CONSTANTS = (
     *("body_subtreemass", "dof_invweight0", "body_invweight0", "tendon_invweight0", "tendon_length0"),
     *("actuator_acc0", "eq_data"),
@@ -142,24 +102,16 @@ class WarpEngine:
         self._late = late
         self._external_forces = external_forces
         self._max_velocity = max_velocity
-        force_columns = force_sensors(model)
-        self._sensor_stages = {_FORCE} if force_columns else set()
-        if len(force_columns) < model.nsensordata:
-            self._sensor_stages.add(_VELOCITY)
-        self._force_columns = as_index(force_columns, self.device)
-        self._senses_motion_alone = _SENSORS_OF_MOTION.issuperset(
-            int(kind)
-            for kind, stage in zip(model.sensor_type, model.sensor_needstage, strict=True)
-            if int(stage) < int(mujoco.mjtStage.mjSTAGE_ACC)
-        )
+        self._stages = Stages(model)
+        self._force_columns = as_index(force_sensors(model), self.device)
         self._holds_bodies = bool(np.isin(model.eq_type, _HOLDS).any())
         self._expanded: dict[str, Tensor] = {}
         self._graphs: dict[tuple[int, bool], Any] = {}
         self._rays: dict[tuple[int, int], tuple[wp.array, wp.array, wp.array]] = {}
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         with wp.ScopedDevice(self._device), _on_torch_stream(self.device):
-            self._model, self._data = self._put(model, capacity)
-            self._arrays = {name: getattr(self._data, name) for name in _STATE}
+            self._model, self._data = put(model, num_envs, self.device, capacity)
+            self._arrays = {name: getattr(self._data, name) for name in STATE}
             qpos, qvel, _ = (self.field(name) for name in ("qpos", "qvel", "qacc_warmstart"))
             self._last_qpos, self._last_qvel = qpos.clone(), qvel.clone()
             self._default_qpos = torch.tensor(model.qpos0, dtype=torch.float32, device=self.device)
@@ -212,20 +164,20 @@ class WarpEngine:
                 raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {did_you_mean(name, known) or ''}")
             kept = self._before_forward()
             self._fields[name] = wp.to_torch(array)
-            if name in _INPUTS:  # nobody has written to it yet
+            if name in INPUTS:  # nobody has written to it yet
                 self._start_inputs[name] = self._fields[name].view(self.num_envs, -1).clone()
-            self._derived |= self._stages(name)
-            self._motion_alone = all(map(self._is_motion, self._fields))
+            self._derived |= self._stages.of(name)
+            self._motion_alone = all(map(self._stages.is_motion, self._fields))
             if name in ("cacc", "cfrc_int"):  # the velocity stage uses their memory for its own accelerations
                 self._overwritten[name] = wp.empty_like(array)
             self._graphs.clear()
-            if self._stages(name):
+            if self._stages.of(name):
                 with self._launching():
                     self._catch_up()
                     mjw.forward(self._model, self._data)  # a field asked for late is that of the state
                 for other, values in kept.items():
                     self._fields[other].copy_(values)
-                if _FORCE in self._stages(name) or (self._late and self._fields[name].dtype == torch.float32):
+                if FORCE in self._stages.of(name) or (self._late and self._fields[name].dtype == torch.float32):
                     self._last_derived[name] = self._fields[name].clone()
         return self._fields[name]
 
@@ -312,7 +264,7 @@ class WarpEngine:
                     wp.from_torch(self._default_qpos),
                     wp.from_torch(self._default_qvel),
                 ],
-                outputs=[self._arrays[name] for name in _STATE[:2]]
+                outputs=[self._arrays[name] for name in STATE[:2]]
                 + [self._arrays[name] for name in ("qacc_warmstart", "ctrl", "act", "time")],
                 device=self._device,
             )
@@ -379,20 +331,20 @@ class WarpEngine:
         """
         flags = self._flags.tolist()
         found = 0
-        for bit in _FULL:
+        for bit in FULL:
             found |= int(bit) if bool((self._overflowed & int(bit)).any()) else 0
         if found:
             self._overflowed.zero_()
-            raise _overflow(found, self.capacity)
+            raise overflow(found, self.capacity)
         if any(flags):
             self._flags.zero_()
         return [what for what, flag in zip(self._watched, flags, strict=False) if flag]
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copies of the state, of bound inputs and of the model fields that differ between worlds."""
-        inputs = [name for name in _INPUTS if name in self._fields]
+        inputs = [name for name in INPUTS if name in self._fields]
         return {
-            **{name: self.field(name).clone() for name in (*_STATE, *inputs)},
+            **{name: self.field(name).clone() for name in (*STATE, *inputs)},
             "last_qpos": self._last_qpos.clone(),
             "last_qvel": self._last_qvel.clone(),
             **{f"model.{name}": values.clone() for name, values in self._expanded.items()},
@@ -412,7 +364,7 @@ class WarpEngine:
             if name.startswith("substep."):
                 self.field(name.removeprefix("substep."))  # whoever saved had asked for it; here that may come later
         for name, values in state.items():
-            if name in (*_STATE, *_INPUTS):
+            if name in (*STATE, *INPUTS):
                 self.field(name).copy_(values)
         self._last_qpos.copy_(state["last_qpos"])
         self._last_qvel.copy_(state["last_qvel"])
@@ -437,7 +389,7 @@ class WarpEngine:
                 getattr(owner, attribute)[:] = value.reshape(getattr(owner, attribute).shape)
             else:
                 setattr(owner, attribute, float(value))
-        for name in (*_STATE[:-1], *(n for n in _INPUTS if n in self._fields)):
+        for name in (*STATE[:-1], *(n for n in INPUTS if n in self._fields)):
             target = getattr(data, name)
             target[:] = self.field(name)[env].cpu().numpy().reshape(target.shape)
         data.time = float(self.field("time")[env])
@@ -495,13 +447,13 @@ class WarpEngine:
     def _derive(self) -> None:
         """Bring the derived fields that somebody reads up to the state; those of forces are the last substep's."""
         m, d = self._model, self._data
-        if _VELOCITY in self._derived and self._motion_alone:
+        if VELOCITY in self._derived and self._motion_alone:
             mjw.fwd_kinematics(m, d)
             mjw.com_vel(m, d)
             if "sensordata" in self._fields:
                 mjw.sensor_pos(m, d)
                 mjw.sensor_vel(m, d)
-        elif _VELOCITY in self._derived:
+        elif VELOCITY in self._derived:
             self._catch_up()
             mjw.fwd_position(m, d, factorize=False)
             for name, kept in self._overwritten.items():
@@ -512,31 +464,17 @@ class WarpEngine:
             if "sensordata" in self._fields:
                 mjw.sensor_pos(m, d)
                 mjw.sensor_vel(m, d)
-        elif _KINEMATICS in self._derived:
+        elif KINEMATICS in self._derived:
             mjw.fwd_kinematics(m, d)
 
     def _owner(self, name: str) -> tuple[Any, str]:
         return (self._model.opt, name[4:]) if name.startswith("opt.") else (self._model, name)
 
-    def _stages(self, name: str) -> set[int]:
-        """What a field derives from."""
-        if name in (*_STATE, *_INPUTS):
-            return set()
-        if name == "sensordata":
-            return self._sensor_stages
-        return {_KINEMATICS if name in _KINEMATIC else _FORCE if name in _ACCELERATION else _VELOCITY}
-
-    def _is_motion(self, name: str) -> bool:
-        """Whether a field can be brought up to the state without contacts, constraints and inertias."""
-        if name == "sensordata":
-            return self._senses_motion_alone
-        return _VELOCITY not in self._stages(name) or name in _MOTION
-
     def _of_substep(self) -> list[str]:
-        return [name for name in self._fields if _FORCE in (stages := self._stages(name)) or (self._late and stages)]
+        return [name for name in self._fields if FORCE in (stages := self._stages.of(name)) or (self._late and stages)]
 
     def _forward(self, selection: Selection) -> None:
-        if not self._late and (_FORCE not in self._derived or not self.forces_after_reset):
+        if not self._late and (FORCE not in self._derived or not self.forces_after_reset):
             with self._launching():
                 self._derive()
             return
@@ -579,51 +517,6 @@ class WarpEngine:
             self._advance(nstep, derive)
         return capture.graph
 
-    def _put(self, model: mujoco.MjModel, capacity: Capacity) -> tuple[mjw.Model, mjw.Data]:
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                on_device = mjw.put_model(model)
-            on_device.opt.warn_overflow = 0  # printing stops the device; `noted` tells
-            if self._device.is_cpu:
-                on_device.opt.graph_conditional = False
-        except (NotImplementedError, ValueError) as error:
-            message = f"the GPU engine (MuJoCo Warp) cannot run this model: {' '.join(str(error).split())}"
-            hint = "--device cpu runs it; or change the option in the MJCF"
-            raise ConfigError([Problem("scene", "", message, hint)]) from None
-        try:
-            return on_device, self._make(model, self.num_envs, capacity)
-        except RuntimeError as error:
-            if "alloc" not in str(error) and "memory" not in str(error):
-                raise
-            raise self._too_little(lambda n: self._make(model, n, capacity)) from None
-
-    def _make(self, model: mujoco.MjModel, num_envs: int, capacity: Capacity) -> mjw.Data:
-        return mjw.make_data(model, nworld=num_envs, nconmax=capacity.contacts, njmax=capacity.constraints)
-
-    def _too_little(self, make: Callable[[int], mjw.Data]) -> DeviceError:
-        some = 64
-        sample = sum(_bytes(value) for value in vars(make(some)).values())
-        free = self._device.free_memory if self._device.is_cuda else 0
-        fits = int(0.8 * free / (sample / some))
-        return DeviceError(
-            f"{self.num_envs} environments need {sample / some * self.num_envs / 2**30:.1f} GiB,"
-            f" {free / 2**30:.1f} GiB are free on {self.device}",
-            hint=f"--num-envs {max(1, fits)} would fit",
-        )
-
-
-def _overflow(found: int, capacity: Capacity) -> DivergedError:
-    settings = {setting for bit, setting in _FULL.items() if found & int(bit)}
-    kinds = " and ".join(bit.name.lower() for bit in _FULL if found & int(bit) and bit.name)
-    now = {"contacts_per_env": capacity.contacts, "constraints_per_env": capacity.constraints}
-    advice = " ".join(f"sim.{setting}={2 * now[setting]}" for setting in sorted(settings))
-    return DivergedError(
-        f"the GPU engine ran out of room ({kinds}): {capacity.contacts} contacts and {capacity.constraints} constraints"
-        " an environment were set aside, and the results since are wrong",
-        hint=f"give it more: {advice}",
-    )
-
 
 @contextlib.contextmanager
 def _on_torch_stream(device: torch.device) -> Any:
@@ -640,11 +533,3 @@ def _batched(owner: Any) -> set[str]:
 
 def _is_batched(kind: Any) -> bool:
     return next(iter(getattr(kind, "shape", ())), None) == "*"
-
-
-def _bytes(value: Any) -> int:
-    if isinstance(value, wp.array):
-        return int(value.capacity)
-    if dataclasses.is_dataclass(value):
-        return sum(_bytes(getattr(value, f.name)) for f in dataclasses.fields(value))
-    return 0

@@ -9,8 +9,8 @@ from worlds import CRITTER, PENDULUM
 from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DeviceError
 from rlcli.sim.engine import open_engine
-from rlcli.sim.entity import SimData
 from rlcli.sim.selection import IdSelection
+from rlcli.sim.state import SimData
 
 XML = CRITTER.replace("<worldbody>", '<worldbody><geom type="plane" size="5 5 1"/>').replace(
     "</mujoco>",

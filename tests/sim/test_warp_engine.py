@@ -11,7 +11,7 @@ from worlds import CRITTER, PENDULUM_TASK, build, critter, edited, pendulum
 from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DivergedError
 from rlcli.sim.engine import open_engine
-from rlcli.sim.entity import SimData
+from rlcli.sim.state import SimData
 
 torch.set_num_threads(1)
 

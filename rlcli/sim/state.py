@@ -1,0 +1,125 @@
+"""The state of all worlds as terms read it: float32, copied once a step; what derives from it when it is read."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from rlcli.sim.engine import Engine
+from rlcli.sim.selection import Selection, ids_of
+
+
+class SimData:
+    """The engine's joint state as float32, copied once a step, and derived fields cast when read.
+
+    `qpos` (num_envs, nq) and `qvel` (num_envs, nv) keep their storage for ever, so views of them stay valid. Where the
+    engine keeps the two side by side they are one copy; where its own are float32, they are the engine's own.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        qpos, qvel = engine.field("qpos"), engine.field("qvel")
+        joined = _joined(qpos, qvel)
+        self._sources = [qpos, qvel] if joined is None else [joined]
+        self._copies = [source.to(torch.float32).contiguous() for source in self._sources]
+        self._flat = [copy.view(-1) for copy in self._copies]
+        own = self._copies[0] is self._sources[0]
+        # an engine in float64 is on the CPU, where small copies cost numpy half of torch's
+        pairs = [] if own else zip(self._copies, self._sources, strict=True)
+        self._stale = [(copy.numpy(), source.numpy()) for copy, source in pairs]
+        self._good = [copy.copy() for copy, _ in self._stale]
+        self.qpos = self._copies[0][:, : qpos.shape[1]]
+        self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
+        self.stamp = 0
+        self._kept_at, self._summed = -1, (-1, 0.0)
+        self._moved: Selection | None = None
+        self._derived: dict[str, tuple[int, Tensor]] = {}
+
+    def moved(self, selection: Selection) -> None:
+        """The selected worlds have been put elsewhere: what derives from their state is that of the new one.
+
+        An engine that computes all worlds at once does so when it is next read: once, however often worlds move.
+        """
+        if not self.engine.asynchronous:
+            self.engine.forward(selection)
+        else:
+            self._moved = selection if self._moved is None else self._moved.joined(selection)
+        self.refresh_rows(selection)
+
+    def settle(self) -> None:
+        """Compute what is left to compute of worlds that have moved."""
+        if self._moved is not None:
+            selection, self._moved = self._moved, None
+            self.engine.forward(selection)
+
+    def refresh(self) -> None:
+        """Copy the state of every world."""
+        for copy, source in self._stale:
+            copy[...] = source
+        self.stamp += 1
+
+    def refresh_rows(self, selection: Selection) -> None:
+        """Copy the state of the selected worlds, and drop what was computed from it."""
+        for copy, source in self._stale:
+            rows = ids_of(selection)
+            copy[rows] = source[rows]
+        self.stamp += 1
+
+    def keep(self) -> None:
+        """Note that the state as it is here is one to go back to."""
+        if self._kept_at == self.stamp:
+            return
+        self._kept_at = self.stamp
+        for good, (copy, _) in zip(self._good, self._stale, strict=True):
+            good[...] = copy
+
+    def restore_rows(self, selection: Selection) -> None:
+        """Write the last state of the selected worlds that was kept back to the engine."""
+        for good, (_, source) in zip(self._good, self._stale, strict=True):
+            rows = ids_of(selection)
+            source[rows] = good[rows]
+
+    def is_finite(self) -> bool:
+        """Whether every position and velocity is a finite number, as the last `refresh` found them."""
+        return math.isfinite(self._squares()) or all(bool(flat.isfinite().all()) for flat in self._flat)
+
+    def out_of_bounds(self, limit: float) -> Tensor | None:
+        """Worlds with a position or a velocity that is not finite or beyond `limit`; None for none. (num_envs,) bool"""
+        # the sum of all squares bounds each of them, is not finite where one is not, and rounds by far less than half
+        if self._squares() <= 0.5 * limit * limit:
+            return None
+        bad = [~(copy.abs() <= limit).all(dim=1) for copy in self._copies]
+        return torch.stack(bad).any(dim=0)
+
+    def _squares(self) -> float:
+        at, total = self._summed
+        if at != self.stamp:
+            total = 0.0
+            for flat in self._flat:
+                total += torch.dot(flat, flat).item()
+            self._summed = self.stamp, total
+        return total
+
+    def derived(self, name: str) -> Tensor:
+        """A derived field as float32, cast once a step. (num_envs, ...)"""
+        self.settle()
+        stamp, value = self._derived.get(name, (-1, None))
+        if stamp != self.stamp or value is None:
+            value = self.engine.field(name).float()
+            self._derived[name] = (self.stamp, value)
+        return value
+
+
+def _joined(left: Tensor, right: Tensor) -> Tensor | None:
+    """Two 2-d views as one, where they are neighbouring columns of the same storage; else None."""
+    neighbours = (
+        left.dtype == right.dtype
+        and left.stride() == right.stride()
+        and left.untyped_storage().data_ptr() == right.untyped_storage().data_ptr()
+        and right.data_ptr() == left.data_ptr() + left.shape[1] * left.element_size()
+    )
+    if not neighbours:
+        return None
+    return left.as_strided((left.shape[0], left.shape[1] + right.shape[1]), left.stride())
