@@ -28,7 +28,7 @@ from rlcli.machine import collect_as_usual, require_device
 from rlcli.managers.term import Binder, check_shape, first_value
 from rlcli.sim.actuators import ActuatorModel
 from rlcli.sim.engine import open_engine
-from rlcli.sim.entity import Entity, SimData, is_finite
+from rlcli.sim.entity import Entity
 from rlcli.sim.guard import LIMIT, SHOWN, Divergence, StateLayout
 from rlcli.sim.names import NameProblem
 from rlcli.sim.rotations import rotate_inverse
@@ -36,6 +36,7 @@ from rlcli.sim.saved import require_alike
 from rlcli.sim.scene import Scene
 from rlcli.sim.selection import Field, Selection, in_place
 from rlcli.sim.sensors import Sensor, make_sensors
+from rlcli.sim.state import SimData, is_finite
 from rlcli.sim.terrain import Terrain
 
 

@@ -14,8 +14,8 @@ from rlcli.errors import DivergedError
 from rlcli.managers.live import LiveValues
 from rlcli.managers.pipeline import Draws, Pipeline
 from rlcli.managers.term import BoundTerm, check_shape, first_value
-from rlcli.sim.entity import is_finite
 from rlcli.sim.selection import Selection
+from rlcli.sim.state import is_finite
 
 
 @dataclass(slots=True)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from rlcli.errors import DivergedError
 from rlcli.rl.policy import Normalizer
-from rlcli.sim.entity import is_finite
+from rlcli.sim.state import is_finite
 
 LEARNER_HINT = "lower learning_rate or max_grad_norm; the last good checkpoint is kept"
 

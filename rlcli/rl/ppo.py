@@ -35,8 +35,8 @@ from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
 from rlcli.rl.trainer import Report, TrainerState
-from rlcli.sim.entity import is_finite
 from rlcli.sim.saved import require_alike
+from rlcli.sim.state import is_finite
 
 _RECORDED = 256
 """Recent observations that a checkpoint keeps, for checking what is made of the policy later."""

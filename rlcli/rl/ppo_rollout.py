@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rlcli.sim.entity import is_finite
+from rlcli.sim.state import is_finite
 
 
 @dataclass(frozen=True, slots=True)

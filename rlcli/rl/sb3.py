@@ -35,8 +35,8 @@ from rlcli.rl.sb3_config import (
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.train import Budget
 from rlcli.rl.trainer import Report, TrainerState
-from rlcli.sim.entity import is_finite
 from rlcli.sim.saved import require_alike
+from rlcli.sim.state import is_finite
 
 _METRICS = {
     "train/policy_gradient_loss": "Loss/surrogate",

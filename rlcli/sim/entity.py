@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -176,11 +175,6 @@ class Entity:
         if joint < 0 or model.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_FREE):
             return None, None
         return int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-
-
-def is_finite(values: Tensor) -> bool:
-    """Whether every value is finite, in one pass where they are: a finite sum has finite summands only."""
-    return math.isfinite(values.sum().item()) or bool(values.isfinite().all())
 
 
 def _ids(

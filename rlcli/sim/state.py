@@ -11,6 +11,11 @@ from rlcli.sim.engine import Engine
 from rlcli.sim.selection import Selection, ids_of
 
 
+def is_finite(values: Tensor) -> bool:
+    """Whether every value is finite, in one pass where they are: a finite sum has finite summands only."""
+    return math.isfinite(values.sum().item()) or bool(values.isfinite().all())
+
+
 class SimData:
     """The engine's joint state as float32, copied once a step, and derived fields cast when read.
 
