@@ -55,6 +55,10 @@ class ConfigError(RlcliError):
         super().__init__("\n".join(str(problem) for problem in self.problems))
 
 
+class ShapeError(ConfigError):
+    """What a term gives is nothing that its manager can take."""
+
+
 class TaskError(RlcliError):
     """A task or plugin is not found or broken."""
 

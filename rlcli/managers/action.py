@@ -9,6 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from rlcli.errors import ConfigError
 from rlcli.managers.term import BoundTerm, resets
 from rlcli.sim.selection import Field, Selection, in_place
 
@@ -103,4 +104,5 @@ def _refuse_shared(terms: list[BoundTerm]) -> None:
         for sink, element in zip(getattr(term.instance, "sinks", ()), term.instance.elements, strict=False):
             first = owner.setdefault(sink, term)
             if first is not term:
-                raise term.error(f"'{element}' is driven by '{first.name}' already")
+                message = f"'{element}' is driven by '{first.name}' already"
+                raise ConfigError([term.resolved.problem(term.path, message)])

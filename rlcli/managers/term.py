@@ -15,7 +15,7 @@ from rlcli.config.load import Resolved
 from rlcli.config.schema import TermConfig
 from rlcli.config.strict_yaml import Path
 from rlcli.config.terms import SELECTORS, Signature
-from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
+from rlcli.errors import ConfigError, Problem, ShapeError, TaskError, did_you_mean, listing
 from rlcli.managers.live import LiveValues
 from rlcli.managers.memory import Memory
 from rlcli.random import stream
@@ -53,9 +53,9 @@ class BoundTerm:
         """The object of a class term; the function of a function term."""
         return self.call
 
-    def error(self, message: str, *keys: str) -> ConfigError:
-        """What is wrong with the term, or with a key of it."""
-        return ConfigError([self.resolved.problem((*self.path, *keys), message)])
+    def error(self, message: str, *keys: str) -> ShapeError:
+        """What is wrong with what the term gives, or with a key of it that must fit that."""
+        return ShapeError([self.resolved.problem((*self.path, *keys), message)])
 
     def state_dict(self) -> dict[str, Tensor]:
         """What a term with memory carries from step to step."""
@@ -237,7 +237,7 @@ def first_value(term: BoundTerm) -> Any:
     """Call a term once, when the environment is built.
 
     Raises:
-        ConfigError: if it refuses its parameters with a ValueError.
+        ShapeError: if it refuses its parameters with a ValueError.
     """
     try:
         return term.call()
@@ -249,7 +249,7 @@ def check_shape(term: BoundTerm, value: Any, expected: tuple[int, ...]) -> None:
     """A term's first value must be a tensor of the expected shape.
 
     Raises:
-        ConfigError: with the term's place, what was found and what was expected.
+        ShapeError: with the term's place, what was found and what was expected.
     """
     shape = tuple(value.shape) if isinstance(value, Tensor) else None
     if shape == expected:

@@ -13,6 +13,7 @@ from rlcli.errors import (
     DeviceError,
     MachineError,
     RlcliError,
+    ShapeError,
     TaskError,
     UsageError,
     did_you_mean,
@@ -138,7 +139,7 @@ def _build(subject: Subject) -> Iterator[Finding]:
     except ConfigError as error:
         for problem in error.problems:
             # a term's first value is looked at when the environment is built
-            check = "shapes" if problem.where in ("observations", "rewards", "terminations") else "names"
+            check = "shapes" if isinstance(error, ShapeError) else "names"
             where = f"{problem.where}: {problem.path}" if problem.path else problem.where
             yield Finding(
                 check, "error", where, problem.message, problem.hint or "mend it; `rlcli validate --deep` agrees"
