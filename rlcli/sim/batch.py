@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import sys
 import warnings
@@ -30,6 +31,7 @@ from rlcli.sim.guard import (
     History,
     StateLayout,
 )
+from rlcli.sim.lean import SHOWS_IT, needless, unprofiled
 from rlcli.sim.mjcf import quiet_mujoco
 from rlcli.sim.selection import Field, IdSelection, Selection, ids_of
 
@@ -124,7 +126,7 @@ class BatchEngine:
         self.causes: dict[str, int] = {}
         self.found: list[Divergence] = []
         self.warnings = dict.fromkeys(_NOTED, 0)
-        self._batch = Batch(model, num_envs, threads, persistent=external_forces)
+        self._batch = _batch_of(model, num_envs, threads, external_forces)
         self._state = torch.from_numpy(self._batch.state)
         self._warning_words = self._batch.warning.reshape(-1).view(np.int64)
         self._failed = np.zeros(num_envs, dtype=bool)
@@ -151,6 +153,8 @@ class BatchEngine:
             self._contacts = self._batch.bind("ncon")
             self._world = mujoco.MjData(model)
         self._own_constants = False
+        self._lean = True
+        """Whether steps leave out what changes no state."""
         self.forces_after_reset = forces_after_reset
         self._reset_stage = _ACC if forces_after_reset else _VEL
         self._force_sensors = force_sensors(model)
@@ -196,7 +200,7 @@ class BatchEngine:
 
     def give_model(self, env: int, model: mujoco.MjModel) -> None:
         """Write the model fields of a world's own into a copy of the model."""
-        self._batch.get_model(env, model)
+        self._write_model(env, model)
 
     def put(self, env: int, row: np.ndarray) -> None:
         """Give a world an integration state; derived fields stay behind."""
@@ -218,6 +222,8 @@ class BatchEngine:
         if name not in self._fields:
             if name not in DATA_FIELDS:
                 raise ValueError(f"'{name}' is not an MjData field; {did_you_mean(name, DATA_FIELDS) or ''}")
+            if name in SHOWS_IT:
+                self._leave_nothing_out()
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # torch has no read-only tensors; derived views must only be read
                 bound = self._bind(name)
@@ -256,7 +262,10 @@ class BatchEngine:
         """A model field with a value for every world."""
         if name not in MODEL_FIELDS:
             raise ValueError(f"'{name}' cannot differ between worlds; {did_you_mean(name, MODEL_FIELDS) or ''}")
-        return torch.from_numpy(self._batch.expand(name))
+        values = torch.from_numpy(self._batch.expand(name))
+        if not values.is_floating_point():
+            self._leave_nothing_out()
+        return values
 
     def expanded(self, name: str) -> Tensor | None:
         """The same where somebody has asked for it before; None where all worlds share the model's value."""
@@ -269,7 +278,8 @@ class BatchEngine:
     def set_constants(self, selection: Selection | None = None) -> None:
         """Let the constants that MuJoCo derives from model fields follow what was written to expanded ones."""
         try:
-            self._batch.set_const(None if selection is None else ids_of(selection).astype(np.int32))
+            with unprofiled:
+                self._batch.set_const(None if selection is None else ids_of(selection).astype(np.int32))
         except SimulationError as error:
             raise _engine_error(error) from None
         self._own_constants = True
@@ -278,7 +288,8 @@ class BatchEngine:
         """Advance every world by `nstep` physics steps; without `derive` the derived fields stay behind."""
         self._history.note(nstep)
         try:
-            self._batch.step(nstep=nstep, stage=self.step_stage if derive else _NONE)
+            with unprofiled:
+                self._batch.step(nstep=nstep, stage=self.step_stage if derive else _NONE)
         except SimulationError:
             self._failed |= self._batch.status != 0  # their rows are as they were; the others have been stepped
             self._error = " ".join(self._batch.error(int(self._failed.argmax())).split()) or self._error
@@ -386,7 +397,8 @@ class BatchEngine:
         try:
             # past the wrapper: it looks for what is wrong with the ids, which takes longer than the numbers of a few
             ids = ids_of(selection).astype(np.int32)
-            self._batch._check(ids, self._batch._b.forward(ids, min(self._forward_stage, self._reset_stage)))
+            with unprofiled:
+                self._batch._check(ids, self._batch._b.forward(ids, min(self._forward_stage, self._reset_stage)))
         except SimulationError as error:
             raise _engine_error(error) from None
         for (field, where), values in zip(forces, kept, strict=True):
@@ -442,9 +454,10 @@ class BatchEngine:
         seen = None if groups is None else np.array([g in groups for g in range(mujoco.mjNGROUP)], dtype=np.uint8)
         ids = None if selection is None else ids_of(selection).astype(np.int32)
         try:
-            distance, _ = self._batch.ray(
-                points.double().numpy(), directions.double().numpy(), geomgroup=seen, bodyexclude=exclude, ids=ids
-            )
+            with unprofiled:
+                distance, _ = self._batch.ray(
+                    points.double().numpy(), directions.double().numpy(), geomgroup=seen, bodyexclude=exclude, ids=ids
+                )
         except SimulationError as error:
             raise _engine_error(error) from None
         return torch.from_numpy(distance).float()
@@ -491,7 +504,8 @@ class BatchEngine:
         for name in substep:
             self.field(name)  # whoever saved had asked for it; here that may come later
         if self._forward_stage != _NONE:
-            self._batch.forward(stage=self._forward_stage)
+            with unprofiled:
+                self._batch.forward(stage=self._forward_stage)
         for name, values in substep.items():
             self._fields[name].copy_(values)
 
@@ -511,10 +525,11 @@ class BatchEngine:
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """One world as MjModel and MjData, forwarded; asked again for the same world, the same two objects, updated."""
         if env not in self._worlds:
-            self._worlds[env] = (self._batch.get_model(env), self._batch.get_data(env))
+            self._worlds[env] = (copy.copy(self.model), self._batch.get_data(env))
+            self._write_model(env, self._worlds[env][0])
         model, data = self._worlds[env]
         if self._batch._expanded:
-            self._batch.get_model(env, model)
+            self._write_model(env, model)
         self._batch.get_data(env, data)
         mujoco.mj_forward(model, data)
         return model, data
@@ -522,11 +537,24 @@ class BatchEngine:
     def close(self) -> None:
         """Nothing is held that Python does not free."""
 
+    def _leave_nothing_out(self) -> None:
+        """Have MuJoCo compute all that it computes for the model as it is, from now on."""
+        if self._lean:
+            self._lean = False
+            flags = self._batch._b.expand("opt.disableflags").view(np.int32)  # past the wrapper: nobody asked for it
+            flags[:] = self.model.opt.disableflags
+
+    def _write_model(self, env: int, model: mujoco.MjModel) -> None:
+        self._batch.get_model(env, model)
+        if "opt.disableflags" not in self._batch._expanded:
+            model.opt.disableflags = self.model.opt.disableflags  # whoever steps it is left everything
+
     def _forward_all(self) -> None:
         """Compute what is bound from the state of every world; fields of the last substep keep their values."""
         kept = {name: value.clone() for name, value in self._fields.items() if self._of_substep(name)}
         try:
-            self._batch.forward(stage=self._forward_stage)
+            with unprofiled:
+                self._batch.forward(stage=self._forward_stage)
         except SimulationError as error:
             raise _engine_error(error) from None
         for name, value in kept.items():
@@ -550,6 +578,16 @@ class BatchEngine:
         row = np.empty(self._batch.nstate)
         mujoco.mj_getState(self.model, data, row, int(_STATE.mjSTATE_INTEGRATION))
         return row
+
+
+def _batch_of(model: mujoco.MjModel, num_envs: int, threads: int, persistent: bool) -> Batch:
+    """A batch of worlds, which has a copy of the model, that leaves out what changes nothing."""
+    flags = model.opt.disableflags
+    try:
+        model.opt.disableflags = flags | needless(model)
+        return Batch(model, num_envs, threads, persistent=persistent)
+    finally:
+        model.opt.disableflags = flags
 
 
 _STATES_AN_ENV = 3

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from rlcli.sim.lean import touching
+
 _TRIALS, _STEPS = 8, 100
 _MARGIN = 3
 """How many times what a short random simulation needed is set aside, where the model's own bound is larger."""
@@ -55,7 +57,7 @@ def capacity(model: mujoco.MjModel, contacts: int | None = None, constraints: in
 def _bound(model: mujoco.MjModel) -> tuple[int, int]:
     """Contacts of every pair of geoms that may touch, and all rows that they, joints and equalities can make."""
     contacts = rows = 0
-    for a, b in _pairs(model):
+    for a, b in touching(model):
         kinds = tuple(sorted((_G(model.geom_type[a]), _G(model.geom_type[b])), key=int))
         points = _ON_HILLS if _G.mjGEOM_HFIELD in kinds else _POINTS.get(kinds, _MANY)
         condim = int(max(model.geom_condim[a], model.geom_condim[b]))
@@ -72,30 +74,6 @@ def _bound(model: mujoco.MjModel) -> tuple[int, int]:
 def _contact_rows(model: mujoco.MjModel, condim: int) -> int:
     pyramidal = model.opt.cone == int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
     return 1 if condim == 1 else 2 * (condim - 1) if pyramidal else condim
-
-
-def _pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Geoms that MuJoCo's filters let touch: bits that match, bodies that are neither welded nor parent and child."""
-    weld, parent = model.body_weldid, model.body_parentid
-    families = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
-    excluded = {int(s) for s in model.exclude_signature}
-    found = []
-    moves = weld[model.geom_bodyid] > 0
-    moving = np.flatnonzero(moves)
-    for a in range(model.ngeom):
-        # of two that stand still none touches the other, and a terrain may have thousands
-        for b in range(a + 1, model.ngeom) if moves[a] else moving[moving > a]:
-            one, two = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
-            bits = (model.geom_contype[a] & model.geom_conaffinity[b]) | (
-                model.geom_contype[b] & model.geom_conaffinity[a]
-            )
-            first, second = int(weld[one]), int(weld[two])
-            related = (first and second and first == int(weld[parent[second]])) or second == int(weld[parent[first]])
-            related = bool(families and first and second and related)
-            signature = (min(one, two) << 16) + max(one, two)
-            if bits and first != second and not related and signature not in excluded:
-                found.append((a, b))
-    return found
 
 
 def _sample(model: mujoco.MjModel) -> tuple[int, int]:

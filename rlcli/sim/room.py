@@ -13,6 +13,7 @@ import warp as wp
 
 from rlcli.errors import ConfigError, DeviceError, DivergedError, Problem
 from rlcli.sim.capacity import Capacity
+from rlcli.sim.lean import needless
 
 FULL = {
     mjw.OverflowType.NEFC: "constraints_per_env",
@@ -37,6 +38,7 @@ def put(model: mujoco.MjModel, num_envs: int, device: torch.device, capacity: Ca
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             on_device = mjw.put_model(model)
+        on_device.opt.disableflags |= needless(model) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         on_device.opt.warn_overflow = 0  # printing stops the device; `noted` tells
         if device.type == "cpu":
             on_device.opt.graph_conditional = False
