@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from rlcli.rl.mlp import Mlp
 from rlcli.rl.optimizers import Adam
 from rlcli.rl.policy import ACTIVATIONS, Lstm, Normalizer
 from rlcli.rl.ppo_config import NetworkConfig, PpoConfig
@@ -158,12 +159,12 @@ def adam(vector: nn.Parameter, learning_rate: Tensor, eps: float) -> Adam:
     return optimizer
 
 
-def _mlp(inputs: int, config: NetworkConfig, outputs: int, init: str, gain: float) -> nn.Sequential:
+def _mlp(inputs: int, config: NetworkConfig, outputs: int, init: str, gain: float) -> Mlp:
     layers: list[nn.Module] = []
     for width in config.hidden:
         layers += [_linear(inputs, width, init, math.sqrt(2.0)), _activation(config.activation)]
         inputs = width
-    return nn.Sequential(*layers, _linear(inputs, outputs, init, gain))
+    return Mlp(*layers, _linear(inputs, outputs, init, gain))
 
 
 def _eyes(spec: VisionSpec | None, columns: int, config: NetworkConfig, init: str) -> tuple[Vision | None, int]:

@@ -10,7 +10,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from rlcli.rl.mlp_gradients import MlpGradients, is_plain
+from rlcli.rl.mlp import is_plain
+from rlcli.rl.mlp_gradients import MlpGradients
 from rlcli.rl.networks import ActorCritic
 from rlcli.rl.ppo_config import PpoConfig
 from rlcli.rl.ppo_loss import Judged, entropy, log_prob, policy_divergence
@@ -57,9 +58,10 @@ class PpoGradient:
         with torch.no_grad():
             std, spread = networks.std, entropy(networks.std)
             objective = _Objective(config, batch, advantage, std)
-            means = self._mlps(batch.obs, batch.critic_obs, objective) / len(advantage)
-            losses, of_std, distance = means.split([4, len(std), len(std)])
-            surrogate, value_loss, clip_fraction, bounds = losses
+            sums = self._mlps(batch.obs, batch.critic_obs, objective.of_mean, objective.of_value)
+            of_actor, value_loss = (values / len(advantage) for values in sums)
+            losses, of_std, distance = of_actor.split([3, len(std), len(std)])
+            surrogate, clip_fraction, bounds = losses
             self._of_std.copy_(networks.std_gradient(of_std - config.entropy_coef))
             kl = policy_divergence(config, distance, std, old_std)
             self._shared[-1:].copy_(kl)
@@ -78,22 +80,26 @@ class _Objective:
         self.mean = torch.empty_like(batch.mean)
         """The actor's outputs. (n, a)"""
 
-    def __call__(self, rows: slice, mean: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def of_mean(self, rows: slice, mean: Tensor) -> tuple[Tensor, Tensor]:
         """`rlcli.rl.mlp_gradients.Slopes`. Sums of losses, of clipped ratios, of slopes to the log-deviation."""
-        config, batch, count = self._config, self._batch, len(self._advantage)
+        config, batch = self._config, self._batch
         self.mean[rows] = mean
         distance = (batch.mean[rows] - mean).square_().sum(dim=0)
         noise = (batch.action[rows] - mean).div_(self._std)
         surrogate, clipped, of_log_prob, of_std = self._surrogate(rows, noise)
         of_mean = noise.mul_(of_log_prob[:, None]).mul_(self._of_mean)
-        value_error, of_value = _value_error(value.squeeze(-1), batch.value[rows], batch.target[rows], config)
         bounds = torch.zeros(())
         if config.bounds_coef:
             beyond = (mean.abs() - config.bounds_margin).clamp_(min=0.0)
             bounds = beyond.square().sum()
-            of_mean += beyond.mul_(mean.sign()).mul_(2.0 * config.bounds_coef / count)
-        numbers = torch.cat((torch.stack((surrogate, value_error, clipped, bounds)), of_std, distance))
-        return of_mean, of_value.mul_(2.0 * config.value_coef / count)[:, None], numbers
+            of_mean += beyond.mul_(mean.sign()).mul_(2.0 * config.bounds_coef / len(self._advantage))
+        return of_mean, torch.cat((torch.stack((surrogate, clipped, bounds)), of_std, distance))
+
+    def of_value(self, rows: slice, value: Tensor) -> tuple[Tensor, Tensor]:
+        """`rlcli.rl.mlp_gradients.Slopes`. The sum of the errors."""
+        config, batch = self._config, self._batch
+        error, slope = _value_error(value.squeeze(-1), batch.value[rows], batch.target[rows], config)
+        return slope.mul_(2.0 * config.value_coef / len(self._advantage))[:, None], error
 
     def _surrogate(self, rows: slice, noise: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The clipped surrogate, how many ratios are clipped, its slopes to log-probabilities and log-deviations."""

@@ -13,8 +13,9 @@ from rlcli.config.load import resolve
 from rlcli.envs.vec_env import make_env
 from rlcli.errors import DivergedError
 from rlcli.registry import find_task
-from rlcli.rl import mlp_gradients
-from rlcli.rl.mlp_gradients import MlpGradients, is_plain
+from rlcli.rl import mlp
+from rlcli.rl.mlp import Mlp, is_plain
+from rlcli.rl.mlp_gradients import MlpGradients
 from rlcli.rl.policy import ACTIVATIONS
 from rlcli.rl.ppo import PpoTrainer
 from rlcli.rl.ppo_config import PpoConfig
@@ -179,17 +180,18 @@ def test_slopes_are_autograds_at_the_edges_of_the_clipping_ranges(clip_value, cl
     expected = torch.autograd.grad(judged.loss, (mean, value, std))
     with torch.no_grad():
         objective = _Objective(config, batch, advantage, std.detach())
-        of_mean, of_value, numbers = objective(slice(0, count), mean.detach(), value.detach())
-    of_std = numbers[4:5] / count
+        of_mean, numbers = objective.of_mean(slice(0, count), mean.detach())
+        of_value, _ = objective.of_value(slice(0, count), value.detach())
+    of_std = numbers[3:4] / count
     for mine, theirs in zip((of_mean, of_value, of_std), expected, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=0, atol=1e-6 * theirs.abs().max().item())
-    assert 0.0 < judged.metrics[4].item() == pytest.approx(numbers[2].item() / count)
+    assert 0.0 < judged.metrics[4].item() == pytest.approx(numbers[1].item() / count)
 
 
 # --- networks alone ---
 
 
-def mlp(activation, *widths):
+def plain(activation, *widths):
     layers = []
     for inputs, outputs in itertools.pairwise(widths):
         layers += [nn.Linear(inputs, outputs), ACTIVATIONS[activation]()]
@@ -204,10 +206,13 @@ def gradients_of(actor, critic, rows, threads):
     parameters = [*actor.parameters(), *critic.parameters()]
     gradients = [torch.full_like(parameter, torch.nan) for parameter in parameters]
 
-    def slopes(_, mean, value):
-        return mean.cos() / rows, value / rows, torch.stack((mean.sin().sum(), torch.tensor(float(len(mean)))))
+    def of_mean(_, mean):
+        return mean.cos() / rows, torch.stack((mean.sin().sum(), torch.tensor(float(len(mean)))))
 
-    sums = MlpGradients(actor, critic, gradients, rows, threads)(obs, critic_obs, slopes)
+    def of_value(_, value):
+        return value / rows, torch.tensor([float(len(value))])
+
+    sums = torch.cat(MlpGradients(actor, critic, gradients, rows, threads)(obs, critic_obs, of_mean, of_value))
     twins = actor.double(), critic.double()
     loss = twins[0](obs.double()).sin().sum() + 0.5 * twins[1](critic_obs.double()).square().sum()
     expected = torch.autograd.grad(loss / rows, [*twins[0].parameters(), *twins[1].parameters()])
@@ -215,39 +220,47 @@ def gradients_of(actor, critic, rows, threads):
     return gradients, expected, sums
 
 
-@pytest.mark.parametrize("vector_expm1", [True, False])
+@pytest.fixture(params=[True, False], ids=["AVX-512", "other"])
+def processor(request, monkeypatch):
+    """The ways of a processor with AVX-512 and of one without, as far as this one can go them."""
+    monkeypatch.setattr(mlp, "_AVX512", request.param)
+    monkeypatch.setattr(mlp, "_linear", mlp._onednn())
+
+
+@pytest.mark.usefixtures("processor")
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-@pytest.mark.parametrize("rows", [1, 5, 4095, 4097, 20001])
-def test_gradients_of_networks_are_autograds_however_many_parts(activation, vector_expm1, rows, monkeypatch):
-    monkeypatch.setattr(mlp_gradients, "_VECTOR_EXPM1", vector_expm1)
+@pytest.mark.parametrize("rows", [1, 5, 8191, 8193, 20001])
+def test_gradients_of_networks_are_autograds_however_many_parts(activation, rows):
     torch.manual_seed(2)
-    actor, critic = mlp(activation, 5, 7, 6, 2), mlp(activation, 3, 130, 1)
+    actor, critic = plain(activation, 5, 130, 70, 2), plain(activation, 3, 130, 1)
     gradients, expected, sums = gradients_of(actor, critic, rows, 2)
     scale = max(gradient.abs().max().item() for gradient in expected)
     for mine, theirs in zip(gradients, expected, strict=True):
         torch.testing.assert_close(mine, theirs.float(), rtol=0, atol=1e-6 * scale)
-    assert sums[1].item() == rows
+    assert sums[1:].tolist() == [rows, rows]
 
 
 def test_gradients_have_the_same_bits_for_any_number_of_threads():
     found = []
     for threads in (1, 2, 3, 5):
         torch.manual_seed(2)
-        gradients, _, sums = gradients_of(mlp("elu", 4, 32, 32, 1), mlp("elu", 4, 32, 32, 1), 30000, threads)
+        gradients, _, sums = gradients_of(plain("elu", 4, 32, 32, 1), plain("elu", 4, 32, 32, 1), 30000, threads)
         found.append(torch.cat([part.flatten() for part in (*gradients, sums)]))
     assert all(torch.equal(found[0], other) for other in found[1:])
 
 
 def test_a_smaller_minibatch_leaves_nothing_of_a_larger_one():
     torch.manual_seed(2)
-    actor, critic = mlp("tanh", 4, 8, 1), mlp("tanh", 4, 8, 1)
+    actor, critic = plain("tanh", 4, 8, 1), plain("tanh", 4, 8, 1)
     found = []
     for largest in (20000, 3000):
         gradients = [torch.zeros_like(parameter) for parameter in (*actor.parameters(), *critic.parameters())]
         way = MlpGradients(actor, critic, gradients, largest, 2)
         for rows in (largest, 3000):
             obs = torch.randn(rows, 4, generator=torch.Generator().manual_seed(rows))
-            way(obs, obs, lambda _, mean, value: (mean.clone(), value.clone(), torch.ones(1)))
+            way(
+                obs, obs, lambda _, mean: (mean.clone(), torch.ones(1)), lambda _, value: (value.clone(), torch.ones(1))
+            )
         found.append(torch.cat([gradient.flatten() for gradient in gradients]))
     torch.testing.assert_close(found[0], found[1], rtol=1e-5, atol=1e-3)
 
@@ -255,21 +268,42 @@ def test_a_smaller_minibatch_leaves_nothing_of_a_larger_one():
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_what_is_not_finite_reaches_the_gradient_without_a_warning(activation):
     torch.manual_seed(2)
-    actor, critic = mlp(activation, 2, 4, 1), mlp(activation, 2, 4, 1)
+    actor, critic = plain(activation, 2, 4, 1), plain(activation, 2, 4, 1)
     gradients = [torch.zeros_like(parameter) for parameter in (*actor.parameters(), *critic.parameters())]
     obs = torch.tensor([[torch.nan, 1.0], [torch.inf, 2.0], [-torch.inf, 1.0], [1e30, -1e30]])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        MlpGradients(actor, critic, gradients, 4, 1)(obs, obs, lambda _, a, b: (a.clone(), b.clone(), torch.ones(1)))
+        slopes = [lambda _, outputs: (outputs.clone(), torch.ones(1))] * 2
+        MlpGradients(actor, critic, gradients, 4, 1)(obs, obs, *slopes)
     assert not any(gradient.isfinite().all() for gradient in gradients)
 
 
 def test_only_layers_of_which_the_gradient_is_known_are_plain():
-    assert is_plain(mlp("elu", 3, 4, 1))
+    assert is_plain(plain("elu", 3, 4, 1))
     assert not is_plain(nn.Sequential(nn.Linear(3, 4), nn.ELU(alpha=0.5), nn.Linear(4, 1)))
     assert not is_plain(nn.Sequential(nn.Linear(3, 4), nn.GELU(), nn.Linear(4, 1)))
     assert not is_plain(nn.Sequential(nn.Linear(3, 4), nn.ELU(), nn.Linear(4, 4), nn.Tanh(), nn.Linear(4, 1)))
     assert not is_plain(nn.Sequential(nn.Linear(3, 4, bias=False), nn.ELU(), nn.Linear(4, 1)))
+
+
+@pytest.mark.usefixtures("processor")
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("rows", [(1,), (7,), (3, 3000), (0,)])
+def test_networks_give_the_same_whether_or_not_a_gradient_is_asked_for(activation, rows):
+    torch.manual_seed(2)
+    network = Mlp(*plain(activation, 5, 130, 70, 2))
+    seen = torch.randn(*rows, 9)[..., 2:7]
+    expected = network(seen)
+    assert expected.requires_grad
+    with torch.no_grad():
+        torch.testing.assert_close(network(seen), expected.detach(), rtol=0, atol=1e-6)
+        torch.testing.assert_close(network[:-1](seen), network[:-1].double()(seen.double()).float(), rtol=0, atol=1e-6)
+
+
+def test_networks_that_are_not_plain_go_torchs_way():
+    odd = Mlp(nn.Linear(3, 4), nn.GELU(), nn.Linear(4, 1))
+    with torch.no_grad():
+        assert torch.equal(odd(torch.ones(2, 3)), nn.Sequential(*odd)(torch.ones(2, 3)))
 
 
 @pytest.mark.parametrize("override", ["agent.rnn={hidden: 4}", "agent.tell_coef=0.1"])
