@@ -39,6 +39,7 @@ HEADS = {
     "num_envs": "environments",
     "ratio": "of bare `Batch`",
     "ratio_stage_none": "of stage NONE",
+    "physics": "physics' share",
     "stock_sb3_ratio": "stock SB3 on the same task",
     "env_steps_per_s": "environment steps/s",
     "bare_steps_per_s": "bare steps/s",
