@@ -1,7 +1,7 @@
 """Plain multilayer perceptrons on a CPU, of what the libraries inside torch and numpy do fastest.
 
-On a processor with AVX-512 that is not Intel's, oneDNN multiplies wide matrices twice as fast as the library that
-torch asks; numpy's expm1 and tanh are three and ten times as fast as torch's.
+The library that torch asks for products, MKL, knows AVX-512 on Intel's processors alone; on AMD's oneDNN is twice as
+fast, on Intel's slower. numpy's expm1 and tanh are three and ten times as fast as torch's.
 """
 
 from __future__ import annotations
@@ -13,16 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from rlcli.rl.environment import processor
+
 _aten = torch.ops.aten
 _AVX512 = torch.backends.cpu.get_cpu_capability() == "AVX512"
-"""Without it, numpy's expm1 goes number by number, and oneDNN is no faster than what torch asks."""
+"""Without it, numpy's expm1 goes number by number."""
 _WORTH, _LARGE = 2**20, 64 * 64
 """Multiplications from which on a product of oneDNN's is faster; numbers of its result, where it sums over samples."""
 
 
 def _onednn() -> Callable[..., Tensor] | None:
-    """`x @ weight.T + bias`. The operator is one of torch's own, so there may come a torch without it."""
-    if not (_AVX512 and torch.backends.mkldnn.is_available()):
+    """`x @ weight.T + bias`, where it pays. The operator is one of torch's own: there may come a torch without it."""
+    if not _AVX512 or "AMD" not in processor()["model"] or not torch.backends.mkldnn.is_available():
         return None
     operator: Any = getattr(torch.ops.mkldnn, "_linear_pointwise", None)
     return operator and (lambda x, weight, bias=None: operator(x, weight, bias, "none", [], ""))

@@ -300,6 +300,12 @@ def test_networks_give_the_same_whether_or_not_a_gradient_is_asked_for(activatio
         torch.testing.assert_close(network[:-1](seen), network[:-1].double()(seen.double()).float(), rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("model", ["Intel(R) Xeon(R) Platinum 8481C CPU @ 2.70GHz", "Neoverse-N1"])
+def test_products_are_the_usual_ones_where_onednns_are_slower(model, monkeypatch):
+    monkeypatch.setattr(mlp, "processor", lambda: {"model": model})
+    assert mlp._onednn() is None
+
+
 def test_networks_that_are_not_plain_go_torchs_way():
     odd = Mlp(nn.Linear(3, 4), nn.GELU(), nn.Linear(4, 1))
     with torch.no_grad():
