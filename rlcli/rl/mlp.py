@@ -102,7 +102,10 @@ def is_plain(layers: Iterable[nn.Module]) -> bool:
 
 
 class Mlp(nn.Sequential):
-    """Layers that go the fast way where nobody asks for a gradient, and the usual one where somebody does."""
+    """Layers that go the fast way where nobody asks for a gradient, and the usual one where somebody does.
+
+    The fast way calls no hooks of its layers.
+    """
 
     def __init__(self, *layers: Any) -> None:
         super().__init__(*layers)
@@ -113,7 +116,7 @@ class Mlp(nn.Sequential):
         usual = inputs.is_cuda or inputs.dtype != torch.float32 or not inputs.numel() or not self._plain
         if usual or torch.is_grad_enabled():
             return super().forward(inputs)
-        values = inputs.flatten(0, -2)
+        values = inputs.reshape(-1, inputs.shape[-1])
         for layer in self:
             if isinstance(layer, nn.Linear):
                 values = affine(values, layer.weight, layer.bias)

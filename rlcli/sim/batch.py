@@ -153,8 +153,8 @@ class BatchEngine:
             self._contacts = self._batch.bind("ncon")
             self._world = mujoco.MjData(model)
         self._own_constants = False
-        self._lean = True
-        """Whether steps leave out what changes no state."""
+        self._lean, self._disabled = True, model.opt.disableflags
+        """Whether steps leave out what changes no state, and what they left out if they did not."""
         self.forces_after_reset = forces_after_reset
         self._reset_stage = _ACC if forces_after_reset else _VEL
         self._force_sensors = force_sensors(model)
@@ -542,12 +542,12 @@ class BatchEngine:
         if self._lean:
             self._lean = False
             flags = self._batch._b.expand("opt.disableflags").view(np.int32)  # past the wrapper: nobody asked for it
-            flags[:] = self.model.opt.disableflags
+            flags[:] = self._disabled
 
     def _write_model(self, env: int, model: mujoco.MjModel) -> None:
         self._batch.get_model(env, model)
         if "opt.disableflags" not in self._batch._expanded:
-            model.opt.disableflags = self.model.opt.disableflags  # whoever steps it is left everything
+            model.opt.disableflags = self._disabled  # whoever steps it is left everything
 
     def _forward_all(self) -> None:
         """Compute what is bound from the state of every world; fields of the last substep keep their values."""
@@ -581,13 +581,10 @@ class BatchEngine:
 
 
 def _batch_of(model: mujoco.MjModel, num_envs: int, threads: int, persistent: bool) -> Batch:
-    """A batch of worlds, which has a copy of the model, that leaves out what changes nothing."""
-    flags = model.opt.disableflags
-    try:
-        model.opt.disableflags = flags | needless(model)
-        return Batch(model, num_envs, threads, persistent=persistent)
-    finally:
-        model.opt.disableflags = flags
+    """A batch of worlds that leaves out what changes nothing; the model, which others may step, stays as it is."""
+    lean = copy.copy(model)
+    lean.opt.disableflags |= needless(model)
+    return Batch(lean, num_envs, threads, persistent=persistent)
 
 
 _STATES_AN_ENV = 3

@@ -7,6 +7,7 @@ one island that they are.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import threading
@@ -62,7 +63,7 @@ def touching(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
 
 
 class _Unprofiled:
-    """`with unprofiled:` MuJoCo does not look at the clock; whoever steps elsewhere meanwhile is not timed, either.
+    """`with unprofiled:` MuJoCo does not look at the clock. Timers of who steps elsewhere meanwhile are wrong.
 
     `mjcb_time` is a variable of MuJoCo's C library. Python's `set_mjcb_time(None)` puts the bindings' own clock there.
     """
@@ -76,15 +77,16 @@ class _Unprofiled:
     def _callback(self) -> ctypes.c_void_p:
         for name in ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll"):
             for path in Path(mujoco.__file__).parent.glob(name):
-                return ctypes.c_void_p.in_dll(ctypes.CDLL(str(path)), "mjcb_time")
+                with contextlib.suppress(OSError, ValueError):
+                    return ctypes.c_void_p.in_dll(ctypes.CDLL(str(path)), "mjcb_time")
         return ctypes.c_void_p()  # a build of MuJoCo that looks different: timed, as anywhere
 
     def __enter__(self) -> None:
         with self._lock:
-            self._inside += 1
-            if self._inside == 1:
+            if not self._inside:
                 self._clock = self._callback.value
                 self._callback.value = None
+            self._inside += 1
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

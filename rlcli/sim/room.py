@@ -38,7 +38,8 @@ def put(model: mujoco.MjModel, num_envs: int, device: torch.device, capacity: Ca
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             on_device = mjw.put_model(model)
-        on_device.opt.disableflags |= needless(model) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        if not on_device.nsensorcollision:  # distances are measured by the same pass
+            on_device.opt.disableflags |= needless(model) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         on_device.opt.warn_overflow = 0  # printing stops the device; `noted` tells
         if device.type == "cpu":
             on_device.opt.graph_conditional = False

@@ -288,7 +288,7 @@ def test_only_layers_of_which_the_gradient_is_known_are_plain():
 
 @pytest.mark.usefixtures("processor")
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-@pytest.mark.parametrize("rows", [(1,), (7,), (3, 3000), (0,)])
+@pytest.mark.parametrize("rows", [(), (1,), (7,), (3, 3000), (0,)])
 def test_networks_give_the_same_whether_or_not_a_gradient_is_asked_for(activation, rows):
     torch.manual_seed(2)
     network = Mlp(*plain(activation, 5, 130, 70, 2))

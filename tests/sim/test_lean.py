@@ -1,5 +1,6 @@
 """What steps leave out, and that nothing comes of it."""
 
+import _ctypes
 import ctypes
 import threading
 from pathlib import Path
@@ -190,7 +191,12 @@ def test_a_clock_that_is_set_meanwhile_stays(looks):
     assert data.timer[mujoco.mjtTimer.mjTIMER_STEP].duration > 0
 
 
-def test_a_mujoco_whose_library_is_elsewhere_is_timed(tmp_path, monkeypatch, looks):
+@pytest.mark.parametrize("found", [None, b"no library", "another"])
+def test_a_mujoco_whose_library_is_not_as_it_should_be_is_timed(found, tmp_path, monkeypatch, looks):
+    if found == "another":
+        (tmp_path / "libmujoco.so").symlink_to(_ctypes.__file__)
+    elif found:
+        (tmp_path / "libmujoco.so").write_bytes(found)
     monkeypatch.setattr(mujoco, "__file__", str(tmp_path / "__init__.py"))
     other = type(unprofiled)()
     with other:
@@ -239,6 +245,46 @@ def test_models_that_are_given_away_leave_nothing_out():
     engine.step(10)
     assert engine.field("qvel")[:, 0].tolist()[1] == 0.0
     assert engine.world(1)[0].opt.disableflags == int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+
+
+def test_flags_that_are_set_in_the_model_later_count_neither_before_nor_after_something_is_expanded():
+    model = model_of(slider())
+    engine = engine_of(model)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    engine.step(1)
+    fallen = engine.field("qvel").clone()
+    engine.expand("jnt_limited")
+    engine.step(1)
+    torch.testing.assert_close(engine.field("qvel"), 2.0 * fallen)
+    assert engine.world(0)[0].opt.disableflags == 0
+
+
+def test_a_model_of_which_several_threads_make_engines_stays_as_it_is():
+    model = model_of(slider())
+
+    def work():
+        for _ in range(100):
+            engine_of(model, 1)
+
+    threads = [threading.Thread(target=work) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    seen = set()
+    while any(thread.is_alive() for thread in threads):
+        seen.add(model.opt.disableflags)
+    assert seen | {model.opt.disableflags} == {0}
+
+
+@pytest.mark.parametrize("engine", ["batch", "warp"])
+def test_distances_are_measured_between_geoms_that_never_touch(engine):
+    far = slider(
+        slider(name="child", geom='<geom name="b" size="0.1" contype="0" conaffinity="0" pos="1 0 0"/>'), geom=GHOST
+    )
+    model = model_of(far, '<sensor><distance geom1="ghost" geom2="b" cutoff="10"/></sensor>')
+    worlds = open_engine(model, 2, SimConfig(dt=model.opt.timestep, engine=engine), device="cpu")
+    values = worlds.field("sensordata")
+    worlds.step(1)
+    assert values.flatten().tolist() == pytest.approx([0.8, 0.8], abs=1e-5)
 
 
 def test_the_library_is_found_here():
