@@ -73,7 +73,7 @@ def _elu(given: Tensor, result: Tensor) -> None:
     torch.maximum(given, result, out=result)  # expm1(x) is above x below 0, and 0 at it
 
 
-ACTIVATIONS: dict[type[nn.Module], Activation] = {
+FAST_ACTIVATIONS: dict[type[nn.Module], Activation] = {
     nn.ELU: Activation(_elu, lambda s, _, y: _aten.elu_backward.grad_input(s, 1.0, 1.0, 1.0, True, y, grad_input=s)),
     nn.ReLU: Activation(
         lambda x, y: torch.clamp(x, min=0.0, out=y),
@@ -97,7 +97,7 @@ def is_plain(layers: Iterable[nn.Module]) -> bool:
         all(isinstance(layer, nn.Linear) and layer.bias is not None for layer in linears)
         and all(not layer.weight.is_cuda for layer in linears)
         and len({type(layer) for layer in activations}) == 1
-        and all(type(layer) in ACTIVATIONS and getattr(layer, "alpha", 1.0) == 1.0 for layer in activations)
+        and all(type(layer) in FAST_ACTIVATIONS and getattr(layer, "alpha", 1.0) == 1.0 for layer in activations)
     )
 
 
@@ -122,5 +122,5 @@ class Mlp(nn.Sequential):
                 values = affine(values, layer.weight, layer.bias)
             else:
                 given, values = values, torch.empty_like(values)
-                ACTIVATIONS[type(layer)].forward(given, values)
+                FAST_ACTIVATIONS[type(layer)].forward(given, values)
         return values.view(*inputs.shape[:-1], values.shape[-1])

@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 from torch import Tensor, nn
 
-from rlcli.rl.mlp import ACTIVATIONS, affine, to_inputs, to_weights
+from rlcli.rl.mlp import FAST_ACTIVATIONS, affine, to_inputs, to_weights
 
 _ROWS, _WIDE = 8192, 64
 """Samples of a part at most, if no layer is wider than the other number: beyond, results leave the cache."""
@@ -59,7 +59,7 @@ class MlpGradients:
         self._sums = _views(self._sum, shapes)
         threads = min(threads, 2 * parts)
         self._scratch = [
-            (_Mlp(actor, min(rows, self._most)), _Mlp(critic, min(rows, self._most))) for _ in range(threads)
+            (_Passes(actor, min(rows, self._most)), _Passes(critic, min(rows, self._most))) for _ in range(threads)
         ]
         self._pool = (
             ThreadPoolExecutor(threads - 1, initializer=torch.set_num_threads, initargs=(1,)) if threads > 1 else None
@@ -71,7 +71,7 @@ class MlpGradients:
         numbers = [[torch.empty(0)] * len(cuts) for _ in range(2)]
         left = deque(itertools.product(range(2), enumerate(cuts)))
 
-        def work(mlps: Sequence[_Mlp]) -> None:
+        def work(mlps: Sequence[_Passes]) -> None:
             while True:
                 try:
                     network, (part, rows) = left.popleft()
@@ -100,13 +100,13 @@ class MlpGradients:
         return [slice(start, end) for start, end in itertools.pairwise(ends)]
 
 
-class _Mlp:
+class _Passes:
     """A network that goes forwards and backwards over some samples, in memory of its own."""
 
     def __init__(self, layers: Iterable[nn.Module], rows: int) -> None:
         linears = [layer for layer in layers if isinstance(layer, nn.Linear)]
         self._weights = [(layer.weight.detach(), layer.bias.detach()) for layer in linears]
-        (self._activation,) = {ACTIVATIONS[type(layer)] for layer in layers if not isinstance(layer, nn.Linear)}
+        (self._activation,) = {FAST_ACTIVATIONS[type(layer)] for layer in layers if not isinstance(layer, nn.Linear)}
         self._given, self._results, self._slopes = (
             [torch.empty(rows, len(bias)) for _, bias in self._weights] for _ in range(3)
         )

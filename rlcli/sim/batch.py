@@ -524,11 +524,10 @@ class BatchEngine:
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """One world as MjModel and MjData, forwarded; asked again for the same world, the same two objects, updated."""
-        if env not in self._worlds:
+        if new := env not in self._worlds:
             self._worlds[env] = (copy.copy(self.model), self._batch.get_data(env))
-            self._write_model(env, self._worlds[env][0])
         model, data = self._worlds[env]
-        if self._batch._expanded:
+        if new or self._batch._expanded:
             self._write_model(env, model)
         self._batch.get_data(env, data)
         mujoco.mj_forward(model, data)
