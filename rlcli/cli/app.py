@@ -13,7 +13,7 @@ from typing import Any
 import typer
 from typer._click.exceptions import ClickException, NoArgsIsHelpError, UsageError
 
-from rlcli.cli.console import console, discard
+from rlcli.cli.console import console, discard, print_log_records
 from rlcli.cli.options import CHOOSE
 from rlcli.config.settings import applied, read_settings, settings_file
 from rlcli.errors import ConfigError, RlcliError
@@ -94,6 +94,7 @@ def build(only: str | None = None) -> typer.Typer:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
+    print_log_records()
     console.owns_process = arguments is None
     if console.owns_process:
         collect_seldom()

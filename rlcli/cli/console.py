@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import logging
 import os
 import re
 import sys
@@ -135,6 +136,27 @@ def _shade(share: float) -> str:
 
 
 console = Console()
+
+
+class _ConsoleHandler(logging.Handler):
+    """Handler that prints the records of the logger `rlcli`: warnings always, INFO unless -q, DEBUG with -v."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one record on stderr."""
+        if record.levelno >= logging.WARNING:
+            console.warn(record.getMessage())
+        elif record.levelno >= logging.INFO:
+            console.info(record.getMessage())
+        else:
+            console.detail(record.getMessage())
+
+
+def print_log_records() -> None:
+    """Send the records of the logger `rlcli` to the console; repeated calls add nothing."""
+    logger = logging.getLogger("rlcli")
+    if not any(isinstance(handler, _ConsoleHandler) for handler in logger.handlers):
+        logger.addHandler(_ConsoleHandler())
+        logger.setLevel(logging.DEBUG)
 
 
 def is_terminal(stream: Any) -> bool:
