@@ -25,7 +25,7 @@ THEIRS = ["mjlab.scripts.train:main", "Mjlab-Cartpole-Balance", "--env.scene.num
           "tensorboard", "--gpu-ids", "None"]  # fmt: skip
 FIRST = {
     "first step": ("rlcli.envs.vec_env:VecEnv.step", "mjlab.envs.manager_based_rl_env:ManagerBasedRlEnv.step"),
-    "first update": ("rlcli.rl.sb3:Sb3Trainer.iterate", "rsl_rl.algorithms.ppo:PPO.update"),
+    "first update": ("rlcli.rl.sb3.trainer:Sb3Trainer.iterate", "rsl_rl.algorithms.ppo:PPO.update"),
 }
 
 

@@ -20,11 +20,11 @@ from machine import describe
 
 from rlcli.config.load import resolve
 from rlcli.config.schema import AutopsyConfig
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task, load_object
-from rlcli.rl.autopsy import open_keeper
-from rlcli.rl.dump import Watch
-from rlcli.rl.saving import Keep, Saver
+from rlcli.replay.crash_dump import CrashDumper
+from rlcli.replay.failure_recorder import open_failure_recorder
+from rlcli.training.checkpoint_writer import CheckpointWriter, Keep
 
 
 class Training:
@@ -38,9 +38,9 @@ class Training:
         self.trainer = make(self.env, resolved.agent, seed=1, device="cpu", torch_threads=1)
         self.trainer.start()
         (folder / "checkpoints").mkdir(parents=True)
-        Watch(self.env, folder / "dumps", print)
-        cases = open_keeper(self.env, config, folder, None, print)
-        self.saver = Saver(folder / "checkpoints", Keep(2), {}, cases=cases)
+        CrashDumper(self.env, folder / "dumps")
+        cases = open_failure_recorder(self.env, config, folder, None)
+        self.saver = CheckpointWriter(folder / "checkpoints", Keep(2), {}, cases=cases)
 
     def block(self, iterations: int) -> tuple[float, float]:
         """Environment steps a second, and a second of the processor."""

@@ -18,10 +18,10 @@ from humanoid import TASK, humanoid
 from machine import describe
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task, load_object
-from rlcli.rl.checkpoint import open_checkpoint
-from rlcli.rl.saving import Keep, Saver
+from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.training.checkpoint_writer import CheckpointWriter, Keep
 
 AGENT = """
 agents:
@@ -46,7 +46,7 @@ def make_trainer(folder: Path, num_envs: int) -> object:
 def measure(trainer: object, checkpoints: Path, repeats: int) -> dict[str, float]:
     """Medians: the copy, what `save` waits for in all, writing, loading [ms]; and the size [MB]."""
     rows = []
-    saver = Saver(checkpoints, Keep(2), {})
+    saver = CheckpointWriter(checkpoints, Keep(2), {})
     for number in range(repeats):
         begin = time.perf_counter()
         state = trainer.state()

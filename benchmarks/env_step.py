@@ -2,8 +2,8 @@
 
 Both are timed in turn in one process, block by block; the ratio of each pair of neighbouring blocks is taken, and the
 median of the ratios is the figure. It may be above 1.00: the engine leaves out what changes nothing
-(`rlcli/sim/lean.py`), and `mujoco.batch.Batch`, as it comes, does not. `physics` is the share of a step that the
-engine's call takes; the rest are actions, observations, rewards, terminations, resets and episode sums.
+(`rlcli/sim/skippable_work.py`), and `mujoco.batch.Batch`, as it comes, does not. `physics` is the share of a step that
+the engine's call takes; the rest are actions, observations, rewards, terminations, resets and episode sums.
 
 The bare physics begins where the environments are and is given their controls; it is put back there before it leaves
 them far behind. `of bare Batch` computes the stage that the task's terms read, `of stage NONE` none.
@@ -25,7 +25,8 @@ from machine import describe
 from mujoco.batch import Batch
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import VecEnv, make_env
+from rlcli.envs.make import make_env
+from rlcli.envs.vec_env import VecEnv
 from rlcli.registry import find_task
 
 NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
@@ -66,7 +67,7 @@ class Bare:
 
 def bare_of(env: VecEnv, actions: torch.Tensor) -> Bare:
     """The physics of an environment as it is, with the controls of its next steps."""
-    start = env.engine.rows(np.arange(env.num_envs))
+    start = env.engine.state_rows(np.arange(env.num_envs))
     controls = []
     for action in actions:
         env.step(action)

@@ -22,9 +22,9 @@ import torch
 import warp as wp
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task
-from rlcli.rl.ppo import PpoTrainer
+from rlcli.rl.ppo.trainer import PpoTrainer
 
 DEVICE = "cuda"
 REPEATS = 7
@@ -87,7 +87,7 @@ def bare(env, controls):
     engine = env.engine
     with wp.ScopedDevice(DEVICE):
         model = mjw.put_model(engine.model)
-        for name in engine.expansions():  # what is randomised differs between the worlds here, too
+        for name in engine.expanded_fields():  # what is randomised differs between the worlds here, too
             theirs, attribute = engine._owner(name)
             setattr(model.opt if name.startswith("opt.") else model, attribute, getattr(theirs, attribute))
         model.opt.warn_overflow = 0
@@ -153,9 +153,9 @@ def measure_train(
     trainer = PpoTrainer(env, resolved.agent, seed=1, device=DEVICE, torch_threads=1)
     change(trainer)
     trainer.start()
-    notes = trainer.iterate().notes
+    trainer.iterate()
     first = time.perf_counter() - begin
-    notes = [*notes, *trainer.iterate().notes]
+    trainer.iterate()
     reports, walls = [], []
     for _ in range(iterations):
         begin = time.perf_counter()
@@ -164,7 +164,7 @@ def measure_train(
     wall = statistics.median(walls)
     parts = {key: statistics.median(r.seconds[key] for r in reports) for key in reports[0].seconds}
     report(what="train", task=task, feature=name, num_envs=num_envs, steps_per_s=trainer.steps_per_iteration / wall,
-           iteration_ms=wall * 1e3, first_iteration_s=first, notes=notes,
+           iteration_ms=wall * 1e3, first_iteration_s=first,
            **{f"{key}_ms": value * 1e3 for key, value in parts.items()})  # fmt: skip
     env.close()
 
@@ -178,7 +178,7 @@ def without(part):
         elif part == "guard":
             trainer.env.engine.diverged = lambda: torch.zeros(trainer.env.num_envs, dtype=torch.bool, device=DEVICE)
         elif part == "finite":
-            trainer.env.engine.watch = lambda values, what: None
+            trainer.env.engine.check_finite = lambda values, what: None
 
     return change
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task
 
 TOLERANCE = 1e-4

@@ -24,7 +24,7 @@ import torch
 import warp as wp
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task
 
 HERE = Path(__file__).parent
@@ -73,20 +73,20 @@ def our_terms(env, states):
     command = env.command_manager.get_command("twist")
     for number in range(len(states["qpos"])):
         env.reset()
-        env.sim.settle()
+        env.sim.forward_moved()
         for field in ("qpos", "qvel"):
             env.engine.field(field)[:] = torch.as_tensor(states[field][number])
         for action in ("before", "action"):
-            env._act(torch.as_tensor(states[action][number]))
+            env._apply_action(torch.as_tensor(states[action][number]))
         command[:] = torch.as_tensor(states["command"][number])
-        env.sim.moved(env._everyone())
-        env.sim.settle()
+        env.sim.on_moved(env._select_all())
+        env.sim.forward_moved()
         for sensor in env.sensors.values():
             sensor.air_time.fill_(1e-9)  # contact that there is has just begun
             sensor.update(env.step_dt)
         row = {f"reward.{term.name}": term.call().float().clone() for term in env.reward_manager.terms}
         groups = {"policy": "actor", "critic": "critic"}
-        observed = env._observe()
+        observed = env._compute_observations()
         rows.append({**row, **{f"observation.{groups[name]}": value.clone() for name, value in observed.items()}})
     return {name: torch.stack([row[name] for row in rows]).numpy() for name in rows[0]}
 
@@ -139,22 +139,22 @@ def measure_split(task, num_envs):
     calm = torch.zeros(num_envs, dtype=torch.bool, device=gpu.DEVICE)
 
     def derive():
-        env.sim.moved(ended)
-        env.sim.settle()
+        env.sim.on_moved(ended)
+        env.sim.forward_moved()
 
     parts = {
-        "act": lambda: env._act(action),
+        "act": lambda: env._apply_action(action),
         "physics": lambda: env.engine.step(env.config.decimation, derive=False),
         "derive": derive,
         "sensors": lambda: [sensor.update(env.step_dt) for sensor in env.sensors.values()],
         "terminations": lambda: env.termination_manager.compute(calm),
         "rewards": env.reward_manager.compute,
         "command metrics": env.command_manager.measure,
-        "final observations": env._final,
-        "episodes": lambda: env._episodes(ended, mask, mask, calm),
-        "restart": lambda: (env._conclude(ended), env._restart(ended), env.sim.settle()),
-        "commands and pushes": lambda: (env._between(), env.sim.settle()),
-        "observations": env._observe,
+        "final observations": env._compute_final_obs,
+        "episodes": lambda: env._end_episodes(mask, calm),
+        "restart": lambda: (env._before_reset(ended), env._reset_envs(ended), env.sim.forward_moved()),
+        "commands and pushes": lambda: (env._update_commands_and_events(), env.sim.forward_moved()),
+        "observations": env._compute_observations,
     }
     found = {}
     for name, part in parts.items():

@@ -18,9 +18,9 @@ import torch
 from machine import describe
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task
-from rlcli.rl.dump import Watch
+from rlcli.replay.crash_dump import CrashDumper
 
 
 class Stopwatch:
@@ -47,14 +47,14 @@ def measure(task: str, num_envs: int, blocks: int, steps: int) -> dict[str, Any]
     """One row of the table."""
     env = make_env(resolve(find_task(task), flags={"scene.num_envs": num_envs}), seed=0)
     env.final_obs_of = "truncated"
-    Watch(env, Path(tempfile.gettempdir()), print)
+    CrashDumper(env, Path(tempfile.gettempdir()))
     env.reset(seed=0)
     watch = Stopwatch()
-    history: Any = env.engine._history  # type: ignore[attr-defined]
-    watch.time(history, "note", "history")
+    history: Any = env.engine.history  # type: ignore[attr-defined]
+    watch.time(history, "record", "history")
     watch.time(env.engine, "diverged", "warnings and states")
-    watch.time(env, "_set_aside", "resets and events")
-    watch.time(env.sim, "keep", "last good state")
+    watch.time(env._guard, "quarantine_out_of_bounds", "resets and events")
+    watch.time(env.sim, "save_good_state", "last good state")
     generator = torch.Generator().manual_seed(0)
     actions = torch.rand(16, num_envs, env.layout.action_size, generator=generator) * 2.0 - 1.0
     shares, parts, durations = [], [], []

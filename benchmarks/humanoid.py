@@ -16,7 +16,8 @@ import torch
 from machine import describe
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import VecEnv, make_env
+from rlcli.envs.make import make_env
+from rlcli.envs.vec_env import VecEnv
 from rlcli.registry import find_task
 
 

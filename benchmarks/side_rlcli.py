@@ -27,7 +27,7 @@ def open_env(task: str, num_envs: int, threads: int = 0, overrides: list[str] | 
     import torch
 
     from rlcli.config.load import resolve
-    from rlcli.envs.vec_env import make_env
+    from rlcli.envs.make import make_env
     from rlcli.registry import find_task
 
     close()
@@ -112,7 +112,7 @@ def step_bare(steps: int) -> float:
 def open_trainer(agent: str, num_envs: int) -> dict[str, Any]:
     """Make a trainer of the cartpole with the sizes of the field's."""
     from rlcli.config.load import resolve
-    from rlcli.envs.vec_env import make_env
+    from rlcli.envs.make import make_env
     from rlcli.machine import available_cores
     from rlcli.registry import find_task, load_object
 

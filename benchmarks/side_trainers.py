@@ -122,7 +122,7 @@ def close() -> None:
 def cartpole(num_envs: int) -> Any:
     """rlcli's cartpole."""
     from rlcli.config.load import resolve
-    from rlcli.envs.vec_env import make_env
+    from rlcli.envs.make import make_env
     from rlcli.registry import find_task
 
     env = make_env(resolve(find_task("cartpole"), flags={"scene.num_envs": num_envs}), seed=0)

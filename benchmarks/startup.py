@@ -44,7 +44,7 @@ def commands(folder: Path) -> dict[str, tuple[str, list[str]]]:
         "mjlab-list": ("mjlab", ["python", "-m", "mjlab.scripts.list_envs"]),  # `list-envs` exits with their number
         "zoo-help": ("rl-zoo3", ["python", "-m", "rl_zoo3.train", "--help"]),
         "step": ("rlcli", ["python", FIRST, "rlcli.envs.vec_env:VecEnv.step", *train]),
-        "update": ("rlcli", ["python", FIRST, "rlcli.rl.sb3:Sb3Trainer.iterate", *train]),
+        "update": ("rlcli", ["python", FIRST, "rlcli.rl.sb3.trainer:Sb3Trainer.iterate", *train]),
         "zoo-update": ("rl-zoo3", ["python", FIRST, "stable_baselines3.ppo.ppo:PPO.train", *ZOO, "-f", str(folder)]),
     }
 

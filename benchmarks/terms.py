@@ -21,8 +21,8 @@ from machine import describe
 
 TESTS = Path(__file__).resolve().parent.parent / "tests"
 sys.path[:0] = [str(TESTS), str(TESTS / "mdp")]
-from mdp_table import OBSERVATIONS, REWARDS, SUCCESS, TERMINATIONS  # noqa: E402
-from mdp_worlds import bound, hand_made, sensors  # noqa: E402
+from support.mdp_table import OBSERVATIONS, REWARDS, SUCCESS, TERMINATIONS  # noqa: E402
+from support.mdp_worlds import bound, hand_made, sensors  # noqa: E402
 
 SECTIONS = {"observations": OBSERVATIONS, "rewards": REWARDS, "terminations": TERMINATIONS, "success": SUCCESS}
 

@@ -24,11 +24,11 @@ from stable_baselines3.common.logger import Logger
 
 from rlcli.adapters.sb3 import Sb3VecEnv
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.machine import available_cores
 from rlcli.registry import find_task
-from rlcli.rl.ppo import PpoTrainer
-from rlcli.rl.sb3 import Sb3Trainer
+from rlcli.rl.ppo.trainer import PpoTrainer
+from rlcli.rl.sb3.trainer import Sb3Trainer
 
 SIZES = {
     "ppo": ["agent.num_steps=16", "agent.num_epochs=5", "agent.num_minibatches=4"],

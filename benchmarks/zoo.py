@@ -85,11 +85,11 @@ def bar_text(bound: Any) -> str:
 
 def value_of(evaluation: dict[str, Any], name: str) -> float | None:
     """A number of an evaluation: success, return, length or a value of the task."""
-    from rlcli.cli.eval import value_of as judged
     from rlcli.errors import UsageError
+    from rlcli.evaluation.limits import Limit
 
     try:
-        return judged(evaluation, name)
+        return Limit(name, 0.0).value_in(evaluation)
     except (UsageError, KeyError):
         return None
 
@@ -179,8 +179,8 @@ def collect_all(folder: Path, hardware: str | None, ship: bool) -> None:
 
 def collect(task: str, runs: list[Path], hardware: str | None, ship: bool, known: dict[str, Any]) -> None:
     """Results and curves of finished runs, and, if asked for, the best policy as the one that is shipped."""
-    from rlcli.rl.curves import read_history
-    from rlcli.rl.run import find_checkpoint
+    from rlcli.reporting.curves import read_history
+    from rlcli.runs.run_ref import find_checkpoint
 
     entry, found = entries()[task], []
     for run in _of_one_agent(entry, runs):
@@ -209,8 +209,8 @@ def collect(task: str, runs: list[Path], hardware: str | None, ship: bool, known
 
 
 def _ship(task: str, run: Any, checkpoint: Path, evaluation: dict[str, Any]) -> None:
-    from rlcli.rl.bundle import write_bundle
-    from rlcli.rl.checkpoint import open_checkpoint
+    from rlcli.runs.bundle import write_bundle
+    from rlcli.runs.checkpoint import open_checkpoint
 
     write_bundle(open_checkpoint(checkpoint), find_task(task).root / "policies" / task, run, evaluation)
 
@@ -222,11 +222,11 @@ def _results(task: str) -> list[dict[str, Any]]:
 def adopt(task: str, other: str) -> None:
     """The policy that the task's other form ships, judged in this one: both forms step alike, column by column."""
     from rlcli.config.load import resolve
-    from rlcli.envs.deployment import describe
-    from rlcli.envs.vec_env import make_env
-    from rlcli.rl.bundle import write_bundle
-    from rlcli.rl.checkpoint import open_checkpoint
-    from rlcli.rl.files import to_json
+    from rlcli.deploy.env_description import describe
+    from rlcli.envs.make import make_env
+    from rlcli.runs.atomic_io import to_json
+    from rlcli.runs.bundle import write_bundle
+    from rlcli.runs.checkpoint import open_checkpoint
 
     entry, source = entries()[task], find_task(task)
     given = open_checkpoint(find_task(other).root / "policies" / other)
@@ -259,7 +259,7 @@ def adopt(task: str, other: str) -> None:
 def _of_one_agent(entry: Entry, folders: list[Path]) -> list[Any]:
     """The newest run of each seed, of the agent that the task is held to its bar with; without one, of any agent."""
     from rlcli.config.load import resolve
-    from rlcli.rl.run import open_run
+    from rlcli.runs.run import open_run
 
     wanted = entry.agent or resolve(find_task(entry.name), device=entry.device).agent_name
     opened = sorted((open_run(folder) for folder in folders), key=lambda run: run.record["started"])
@@ -294,7 +294,7 @@ def _evaluate(policy: Path, entry: Entry) -> dict[str, Any]:
 
 def _evaluated(run: Any, checkpoint: Path, entry: Entry, known: dict[str, Any]) -> dict[str, Any]:
     """An evaluation that is there, in the run or in `known`, or a new one where it is of too few episodes."""
-    from rlcli.rl.evaluations import read_evaluation
+    from rlcli.runs.eval_store import read_evaluation
 
     there = [read_evaluation(run, checkpoint.name), known.get(f"{run.folder.name}/{checkpoint.name}")]
     for said in there:
@@ -355,21 +355,12 @@ def picture(task: str) -> None:
     os.environ.setdefault("MUJOCO_GL", "egl")
     import numpy as np
 
-    from rlcli.cli.session import open_session
-    from rlcli.viewer.video import Renderer
+    from rlcli.evaluation.session import PolicyRequest, open_session
+    from rlcli.viewer.offscreen import Renderer
 
     entry = entries()[task]
-    session = open_session(
-        task,
-        ["viewer.width=320", "viewer.height=240"],
-        checkpoint="shipped",
-        policy="trained",
-        stochastic=False,
-        num_envs=1,
-        seed=42,
-        config=None,
-        runs_dir=None,
-    )
+    size = ["viewer.width=320", "viewer.height=240"]
+    session = open_session(PolicyRequest(task, size, checkpoint="shipped", num_envs=1))
     env, shown = session.env, []
     last = min(env.max_episode_length - 1, round(entry.picture / env.step_dt))
     wanted = {round(last * number / (_FRAMES - 1)) for number in range(_FRAMES)}

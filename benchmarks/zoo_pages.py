@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rlcli.config.card import markdown, task_card
 from rlcli.config.load import resolve
 from rlcli.registry import OWN, catalog, find_task
+from rlcli.reporting.task_card import markdown, task_card
 
 BLOCKS = ("card", "results", "curves")
 
@@ -195,7 +195,7 @@ def _outcome(rows: list[dict[str, Any]], entry: Any) -> str:
 
 
 def _index_json() -> dict[str, Any]:
-    from rlcli.probe import cached
+    from rlcli.registry.probe import cached
 
     own = [entry for entry in catalog()[0] if entry.distribution == OWN]
     return {name.partition(":")[2]: row.record() for name, row in cached(own).items()}

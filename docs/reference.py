@@ -16,18 +16,22 @@ WORDS = Path(__file__).parent / "public-words.txt"
 MODULES = (
     "rlcli.task",
     "rlcli.trainers",
+    "rlcli.formats",
     "rlcli.errors",
     "rlcli.gym",
     "rlcli.random",
     "rlcli.registry",
     "rlcli.config.load",
     "rlcli.config.schema",
-    "rlcli.config.card",
+    "rlcli.reporting.task_card",
     "rlcli.envs.vec_env",
+    "rlcli.envs.make",
+    "rlcli.envs.build",
     "rlcli.envs.direct",
     "rlcli.envs.articulation",
     "rlcli.envs.step",
-    "rlcli.envs.markers",
+    "rlcli.envs.observers",
+    "rlcli.sim.markers",
     "rlcli.sim.selection",
     "rlcli.sim.rotations",
     "rlcli.rl.trainer",
@@ -64,10 +68,16 @@ def public_names(module_name: str) -> list[str]:
         return sorted(offered)
     found = []
     for name, value in vars(module).items():
-        own = getattr(value, "__module__", None) == module_name
+        own = _defined_in(value, module_name)
         if not name.startswith("_") and own and (inspect.isclass(value) or inspect.isfunction(value)):
             found.append(name)
     return sorted(found)
+
+
+def _defined_in(value: Any, module_name: str) -> bool:
+    """Whether a module, or a module of this package, defines the value."""
+    place = str(getattr(value, "__module__", ""))
+    return place == module_name or place.startswith(f"{module_name}.")
 
 
 def public_words() -> list[str]:
@@ -76,11 +86,12 @@ def public_words() -> list[str]:
 
     from rlcli.cli.app import build
     from rlcli.config.schema import TaskConfig
-    from rlcli.rl import ppo_config, sb3_config
+    from rlcli.rl.ppo.config import SPEC as PPO
+    from rlcli.rl.sb3.config import SPEC as SB3
 
     words = [f"term {section}.{name}" for section in TERMS for name, _ in _terms_of(section)]
     models: dict[str, Any] = {"Task": TaskConfig}
-    for trainer, spec in (("ppo", ppo_config.SPEC), ("sb3", sb3_config.SPEC)):
+    for trainer, spec in (("ppo", PPO), ("sb3", SB3)):
         for algorithm, place in spec.algorithms.items():
             module, _, name = place.partition(":")
             models[f"{trainer}.{algorithm}"] = getattr(importlib.import_module(module), name)
@@ -208,7 +219,7 @@ def _terms_of(section: str) -> Iterator[tuple[str, Any]]:
 
     module = importlib.import_module(f"rlcli.mdp.{section}")
     for name, value in vars(module).items():
-        if name.startswith("_") or getattr(value, "__module__", "") != module.__name__:
+        if name.startswith("_") or not _defined_in(value, module.__name__):
             continue
         if inspect.isclass(value) or inspect.isfunction(value):
             yield snake_case(name) if inspect.isclass(value) else name, value

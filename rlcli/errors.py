@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 
@@ -126,6 +126,27 @@ def did_you_mean(name: str, candidates: Iterable[str]) -> str | None:
     """`did you mean 'x'?` for the nearest of `candidates`, or None."""
     close = difflib.get_close_matches(name, dict.fromkeys(candidates), n=3, cutoff=0.6)
     return f"did you mean {' or '.join(repr(match) for match in close)}?" if close else None
+
+
+def one_line(error: BaseException, limit: int | None = None) -> str:
+    """Return the message of an error on one line, cut to a length; its class if it has no message."""
+    return " ".join(str(error).split())[:limit] or type(error).__name__
+
+
+def require_known(name: str, names: Sequence[str], what: str, plural: str) -> None:
+    """Check that a name on the command line is one of a few.
+
+    Args:
+        name: the name that was given.
+        names: the valid names.
+        what: the kind of name, as in `no {what} '{name}'`.
+        plural: several of that kind, for the hint.
+
+    Raises:
+        UsageError: with the nearest name, or else all of them.
+    """
+    if name not in names:
+        raise UsageError(f"no {what} '{name}'", hint=did_you_mean(name, names) or f"{plural}: {', '.join(names)}")
 
 
 def listing(names: Iterable[str], limit: int = 20) -> str:

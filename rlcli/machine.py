@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import gc
+import hashlib
 import os
+import platform
+import re
+import shutil
 import stat
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
-from rlcli.errors import DeviceError
+from rlcli.errors import DependencyError, DeviceError, UsageError
 
 _GROUPS, _OWN_GROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _NO_LIMIT = 1 << 60
@@ -159,3 +165,57 @@ def require_device(device: str) -> None:
         found = f"{count} CUDA devices" if count else "no CUDA device"
         message = f"device '{device}' is not available: torch {torch.__version__} sees {found}"
         raise DeviceError(message, hint="--device cpu")
+
+
+def choose_device(wanted: str) -> str:
+    """Return the torch device for auto, cpu, cuda or cuda:N; auto is the GPU if it can be used.
+
+    Raises:
+        UsageError: for something else.
+        DeviceError: for a device that is not there.
+        DependencyError: for a GPU without rlcli[gpu].
+    """
+    if wanted == "cpu" or (wanted == "auto" and not _may_have_gpu()):
+        return "cpu"
+    if wanted == "auto":
+        import torch
+
+        return "cuda" if torch.cuda.is_available() and find_spec("mujoco_warp") else "cpu"
+    if not re.fullmatch(r"cuda(:[0-9]+)?", wanted):
+        raise UsageError(f"no device '{wanted}'", hint="auto, cpu, cuda or cuda:N")
+    require_device(wanted)
+    if find_spec("mujoco_warp") is None:
+        raise DependencyError("the GPU engine needs mujoco-warp", hint='pip install "rlcli[gpu]"')
+    return wanted
+
+
+def _may_have_gpu() -> bool:
+    """Whether a driver is installed; torch is not imported for that."""
+    return (
+        Path("/dev/nvidiactl").exists()
+        or Path("/proc/driver/nvidia").exists()
+        or shutil.which("nvidia-smi") is not None
+    )
+
+
+def processor(info: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
+    """The processor's model and the hash of what it can do: libraries choose their kernels by both."""
+    entries: dict[str, str] = {}
+    with contextlib.suppress(OSError), info.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            key, colon, value = line.partition(":")
+            if not colon:
+                break  # the first core's block is over
+            entries[key.strip()] = value.strip()
+    model = entries.get("model name") or platform.processor() or platform.machine()
+    flags = sorted((entries.get("flags") or entries.get("Features") or "").split())
+    kernels = [flag for flag in flags if re.match(r"avx|fma|sse4|amx|sve|asimd|neon|f16c", flag)]
+    record = {"model": model, "kernels": " ".join(kernels)}
+    return record | ({"flags": hashlib.sha256(" ".join(flags).encode()).hexdigest()} if flags else {})
+
+
+def has_onednn() -> bool:
+    """Return whether torch was built with oneDNN."""
+    import torch
+
+    return bool(torch.backends.mkldnn.is_available())  # type: ignore[no-untyped-call]  # torch has no type here

@@ -63,7 +63,8 @@ def normal(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.
     """Standard normal, by Box and Muller's transform of two uniforms each. (n, count)"""
     u = uniform(keys, stream, index, 2 * count)
     radius = np.sqrt(-2.0 * np.log1p(-u[:, :count].astype(np.float64)))
-    return (radius * np.cos(2.0 * np.pi * u[:, count:])).astype(np.float32)
+    values: NDArray[np.float32] = (radius * np.cos(2.0 * np.pi * u[:, count:])).astype(np.float32)
+    return values
 
 
 def integers(keys: Keys, stream: np.uint64, index: int, count: int, high: int) -> NDArray[np.int64]:

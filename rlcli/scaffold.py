@@ -16,10 +16,9 @@ import sys
 import tempfile
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from rlcli import __version__
-from rlcli.errors import MachineError, UsageError, did_you_mean, listing
+from rlcli.errors import MachineError, UsageError, listing, require_known
 from rlcli.registry import TASKS, catalog, folder_task
 
 FLAVOURS = ("yaml", "direct")
@@ -53,9 +52,7 @@ def create(name: str, flavour: str, folder: Path | None = None) -> tuple[Path, l
         UsageError: if the name cannot be a task's, a distribution's and a package's, or the folder holds something.
         MachineError: if the disk refuses.
     """
-    if flavour not in FLAVOURS:
-        near = did_you_mean(flavour, FLAVOURS)
-        raise UsageError(f"no flavour '{flavour}'", hint=f"{near or '--flavour'} {' or '.join(FLAVOURS)}")
+    require_known(flavour, FLAVOURS, "flavour", "flavours")
     check_name(name)
     folder = Path(name) if folder is None else folder
     _check_folder(folder)
@@ -104,12 +101,8 @@ def render(name: str, flavour: str) -> dict[str, str]:
     import jinja2
 
     package = name.replace("-", "_")
-    values: dict[str, Any] = {
-        "name": name,
-        "package": package,
-        "version": ".".join(__version__.split(".")[:2]),
-        **_FLAVOUR_TEXTS[flavour],
-    }
+    version = ".".join(__version__.split(".")[:2])
+    values = {"name": name, "package": package, "version": version, **_FLAVOUR_TEXTS[flavour]}
     # The texts are Python, TOML, XML and Markdown, and the values have been checked: nothing is to be escaped.
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
     names = {"package": package, "suite": "tests", "gitignore": ".gitignore"}

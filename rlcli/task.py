@@ -51,7 +51,7 @@ class TaskSpec:
 # model. They are Any to a type checker because the default in a signature is the name ("robot") while the
 # function body uses the object.
 Entity: TypeAlias = Any
-"""An entity of the scene. YAML: its name. At run time: `rlcli.sim.entity.Entity`."""
+"""An entity of the scene. YAML: its name. At run time: `rlcli.scene.entity.Entity`."""
 Joints: TypeAlias = Any
 """Hinge and slide joints of `entity`, in the order written. At run time: an index into joint columns."""
 Bodies: TypeAlias = Any
@@ -69,11 +69,11 @@ Tendons: TypeAlias = Any
 Pairs: TypeAlias = Any
 """Contact pairs of `entity`. At run time: an index into the names of its pairs."""
 ContactSensor: TypeAlias = Any
-"""A contact sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.sensors.ContactSensor`."""
+"""A contact sensor. YAML: its name in `scene.sensors`. At run time: `rlcli.scene.sensors.ContactSensor`."""
 RaySensor: TypeAlias = Any
-"""A ray sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.sensors.RaySensor`."""
+"""A ray sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.scene.sensors.RaySensor`."""
 CameraSensor: TypeAlias = Any
-"""A camera of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.sim.camera.CameraSensor`."""
+"""A camera of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.scene.camera.CameraSensor`."""
 Command: TypeAlias = Any
 """A term of `commands:`. YAML: its name. At run time: the term, whose `.command` is (num_envs, k)."""
 Address: TypeAlias = Any

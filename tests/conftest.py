@@ -1,38 +1,5 @@
-"""What all tests share: nothing is noted in the folders of whoever runs them."""
+"""What all tests share."""
 
-import os
-import signal
-from dataclasses import fields, replace
+from support.own_session import own_console, own_state
 
-import pytest
-
-from rlcli.cli.console import console
-
-# A shell's background job ignores the one, what nohup starts the other: what the tests start would inherit it.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _own_state(tmp_path_factory):
-    """Tasks that the tests use are noted in a folder of the tests, and nobody's preferences are followed."""
-    own = {"RLCLI_STATE_DIR": str(tmp_path_factory.mktemp("state")), "RLCLI_SETTINGS": "none"}
-    before = {name: os.environ.get(name) for name in own}
-    os.environ.update(own)
-    yield
-    for name, value in before.items():
-        if value is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = value
-
-
-@pytest.fixture(autouse=True)
-def _own_console():
-    """What a command was told to print ends with the test that ran it."""
-    before = replace(console)
-    yield
-    for field in fields(console):
-        setattr(console, field.name, getattr(before, field.name))
+__all__ = ["own_console", "own_state"]

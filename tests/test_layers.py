@@ -1,8 +1,9 @@
-"""The layers of the package: a module imports only what stands in its own layer or below it."""
+"""The structure of the package: the order of its folders, no import circles, small modules, light imports."""
 
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -11,36 +12,39 @@ import rlcli
 
 PACKAGE = Path(rlcli.__file__).parent
 REPOSITORY = PACKAGE.parent
-LAYERS = [
-    {"errors", "task", "trainers", "random", "machine"},
-    {"config", "registry", "probe"},
-    {"sim"},
-    {"managers", "mdp", "envs", "oige"},
-    {"rl", "viewer", "adapters", "testing", "pytest_plugin", "isaaclab", "diagnosis", "scaffold"},
-    {"cli", "gym"},
-]
+LAYERS = """
+    errors task trainers formats random machine settings text
+    registry  config  sim  scene  managers  envs  mdp  rl  runs  replay  evaluation  deploy  viewer  reporting  testing
+    training  adapters  tuning  doctor  scaffold  cli  gym  pytest_plugin
+"""
+"""Lowest first. The names of the first line stand side by side; each later name is a layer of its own."""
+INNER = ["rl < rl.ppo rl.sb3", "mdp < mdp.rewards mdp.randomization", "cli.ui < cli.commands < cli.app"]
+"""Orders within a folder: the modules of a folder itself, or of a folder in it."""
 ANYWHERE = {"rlcli", "rlcli.__main__"}
-"""The package itself, which imports nothing, and what starts the command line."""
+"""The package itself, which imports nothing, and the module that starts the command line."""
+MOST_LINES = 450
 
 HEAVY = {"torch", "mujoco", "numpy", "stable_baselines3", "gymnasium"}
 LIGHT = [
-    "errors",
-    "task",
-    "trainers",
+    "errors.py",
+    "task.py",
+    "trainers.py",
+    "formats.py",
+    "settings.py",
+    "text.py",
     "config",
     "registry",
-    "probe",
-    "diagnosis",
+    "doctor",
     "scaffold.py",
     "cli",
     "rl/trainer.py",
-    "rl/sb3_config.py",
-    "rl/ppo_config.py",
+    "rl/sb3/config.py",
+    "rl/ppo/config.py",
     "rl/distributed.py",
-    "rl/sweeps.py",
-    "rl/heat_map.py",
+    "evaluation/stress_params.py",
+    "reporting/heat_map.py",
 ]
-"""What is imported before a configuration is known to be good."""
+"""Modules that are imported before a configuration has been checked."""
 
 
 def module_name(file):
@@ -48,9 +52,14 @@ def module_name(file):
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def level(module):
-    top = module.split(".")[1]
-    return next(number for number, names in enumerate(LAYERS) if top in names)
+def ranks():
+    first, *rest = LAYERS.strip().splitlines()
+    return dict.fromkeys(first.split(), 0) | {name: 1 + i for i, name in enumerate(" ".join(rest).split())}
+
+
+RANKS = ranks()
+FILES = sorted(file for file in PACKAGE.rglob("*.py") if "templates" not in file.relative_to(PACKAGE).parts)
+MODULES = {module_name(file) for file in FILES}
 
 
 def imports(file, *, everywhere=True):
@@ -76,36 +85,76 @@ def imports(file, *, everywhere=True):
                 yield node.lineno, f"{base}.{alias.name}" if is_module else base
 
 
-FILES = sorted(PACKAGE.rglob("*.py"))
+def own_imports(file):
+    """(line, module) of each import of the package's own modules in a file."""
+    return [(line, name) for line, name in imports(file) if name.split(".")[0] == "rlcli" and name != "rlcli"]
+
+
+def folder(module):
+    """`rlcli.rl.ppo.loss` -> `rl.ppo`, `rlcli.rl.policy` -> `rl`, `rlcli.cli.app` -> `cli.app`."""
+    inner = module.removeprefix("rlcli.")
+    if inner == "cli.app" or (PACKAGE / inner.replace(".", "/")).is_dir():
+        return inner
+    return inner.rpartition(".")[0] or inner
 
 
 def test_every_module_belongs_to_a_layer():
-    tops = {module_name(file).split(".")[1] for file in FILES if module_name(file) not in ANYWHERE}
-    assert tops == set().union(*LAYERS)
+    tops = {name.split(".")[1] for name in MODULES - ANYWHERE}
+    assert tops == set(RANKS)
 
 
 def test_modules_import_only_their_own_layer_and_those_below():
+    wrong = [
+        f"{file}:{line}: {module_name(file)} imports {imported}"
+        for file in FILES
+        if module_name(file) not in ANYWHERE
+        for line, imported in own_imports(file)
+        if RANKS[imported.split(".")[1]] > RANKS[module_name(file).split(".")[1]]
+    ]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("order", INNER)
+def test_folders_within_a_folder_have_an_order(order):
+    levels = {name: level for level, names in enumerate(order.split(" < ")) for name in names.split()}
     wrong = []
     for file in FILES:
         name = module_name(file)
-        if name in ANYWHERE:
+        own = levels.get(folder(name))
+        # the __init__ of a package of terms hands on the names of all its modules
+        if own is None or (file.name == "__init__.py" and order.startswith("mdp")):
             continue
-        for line, imported in imports(file):
-            if imported.split(".")[0] == "rlcli" and imported != "rlcli" and level(imported) > level(name):
+        for line, imported in own_imports(file):
+            if levels.get(folder(imported), own) > own:
                 wrong.append(f"{file}:{line}: {name} imports {imported}")
     assert wrong == []
 
 
-def test_the_check_sees_what_it_should(tmp_path):
+def test_no_module_imports_itself_through_others():
+    graph = {module_name(file): {name for _, name in own_imports(file)} & MODULES for file in FILES}
+    for name, needed in graph.items():
+        needed.discard(name)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail("import circle: " + " <- ".join(error.args[1]))
+
+
+def test_no_module_is_long():
+    lengths = {module_name(file): len(file.read_text(encoding="utf-8").splitlines()) for file in FILES}
+    assert {name: length for name, length in lengths.items() if length > MOST_LINES} == {}
+
+
+def test_the_check_sees_imports_at_the_top_and_inside_functions(tmp_path):
     file = tmp_path / "module.py"
     file.write_text(
-        "from typing import TYPE_CHECKING\nfrom rlcli import random\nfrom rlcli.rl.run import Run\n"
+        "from typing import TYPE_CHECKING\nfrom rlcli import random\nfrom rlcli.runs.run import Run\n"
         "if TYPE_CHECKING:\n    import rlcli.cli.app\ndef f():\n    import rlcli.envs.direct\n"
     )
     assert list(imports(file)) == [
         (1, "typing"),
         (2, "rlcli.random"),
-        (3, "rlcli.rl.run"),
+        (3, "rlcli.runs.run"),
         (7, "rlcli.envs.direct"),
     ]
 
@@ -113,7 +162,7 @@ def test_the_check_sees_what_it_should(tmp_path):
 @pytest.mark.parametrize("part", LIGHT)
 def test_light_modules_import_nothing_heavy_at_their_top(part):
     place = PACKAGE / part
-    files = [place] if place.suffix else sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
+    files = sorted(place.rglob("*.py")) if place.is_dir() else [place]
     wrong = []
     for file in files:
         for line, imported in imports(file, everywhere=False):
@@ -147,9 +196,11 @@ def test_importing_the_package_imports_nothing_else():
 def test_training_on_the_cpu_loads_nothing_of_the_gpu_engine(tmp_path):
     words = ["train", "cartpole", "--agent", "ppo", "--device", "cpu", "--num-envs", "4", "--max-iterations", "1"]
     words += ["--logger", "none", "-q", "--runs-dir", str(tmp_path)]
+    modules = [name for name in MODULES if name.startswith("rlcli.sim.warp") or name == "rlcli.sim.mask_selection"]
+    assert len(modules) > 3
     program = (
         f"import sys; from rlcli.cli.app import main; code = main({words!r}); "
-        "gpu = {'warp', 'mujoco_warp', *(f'rlcli.sim.{m}' for m in ('warp', 'room', 'stages', 'mask', 'kernels'))}; "
+        f"gpu = {{'warp', 'mujoco_warp', *{modules!r}}}; "
         "print(code, 'torch' in sys.modules, sorted(gpu & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -19,9 +19,13 @@ from torch import Tensor
 
 from rlcli.config.load import Resolved, resolve
 from rlcli.config.schema import TaskConfig
+from rlcli.envs.make import make_env
 from rlcli.envs.step import StepResult
-from rlcli.envs.vec_env import VecEnv, make_env
+from rlcli.envs.vec_env import VecEnv
 from rlcli.registry import find_task
+
+if TYPE_CHECKING:
+    from rlcli.viewer.offscreen import Renderer
 
 Floats = NDArray[np.float32]
 Changes = Mapping[str, Any] | Iterable[str] | TaskConfig | Resolved | None
@@ -293,12 +297,12 @@ class _Camera:
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
-        self._renderer: Any = None
+        self._renderer: Renderer | None = None
 
     def picture(self) -> NDArray[np.uint8]:
         """As the environment is now. (height, width, 3)"""
         if self._renderer is None:
-            from rlcli.viewer.video import Renderer
+            from rlcli.viewer.offscreen import Renderer
 
             self._renderer = Renderer(self._env.engine.model, self._env.config.viewer)
         return self._renderer.picture(self._env)

@@ -1,4 +1,4 @@
-"""A `VecEnv` as RSL-RL wants it: its own runners train in it."""
+"""A `VecEnv` with the interface of RSL-RL, for its own runners."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.rl.statistics import EpisodeStatistics
 
 
-class RslRlVecEnv(RslRlBase):
-    """All observation groups of a `VecEnv`. The first look at the observations starts the first episodes.
+class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types
+    """All observation groups of a `VecEnv`. The first call of `get_observations` starts the first episodes.
 
-    `extras["time_outs"]` marks episodes that time alone ended; RSL-RL then bootstraps from the observation before the
-    step. The true last observations are in `extras["final_obs"]`, which RSL-RL does not read.
+    `extras["time_outs"]` marks episodes that were truncated and not terminated; RSL-RL then bootstraps from the
+    observation before the step. The last observations of episodes are in `extras["final_obs"]`, which RSL-RL does not
+    read.
 
     Args:
         env: the environment.
@@ -45,12 +46,12 @@ class RslRlVecEnv(RslRlBase):
         self.unwrapped.episode_length_buf.copy_(value)
 
     def reset(self) -> tuple[TensorDict, dict[str, Any]]:
-        """Start new episodes everywhere."""
+        """Start new episodes in all environments."""
         self._obs = self.observations(self.unwrapped.reset())
         return self._obs, {}
 
     def get_observations(self) -> TensorDict:
-        """Group -> observations. (num_envs, d) each"""
+        """Return the observations by group. (num_envs, d) each"""
         if self._obs is None:
             self._obs = self.observations(self.unwrapped.reset(seed=self.unwrapped.seed))
         return self._obs
@@ -71,11 +72,11 @@ class RslRlVecEnv(RslRlBase):
         return self._obs, result.reward, (result.terminated | result.truncated).long(), extras
 
     def observations(self, groups: dict[str, Tensor]) -> TensorDict:
-        """Observation groups in RSL-RL's form."""
+        """Return observation groups in RSL-RL's form."""
         return TensorDict(dict(groups), batch_size=[self.num_envs], device=self.device)
 
-    def blank(self) -> TensorDict:
-        """Observations of zeros, which show the shapes alone."""
+    def zero_observations(self) -> TensorDict:
+        """Return observations of zeros, for their shapes."""
         layout = self.unwrapped.layout
         return self.observations(
             {group: torch.zeros(self.num_envs, layout.size(group), device=self.device) for group in layout.observations}

@@ -8,51 +8,36 @@ import os
 import re
 import sys
 import traceback
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from typer._click.exceptions import ClickException, NoArgsIsHelpError, UsageError
 
-from rlcli.cli.console import console, discard, print_log_records
-from rlcli.cli.options import CHOOSE
-from rlcli.config.settings import applied, read_settings, settings_file
+from rlcli.cli.ui.console import console, discard, print_log_records
+from rlcli.cli.ui.options import CHOOSE, with_common_options
+from rlcli.config.settings_file import read_settings
 from rlcli.errors import ConfigError, RlcliError
 from rlcli.machine import collect_seldom
-from rlcli.registry import malformed_metadata_ignored
+from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
+from rlcli.settings import applied, settings_file
+from rlcli.trainers import TrainerSpec
 
-COMMANDS = {
-    "list-tasks": "list_tasks",
-    "show": "show",
-    "validate": "validate",
-    "train": "train",
-    "sweep": "sweep",
-    "bench": "bench",
-    "play": "play",
-    "eval": "eval",
-    "stress": "stress",
-    "export": "export",
-    "replay": "replay",
-    "autopsy": "autopsy",
-    "runs": "runs",
-    "watch": "watch",
-    "plot": "plot",
-    "report": "report",
-    "diff": "diff",
-    "reproduce": "reproduce",
-    "check": "check",
-    "lint": "lint",
-    "new": "new",
-    "doctor": "doctor",
-}
-"""Command -> module of `rlcli.cli` that registers it."""
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+COMMANDS = (
+    "list-tasks", "show", "validate", "train", "sweep", "bench", "play", "eval", "stress", "export", "replay",
+    "autopsy", "runs", "watch", "plot", "report", "diff", "reproduce", "check", "lint", "new", "doctor",
+)  # fmt: skip
+"""Commands, in the order of `--help`; each has a module of `rlcli.cli.commands` of its name with `command`."""
 
 GROUPS = {"import": "import_"}
-"""Command that has commands of its own -> module of `rlcli.cli` with their `app`."""
+"""Command that has commands of its own -> module of `rlcli.cli.commands` with their `app`."""
 
 _INTERRUPTED = 130
-_ASKING = frozenset(("-h", "--help", "--version", "--install-completion", "--show-completion"))
-_COMPLETING = "_RLCLI_COMPLETE"
-"""Set by a shell that asks how a line may go on."""
+_HELP_FLAGS = frozenset(("-h", "--help", "--version", "--install-completion", "--show-completion"))
+_COMPLETION_VARIABLE = "_RLCLI_COMPLETE"
+"""Environment variable that a shell sets to complete a line."""
 
 _SETTINGS = {
     "help_option_names": ["-h", "--help"],
@@ -81,13 +66,13 @@ def build(only: str | None = None) -> typer.Typer:
         help="Train, play, evaluate and export robot-control policies in MuJoCo.",
     )
     app.callback(invoke_without_command=True)(_root)
-    for name, module in COMMANDS.items():
+    for name in COMMANDS:
         if only in (None, name):
-            command = importlib.import_module(f"rlcli.cli.{module}").command
-            app.command(name, context_settings=_SETTINGS)(command)
+            command = importlib.import_module(f"rlcli.cli.commands.{name.replace('-', '_')}").command
+            app.command(name, context_settings=_SETTINGS)(with_common_options(command))
     for name, module in GROUPS.items():
         if only in (None, name):
-            group = importlib.import_module(f"rlcli.cli.{module}").app
+            group = importlib.import_module(f"rlcli.cli.commands.{module}").app
             app.add_typer(group, name=name, context_settings=_SETTINGS)
     return app
 
@@ -100,7 +85,7 @@ def main(arguments: list[str] | None = None) -> int:
         collect_seldom()
     arguments = sys.argv[1:] if arguments is None else arguments
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
-    console.told = False  # what an earlier command of this process was told
+    console.has_document = False  # an earlier command of this process may have printed one
     with console.stdout_kept(), malformed_metadata_ignored():
         code = _run(_with_values(arguments))
     try:
@@ -122,8 +107,8 @@ def _with_values(arguments: list[str]) -> list[str]:
     return filled
 
 
-def _named(arguments: list[str]) -> str | None:
-    """The command that is asked for, if there is such a one."""
+def _command_name(arguments: list[str]) -> str | None:
+    """The command on the command line, if it exists."""
     word = next((word for word in arguments if not word.startswith("-")), "").replace("_", "-")
     return word if word in COMMANDS or word in GROUPS else None
 
@@ -131,7 +116,7 @@ def _named(arguments: list[str]) -> str | None:
 def _run(arguments: list[str]) -> int:
     try:
         with applied(_preferences(arguments)):
-            result = build(_named(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
+            result = build(_command_name(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
         if result == _INTERRUPTED:  # how typer hands on Ctrl-C
             raise KeyboardInterrupt
         return result if isinstance(result, int) else 0
@@ -148,16 +133,16 @@ def _run(arguments: list[str]) -> int:
     except OSError as error:
         return _machine(error)
     except Exception as error:
-        from rlcli.cli.culprit import own_failure
-        from rlcli.sim.gl import unusable_choice
+        from rlcli.cli.ui.error_origin import own_failure
+        from rlcli.sim.gl import opengl_import_error
 
-        if (unusable := unusable_choice(error)) is not None:
+        if (unusable := opengl_import_error(error)) is not None:
             return _report(unusable)
         if (failure := own_failure(error)) is not None:
             return _report(failure)
         traceback.print_exc()
-        said = f"this is a bug in rlcli: {type(error).__name__}: {error}"
-        console.error("bug", 1, said, "please report it with the lines above", [])
+        message = f"this is a bug in rlcli: {type(error).__name__}: {error}"
+        console.error("bug", 1, message, "please report it with the lines above", [])
         return 1
 
 
@@ -166,13 +151,13 @@ def _preferences(arguments: list[str]) -> dict[str, Any]:
     try:
         settings = read_settings()
     except ConfigError:
-        looking = arguments[:1] in ([], ["doctor"]) or _ASKING.intersection(arguments)
-        if not looking and _COMPLETING not in os.environ:
+        needs_no_settings = arguments[:1] in ([], ["doctor"]) or _HELP_FLAGS.intersection(arguments)
+        if not needs_no_settings and _COMPLETION_VARIABLE not in os.environ:
             raise
         settings = {}
-    told = settings.get("verbosity")
-    console.quiet = told == "quiet"  # unless a flag says otherwise
-    console.verbose = told == "verbose" or not {"-v", "--verbose"}.isdisjoint(arguments)
+    verbosity = settings.get("verbosity")
+    console.quiet = verbosity == "quiet"  # a flag may change it
+    console.verbose = verbosity == "verbose" or not {"-v", "--verbose"}.isdisjoint(arguments)
     if settings:
         console.detail(f"settings: {settings_file()}")
     return settings
@@ -194,22 +179,24 @@ def _usage(error: UsageError, arguments: list[str]) -> int:
         return 2
     hint = "rlcli --help" if error.ctx is None else f"{error.ctx.command_path} --help"
     match = re.match(r"No such option: --([A-Za-z_][\w.-]*)", error.format_message())
-    keys = _settings_called(match[1]) if match else []
-    if match and keys:
-        key = match[1]
-        given = next(
-            (a for a in arguments if a.startswith(f"--{key}") or a.startswith(f"--{key.replace('-', '_')}")),
-            "",
-        )
-        value = given.partition("=")[2]
-        if not value and given in arguments[:-1]:
-            value = arguments[arguments.index(given) + 1]
-        value = value or "VALUE"
-        hint = f"overrides have no dashes: {' or '.join(f'{key}={value}' for key in keys)}"
-    elif match and match[1] in _WRITTEN_OTHERWISE:
-        hint = _WRITTEN_OTHERWISE[match[1]]
+    if match:
+        hint = _hint_for_option(match[1], arguments) or hint
     console.error("usage", 2, error.format_message(), hint, [])
     return 2
+
+
+def _hint_for_option(name: str, arguments: list[str]) -> str | None:
+    """What to write where an option does not exist: the override of a setting, or an option of rlcli."""
+    keys = _settings_called(name)
+    if not keys:
+        return _WRITTEN_OTHERWISE.get(name)
+    spellings = (f"--{name}", f"--{name.replace('-', '_')}")
+    given = next((word for word in arguments if word.startswith(spellings)), "")
+    value = given.partition("=")[2]
+    if not value and given in arguments[:-1]:
+        value = arguments[arguments.index(given) + 1]
+    value = value or "VALUE"
+    return f"overrides have no dashes: {' or '.join(f'{key}={value}' for key in keys)}"
 
 
 def _settings_called(option: str) -> list[str]:
@@ -219,13 +206,17 @@ def _settings_called(option: str) -> list[str]:
         return [name]
     from rlcli.config.messages import homes
     from rlcli.config.schema import TaskConfig
-    from rlcli.rl.ppo_config import PpoConfig
-    from rlcli.rl.sb3_config import Sb3Config
 
     key = _SHORT_FOR.get(name, name)
-    both: tuple[dict[str, Any], ...] = ({"": TaskConfig, "agent": PpoConfig}, {"agent": Sb3Config})
-    places = list(dict.fromkeys(place for models in both for place in homes(models).get(key, [])))
+    models: list[dict[str, Any]] = [{"": TaskConfig}, *({"agent": model} for model in _agent_models())]
+    places = list(dict.fromkeys(place for model in models for place in homes(model).get(key, [])))
     return places if len(places) <= 3 and name != "task" else []  # the task is an argument
+
+
+def _agent_models() -> set[type[BaseModel]]:
+    """Return the models of the settings of rlcli's own trainers."""
+    specs = [load_entry(entry, TrainerSpec) for entry in catalog(TRAINERS)[0] if entry.distribution == OWN]
+    return {load_object(model) for spec in specs for model in spec.algorithms.values()}
 
 
 _WRITTEN_OTHERWISE = {

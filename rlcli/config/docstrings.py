@@ -18,7 +18,7 @@ def describe(schema: dict[str, Any], model: type[BaseModel]) -> None:
     properties = schema.get("properties", {})
     for each in model.__mro__:
         module = each.__dict__.get("_defined_in")
-        texts = {} if module is None else _texts(module).get(each.__qualname__, {})
+        texts = {} if module is None else _class_docstrings(module).get(each.__qualname__, {})
         for name, field in model.model_fields.items():
             for key in {name, field.alias, field.serialization_alias} & properties.keys():
                 if name in texts:
@@ -26,7 +26,7 @@ def describe(schema: dict[str, Any], model: type[BaseModel]) -> None:
 
 
 @functools.cache
-def _texts(module: ModuleType) -> dict[str, dict[str, str]]:
+def _class_docstrings(module: ModuleType) -> dict[str, dict[str, str]]:
     """Class, by its qualified name -> field -> the string that follows it. Two classes of one name say nothing."""
     try:
         tree = ast.parse(inspect.getsource(module))
@@ -34,7 +34,7 @@ def _texts(module: ModuleType) -> dict[str, dict[str, str]]:
         return {}
     found: dict[str, dict[str, str]] = {}
     for name, body in _classes(tree, ""):
-        found[name] = {} if name in found else dict(_followed(body))
+        found[name] = {} if name in found else dict(_field_docstrings(body))
     return found
 
 
@@ -49,7 +49,7 @@ def _classes(node: ast.AST, outside: str) -> Iterator[tuple[str, list[ast.stmt]]
             yield from _classes(inner, outside)
 
 
-def _followed(body: list[ast.stmt]) -> Iterator[tuple[str, str]]:
+def _field_docstrings(body: list[ast.stmt]) -> Iterator[tuple[str, str]]:
     for field, text in itertools.pairwise(body):
         match field, text:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(said))):

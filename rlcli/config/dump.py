@@ -8,7 +8,7 @@ import yaml
 from pydantic import BaseModel
 
 from rlcli.config import messages, strict_yaml
-from rlcli.config.layers import Origin
+from rlcli.config.layers import Origin, leaves
 from rlcli.config.load import Resolved
 from rlcli.config.schema import ObservationGroupConfig, TaskConfig
 from rlcli.config.strict_yaml import Path
@@ -17,11 +17,11 @@ from rlcli.config.terms import SECTIONS, SignatureError, Vocabulary, params_mode
 _TAGS = {type(None): "null", bool: "bool", int: "int", float: "float", str: "str"}
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
     def resolve(self, kind: type[yaml.Node], value: Any, implicit: tuple[bool, bool]) -> str:
         """The tag that the strict reader gives a plain scalar, so that whatever it reads otherwise is quoted."""
         if kind is not yaml.ScalarNode or not implicit[0]:
-            return super().resolve(kind, value, implicit)
+            return str(super().resolve(kind, value, implicit))
         if value == "<<":  # a merge, as a key
             return "not a plain scalar"
         try:
@@ -55,6 +55,7 @@ _Dumper.add_representer(list, _sequence)
 def to_data(resolved: Resolved) -> dict[str, Any]:
     """The whole configuration as plain data: patches applied, defaults filled in, one agent."""
     data = resolved.task.model_dump(mode="json", exclude={"agents"})
+    data |= data.pop("foreign")
     data["play"] = resolved.layers.data.get("play", {})
     if resolved.agent is not None:
         agent = resolved.agent.model_dump(mode="json", exclude={"task"})
@@ -66,7 +67,7 @@ def to_data(resolved: Resolved) -> dict[str, Any]:
 
 def to_yaml(data: dict[str, Any]) -> str:
     """Plain data as YAML that `strict_yaml` reads back unchanged."""
-    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=110, allow_unicode=True)
+    return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=110, allow_unicode=True))
 
 
 def to_yaml_with_origins(resolved: Resolved) -> str:
@@ -78,7 +79,7 @@ def to_yaml_with_origins(resolved: Resolved) -> str:
 
 def origins(resolved: Resolved) -> dict[str, str]:
     """Dotted key of every value -> where it comes from."""
-    return {messages.dotted(path): _origin(resolved, path) for path in _leaves(to_data(resolved))}
+    return {messages.dotted(path): _origin(resolved, path) for path, _ in leaves(to_data(resolved))}
 
 
 def given(resolved: Resolved) -> dict[str, str]:
@@ -134,16 +135,10 @@ def _annotate(value: Any, path: Path, resolved: Resolved, lines: list[str]) -> N
             lines.append(f"{text.ljust(60)}  # {_origin(resolved, below)}")
 
 
-def _inline(value: Any) -> str:
+def _inline(value: object) -> str:
     """A value on one line, to stand anywhere in YAML."""
-    text = yaml.dump((value,), Dumper=_Dumper, default_flow_style=True, width=10**6, allow_unicode=True)
+    text: str = yaml.dump((value,), Dumper=_Dumper, default_flow_style=True, width=10**6, allow_unicode=True)
     return text.strip()[1:-1]
-
-
-def _leaves(value: Any, path: Path = ()) -> list[Path]:
-    if isinstance(value, dict) and value:
-        return [leaf for key, item in value.items() for leaf in _leaves(item, (*path, key))]
-    return [path]
 
 
 def _origin(resolved: Resolved, path: Path) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Any
@@ -50,7 +50,7 @@ class Layers:
             for below in _paths(value):
                 self.origins[path + below] = origin(source + below)
 
-    def set(self, path: Path, value: Any, origin: Origin) -> None:
+    def set(self, path: Path, value: object, origin: Origin) -> None:
         """Set one value, as an override does; missing mappings on the way are made.
 
         Raises:
@@ -71,7 +71,7 @@ class Layers:
         for below in _paths(value):
             self.origins[taken + below] = origin
 
-    def get(self, path: Path, default: Any = None) -> Any:
+    def get(self, path: Path, default: object = None) -> Any:
         """The value at a path."""
         value: Any = self.data
         for step in path:
@@ -92,7 +92,7 @@ class Layers:
         origin = self.origin(path)
         return origin.where if origin else "configuration"
 
-    def _step(self, target: Any, step: str | int, taken: Path, origin: Origin) -> tuple[Any, Path]:
+    def _step(self, target: object, step: str | int, taken: Path, origin: Origin) -> tuple[Any, Path]:
         if isinstance(target, list):
             index = _index(target, step, taken)
             return target[index], (*taken, index)
@@ -155,6 +155,20 @@ def marked(document: Document, name: str, layer: str, at: Path = ()) -> Callable
     return origin
 
 
+def flags(**values: Any) -> dict[str, Any]:
+    """Return the values of flags by dotted key (`scene__num_envs` is `scene.num_envs`), without those that are None."""
+    return {key.replace("__", "."): value for key, value in values.items() if value is not None}
+
+
+def leaves(value: object, path: Path = ()) -> Iterator[tuple[Path, Any]]:
+    """Yield every value in nested mappings with its path; an empty mapping is a value."""
+    if isinstance(value, dict) and value:
+        for key, item in value.items():
+            yield from leaves(item, (*path, key))
+    else:
+        yield path, value
+
+
 def parse_override(text: str) -> tuple[Path, Any]:
     """`rewards.alive.weight=2` -> (path, value); a key that holds a dot is quoted: joints.".*".damping=1.
 
@@ -183,7 +197,7 @@ def _index(target: list[Any], step: str | int, taken: Path) -> int:
     return int(step)
 
 
-def _paths(value: Any) -> list[Path]:
+def _paths(value: object) -> list[Path]:
     if isinstance(value, dict):
         return [(), *((key, *below) for key, item in value.items() for below in _paths(item))]
     if isinstance(value, list):
@@ -191,7 +205,7 @@ def _paths(value: Any) -> list[Path]:
     return [()]
 
 
-def _copy(value: Any) -> Any:
+def _copy(value: object) -> Any:
     if isinstance(value, dict):
         return {key: _copy(item) for key, item in value.items()}
     return [_copy(item) for item in value] if isinstance(value, list) else value

@@ -41,7 +41,7 @@ Homes = Mapping[str, list[str]]
 def problems(
     error: ValidationError,
     model: type[BaseModel],
-    data: Any,
+    data: object,
     place: Callable[[Path], str],
     prefix: Path = (),
     homes: Homes | None = None,
@@ -57,7 +57,7 @@ def problems(
     for path, items in grouped.items():
         if any(len(other) > len(path) and other[: len(path)] == path for other in grouped):
             continue  # an arm of a union that did not fit; another one got further
-        message, hint, at = _said(path, items, model, data, homes or {})
+        message, hint, at = _message(path, items, model, data, homes or {})
         found.append(Problem(place(prefix + at), dotted(prefix + at), message, hint))
     return found
 
@@ -67,7 +67,7 @@ def dotted(path: Path) -> str:
     return ".".join(f'"{part}"' if isinstance(part, str) and "." in part else str(part) for part in path)
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """A value as it would be written in YAML, cut short."""
     if isinstance(value, dict):
         return "a mapping"
@@ -84,8 +84,8 @@ def homes(models: Mapping[str, type[BaseModel]]) -> dict[str, list[str]]:
     return found
 
 
-def _said(
-    path: Path, items: list[Any], model: type[BaseModel], data: Any, homes: Homes
+def _message(
+    path: Path, items: list[Any], model: type[BaseModel], data: object, homes: Homes
 ) -> tuple[str, str | None, Path]:
     """What to say, what to do, and at which path."""
     kind, found = items[0]["type"], items[0]["input"]
@@ -107,7 +107,7 @@ def _said(
         return f"missing key '{path[-1]}'", None, path[:-1]
     length = _length(model, path)
     if length is not None and kind in ("missing", "too_short", "too_long"):
-        return f"expected a list of {length}, found {shown(_at(data, path))}", None, path
+        return f"expected a list of {length}, found {shown(_value_at(data, path))}", None, path
     hint = None
     if isinstance(found, str):
         choices = [word.strip("'") for item in items for word in _choices(item)]
@@ -117,7 +117,7 @@ def _said(
     return f"expected {' or '.join(dict.fromkeys(map(_expected, items)))}, found {shown(found)}", hint, path
 
 
-_SAID_ELSEWHERE = {
+_OTHER_PLACES = {
     "env": ("scene", "leave 'env.' out: the task's settings stand at the top, as scene.num_envs"),
     "params": ("func", "the parameters of a term stand beside its 'func'"),
     "device": ("dt", "it is an option: --device cpu"),
@@ -127,7 +127,7 @@ _SAID_ELSEWHERE = {
 
 def _right_key(key: str, fields: Iterable[str], homes: Homes) -> str:
     fields = list(fields)
-    beside, instead = _SAID_ELSEWHERE.get(key, ("", ""))
+    beside, instead = _OTHER_PLACES.get(key, ("", ""))
     if beside in fields:
         return instead
     near = did_you_mean(key, fields)
@@ -151,12 +151,17 @@ def _expected(item: Any) -> str:
         whole = "whole " if isinstance(item["input"], int) and not isinstance(bound, float) else ""
         return f"a {whole}number {sign} {bound if isinstance(bound, int) else f'{bound:g}'}"
     if kind == "literal_error":
-        return context["expected"]
+        return str(context["expected"])
     if kind in ("too_short", "too_long"):
         bound = context.get("min_length", context.get("max_length"))
         return f"{'at least' if kind == 'too_short' else 'at most'} {bound} item{'s' if bound != 1 else ''}"
+    if kind == "string_pattern_mismatch":
+        return f"text like {context['pattern']}"
+    if kind in ("string_too_short", "string_too_long"):
+        bound = f"{'at least' if kind == 'string_too_short' else 'at most'}"
+        return f"text of {bound} {context.get('min_length', context.get('max_length'))} characters"
     stem = kind.removesuffix("_type").removesuffix("_parsing").removesuffix("_required")
-    return _EXPECTED.get(stem, item["msg"])
+    return _EXPECTED.get(stem) or str(item["msg"])
 
 
 def _choices(item: Any) -> list[str]:
@@ -191,7 +196,7 @@ def _data_path(item: Any, data: Any) -> Path:
     return tuple(path)
 
 
-def _at(data: Any, path: Path) -> Any:
+def _value_at(data: Any, path: Path) -> Any:
     for step in path:
         data = data[step]
     return data
@@ -233,7 +238,7 @@ def _children(arm: Any, step: str | int) -> Iterator[Any]:
         yield get_args(arm)[0]
 
 
-def _arms(annotation: Any) -> Iterator[Any]:
+def _arms(annotation: object) -> Iterator[Any]:
     if get_origin(annotation) in (Union, types.UnionType):
         for arm in get_args(annotation):
             yield from _arms(arm)
@@ -255,5 +260,5 @@ def _keys(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, str]]:
                 yield from _keys(inner, below)
 
 
-def _is_model(arm: Any) -> bool:
+def _is_model(arm: object) -> bool:
     return isinstance(arm, type) and issubclass(arm, BaseModel)

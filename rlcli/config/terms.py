@@ -1,8 +1,8 @@
 """Term signatures, read from source text with `ast`: files are checked without importing a stranger's code.
 
-A term is a public function whose first parameter is `env`, or a class whose `__init__` takes `(self, env, *, ...)`,
-its own or that of a base in the same file (named in YAML by its class name in snake_case). Its keyword-only parameters
-are its YAML keys.
+A term is a public function whose first parameter is `env`, or a class whose `__init__` takes `(self, env, *, ...)`
+(named in YAML by its class name in snake_case). Its keyword-only parameters are its YAML keys. A class may inherit its
+`__init__` from a base in the same file, in another file of the task or in `rlcli.mdp`, or have it from `@dataclass`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from typing import Any, Literal, Union
 
 from pydantic import ConfigDict, Field, create_model
 
-from rlcli.config.classes import nested_lineage, parse
 from rlcli.config.schema import (
     ActionConfig,
     CommandConfig,
@@ -35,6 +34,7 @@ from rlcli.config.schema import (
     TermConfig,
     TerminationConfig,
 )
+from rlcli.config.source_classes import SourceClass, constructor, last_name, nested_lineage, parse
 
 SECTIONS: dict[str, type[TermConfig]] = {
     "actions": ActionConfig,
@@ -99,6 +99,11 @@ class Signature:
     description: str = ""
     """The first paragraph of its docstring, on one line."""
 
+    @property
+    def module(self) -> str:
+        """The module of a built-in term."""
+        return ".".join(("rlcli", "mdp", *self.file.relative_to(_MDP).with_suffix("").parts))
+
 
 @dataclass(slots=True)
 class Vocabulary:
@@ -130,8 +135,9 @@ class Vocabulary:
 @functools.cache
 def builtin_terms(section: str) -> dict[str, Signature]:
     """The terms of `rlcli.mdp` for a section of the YAML."""
-    terms = read_terms(_MDP / f"{section}.py")
-    return {**read_terms(_MDP / "randomization.py"), **terms} if section == "events" else terms
+    modules = ("randomization", "events") if section == "events" else (section,)
+    files = [file for module in modules for file in (_MDP / f"{module}.py", *sorted((_MDP / module).glob("*.py")))]
+    return {name: term for file in files if file.exists() for name, term in read_terms(file).items()}
 
 
 def read_terms(file: Path) -> dict[str, Signature]:
@@ -141,13 +147,13 @@ def read_terms(file: Path) -> dict[str, Signature]:
         SyntaxError: if the file is not Python.
     """
     tree = parse(file)
-    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    trees = {file: tree}
     terms: dict[str, Signature] = {}
     for node in tree.body:
         if isinstance(node, ast.FunctionDef) and _takes_env(node.args, 0) and not node.name.startswith("_"):
             terms[node.name] = _signature(node, node, node.name, file)
         elif isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-            init = _init(node, classes)
+            init = constructor(SourceClass(file, node), trees)
             if init is not None and _takes_env(init.args, 1):
                 name = snake_case(node.name)
                 terms[name] = _signature(node, init, name, file)
@@ -167,7 +173,7 @@ def signature_of(term: Any, name: str) -> Signature:
         raise SignatureError("its source cannot be read; define it at the top of a file") from None
     call: ast.stmt | None = node
     if isinstance(node, ast.ClassDef):
-        call = next((n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"), None)
+        call = constructor(SourceClass(Path(file or "?"), node), {})
     if not isinstance(node, ast.FunctionDef | ast.ClassDef) or not isinstance(call, ast.FunctionDef):
         raise SignatureError("a term is a function (env, *, ...), or a class whose __init__ takes (self, env, *, ...)")
     if not _takes_env(call.args, 1 if isinstance(node, ast.ClassDef) else 0):
@@ -225,19 +231,19 @@ def annotation_type(node: ast.expr) -> Any:
         return None
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return annotation_type(_quoted(node.value))
-    name = _last_name(node)
+    name = last_name(node)
     if name in _TYPES:
         return _TYPES[name]
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitOr):
         return Union[annotation_type(node.left), annotation_type(node.right)]  # noqa: UP007  (built at run time)
     if isinstance(node, ast.Subscript):
         items = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
-        outer = _last_name(node.value)
+        outer = last_name(node.value)
         if outer == "Literal":
             return Literal[tuple(_literal(item) for item in items)]
         if outer == "list" and len(items) == 1:
             return list[annotation_type(items[0])]  # type: ignore[misc]
-        if outer == "dict" and len(items) == 2 and _last_name(items[0]) == "str":
+        if outer == "dict" and len(items) == 2 and last_name(items[0]) == "str":
             return dict[str, annotation_type(items[1])]  # type: ignore[misc]
         if outer == "tuple":
             if len(items) == 2 and isinstance(items[1], ast.Constant) and items[1].value is ...:
@@ -326,7 +332,7 @@ def _alias(node: ast.expr) -> str | None:
         return _alias(_quoted(node.value))
     if isinstance(node, ast.BinOp):
         return _alias(node.left) or _alias(node.right)
-    name = _last_name(node)
+    name = last_name(node)
     return name if name in (*SELECTORS, *NAMED) else None
 
 
@@ -349,28 +355,12 @@ def _literal(node: ast.expr) -> Any:
 def _field_default(node: ast.expr | None) -> Any:
     if node is None:
         return ...
-    if isinstance(node, ast.Call) and _last_name(node.func) == "Field":
+    if isinstance(node, ast.Call) and last_name(node.func) == "Field":
         arguments = [_literal(argument) for argument in node.args]
         keywords = {k.arg: _literal(k.value) for k in node.keywords if k.arg}
         return Field(*arguments, **keywords)
     return _literal(node)
 
 
-def _init(node: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> ast.FunctionDef | None:
-    """A class's own `__init__`, or the one that it inherits from a class of the same file."""
-    own = next((n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"), None)
-    if own is not None:
-        return own
-    others = {name: other for name, other in classes.items() if other is not node}  # a class that is its own base ends
-    bases = (others[base.id] for base in node.bases if isinstance(base, ast.Name) and base.id in others)
-    return next((init for base in bases if (init := _init(base, others)) is not None), None)
-
-
 def _takes_env(arguments: ast.arguments, position: int) -> bool:
     return len(arguments.args) > position and arguments.args[position].arg == "env"
-
-
-def _last_name(node: ast.expr) -> str | None:
-    if isinstance(node, ast.Name):
-        return node.id
-    return node.attr if isinstance(node, ast.Attribute) else None

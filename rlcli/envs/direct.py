@@ -14,13 +14,13 @@ from rlcli.envs.articulation import ArticulationView
 from rlcli.envs.layout import Layout, TermLayout
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, RlcliError, TaskError
-from rlcli.managers.memory import Memory
+from rlcli.managers.attribute_state import TermState
 from rlcli.managers.termination import DIVERGED
 from rlcli.random import stream
 from rlcli.registry import load_object
-from rlcli.sim.saved import require_alike
-from rlcli.sim.scene import Scene
+from rlcli.scene.scene import Scene
 from rlcli.sim.selection import IdSelection, Selection
+from rlcli.sim.tensor_state import require_matching_tensors, substate
 
 _RESET = stream("direct.reset")
 
@@ -130,8 +130,8 @@ class DirectTask:
         """
         ids, episodes = env_ids.cpu().numpy(), self.env.episode_index.cpu().numpy()
         device = None if self.device.type == "cpu" else self.device
-        lives = self.env.engine.lives
-        return IdSelection(ids, self.env.seed, episodes[ids], stream(f"direct.{name}"), device, lives)
+        streams = self.env.engine.shared_streams
+        return IdSelection(ids, self.env.seed, episodes[ids], stream(f"direct.{name}"), device, streams)
 
     def selection(self, mask: Tensor, name: str) -> Selection | None:
         """The environments where `mask` (num_envs,) holds, to draw for in the middle of an episode; None for nobody.
@@ -148,7 +148,10 @@ class DirectTask:
 class DirectEnv(VecEnv):
     """Runs a `DirectTask` in the environment loop."""
 
-    def _prepare(self, scene: Scene) -> None:
+    not_recorded: ClassVar[str | None] = None
+    """Why the steps of this class cannot be recorded on a GPU; None: they can."""
+
+    def _prepare_scene(self, scene: Scene) -> None:
         task_class = self._task_class()
         try:
             params = task_class.Params.model_validate(self.config.params)
@@ -175,15 +178,15 @@ class DirectEnv(VecEnv):
             raise TaskError(f"task '{source.name}' is broken: {source.task} is not a DirectTask")
         return task_class
 
-    def _build(self) -> None:
+    def _build_workflow(self) -> None:
         for view in self.views:
             if isinstance(view, ArticulationView):
                 view.bind(self)
         task = self.task
         self._returns = torch.zeros(self.num_envs, device=self.device)
         self._fresh = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        self._begun: Selection | None = None  # the same, as the step's resets selected them
-        self._earned, self._marked = self.engine.as_field(self._returns), self.engine.as_field(self._fresh)
+        self._reset_in_step: Selection | None = None  # the same, as the step's resets selected them
+        self._return_field, self._fresh_field = self.engine.as_field(self._returns), self.engine.as_field(self._fresh)
         self._resets_by_selection = type(task).reset is not DirectTask.reset
         self._resets_by_id = type(task).reset_idx is not DirectTask.reset_idx
         self._reset_hook = task.reset_idx
@@ -194,16 +197,16 @@ class DirectEnv(VecEnv):
         self._rewards = itertools.cycle([torch.zeros_like(task.rew_buf) for _ in range(3)])
         self._final_obs = torch.zeros_like(task.obs_buf)
         self._final_states = torch.zeros_like(task.states_buf)
-        self._observed = False
-        self._settled = False  # a loaded state holds its second look already
-        self._causes: dict[str, Tensor] = {}
+        self._obs_current = False
+        self._obs_restored = False  # a loaded state holds its second look already
+        self._episode_causes: dict[str, Tensor] = {}
         self._observation_columns = [f"obs_buf[{i}]" for i in range(task.num_observations)]
         if len(task.observation_names) == task.num_observations:
             self._observation_columns = list(task.observation_names)
         task.post_reset()
-        self._memory = Memory(task, other=("env", "cfg", "params"))
+        self._memory = TermState(task, other=("env", "cfg", "params"))
 
-    def _layout(self) -> Layout:
+    def _make_layout(self) -> Layout:
         task = self.task
         names, size = task.observation_names, task.num_observations
         units = task.observation_units if len(task.observation_units) == size else ("",) * size
@@ -223,28 +226,28 @@ class DirectEnv(VecEnv):
             self.config.decimation,
         )
 
-    def holders(self) -> list[Any]:
+    def stateful_objects(self) -> list[Any]:
         """The task."""
         return [self.task]
 
-    def _logged(self) -> dict[str, Any]:
+    def _extras(self) -> dict[str, Any]:
         """The task's `extras`, by name."""
         return self.task.extras
 
-    def _extras(self) -> dict[str, float]:
+    def _task_metrics(self) -> dict[str, float]:
         """The task's `extras`: numbers, and means of tensors."""
         found = {}
-        for name, value in self._logged().items():
+        for name, value in self._extras().items():
             if isinstance(value, Tensor) and value.numel():
                 found[f"Task/{name}"] = float(value.float().mean())
             elif isinstance(value, int | float):
                 found[f"Task/{name}"] = float(value)
         return found
 
-    def measured(self) -> dict[str, Tensor]:
+    def step_metrics(self) -> dict[str, Tensor]:
         """The task's `extras`: of each environment where there is a row for each, else the same for all."""
         found = {}
-        for name, value in self._logged().items():
+        for name, value in self._extras().items():
             if isinstance(value, Tensor) and value.numel():
                 rows = value.float() if value.shape[:1] == (self.num_envs,) else value.float().mean().expand(1, 1)
                 found[name] = rows.reshape(len(rows), -1).mean(dim=1).expand(self.num_envs)
@@ -252,65 +255,65 @@ class DirectEnv(VecEnv):
                 found[name] = torch.full((self.num_envs,), float(value), device=self.device)
         return found
 
-    def carried(self) -> list[str]:
+    def episode_dependencies(self) -> list[str]:
         """The task: its class may remember anything, and draw from anywhere."""
-        return [*super().carried(), f"the class {type(self.task).__name__}"]
+        return [*super().episode_dependencies(), f"the class {type(self.task).__name__}"]
 
-    def _start_over(self) -> None:
-        self._observed = False
+    def _before_full_reset(self) -> None:
+        self._obs_current = False
 
-    def _act(self, action: Tensor) -> None:
+    def _apply_action(self, action: Tensor) -> None:
         bound = self.config.clip_actions
         self.task.pre_physics_step(action.clamp(-bound, bound) if bound is not None else action)
         self.task.reset_buf.zero_()
         self._fresh.zero_()
-        self._begun = None
+        self._reset_in_step = None
 
-    def _judge(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def _compute_rewards_and_dones(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         task = self.task
         task.progress_buf += 1
-        self._fill()
+        self._fill_buffers()
         task.calculate_metrics()
         task.is_done()
-        failed = task.reset_buf != 0  # a copy, even of a bool buffer: the flags are raised for time-outs too
-        truncated = self.episode_length_buf >= self.max_episode_length
-        self._causes = {"time_out": truncated, "task": failed}
+        failed, truncated = self._compute_dones()
+        self._episode_causes = {"time_out": truncated, "task": failed}
         reward = next(self._rewards).copy_(task.rew_buf)
         if diverged is not None:
-            self._causes[DIVERGED] = diverged
+            self._episode_causes[DIVERGED] = diverged
             failed = failed | diverged
             if self.config.divergence_reward is not None:
                 reward.masked_fill_(diverged, self.config.divergence_reward)
-        self._pay(reward, diverged)
-        self._observed = True
+            if not self.engine.asynchronous:  # a GPU finds out later, in `check`
+                reward.masked_fill_(diverged & ~reward.isfinite(), 0.0)
+        self._guard.require_finite(reward, "the reward")
+        self._returns += reward
+        self._obs_current = True
         return reward, failed, truncated
 
-    def _pay(self, reward: Tensor, diverged: Tensor | None) -> None:
-        """Add a step's reward to the returns; where the simulation diverged, one that is not finite is none."""
-        if diverged is not None and not self.engine.asynchronous:
-            reward.masked_fill_(diverged & ~reward.isfinite(), 0.0)
-        self._require_finite(reward, "the reward")
-        self._returns += reward
+    def _compute_dones(self) -> tuple[Tensor, Tensor]:
+        """Return where the task ended the episode, and where time did. (num_envs,) bool each"""
+        failed = self.task.reset_buf != 0  # a copy, even of a bool buffer: the flags are raised for time-outs too
+        return failed, self.episode_length_buf >= self.max_episode_length
 
-    def _final(self) -> dict[str, Tensor]:
+    def _compute_final_obs(self) -> dict[str, Tensor]:
         self._final_obs.copy_(self.task.obs_buf)
-        self._require_finite(self._final_obs, "the last observation", self._observation_columns)
+        self._guard.require_finite(self._final_obs, "the last observation", self._observation_columns)
         if self.task.num_states:
             self._final_states.copy_(self.task.states_buf)
-            self._require_finite(self._final_states, "the last state (states_buf)")
+            self._guard.require_finite(self._final_states, "the last state (states_buf)")
         return self._group(self._final_obs, self._final_states)
 
-    def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+    def _episode_returns_and_causes(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         return (
-            ended.read(self._earned),
+            ended.read(self._return_field),
             {},
-            {name: ended.peek(fired) for name, fired in self._causes.items()},
+            {name: ended.read_view(fired) for name, fired in self._episode_causes.items()},
         )
 
-    def _metrics_of(self, ended: Selection) -> dict[str, Tensor]:
+    def _episode_metrics(self, ended: Selection) -> dict[str, Tensor]:
         return {name: ended.read(values).float() for name, values in self.task.episode_metrics.items()}
 
-    def _restart_workflow(self, selection: Selection) -> None:
+    def _reset_workflow(self, selection: Selection) -> None:
         task = self.task
         if self._resets_by_selection:
             task.reset(selection.stream(_RESET))
@@ -318,36 +321,36 @@ class DirectEnv(VecEnv):
             ids = selection.env_ids()
             if len(ids):
                 self._reset_hook(ids)
-        self._begin(selection)
+        self._mark_reset(selection)
 
-    def _begin(self, selection: Selection) -> None:
+    def _mark_reset(self, selection: Selection) -> None:
         """Note the episodes that begin."""
         selection.write(self.task.progress_buf, 0)
         selection.write(self.task.reset_buf, 1)
-        selection.write(self._marked, True)
-        selection.write(self._earned, 0.0)
-        self._begun = selection if self._begun is None else self._begun.joined(selection)
+        selection.write(self._fresh_field, True)
+        selection.write(self._return_field, 0.0)
+        self._reset_in_step = selection if self._reset_in_step is None else self._reset_in_step.union(selection)
 
-    def _observe(self) -> dict[str, Tensor]:
+    def _compute_observations(self) -> dict[str, Tensor]:
         """Running environments keep what `_judge` observed; only those just reset take a second look."""
         task, obs, states = self.task, next(self._obs), next(self._states)
-        if not self._observed:
-            self._fill()
+        if not self._obs_current:
+            self._fill_buffers()
         looked = [(task.obs_buf, obs), (task.states_buf, states)][: 2 if task.num_states else 1]
         for buffer, kept in looked:
             kept.copy_(buffer)
-        if self._begun is not None and self._observed and not self._settled:
-            self._fill()
+        if self._reset_in_step is not None and self._obs_current and not self._obs_restored:
+            self._fill_buffers()
             for buffer, kept in looked:
-                self._begun.write(kept, self._begun.peek(buffer))
+                self._reset_in_step.write(kept, self._reset_in_step.read_view(buffer))
                 buffer.copy_(kept)
-        self._observed, self._settled = False, False
-        self._require_finite(obs, "the observation", self._observation_columns)
+        self._obs_current, self._obs_restored = False, False
+        self._guard.require_finite(obs, "the observation", self._observation_columns)
         if task.num_states:
-            self._require_finite(states, "the state (states_buf)")
+            self._guard.require_finite(states, "the state (states_buf)")
         return self._group(obs, states)
 
-    def _fill(self) -> None:
+    def _fill_buffers(self) -> None:
         task, bound = self.task, self.config.clip_observations
         task.get_observations()
         task.get_states()
@@ -372,7 +375,7 @@ class DirectEnv(VecEnv):
             self._reset_hook(stale)
             self.episode_length_buf[stale] = 0
 
-    def unsaved(self) -> list[str]:
+    def unsaved_state(self) -> list[str]:
         """What the task keeps that cannot be saved."""
         return self._memory.unsaved()
 
@@ -384,12 +387,11 @@ class DirectEnv(VecEnv):
         own = {
             f"task.{name}": value for name in _BUFFERS if isinstance(value := getattr(self.task, name, None), Tensor)
         }
-        require_alike(state, {**own, "_returns": self._returns, "_fresh": self._fresh}, "env: workflow")
+        require_matching_tensors(state, {**own, "_returns": self._returns, "_fresh": self._fresh}, "env: workflow")
         self._returns.copy_(state["_returns"])
         self._fresh.copy_(state["_fresh"])
-        task = {name.removeprefix("task."): value for name, value in state.items() if name.startswith("task.")}
-        self._memory.load_state_dict(task)
-        self._observed, self._settled = True, True
+        self._memory.load_state_dict(substate(state, "task."))
+        self._obs_current, self._obs_restored = True, True
 
 
 _BUFFERS = ("obs_buf", "states_buf", "rew_buf", "reset_buf", "progress_buf")

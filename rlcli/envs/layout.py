@@ -52,8 +52,16 @@ class Layout:
         """Columns of the action."""
         return sum(term.size for term in self.actions)
 
+    def action_columns(self) -> list[str]:
+        """Return a name for each column of the action: `term.element`, or `term[3]` where elements have no names."""
+        return [
+            f"{term.name}.{term.elements[i]}" if i < len(term.elements) else f"{term.name}[{i}]"
+            for term in self.actions
+            for i in range(term.size)
+        ]
+
     def record(self) -> dict[str, Any]:
-        """As plain JSON."""
+        """Return the layout as plain JSON."""
 
         def term(t: TermLayout) -> dict[str, Any]:
             return {

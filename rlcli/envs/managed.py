@@ -14,22 +14,22 @@ from torch import Tensor
 from rlcli.config.schema import ObservationConfig
 from rlcli.config.terms import SELECTORS
 from rlcli.envs.layout import Layout, TermLayout
-from rlcli.envs.markers import Marker
 from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.action import ActionManager, CommandMap
 from rlcli.managers.command import CommandManager
 from rlcli.managers.curriculum import CurriculumManager
 from rlcli.managers.event import EventManager
 from rlcli.managers.observation import ObservationManager, Watch
-from rlcli.managers.pipeline import Pipeline
+from rlcli.managers.observation_pipeline import Pipeline
 from rlcli.managers.reward import RewardManager
 from rlcli.managers.term import BoundTerm
 from rlcli.managers.termination import TerminationManager
-from rlcli.sim.engine import add_body_forces
-from rlcli.sim.saved import require_alike
-from rlcli.sim.scene import Scene
-from rlcli.sim.scene_joints import ActuatorNeed
+from rlcli.scene.scene import Scene
+from rlcli.scene.scene_joints import ActuatorNeed
+from rlcli.sim.force_sensors import add_body_forces
+from rlcli.sim.markers import Marker
 from rlcli.sim.selection import Selection
+from rlcli.sim.tensor_state import require_matching_tensors, substate
 
 _STATELESS = ("functools", "rlcli.mdp.")
 """Modules of terms that begin alike in every episode."""
@@ -43,18 +43,18 @@ class ManagedEnv(VecEnv):
     A step: actions, physics, terminations, rewards, curriculum and resets, commands, interval events, observations.
     """
 
-    def _prepare(self, scene: Scene) -> None:
+    def _prepare_scene(self, scene: Scene) -> None:
         scene.add_actuators(self._actuator_needs())
         if any(getattr(term, "reads_body_forces", False) for term in self._judging_terms()):
             add_body_forces(scene.spec)
         for config in self.config.events.values():
             assert config is not None
-            signature = self.resolved.vocabulary.find("events", config.func)
-            prepare = None if signature is None else getattr(self._binder.load(signature), "prepare", None)
+            term = self._binder.load(self._binder.signature("events", config))
+            prepare = getattr(term, "prepare", None)
             if prepare is not None:
                 prepare(scene.spec, config.params)
 
-    def _bind(self) -> None:
+    def _bind_terms(self) -> None:
         binder = self._binder
         self._commands = binder.bind_all("commands")  # first: terms of other sections refer to them
         self._actions = binder.bind_all("actions")
@@ -64,20 +64,20 @@ class ManagedEnv(VecEnv):
         self._observations = {group: binder.bind_group(group) for group in self.config.observations}
         self._curriculum = binder.bind_all("curriculum")
 
-    def _build(self) -> None:
+    def _build_workflow(self) -> None:
         # in this order: a term's first value may use what stands before it
-        self._everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        n, device, live = self.num_envs, self.device, self._binder.live
-        self.command_manager = CommandManager(self._commands, n, self.step_dt, device, live)
+        self._all_envs = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        n, device, tunable = self.num_envs, self.device, self._binder.tunable
+        self.command_manager = CommandManager(self._commands, n, self.step_dt, device, tunable)
         self.action_manager = ActionManager(self._actions, n, device, self.engine.as_field)
         self.termination_manager = TerminationManager(self._terminations, n, device)
         self.event_manager = EventManager(self._events, n, self.step_dt, device, self.engine.set_constants)
         if self.event_manager.derives:
             self.engine.set_constants()  # makes room for them; from here on all of them are derived in one way
-        self.event_manager.startup(self._everyone())
+        self.event_manager.startup(self._select_all())
         reward_dt = self.step_dt if self.config.reward_dt_scaling else 1.0
         self.reward_manager = RewardManager(
-            self._rewards, n, reward_dt, device, live, self.engine.as_field, self.config.divergence_reward
+            self._rewards, n, reward_dt, device, tunable, self.engine.as_field, self.config.divergence_reward
         )
         self.observation_manager = ObservationManager(
             self._observations,
@@ -85,22 +85,31 @@ class ManagedEnv(VecEnv):
             n,
             self.step_dt,
             device,
-            self._everyone_now,
-            live,
+            self._select_all_by_step,
+            tunable,
             self._watch(),
         )
-        self.curriculum_manager = CurriculumManager(self._curriculum, live, device)
+        self.curriculum_manager = CurriculumManager(self._curriculum, tunable, device)
 
-    def holders(self) -> list[Any]:
-        """The terms that are objects."""
-        bound = [*self._commands, *self._actions, *self._events, *self._terminations, *self._rewards]
-        bound += self._curriculum
-        terms = [*bound, *(term for group in self._observations.values() for term in group)]
-        return [term.instance for term in terms if not isinstance(term.instance, functools.partial)]
+    def stateful_objects(self) -> list[Any]:
+        """Return the class terms."""
+        return [term.instance for term in self._terms() if not isinstance(term.instance, functools.partial)]
 
-    def carried(self) -> list[str]:
+    def _terms(self) -> list[BoundTerm]:
+        sections = (
+            self._actions,
+            self._events,
+            self._terminations,
+            self._rewards,
+            self._commands,
+            self._curriculum,
+            *self._observations.values(),
+        )
+        return [term for section in sections for term in section]
+
+    def episode_dependencies(self) -> list[str]:
         """Whatever draws by the clock of all episodes, remembers beyond a reset, or may: objects of a task's own."""
-        found = [*super().carried(), *(f"actuators.{name}" for name in self._actuators)]
+        found = [*super().episode_dependencies(), *(f"actuators.{name}" for name in self.actuators)]
         found += [".".join(map(str, term.path)) for term in (*self._commands, *self._curriculum)]
         for term in self._events:
             config = term.config
@@ -114,14 +123,15 @@ class ManagedEnv(VecEnv):
                 drawn = config.noise is not None or config.bias is not None or config.delay is not None
                 if (drawn and self.config.observations[group].enable_corruption) or config.modifiers:
                     found.append(f"observations.{group}.{term.name}")
-        own = [term for term in self._parts().values() if isinstance(term, BoundTerm)]
-        found += [".".join(map(str, t.path)) for t in own if not type(t.instance).__module__.startswith(_STATELESS)]
+        for term in self._terms():
+            if not type(term.instance).__module__.startswith(_STATELESS):
+                found.append(".".join(map(str, term.path)))
         return list(dict.fromkeys(found))
 
     def _watch(self) -> Watch | None:
-        return self.engine.watch if self.engine.asynchronous else None
+        return self.engine.check_finite if self.engine.asynchronous else None
 
-    def _layout(self) -> Layout:
+    def _make_layout(self) -> Layout:
         observations = {
             group: tuple(self._observation_layout(pipeline) for pipeline in self.observation_manager.pipelines(group))
             for group in self.config.observations
@@ -149,27 +159,27 @@ class ManagedEnv(VecEnv):
             modifiers=tuple(modifier.model_dump(mode="json") for modifier in config.modifiers),
         )
 
-    def _act(self, action: Tensor) -> None:
+    def _apply_action(self, action: Tensor) -> None:
         self.action_manager.process(action)
 
-    def _judge(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def _compute_rewards_and_dones(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         terminated, truncated = self.termination_manager.compute(diverged)
         reward = self.reward_manager.compute(diverged, terminated)
-        self._require_finite(reward, "the reward")
-        self.reward_manager.add_up()
+        self._guard.require_finite(reward, "the reward")
+        self.reward_manager.add_to_episodes()
         if diverged is not None:
             self.reward_manager.replace_diverged(diverged, reward)
         self.command_manager.measure()
         return reward, terminated, truncated
 
-    def _explain(self, what: str) -> None:
+    def _raise_for_term(self, what: str) -> None:
         if what == "the reward":
-            self.reward_manager.explain()
+            self.reward_manager.require_finite_terms()
 
-    def _final(self) -> dict[str, Tensor]:
+    def _compute_final_obs(self) -> dict[str, Tensor]:
         return self.observation_manager.compute_final()
 
-    def _terms_of(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+    def _episode_returns_and_causes(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         returns, terms = self.reward_manager.episode(ended)
         return returns, terms, self.termination_manager.causes(ended)
 
@@ -178,56 +188,56 @@ class ManagedEnv(VecEnv):
         """The terms of the reward."""
         return [term.name for term in self.reward_manager.terms]
 
-    def _paid(self) -> Tensor:
-        return self.reward_manager.paid
+    def _reward_terms(self) -> Tensor:
+        return self.reward_manager.step_terms
 
-    def _start_over(self) -> None:
-        self.curriculum_manager.advance(self._steps)  # the clock may have been set back
-        self.event_manager.start_over(self._everyone())
+    def _before_full_reset(self) -> None:
+        self.curriculum_manager.advance(self._counters.common_step)  # the clock may have been set back
+        self.event_manager.before_full_reset(self._select_all())
 
-    def _metrics_of(self, ended: Selection) -> dict[str, Tensor]:
+    def _episode_metrics(self, ended: Selection) -> dict[str, Tensor]:
         return self.command_manager.episode(ended)
 
-    def _conclude(self, ended: Selection) -> None:
+    def _before_reset(self, ended: Selection) -> None:
         self.curriculum_manager.compute(ended)
 
-    def _restart_workflow(self, selection: Selection) -> None:
-        self.event_manager.reset(selection, self._steps)
+    def _reset_workflow(self, selection: Selection) -> None:
+        self.event_manager.reset(selection, self._counters.common_step)
         self.action_manager.reset(selection)
         self.command_manager.reset(selection)
         self.reward_manager.reset(selection)
         self.termination_manager.reset(selection)
         self.observation_manager.reset(selection)
 
-    def _between(self) -> None:
-        self.curriculum_manager.advance(self._steps)
+    def _update_commands_and_events(self) -> None:
+        self.curriculum_manager.advance(self._counters.common_step)
         if not self.event_manager.has_intervals and not self.command_manager.terms:
             return
         running = (self.episode_length_buf > 0).long()  # no time has passed for those just reset
-        self.command_manager.compute(self._now, running)
-        self.event_manager.interval(self._now, running, self._written)
+        self.command_manager.compute(self._select_by_step, running)
+        self.event_manager.interval(self._select_by_step, running, self._after_interval_event)
 
-    def _everyone_now(self) -> Selection:
-        everyone = self._now(self._everywhere)
+    def _select_all_by_step(self) -> Selection:
+        everyone = self._select_by_step(self._all_envs)
         assert everyone is not None
         return everyone
 
-    def _now(self, mask: Tensor) -> Selection | None:
+    def _select_by_step(self, mask: Tensor) -> Selection | None:
         """A selection that draws from the step's own counter."""
-        return self.engine.select(mask, self.seed, self._steps.expand(self.num_envs).contiguous())
+        return self.engine.select(mask, self.seed, self._counters.common_step.expand(self.num_envs).contiguous())
 
-    def _written(self, selection: Selection) -> None:
-        self.sim.moved(selection)
+    def _after_interval_event(self, selection: Selection) -> None:
+        self.sim.on_moved(selection)
         for sensor in self.sensors.values():
-            sensor.moved(selection)
+            sensor.on_moved(selection)
 
-    def _observe(self) -> dict[str, Tensor]:
+    def _compute_observations(self) -> dict[str, Tensor]:
         return self.observation_manager.compute()
 
-    def _observe_again(self) -> dict[str, Tensor]:
+    def _restore_observations(self) -> dict[str, Tensor]:
         return self.observation_manager.again()
 
-    def _extras(self) -> dict[str, float]:
+    def _task_metrics(self) -> dict[str, float]:
         """What the curriculum's terms gave last."""
         return self.curriculum_manager.values()
 
@@ -239,10 +249,9 @@ class ManagedEnv(VecEnv):
 
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
         for name, part in self._parts().items():
-            prefix = f"{name}."
-            saved = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+            saved = substate(state, f"{name}.")
             if not (isinstance(part, BoundTerm) and part.memory):  # an author's own tensors may come and go
-                require_alike(saved, part.state_dict(), f"env: workflow.{name}")
+                require_matching_tensors(saved, part.state_dict(), f"env: workflow.{name}")
             part.load_state_dict(saved)
 
     def _parts(self) -> dict[str, Any]:
@@ -254,28 +263,15 @@ class ManagedEnv(VecEnv):
             "event": self.event_manager,
             "reward": self.reward_manager,
         }
-        terms = [
-            *self.action_manager.terms,
-            *self.event_manager.terms,
-            *self.termination_manager.terms,
-            *self.reward_manager.terms,
-            *self.command_manager.terms,
-            *self.curriculum_manager.terms,
-            *(
-                pipeline.term
-                for group in self.config.observations
-                for pipeline in self.observation_manager.pipelines(group)
-            ),
-        ]
-        return {**parts, **{"term." + ".".join(map(str, t.path)): t for t in terms}}
+        return {**parts, **{"term." + ".".join(map(str, term.path)): term for term in self._terms()}}
 
     def markers(self) -> list[Marker]:
         """What the commands ask for."""
         return self.command_manager.markers()
 
-    def unsaved(self) -> list[str]:
+    def unsaved_state(self) -> list[str]:
         """What class terms keep that cannot be saved."""
-        memories = [part.memory for part in self._parts().values() if isinstance(part, BoundTerm) and part.memory]
+        memories = [term.memory for term in self._terms() if term.memory]
         return [what for memory in memories for what in memory.unsaved()]
 
     def _judging_terms(self) -> Iterator[Any]:
@@ -286,16 +282,13 @@ class ManagedEnv(VecEnv):
         for section, configs in [*sections.items(), *groups]:
             for config in configs.values():  # type: ignore[attr-defined]
                 if config is not None:
-                    signature = self.resolved.vocabulary.find(section, config.func)
-                    assert signature is not None  # phase 1 has looked it up
-                    yield self._binder.load(signature)
+                    yield self._binder.load(self._binder.signature(section, config))
 
     def _actuator_needs(self) -> list[ActuatorNeed]:
         needs = []
         for name, config in self.config.actions.items():
             assert config is not None
-            signature = self.resolved.vocabulary.find("actions", config.func)
-            assert signature is not None
+            signature = self._binder.signature("actions", config)
             kind = getattr(self._binder.load(signature), "actuator", None)
             joints = next((p.name for p in signature.parameters if p.alias == SELECTORS[0]), None)
             if kind is not None and joints is not None:

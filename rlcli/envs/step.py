@@ -69,8 +69,8 @@ class StepResult:
 
 
 @dataclass(frozen=True, slots=True)
-class Lived:
-    """What a step was, for whoever watches; tensors are the environment's own, to be copied at once."""
+class StepRecord:
+    """One step as observers get it. Tensors belong to the environment: copy what is kept."""
 
     obs: Mapping[str, Tensor]
     """Group -> observations that the action was taken for. (num_envs, d) float32"""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from rlcli.errors import ConfigError
 from rlcli.managers.term import BoundTerm, resets
 from rlcli.sim.selection import Field, Selection, in_place
+from rlcli.sim.tensor_state import TensorState
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,7 @@ class ActionTerm(Protocol):
         ...
 
 
-class ActionManager:
+class ActionManager(TensorState):
     """Keeps the raw actions of this step and the last, and hands each term its columns."""
 
     def __init__(
@@ -83,14 +84,9 @@ class ActionManager:
         for reset in self._forget:
             reset(selection)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Both actions."""
-        return {"action": self.action.clone(), "prev_action": self.prev_action.clone()}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
-        self.action.copy_(state["action"])
-        self.prev_action.copy_(state["prev_action"])
+    def tensors(self) -> dict[str, Tensor]:
+        """Return both actions."""
+        return {"action": self.action, "prev_action": self.prev_action}
 
 
 def _refuse_shared(terms: list[BoundTerm]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -12,11 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.envs.markers import Arrow, Frame, Marker, Sphere
 from rlcli.errors import UsageError, did_you_mean, listing
-from rlcli.managers.live import LiveValues
 from rlcli.managers.term import BoundTerm, resets
+from rlcli.managers.tunable import TunableValues
+from rlcli.sim.markers import Arrow, Frame, Marker, Sphere
 from rlcli.sim.selection import Selection
+from rlcli.sim.tensor_state import TensorState
 
 Select = Callable[[Tensor], Selection | None]
 _COLUMNS = {"start": 3, "end": 3, "center": 3, "position": 3, "quat": 4}
@@ -31,7 +32,7 @@ class CommandTerm(Protocol):
     `elements`, names of the columns of `command` that a person may set ("" for the others), and `limits`, the [low,
     high] that they usually have.
 
-    A method `markers() -> list[Marker]` gives what is asked as arrows, spheres and frames (`rlcli.envs.markers`), with
+    A method `markers() -> list[Marker]` gives what is asked as arrows, spheres and frames (`rlcli.sim.markers`), with
     places in the world as `entity.data.root_pos_w` is, (num_envs, 3) [m], and orientations (w, x, y, z), (num_envs, 4).
     It is called once a picture, never in a step. It changes nothing. It reads the state of roots and joints, and beyond
     that only what `metrics` or `update` reads too: the engine computes other fields from the first look at them on.
@@ -61,18 +62,18 @@ class Knob:
     high: float
 
 
-class CommandManager:
+class CommandManager(TensorState):
     """Keeps the timers, and the sums of the metrics over an episode."""
 
     def __init__(
-        self, terms: list[BoundTerm], num_envs: int, step_dt: float, device: torch.device, live: LiveValues
+        self, terms: list[BoundTerm], num_envs: int, step_dt: float, device: torch.device, tunable: TunableValues
     ) -> None:
         self.terms = terms
         self._forget = [resets([term]) for term in terms]
         self._by_name = {term.name: term for term in terms}
         self._step_dt = step_dt
         self._times = [
-            live.get((*term.path, "resampling_time_s"), term.config.resampling_time_s)  # type: ignore[attr-defined]
+            tunable.get((*term.path, "resampling_time_s"), term.config.resampling_time_s)  # type: ignore[attr-defined]
             for term in terms
         ]
         # counted in whole steps: subtracting step_dt again and again drifts
@@ -141,11 +142,12 @@ class CommandManager:
 
     def get_command(self, name: str) -> Tensor:
         """The command of a term. (num_envs, k)"""
-        return self._by_name[name].instance.command
+        return self.get_term(name).command
 
     def get_term(self, name: str) -> CommandTerm:
         """A command term."""
-        return self._by_name[name].instance
+        term: CommandTerm = self._by_name[name].instance
+        return term
 
     def measure(self) -> None:
         """Add up how well this step followed its commands, before anything is drawn anew."""
@@ -159,7 +161,7 @@ class CommandManager:
         """Means of the metrics over the episodes that end. (n,) each"""
         if not self._measured:
             return {}
-        means = ended.peek(self._sums) / ended.peek(self._steps).clamp(min=1.0)[:, None]
+        means = ended.read_view(self._sums) / ended.read_view(self._steps).clamp(min=1.0)[:, None]
         return {name: column for (name, _, _), column in zip(self._measured, means.unbind(1), strict=True)}
 
     def so_far(self, term: CommandTerm, metric: str) -> Tensor:
@@ -192,19 +194,10 @@ class CommandManager:
         for name, knob in self._holds.items():
             self._by_name[knob.term].instance.command[:, knob.column] = self.held[name]
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Timers, sums, and the commands."""
-        commands = {f"command.{term.name}": term.instance.command.clone() for term in self.terms}
-        own = {"steps_left": self._steps_left, "sums": self._sums, "steps": self._steps}
-        return {**{name: tensor.clone() for name, tensor in own.items()}, **commands}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
-        self._steps_left.copy_(state["steps_left"])
-        self._sums.copy_(state["sums"])
-        self._steps.copy_(state["steps"])
-        for term in self.terms:
-            term.instance.command.copy_(state[f"command.{term.name}"])
+    def tensors(self) -> dict[str, Tensor]:
+        """Return timers, sums, and the commands."""
+        commands = {f"command.{term.name}": term.instance.command for term in self.terms}
+        return {"steps_left": self._steps_left, "sums": self._sums, "steps": self._steps, **commands}
 
     def _resample(self, number: int, selection: Selection, when: np.uint64) -> None:
         term, (low, high) = self.terms[number], self._times[number]

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor
 
-from rlcli.managers.live import LiveValues
 from rlcli.managers.term import BoundTerm
+from rlcli.managers.tunable import TunableValues
 from rlcli.sim.selection import Selection
+from rlcli.sim.tensor_state import TensorState
 
 
-class CurriculumManager:
+class CurriculumManager(TensorState):
     """A term is called with the environments whose episode ends, before anything of it is forgotten.
 
     It is a function `name(env, selection, *, ...)` or a class; a class may have a method `advance(step)` instead, which
@@ -20,37 +19,31 @@ class CurriculumManager:
     Either may give a number to log, `()` or (num_envs,), of which the mean is logged.
     """
 
-    def __init__(self, terms: list[BoundTerm], live: LiveValues, device: torch.device) -> None:
+    def __init__(self, terms: list[BoundTerm], tunable: TunableValues, device: torch.device) -> None:
         self.terms = terms
-        self._live = live
+        self._tunable = tunable
         self._scheduled = [term for term in terms if hasattr(term.instance, "advance")]
-        self._judged = [term for term in terms if not hasattr(term.instance, "advance")]
+        self._per_episode = [term for term in terms if not hasattr(term.instance, "advance")]
         self._values = {term.name: torch.full((), torch.nan, device=device) for term in terms}
 
     def advance(self, step: Tensor) -> None:
-        """Move schedules on. step () int64"""
+        """Advance schedules to a step. step () int64"""
         for term in self._scheduled:
             self._keep(term, term.instance.advance(step))
 
     def compute(self, ended: Selection) -> None:
-        """Judge the episodes that end."""
-        for term in self._judged:
+        """Call the terms that look at episodes, with those that end."""
+        for term in self._per_episode:
             self._keep(term, term.call(ended.stream(term.stream)))
 
     def values(self) -> dict[str, float]:
         """What the terms gave last, by name."""
         return {f"Curriculum/{name}": float(value) for name, value in self._values.items()}
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """The values that were changed, and those last logged."""
-        logged = {f"value.{name}": value.clone() for name, value in self._values.items()}
-        return {**logged, **{f"live.{path}": value for path, value in self._live.state_dict().items()}}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
-        for name, value in self._values.items():
-            value.copy_(state[f"value.{name}"])
-        self._live.load_state_dict({n.removeprefix("live."): v for n, v in state.items() if n.startswith("live.")})
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tunable values, and those last logged."""
+        logged = {f"value.{name}": value for name, value in self._values.items()}
+        return {**logged, **{f"live.{path}": value for path, value in self._tunable.tensors().items()}}
 
     def _keep(self, term: BoundTerm, value: Tensor | float | None) -> None:
         if isinstance(value, Tensor):

@@ -10,12 +10,13 @@ from torch import Tensor
 
 from rlcli.managers.term import BoundTerm, resets
 from rlcli.sim.selection import Selection
+from rlcli.sim.tensor_state import TensorState
 
 Select = Callable[[Tensor], Selection | None]
-Settle = Callable[[Selection], None]
+SetConstants = Callable[[Selection], None]
 
 
-class EventManager:
+class EventManager(TensorState):
     """Fires events; interval timers run an environment each and start anew with its episode, unless they are global.
 
     Args:
@@ -23,7 +24,7 @@ class EventManager:
         num_envs: environments.
         step_dt: control period [s].
         device: of the timers.
-        settle: called once after a firing that wrote something from which the engine derives constants.
+        set_constants: called once after a firing that wrote something from which the engine derives constants.
     """
 
     def __init__(
@@ -32,7 +33,7 @@ class EventManager:
         num_envs: int,
         step_dt: float,
         device: torch.device,
-        settle: Settle = lambda _: None,
+        set_constants: SetConstants = lambda _: None,
     ) -> None:
         by_mode: dict[str, list[BoundTerm]] = {"startup": [], "reset": [], "interval": []}
         for term in terms:
@@ -41,7 +42,7 @@ class EventManager:
         self._startup, self._reset, self._interval = by_mode["startup"], by_mode["reset"], by_mode["interval"]
         self._lasting = [term.instance for term in terms if hasattr(term.instance, "update")]
         self._step_dt = step_dt
-        self._settle = settle
+        self._set_constants = set_constants
         # counted in whole steps: subtracting step_dt again and again drifts
         self._steps_left = torch.zeros(len(self._interval), num_envs, dtype=torch.int64, device=device)
         self._fired_at = torch.full((len(self._reset), num_envs), _NEVER, dtype=torch.int64, device=device)
@@ -66,8 +67,8 @@ class EventManager:
             term.call(everyone.stream(term.stream))
         self._after(self._startup, everyone)
 
-    def start_over(self, everyone: Selection) -> None:
-        """Forget what has fired, before all environments begin anew."""
+    def before_full_reset(self, everyone: Selection) -> None:
+        """Clear what has fired, before all environments are reset."""
         self._fired_at.fill_(_NEVER)
         for term, left in self._intervals:
             if _is_global(term):
@@ -85,7 +86,7 @@ class EventManager:
                 if apart:
                     due.write(fired_at, step.expand(1))
         if self._resets_derive:
-            self._settle(selection)
+            self._set_constants(selection)
         for term, left in self._intervals:
             if not _is_global(term):
                 selection.write(left, self._draw(term, selection, _FIRST))
@@ -108,19 +109,17 @@ class EventManager:
                 due.write(left, steps[:1] if is_global else steps)
                 fired(due)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """The interval timers, and when reset events fired."""
-        return {"steps_left": self._steps_left.clone(), "fired_at": self._fired_at.clone()}
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the interval timers, and when reset events fired."""
+        return {"steps_left": self._steps_left, "fired_at": self._fired_at}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
-        self._steps_left.copy_(state["steps_left"])
-        if "fired_at" in state:
-            self._fired_at.copy_(state["fired_at"])
+        """Restore the state returned by `state_dict()`; older checkpoints lack `fired_at`."""
+        super().load_state_dict({"fired_at": self._fired_at, **state})
 
     def _after(self, fired: Sequence[BoundTerm], selection: Selection) -> None:
         if any(map(_derives, fired)):
-            self._settle(selection)
+            self._set_constants(selection)
 
     def _draw(self, term: BoundTerm, selection: Selection, timer: np.uint64) -> Tensor:
         low, high = term.config.interval_range_s  # type: ignore[attr-defined]

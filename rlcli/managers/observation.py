@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from rlcli.config.schema import ObservationGroupConfig
-from rlcli.errors import DivergedError
-from rlcli.managers.live import LiveValues
-from rlcli.managers.pipeline import Draws, Pipeline
+from rlcli.managers.observation_pipeline import Draws, Pipeline
 from rlcli.managers.term import BoundTerm, check_shape, first_value
+from rlcli.managers.tunable import TunableValues
 from rlcli.sim.selection import Selection
-from rlcli.sim.state import is_finite
+from rlcli.sim.state_cache import is_finite
+from rlcli.sim.tensor_state import TensorState
 
 
 @dataclass(slots=True)
@@ -33,7 +33,7 @@ _FINAL = np.uint64(0x46494E414C)
 """The last observation of an episode draws apart, so that the first of the next one is not seen with its noise."""
 
 
-class ObservationManager:
+class ObservationManager(TensorState):
     """Computes every group into one of three buffers in turn, so that consecutive observations share no memory.
 
     Args:
@@ -41,7 +41,7 @@ class ObservationManager:
         configs: the groups' settings.
         step_dt: control period [s].
         now: gives all environments, drawing by the step's counter.
-        live: what a curriculum moves.
+        tunable: what a curriculum moves.
         watch: notes what is not finite; None checks at once.
     """
 
@@ -53,11 +53,11 @@ class ObservationManager:
         step_dt: float,
         device: torch.device,
         now: Callable[[], Selection],
-        live: LiveValues,
+        tunable: TunableValues,
         watch: Watch | None = None,
     ) -> None:
         self.num_envs = num_envs
-        self._device, self._step_dt, self._live, self._now, self._watch = device, step_dt, live, now, watch
+        self._device, self._step_dt, self._tunable, self._now, self._watch = device, step_dt, tunable, now, watch
         self.groups = {name: self._group(terms, configs[name]) for name, terms in groups.items()}
         self._final = {name: torch.zeros_like(group.buffers[0]) for name, group in self.groups.items()}
         self._final_views = {name: _split(self._final[name], group.pipelines) for name, group in self.groups.items()}
@@ -89,7 +89,7 @@ class ObservationManager:
         """The observations that `compute` gave last, after `load_state_dict`."""
         result, draws = {}, self._draws(np.uint64(0))
         for name, group in self.groups.items():
-            if not _remembers(group):
+            if not _has_memory(group):
                 self._fill(group, group.views[group.next], draws, advance=True)
             result[name] = group.buffers[group.next]
         return result
@@ -104,30 +104,21 @@ class ObservationManager:
         """The terms of a group with what is done to them."""
         return self.groups[group].pipelines
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """What pipelines carry from step to step, and the last observations of the groups that do."""
-        state = {name: tensor.clone() for name, tensor in self._tensors().items()}
-        for name, group in self.groups.items():
-            if _remembers(group):
-                state[f"last.{name}"] = group.buffers[group.next].clone()
-        return state
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
-        for name, tensor in self._tensors().items():
-            tensor.copy_(state[name])
-        for name, group in self.groups.items():
-            if _remembers(group):
-                group.buffers[group.next].copy_(state[f"last.{name}"])
-        self._fresh = None
-
-    def _tensors(self) -> dict[str, Tensor]:
-        return {
+    def tensors(self) -> dict[str, Tensor]:
+        """Return what pipelines carry from step to step, and the last observations of the groups that do."""
+        tensors = {
             f"{name}.{pipeline.term.name}.{key}": tensor
             for name, group in self.groups.items()
             for pipeline in group.pipelines
             for key, tensor in pipeline.tensors().items()
         }
+        last = {f"last.{name}": g.buffers[g.next] for name, g in self.groups.items() if _has_memory(g)}
+        return {**tensors, **last}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore the state returned by `state_dict()`."""
+        super().load_state_dict(state)
+        self._fresh = None
 
     def _draws(self, salt: np.uint64) -> Draws:
         everyone: list[Selection] = []  # made when somebody draws, once a step
@@ -150,7 +141,7 @@ class ObservationManager:
             dims = value.dim() if isinstance(value, Tensor) else 0
             shape = tuple(value.shape[1:]) if dims in (2, 4) else (1,)  # columns, or a picture
             check_shape(term, value, (self.num_envs, *shape))
-            pipelines.append(Pipeline(term, shape, config, self.num_envs, self._step_dt, self._device, self._live))
+            pipelines.append(Pipeline(term, shape, config, self.num_envs, self._step_dt, self._device, self._tunable))
         size = sum(pipeline.size for pipeline in pipelines)
         buffers = [torch.zeros(self.num_envs, size, device=self._device) for _ in range(3)]
         return _Group(pipelines, buffers, [_split(buffer, pipelines) for buffer in buffers])
@@ -162,18 +153,12 @@ class ObservationManager:
         if is_finite(values):
             return
         for pipeline, view in zip(group.pipelines, _split(values, group.pipelines), strict=True):
-            bad = ~view.isfinite().all(dim=1)
-            if bool(bad.any()):
-                term, first = pipeline.term, int(bad.nonzero()[0, 0])
-                raise DivergedError(
-                    f"observation '{name}.{term.name}' ({term.config.func}) is not finite in {int(bad.sum())}"
-                    f" environments, first in environment {first}"
-                )
+            pipeline.term.require_finite(view, f"observation '{name}.{pipeline.term.name}'")
 
 
-def _remembers(group: _Group) -> bool:
+def _has_memory(group: _Group) -> bool:
     return any(pipeline.has_memory for pipeline in group.pipelines)
 
 
 def _split(buffer: Tensor, pipelines: list[Pipeline]) -> list[Tensor]:
-    return list(buffer.split([pipeline.size for pipeline in pipelines], dim=1))
+    return list(torch.split(buffer, [pipeline.size for pipeline in pipelines], dim=1))

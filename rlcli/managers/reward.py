@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.errors import DivergedError
-from rlcli.managers.live import LiveValues
 from rlcli.managers.term import BoundTerm, check_shape, first_value, resets
 from rlcli.managers.termination import DIVERGED
+from rlcli.managers.tunable import TunableValues
 from rlcli.sim.selection import Field, Selection, in_place
+from rlcli.sim.tensor_state import TensorState
 
 
-class RewardManager:
+class RewardManager(TensorState):
     """Terms whose weight is 0 and stays so are not called.
 
     Where a `divergence_reward` is configured, what it paid is kept as a term of its own.
@@ -27,48 +27,48 @@ class RewardManager:
         num_envs: int,
         dt: float,
         device: torch.device,
-        live: LiveValues,
+        tunable: TunableValues,
         as_field: Callable[[Tensor], Field],
         divergence_reward: float | None = None,
     ) -> None:
         self.terms = terms
         self._forget = resets(terms)
         self._dt = dt
-        weights = [live.get((*term.path, "weight"), term.config.weight) for term in terms]  # type: ignore[attr-defined]
+        weights = [tunable.get((*term.path, "weight"), term.config.weight) for term in terms]  # type: ignore[attr-defined]
         # for one environment a second column: numpy adds the only one up in another order than it does several
         table = torch.zeros(len(terms), max(num_envs, 2), device=device)
         self._values = table[:, :num_envs]
         self._sums = torch.zeros(len(terms), num_envs, device=device)
         self._rows = list(self._values.unbind(0))
-        factors = [0.0 if _moves(weight) else weight * dt for weight in weights]
+        factors = [0.0 if _is_tunable(weight) else weight * dt for weight in weights]
         self._factors = torch.tensor(factors, dtype=torch.float32, device=device)[:, None]
         kept = [term.config.while_alive for term in terms]  # type: ignore[attr-defined]
         self._while_alive = torch.tensor(kept, device=device)[:, None] if any(kept) else None
         self._divergence_reward = divergence_reward
         self._divergence_sums = torch.zeros(num_envs, device=device)
-        self._moved = [
+        self._tunable = [
             (factor, weight)
             for factor, weight in zip(self._factors.flatten().unbind(0), weights, strict=True)
-            if _moves(weight)
+            if _is_tunable(weight)
         ]
         self._active = [
             (term.call, row)
             for term, row, weight in zip(terms, self._rows, weights, strict=True)
-            if _moves(weight) or weight * dt != 0.0
+            if _is_tunable(weight) or weight * dt != 0.0
         ]
         totals = [torch.zeros(table.shape[1], device=device) for _ in range(3)]
         self._totals = [total[:num_envs] for total in totals]
         self._next = 0
         self._fused = device.type == "cuda"
-        self._paid, self._owed = in_place(self._values), in_place(self._sums)
+        self._step_terms, self._episode_terms = in_place(self._values), in_place(self._sums)
         self._sums_by_env = as_field(self._sums.t())
         self._added, self._added_to = in_place(table), [in_place(total) for total in totals]
         for term, weight in zip(terms, weights, strict=True):
-            if _moves(weight) or weight != 0.0:
+            if _is_tunable(weight) or weight != 0.0:
                 check_shape(term, first_value(term), (num_envs,))
 
     def compute(self, diverged: Tensor | None = None, terminated: Tensor | None = None) -> Tensor:
-        """This step's reward; `add_up` takes it into the episode's sums. (num_envs,)
+        """This step's reward; `add_to_episodes` takes it into the episode's sums. (num_envs,)
 
         Where it `terminated`, terms with `while_alive` pay nothing.
 
@@ -79,7 +79,7 @@ class RewardManager:
         """
         for call, row in self._active:
             row.copy_(call())
-        for factor, weight in self._moved:
+        for factor, weight in self._tunable:
             torch.mul(weight, self._dt, out=factor)
         self._values *= self._factors
         if self._while_alive is not None and terminated is not None:
@@ -94,12 +94,12 @@ class RewardManager:
             np.add.reduce(self._added, axis=0, out=self._added_to[self._next])
         return total
 
-    def add_up(self) -> None:
+    def add_to_episodes(self) -> None:
         """Take the step's terms into the sums of the running episodes."""
-        self._owed += self._paid
+        self._episode_terms += self._step_terms
 
     @property
-    def paid(self) -> Tensor:
+    def step_terms(self) -> Tensor:
         """What each term paid in the last step, weight included, live. (terms, num_envs)"""
         return self._values
 
@@ -125,19 +125,14 @@ class RewardManager:
             returns += shares[DIVERGED]
         return returns, shares
 
-    def explain(self) -> None:
-        """Name the term that made a reward that is not finite.
+    def require_finite_terms(self) -> None:
+        """Name the term behind a reward that is not finite.
 
         Raises:
             DivergedError: if there is one.
         """
         for term, row in zip(self.terms, self._rows, strict=True):
-            bad = ~row.isfinite()
-            if bool(bad.any()):
-                raise DivergedError(
-                    f"reward term '{term.name}' ({term.config.func}) is not finite in {int(bad.sum())} environments,"
-                    f" first in environment {int(bad.nonzero()[0, 0])}"
-                )
+            term.require_finite(row, f"reward term '{term.name}'")
 
     def reset(self, selection: Selection) -> None:
         """Episode sums start at zero."""
@@ -147,16 +142,11 @@ class RewardManager:
         for reset in self._forget:
             reset(selection)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """The running sums."""
-        return {"sums": self._sums.clone(), "divergence_sums": self._divergence_sums.clone()}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
-        self._sums.copy_(state["sums"])
-        self._divergence_sums.copy_(state["divergence_sums"])
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the running sums."""
+        return {"sums": self._sums, "divergence_sums": self._divergence_sums}
 
 
-def _moves(weight: float | Tensor) -> bool:
+def _is_tunable(weight: float | Tensor) -> bool:
     """Whether a curriculum changes a weight."""
     return isinstance(weight, Tensor)

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from rlcli.config.load import Resolved
 from rlcli.config.schema import TermConfig
 from rlcli.config.strict_yaml import Path
 from rlcli.config.terms import SELECTORS, Signature
-from rlcli.errors import ConfigError, Problem, ShapeError, TaskError, did_you_mean, listing
-from rlcli.managers.live import LiveValues
-from rlcli.managers.memory import Memory
+from rlcli.errors import ConfigError, DivergedError, Problem, ShapeError, TaskError, did_you_mean, listing
+from rlcli.managers.attribute_state import TermState
+from rlcli.managers.tunable import TunableValues
 from rlcli.random import stream
-from rlcli.registry import load_module
-from rlcli.sim.names import NameProblem
+from rlcli.registry import is_framework, load_module
+from rlcli.scene.names import NameProblem
 
 if TYPE_CHECKING:
-    from rlcli.envs.vec_env import VecEnv
-    from rlcli.sim.sensors import Sensor
+    from rlcli.scene.entity import Entity
+    from rlcli.scene.sensors import Sensor
 
 
 SENSORS = {"ContactSensor": "contact", "RaySensor": "rays", "CameraSensor": "camera"}
@@ -45,7 +46,7 @@ class BoundTerm:
     """Selector parameter -> the names it resolved to."""
     stream: np.uint64
     """The term's random stream."""
-    memory: Memory | None = None
+    memory: TermState | None = None
     """What a class term of a task's own carries from step to step, if it does not say so itself."""
 
     @property
@@ -57,6 +58,19 @@ class BoundTerm:
         """What is wrong with what the term gives, or with a key of it that must fit that."""
         return ShapeError([self.resolved.problem((*self.path, *keys), message)])
 
+    def require_finite(self, values: Tensor, what: str) -> None:
+        """Raise if a value of the term is not finite. values (num_envs, ...)
+
+        Raises:
+            DivergedError: with the number of environments and the first of them.
+        """
+        bad = ~values.isfinite().flatten(1).all(dim=1) if values.dim() > 1 else ~values.isfinite()
+        if bool(bad.any()):
+            raise DivergedError(
+                f"{what} ({self.config.func}) is not finite in {int(bad.sum())} environments, first in environment"
+                f" {int(bad.nonzero()[0, 0])}"
+            )
+
     def state_dict(self) -> dict[str, Tensor]:
         """What a term with memory carries from step to step."""
         if hasattr(self.call, "state_dict"):
@@ -65,28 +79,43 @@ class BoundTerm:
         return {} if self.memory is None else self.memory.state_dict()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
+        """Restore the state returned by `state_dict()`."""
         if hasattr(self.call, "load_state_dict"):
             self.call.load_state_dict(state)
         elif self.memory is not None:
             self.memory.load_state_dict(state)
 
 
-class Binder:
-    """Binds the terms of one environment, and gathers every problem before any is raised."""
+class TermEnv(Protocol):
+    """What a binder needs of an environment; terms get the same object as their `env`."""
 
-    def __init__(self, env: VecEnv, resolved: Resolved) -> None:
+    device: torch.device
+
+    @property
+    def entities(self) -> Mapping[str, Entity]:
+        """The entities of the scene by name."""
+        ...
+
+    @property
+    def sensors(self) -> Mapping[str, Sensor]:
+        """The sensors of the scene by name."""
+        ...
+
+
+class Binder:
+    """Binds the terms of one environment, and collects every problem before any is raised."""
+
+    def __init__(self, env: TermEnv, resolved: Resolved) -> None:
         self.env = env
         self.resolved = resolved
         self.problems: list[Problem] = []
-        self.live = LiveValues(resolved.task, env.device)
+        self.tunable = TunableValues(resolved.task, env.device)
         self._commands: dict[str, BoundTerm] = {}
         self._open_addresses()
 
     def bind(self, section: str, path: Path, config: TermConfig) -> BoundTerm | None:
         """A bound term, or None if something in it does not resolve."""
-        signature = self.resolved.vocabulary.find(section, config.func)
-        assert signature is not None  # phase 1 has looked it up
+        signature = self.signature(section, config)
         params, elements = self._resolve(signature, path, config)
         if params is None:
             return None
@@ -94,13 +123,19 @@ class Binder:
         try:
             call = target(self.env, **params) if signature.is_class else functools.partial(target, self.env, **params)
         except (NameProblem, ValueError) as problem:
-            self.problems.append(self.resolved.problem(path, str(problem), getattr(problem, "hint", None)))
+            self.add_problem(path, str(problem), getattr(problem, "hint", None))
             return None
         name = str(path[-1])
-        own = signature.is_class and not hasattr(call, "state_dict") and not type(call).__module__.startswith("rlcli.")
-        memory = Memory(call) if own else None
+        own = signature.is_class and not hasattr(call, "state_dict") and not is_framework(type(call).__module__)
+        memory = TermState(call) if own else None
         draws = stream(".".join(str(step) for step in path))
         return BoundTerm(name, path, config, self.resolved, call, elements, draws, memory)
+
+    def signature(self, section: str, config: TermConfig) -> Signature:
+        """Return the signature of a configured term."""
+        signature = self.resolved.vocabulary.find(section, config.func)
+        assert signature is not None  # phase 1 has looked it up
+        return signature
 
     def bind_all(self, section: str) -> list[BoundTerm]:
         """The terms of a section, in order."""
@@ -137,7 +172,11 @@ class Binder:
                 return getattr(load_module(module), signature.attribute)
             except Exception as error:
                 raise TaskError(f"{signature.file}: cannot be imported: {type(error).__name__}: {error}") from error
-        return getattr(importlib.import_module(f"rlcli.mdp.{signature.file.stem}"), signature.attribute)
+        return getattr(importlib.import_module(signature.module), signature.attribute)
+
+    def add_problem(self, path: Path, message: str, hint: str | None = None) -> None:
+        """Note what does not fit at a place of the configuration."""
+        self.problems.append(self.resolved.problem(path, message, hint))
 
     def raise_problems(self) -> None:
         """Report everything at once.
@@ -160,7 +199,7 @@ class Binder:
                 entity = self.env.entities.get(name)
                 if entity is None:
                     near = did_you_mean(name, self.env.entities) or f"entities: {listing(self.env.entities)}"
-                    self._problem(path, parameter.name, f"no entity '{name}' in the scene", near)
+                    self.add_problem((*path, parameter.name), f"no entity '{name}' in the scene", near)
                     return None, elements
                 params[parameter.name] = entity
         for parameter in signature.parameters:
@@ -176,13 +215,13 @@ class Binder:
                     params[name] = self._sensor(path, name, params[name], SENSORS[parameter.alias])
                     good = good and params[name] is not None
             else:
-                params[name] = self.live.get((*path, name), params[name])
+                params[name] = self.tunable.get((*path, name), params[name])
         for parameter in signature.parameters:
             if parameter.alias in SELECTORS and params[parameter.name] is not None:
                 try:
                     index, names = params["entity"].select(parameter.alias, params[parameter.name])
                 except NameProblem as problem:
-                    self._problem(path, parameter.name, str(problem), problem.hint)
+                    self.add_problem((*path, parameter.name), str(problem), problem.hint)
                     good = False
                     continue
                 params[parameter.name], elements[parameter.name] = index, names
@@ -198,7 +237,7 @@ class Binder:
         if found is not None:
             message = f"sensor '{name}' is of kind {found.kind}, the term needs one of kind {kind}"
         near = did_you_mean(name, names) or f"sensors of this kind: {listing(names) if names else 'none'}"
-        self._problem(path, parameter, message, near)
+        self.add_problem((*path, parameter), message, near)
         return None
 
     def _open_addresses(self) -> None:
@@ -211,9 +250,9 @@ class Binder:
                     path = ("curriculum", name)
                     assert config is not None
                     try:
-                        self._opened[*path, parameter.name] = self.live.open(config.params[parameter.name])
+                        self._opened[*path, parameter.name] = self.tunable.open(config.params[parameter.name])
                     except NameProblem as problem:
-                        self._problem(path, parameter.name, str(problem), problem.hint)
+                        self.add_problem((*path, parameter.name), str(problem), problem.hint)
 
     def _command(self, path: Path, parameter: str, name: str) -> Any:
         if name in self._commands:
@@ -221,11 +260,8 @@ class Binder:
         names = [command for command, config in self.resolved.task.commands.items() if config is not None]
         if name not in names:  # else its own problem has been said
             have = f"commands: {listing(names)}" if names else "the task has no commands: section"
-            self._problem(path, parameter, f"no command '{name}'", did_you_mean(name, names) or have)
+            self.add_problem((*path, parameter), f"no command '{name}'", did_you_mean(name, names) or have)
         return None
-
-    def _problem(self, path: Path, parameter: str, message: str, hint: str | None) -> None:
-        self.problems.append(self.resolved.problem((*path, parameter), message, hint))
 
 
 def resets(terms: Iterable[BoundTerm]) -> list[Callable[[Any], None]]:
@@ -245,7 +281,7 @@ def first_value(term: BoundTerm) -> Any:
         raise term.error(str(error)) from None
 
 
-def check_shape(term: BoundTerm, value: Any, expected: tuple[int, ...]) -> None:
+def check_shape(term: BoundTerm, value: object, expected: tuple[int, ...]) -> None:
     """A term's first value must be a tensor of the expected shape.
 
     Raises:

@@ -49,7 +49,7 @@ class TerminationManager:
 
     def causes(self, ended: Selection) -> dict[str, Tensor]:
         """Term -> whether it fired where episodes ended. (n,) bool each"""
-        return {name: ended.peek(fired) for name, fired in self.fired.items()}
+        return {name: ended.read_view(fired) for name, fired in self.fired.items()}
 
     def reset(self, selection: Selection) -> None:
         """Tell terms with memory."""

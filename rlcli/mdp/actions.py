@@ -12,12 +12,14 @@ import torch
 from torch import Tensor
 
 from rlcli.managers.action import CommandMap
-from rlcli.sim.actuators import JointCommand
-from rlcli.sim.kinematics import Jacobian
-from rlcli.sim.names import NameProblem, match_values
+from rlcli.mdp.parameters import Entity
+from rlcli.scene.actuators import JointCommand
+from rlcli.scene.kinematics import Jacobian
+from rlcli.scene.names import NameProblem, match_values
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotation_vector
-from rlcli.sim.selection import Columns, Selection, one_column
-from rlcli.task import Bodies, Entity, Joints, Range
+from rlcli.sim.selection import Selection, one_column
+from rlcli.sim.tensor_state import TensorState
+from rlcli.task import Bodies, Joints, Range
 
 if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
@@ -33,10 +35,11 @@ class _JointAction:
     def __init__(
         self,
         env: ManagedEnv,
-        entity: Entity,
-        joints: Columns,
-        scale: float | dict[str, float],
-        clip: Range | dict[str, Range] | None,
+        *,
+        entity: Entity = "robot",
+        joints: Joints = ".*",
+        scale: float | dict[str, float] = 1.0,
+        clip: Range | dict[str, Range] | None = None,
     ) -> None:
         self._entity, self._joints = entity, joints
         columns = torch.arange(len(entity.joint_names))[joints if isinstance(joints, slice) else joints.cpu()].tolist()
@@ -86,18 +89,17 @@ class _AffineJointAction(_JointAction):
     def __init__(
         self,
         env: ManagedEnv,
-        entity: Entity,
-        joints: Columns,
-        scale: float | dict[str, float],
-        offset: float | dict[str, float],
-        default: Tensor | None,
-        clip: Range | dict[str, Range] | None,
+        *,
+        entity: Entity = "robot",
+        joints: Joints = ".*",
+        scale: float | dict[str, float] = 1.0,
+        offset: float | dict[str, float] = 0.0,
+        clip: Range | dict[str, Range] | None = None,
     ) -> None:
-        super().__init__(env, entity, joints, scale, clip)
+        super().__init__(env, entity=entity, joints=joints, scale=scale, clip=clip)
         # a number is wrapped into a tensor at each use, which costs as much as the product
         self._factor = torch.as_tensor(self._scale, dtype=torch.float32, device=env.device)
-        own = self._by_joint(offset, 0.0, env)
-        self._offset = own if default is None else default[:, joints] + own
+        self._offset = self._by_joint(offset, 0.0, env)
         self._limits = _command_limits(entity.engine.model, self._drive.actuators, self.actuator)
 
     def command_map(self) -> CommandMap:
@@ -118,11 +120,11 @@ class _AffineJointAction(_JointAction):
         return (value,) * self.size
 
 
-class JointEffort(_AffineJointAction):
-    """Efforts of joint motors: raw x scale + offset [N or N m]. Isaac Lab: JointEffortAction."""
+class _AffineAboutDefault(_AffineJointAction):
+    """raw x scale + offset, about the default of the quantity unless told otherwise."""
 
-    actuator = "motor"
-    unit = "N or N m"
+    default: ClassVar[str]
+    """The defaults' name among an entity's data."""
 
     def __init__(
         self,
@@ -132,12 +134,22 @@ class JointEffort(_AffineJointAction):
         joints: Joints = ".*",
         scale: float | dict[str, float] = 1.0,
         offset: float | dict[str, float] = 0.0,
+        use_default_offset: bool = True,
         clip: Range | dict[str, Range] | None = None,
     ) -> None:
-        super().__init__(env, entity, joints, scale, offset, None, clip)
+        super().__init__(env, entity=entity, joints=joints, scale=scale, offset=offset, clip=clip)
+        if use_default_offset:
+            self._offset = getattr(entity.data, self.default)[:, joints] + self._offset
 
 
-class JointPosition(_AffineJointAction):
+class JointEffort(_AffineJointAction):
+    """Efforts of joint motors: raw x scale + offset [N or N m]. Isaac Lab: JointEffortAction."""
+
+    actuator = "motor"
+    unit = "N or N m"
+
+
+class JointPosition(_AffineAboutDefault):
     """Targets of position actuators: raw x scale + offset [m or rad], about the default pose unless told otherwise.
 
     Isaac Lab: JointPositionAction.
@@ -145,41 +157,15 @@ class JointPosition(_AffineJointAction):
 
     actuator = "position"
     unit = "m or rad"
-
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        joints: Joints = ".*",
-        scale: float | dict[str, float] = 1.0,
-        offset: float | dict[str, float] = 0.0,
-        use_default_offset: bool = True,
-        clip: Range | dict[str, Range] | None = None,
-    ) -> None:
-        default = entity.data.default_joint_pos if use_default_offset else None
-        super().__init__(env, entity, joints, scale, offset, default, clip)
+    default = "default_joint_pos"
 
 
-class JointVelocity(_AffineJointAction):
+class JointVelocity(_AffineAboutDefault):
     """Targets of velocity actuators: raw x scale + offset [m/s or rad/s]. Isaac Lab: JointVelocityAction."""
 
     actuator = "velocity"
     unit = "m/s or rad/s"
-
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        joints: Joints = ".*",
-        scale: float | dict[str, float] = 1.0,
-        offset: float | dict[str, float] = 0.0,
-        use_default_offset: bool = True,
-        clip: Range | dict[str, Range] | None = None,
-    ) -> None:
-        default = entity.data.default_joint_vel if use_default_offset else None
-        super().__init__(env, entity, joints, scale, offset, default, clip)
+    default = "default_joint_vel"
 
 
 class RelativeJointPosition(_JointAction):
@@ -190,17 +176,6 @@ class RelativeJointPosition(_JointAction):
 
     actuator = "position"
     unit = "m or rad"
-
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        joints: Joints = ".*",
-        scale: float | dict[str, float] = 1.0,
-        clip: Range | dict[str, Range] | None = None,
-    ) -> None:
-        super().__init__(env, entity, joints, scale, clip)
 
     def _target(self, action: Tensor) -> None:
         torch.add(self._entity.data.joint_pos_of(self._joints), action * self._scale, out=self.command)
@@ -226,7 +201,7 @@ class JointPositionToLimits(_JointAction):
         rescale_to_limits: bool = True,
         clip: Range | dict[str, Range] | None = None,
     ) -> None:
-        super().__init__(env, entity, joints, scale, clip)
+        super().__init__(env, entity=entity, joints=joints, scale=scale, clip=clip)
         self._rescale = rescale_to_limits
         limits = entity.data.soft_joint_pos_limits[joints]
         if rescale_to_limits and not bool(limits.isfinite().all()):
@@ -246,7 +221,7 @@ class JointPositionToLimits(_JointAction):
         return 0.5 * (raw.clamp(-1.0, 1.0) * (high - low) + high + low)
 
 
-class EmaJointPositionToLimits(JointPositionToLimits):
+class EmaJointPositionToLimits(JointPositionToLimits, TensorState):
     """The same, averaged over time: alpha x new target + (1 - alpha) x the target before, from the joint's position.
 
     Isaac Lab: EMAJointPositionToLimitsAction.
@@ -279,14 +254,9 @@ class EmaJointPositionToLimits(JointPositionToLimits):
         """New episodes average from where their joints start."""
         selection.write(self._fresh, True)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """The target before."""
-        return {"before": self._before.clone(), "fresh": self._fresh.clone()}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
-        self._before.copy_(state["before"])
-        self._fresh.copy_(state["fresh"])
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the target before."""
+        return {"before": self._before, "fresh": self._fresh}
 
 
 class _BinaryJoint(_JointAction):
@@ -302,7 +272,7 @@ class _BinaryJoint(_JointAction):
         close_command: dict[str, float],
         threshold: float = 0.0,
     ) -> None:
-        super().__init__(env, entity, joints, 1.0, None)
+        super().__init__(env, entity=entity, joints=joints)
         self._open, self._close = (self._all(c, w, env) for c, w in ((open_command, "open"), (close_command, "close")))
         self._threshold = threshold
         self.elements, self.size = (",".join(self.elements),), 1
@@ -370,7 +340,7 @@ class DifferentialInverseKinematics(_JointAction):
         offset_quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
         clip: Range | dict[str, Range] | None = None,
     ) -> None:
-        super().__init__(env, entity, joints, scale, clip)
+        super().__init__(env, entity=entity, joints=joints, scale=scale, clip=clip)
         self._body = one_column(bodies, len(entity.body_ids), "bodies")
         self._mode, self._relative, self._damping, self._posture = mode, relative, damping, posture
         self._point = torch.tensor(offset_pos, device=env.device)

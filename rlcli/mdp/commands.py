@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from rlcli.envs.markers import ACTUAL, ASKED, Arrow, Color, Frame, Marker, Sphere
+from rlcli.mdp.parameters import Entity
+from rlcli.mdp.term import Term
+from rlcli.sim.markers import ACTUAL, COMMANDED, Arrow, Color, Frame, Marker, Sphere
 from rlcli.sim.rotations import atan2, from_euler, heading, multiply, rotate, unique, wrap_to_pi, yaw_only
 from rlcli.sim.selection import Selection, one_column
-from rlcli.task import Bodies, Entity, Range
+from rlcli.sim.tensor_state import TensorState
+from rlcli.task import Bodies, Range
 
 if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
@@ -32,7 +36,7 @@ class NullCommand:
         """Nothing to do."""
 
 
-class _VelocityCommand:
+class _VelocityCommand(TensorState):
     """`drawn` (num_envs, 3) is what was asked; `command` is that after heading control and standing."""
 
     elements = ("vx", "vy", "wz")
@@ -81,7 +85,7 @@ class _VelocityCommand:
         """Above the root, green what is asked, blue what is: its way in a second, and that of its nose in turning."""
         data = self._entity.data
         actual = torch.cat([data.root_lin_vel_b[:, :2], data.root_ang_vel_b[:, 2:]], dim=1)
-        return [*self._arrows(self.command, ASKED, 0.5), *self._arrows(actual, ACTUAL, 0.45)]
+        return [*self._arrows(self.command, COMMANDED, 0.5), *self._arrows(actual, ACTUAL, 0.45)]
 
     def _arrows(self, velocity: Tensor, color: Color, height: float) -> list[Marker]:
         """Arrows of a velocity (vx, vy, wz), so much above the root [m]."""
@@ -96,16 +100,8 @@ class _VelocityCommand:
         ahead = above + in_world(zero + _ARM, zero)
         return [Arrow(above, above + in_world(vx, vy), color), Arrow(ahead, ahead + in_world(zero, wz * _ARM), color)]
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """What was drawn."""
-        return {name: value.clone() for name, value in self._tensors().items()}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
-        for name, value in self._tensors().items():
-            value.copy_(state[name])
-
-    def _tensors(self) -> dict[str, Tensor]:
+    def tensors(self) -> dict[str, Tensor]:
+        """Return what was drawn."""
         return {"drawn": self._drawn, "target": self._target, "heads": self._heads, "stands": self._stands}
 
 
@@ -180,7 +176,8 @@ class NormalVelocity(_VelocityCommand):
         return [(mean - 2.0 * std, mean + 2.0 * std) for mean, std in zip(self._mean, self._std, strict=True)]
 
 
-class UniformPose:
+@dataclass(kw_only=True, eq=False)
+class UniformPose(Term):
     """Pose of a body in the root's frame: position [m] and quaternion (w, x, y, z), drawn uniformly. (num_envs, 7)
 
     Angles are roll, pitch, yaw [rad]. Isaac Lab: UniformPoseCommand.
@@ -188,30 +185,27 @@ class UniformPose:
 
     elements = ("x", "y", "z", "", "", "", "")
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        bodies: Bodies,
-        x: Range,
-        y: Range,
-        z: Range,
-        roll: Range = (0.0, 0.0),
-        pitch: Range = (0.0, 0.0),
-        yaw: Range = (0.0, 0.0),
-        make_quat_unique: bool = False,
-    ) -> None:
-        self._entity, self._body = entity, one_column(bodies, len(entity.body_ids), "bodies")
-        self._ranges, self._unique = (x, y, z, roll, pitch, yaw), make_quat_unique
-        self.command = torch.zeros(env.num_envs, 7, device=env.device)
+    entity: Entity = "robot"
+    bodies: Bodies
+    x: Range
+    y: Range
+    z: Range
+    roll: Range = (0.0, 0.0)
+    pitch: Range = (0.0, 0.0)
+    yaw: Range = (0.0, 0.0)
+    make_quat_unique: bool = False
+
+    def __post_init__(self) -> None:
+        self._body = one_column(self.bodies, len(self.entity.body_ids), "bodies")
+        self._ranges = (self.x, self.y, self.z, self.roll, self.pitch, self.yaw)
+        self.command = torch.zeros(self.env.num_envs, 7, device=self.env.device)
         self.command[:, 3] = 1.0
 
     def resample(self, selection: Selection) -> None:
         """Draw poses."""
         x, y, z, roll, pitch, yaw = (selection.uniform(*bounds) for bounds in self._ranges)
         quat = from_euler(roll, pitch, yaw)
-        quat = unique(quat) if self._unique else quat
+        quat = unique(quat) if self.make_quat_unique else quat
         selection.write(self.command, torch.cat([torch.stack([x, y, z], dim=1), quat], dim=1))
 
     def update(self) -> None:
@@ -225,14 +219,14 @@ class UniformPose:
     @property
     def pose_w(self) -> tuple[Tensor, Tensor]:
         """The asked pose in the world: position [m], quaternion. (num_envs, 3), (num_envs, 4)"""
-        root = self._entity.data
+        root = self.entity.data
         position = root.root_pos_w + rotate(root.root_quat_w, self.command[:, :3])
         return position, multiply(root.root_quat_w, self.command[:, 3:])
 
     @property
     def body_pose_w(self) -> tuple[Tensor, Tensor]:
         """The body's pose in the world: position [m], quaternion. (num_envs, 3), (num_envs, 4)"""
-        data = self._entity.data
+        data = self.entity.data
         return data.body_pos_w[:, self._body], data.body_quat_w[:, self._body]
 
     def metrics(self) -> dict[str, Tensor]:
@@ -252,7 +246,8 @@ class UniformPose:
         return [Sphere(position), Frame(position, quat)]
 
 
-class UniformPose2d:
+@dataclass(kw_only=True, eq=False)
+class UniformPose2d(Term, TensorState):
     """A place and a heading on the ground, relative to where an environment starts. (num_envs, 4)
 
     `command` is that seen from the root: x, y, z in its yaw frame [m], and the turn to the heading [rad]. With
@@ -261,36 +256,32 @@ class UniformPose2d:
 
     elements = ("ahead", "left", "", "turn")
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        x: Range,
-        y: Range,
-        heading: Range = (-3.1415927, 3.1415927),
-        simple_heading: bool = False,
-    ) -> None:
-        self._entity, self._env = entity, env
-        self._ranges, self._simple = (x, y, heading), simple_heading
-        self.command = torch.zeros(env.num_envs, 4, device=env.device)
-        self._target = torch.zeros(env.num_envs, 4, device=env.device)
+    entity: Entity = "robot"
+    x: Range
+    y: Range
+    heading: Range = (-3.1415927, 3.1415927)
+    simple_heading: bool = False
+
+    def __post_init__(self) -> None:
+        self._ranges = (self.x, self.y, self.heading)
+        self.command = torch.zeros(self.env.num_envs, 4, device=self.env.device)
+        self._target = torch.zeros(self.env.num_envs, 4, device=self.env.device)
 
     def resample(self, selection: Selection) -> None:
         """Draw places and headings."""
-        data = self._entity.data
+        data = self.entity.data
         x, y, turn = (selection.uniform(*bounds) for bounds in self._ranges)
-        height = selection.peek(data.default_root_state)[:, 2]
+        height = selection.read_view(data.default_root_state)[:, 2]
         selection.write(self._target, torch.stack([x, y, height, turn], dim=1))
 
     def update(self) -> None:
         """See it from where the root is."""
-        data = self._entity.data
-        dx, dy, dz = (self._target[:, :3] + self._env.origins - data.root_pos_w).unbind(1)
+        data = self.entity.data
+        dx, dy, dz = (self._target[:, :3] + self.env.origins - data.root_pos_w).unbind(1)
         yaw = heading(data.root_quat_w)
         cos, sin = torch.cos(yaw), torch.sin(yaw)
         ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
-        turn = atan2(left, ahead) if self._simple else wrap_to_pi(self._target[:, 3] - yaw)
+        turn = atan2(left, ahead) if self.simple_heading else wrap_to_pi(self._target[:, 3] - yaw)
         self.command.copy_(torch.stack([ahead, left, dz, turn], dim=1))
 
     def metrics(self) -> dict[str, Tensor]:
@@ -300,16 +291,12 @@ class UniformPose2d:
 
     def markers(self) -> list[Marker]:
         """A green sphere at the place, with an arrow towards the heading."""
-        upright = yaw_only(self._entity.data.root_quat_w)
-        place = self._entity.data.root_pos_w + rotate(upright, self.command[:, :3])
+        upright = yaw_only(self.entity.data.root_quat_w)
+        place = self.entity.data.root_pos_w + rotate(upright, self.command[:, :3])
         turn = self.command[:, 3]
         towards = torch.stack([torch.cos(turn), torch.sin(turn), torch.zeros_like(turn)], dim=1)
         return [Sphere(place, radius=0.05), Arrow(place, place + rotate(upright, 0.5 * towards))]
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """The place and the heading."""
-        return {"target": self._target.clone()}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
-        self._target.copy_(state["target"])
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the place and the heading."""
+        return {"target": self._target}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rlcli.task import Address, Command, Entity
+from rlcli.mdp.parameters import Address, Command, Entity
 
 if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
@@ -95,13 +95,13 @@ class TerrainLevels:
         """Move the environments whose episode ends. -> (num_envs,)"""
         terrain = self._env.terrain
         assert terrain is not None
-        way = selection.peek(self._entity.data.root_pos_w) - selection.peek(self._env.origins)
+        way = selection.read_view(self._entity.data.root_pos_w) - selection.read_view(self._env.origins)
         distance = _length(way)
         up = distance > self._far
         if self._command is None:
             down = distance < self._least
         else:
-            down = distance < _length(selection.peek(self._command.command)) * self._asked
+            down = distance < _length(selection.read_view(self._command.command)) * self._asked
         terrain.move(selection, up, down)
         return terrain.levels
 

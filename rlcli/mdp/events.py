@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from rlcli.errors import listing
+from rlcli.mdp.parameters import Entity
 from rlcli.mdp.ranges import Pair, Ranges
-from rlcli.sim.names import NameProblem
+from rlcli.mdp.sampling import element_names
+from rlcli.mdp.term import BodyTerm, JointTerm
+from rlcli.scene.names import NameProblem
 from rlcli.sim.rotations import from_euler, multiply, random_quaternion
-from rlcli.sim.selection import Columns, Selection
-from rlcli.task import Bodies, Entity, Joints, Range
+from rlcli.sim.selection import Selection
+from rlcli.sim.tensor_state import TensorState
+from rlcli.task import Bodies, Joints, Range
 
 if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
@@ -65,32 +70,27 @@ def reset_joints_by_gaussian(
     _write_joints(entity, selection, joints, default_pos + offset[:, 0], default_vel + offset[:, 1])
 
 
-class ResetJointsWithinLimits:
+@dataclass(kw_only=True, eq=False)
+class ResetJointsWithinLimits(JointTerm):
     """Joint positions between the soft limits: 0 is the lower one, 1 the upper; velocities drawn [m/s or rad/s]."""
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        joints: Joints = ".*",
-        position: Range = (0.0, 1.0),
-        velocity: Range = (0.0, 0.0),
-    ) -> None:
-        finite = entity.data.joint_limits()[0][0].isfinite()[joints].tolist()
-        names = [entity.joint_names[j] for j in torch.arange(len(entity.joint_names))[_host(joints)].tolist()]
+    position: Range = (0.0, 1.0)
+    velocity: Range = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        finite = self.entity.data.joint_limits()[0][0].isfinite()[self.joints].tolist()
+        names = element_names(self.entity, "Joints", self.joints)
         if not all(finite):
             without = [name for name, limited in zip(names, finite, strict=True) if not limited]
             raise NameProblem(f"{listing(without)}: no limits to reset within", "choose joints that have a range")
-        self._env, self._entity, self._joints, self._count = env, entity, joints, len(names)
-        self._ranges = position, velocity
+        self._count = len(names)
 
     def __call__(self, selection: Selection) -> None:
         """Draw the joint state of the selected environments."""
-        low, high = (_rows(selection, limit)[:, self._joints] for limit in self._entity.data.joint_limits(soft=True))
-        drawn = selection.uniform(*_bounds(self._env, *self._ranges), (2, self._count))
+        low, high = (_rows(selection, limit)[:, self.joints] for limit in self.entity.data.joint_limits(soft=True))
+        drawn = selection.uniform(*_bounds(self.env, self.position, self.velocity), (2, self._count))
         position = low + (high - low) * drawn[:, 0]
-        _write_joints(self._entity, selection, self._joints, position, drawn[:, 1])
+        _write_joints(self.entity, selection, self.joints, position, drawn[:, 1])
 
 
 def reset_root_state_uniform(
@@ -112,7 +112,7 @@ def reset_root_state_uniform(
     offset = selection.uniform(*_bounds(env, x, y, z), (3, 1)).squeeze(2)
     turn = from_euler(*selection.uniform(*_bounds(env, roll, pitch, yaw), (3, 1)).squeeze(2).unbind(1))
     velocity = selection.uniform(*_bounds(env, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
-    position = default[:, :3] + selection.peek(env.origins) + offset
+    position = default[:, :3] + selection.read_view(env.origins) + offset
     entity.write_root_pose(selection, position, multiply(default[:, 3:7], turn))
     entity.write_root_velocity(selection, default[:, 7:10] + velocity[:, :3], default[:, 10:] + velocity[:, 3:])
 
@@ -133,7 +133,7 @@ def reset_root_state_with_random_orientation(
     offset = selection.uniform(*_bounds(env, x, y, z), (3, 1)).squeeze(2)
     velocity = selection.uniform(*_bounds(env, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
     quat = random_quaternion(*selection.uniform(0.0, 1.0, (3,)).unbind(1))
-    entity.write_root_pose(selection, default[:, :3] + selection.peek(env.origins) + offset, quat)
+    entity.write_root_pose(selection, default[:, :3] + selection.read_view(env.origins) + offset, quat)
     entity.write_root_velocity(selection, default[:, 7:10] + velocity[:, :3], default[:, 10:] + velocity[:, 3:])
 
 
@@ -146,7 +146,7 @@ def reset_scene_to_default(env: ManagedEnv, selection: Selection) -> None:
             entity.write_joint_velocities(selection, selection.read(data.default_joint_vel))
         root = selection.read(data.default_root_state)
         if entity.is_floating or entity.mocap >= 0:
-            entity.write_root_pose(selection, root[:, :3] + selection.peek(env.origins), root[:, 3:7])
+            entity.write_root_pose(selection, root[:, :3] + selection.read_view(env.origins), root[:, 3:7])
         if entity.is_floating:
             entity.write_root_velocity(selection, root[:, 7:10], root[:, 10:])
 
@@ -196,31 +196,25 @@ def apply_external_force_torque(
     selection.write(wrench, _drawn_wrench(env, selection, len(columns) // 6, force, torque), columns)
 
 
-class ApplyBodyImpulse:
+@dataclass(kw_only=True, eq=False)
+class ApplyBodyImpulse(BodyTerm, TensorState):
     """A uniform wrench on bodies for a while, world frame, each component drawn [N, N m]; it ends by itself [s]."""
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        entity: Entity = "robot",
-        bodies: Bodies = ".*",
-        force: Range = (0.0, 0.0),
-        torque: Range = (0.0, 0.0),
-        duration_s: Range = (0.1, 0.1),
-    ) -> None:
-        self._env = env
-        self._wrench = entity.engine.field("xfrc_applied").view(env.num_envs, -1)
-        self._columns = _wrench_columns(entity, bodies)
-        self._force, self._torque, self._duration = force, torque, duration_s
-        self._steps_left = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
+    force: Range = (0.0, 0.0)
+    torque: Range = (0.0, 0.0)
+    duration_s: Range = (0.1, 0.1)
+
+    def __post_init__(self) -> None:
+        self._wrench = self.entity.engine.field("xfrc_applied").view(self.env.num_envs, -1)
+        self._columns = _wrench_columns(self.entity, self.bodies)
+        self._steps_left = torch.zeros(self.env.num_envs, dtype=torch.int64, device=self.env.device)
 
     def __call__(self, selection: Selection) -> None:
         """Begin to act on the selected environments."""
-        drawn = _drawn_wrench(self._env, selection, len(self._columns) // 6, self._force, self._torque)
+        drawn = _drawn_wrench(self.env, selection, len(self._columns) // 6, self.force, self.torque)
         selection.write(self._wrench, drawn, self._columns)
-        low, high = _bounds(self._env, self._duration)
-        steps = selection.uniform(low[0], high[0], (1,))[:, 0].double() / self._env.step_dt
+        low, high = _bounds(self.env, self.duration_s)
+        steps = selection.uniform(low[0], high[0], (1,))[:, 0].double() / self.env.step_dt
         selection.write(self._steps_left, (steps * (1.0 - 1e-6)).ceil_().long())
 
     def update(self, select: Callable[[Tensor], Selection | None], running: Tensor) -> None:
@@ -235,13 +229,9 @@ class ApplyBodyImpulse:
         """A new episode begins without."""
         selection.write(self._steps_left, 0)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """How long the wrenches act yet."""
-        return {"steps_left": self._steps_left.clone()}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
-        self._steps_left.copy_(state["steps_left"])
+    def tensors(self) -> dict[str, Tensor]:
+        """Return how long the wrenches act yet."""
+        return {"steps_left": self._steps_left}
 
 
 def _drawn_wrench(env: ManagedEnv, selection: Selection, bodies: int, force: Pair, torque: Pair) -> Tensor:
@@ -266,7 +256,7 @@ def _fixed_bounds(device: torch.device, *pairs: tuple[float, float]) -> tuple[Te
 
 def _wrench_columns(entity: Entity, bodies: Bodies) -> Tensor:
     """Where the wrenches of bodies lie in `xfrc_applied`, a row of it flattened. (6 k,)"""
-    cache = entity.__dict__.setdefault("_wrench_columns", {})
+    cache: dict[int, tuple[Bodies, Tensor]] = entity.__dict__.setdefault("_wrench_columns", {})
     if id(bodies) not in cache:
         device = entity.engine.device
         ids = torch.as_tensor(entity.body_ids, device=device)[bodies]
@@ -282,8 +272,4 @@ def _write_joints(entity: Entity, selection: Selection, joints: Joints, position
 
 def _rows(selection: Selection, values: Tensor) -> Tensor:
     """The selected rows of what may be the same for all environments and then has one row. (rows or 1, k)"""
-    return values if values.shape[0] == 1 else selection.peek(values)
-
-
-def _host(index: Columns) -> Columns:
-    return index.cpu() if isinstance(index, Tensor) else index
+    return values if values.shape[0] == 1 else selection.read_view(values)

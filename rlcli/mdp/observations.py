@@ -7,20 +7,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rlcli.mdp.measures import only, vector
+from rlcli.mdp.measures import HandleTerm, only, vector
+from rlcli.mdp.parameters import CameraSensor, Command, ContactSensor, Entity, RaySensor
 from rlcli.sim.rotations import atan2, conjugate, length, multiply, roll_pitch_yaw, rotate_inverse, unique, wrap_to_pi
-from rlcli.task import (
-    Bodies,
-    CameraSensor,
-    Command,
-    ContactSensor,
-    Entity,
-    Joints,
-    RaySensor,
-    Sensors,
-    Sites,
-    reads_body_forces,
-)
+from rlcli.task import Bodies, Joints, Sensors, Sites, reads_body_forces
 
 if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
@@ -335,19 +325,12 @@ def ee_to_object_distance(
     return rotate_inverse(entity.data.root_quat_w, way)
 
 
-class RelEeDrawerDistance:
+class RelEeDrawerDistance(HandleTerm):
     """Way from a site of `entity` to a site, `handle`, of another entity, world frame [m]. (num_envs, 3)"""
-
-    def __init__(
-        self, env: ManagedEnv, *, entity: Entity = "robot", sites: Sites, cabinet: Entity = "cabinet", handle: str
-    ) -> None:
-        self._entity, self._sites = entity, sites
-        self._cabinet, self._handle = cabinet, cabinet.select("Sites", handle)[0]
 
     def __call__(self) -> Tensor:
         """(num_envs, 3)"""
-        handle = only(self._cabinet.data.site_pos_w[:, self._handle], "handle")
-        return handle - only(self._entity.data.site_pos_w[:, self._sites], "site")
+        return self.way_to_handle()
 
 
 def object_to_goal_distance(

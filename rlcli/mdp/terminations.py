@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from rlcli.mdp.measures import cosine, goal_in_world, some, strongest_force
+from rlcli.mdp.parameters import Command, ContactSensor, Entity
 from rlcli.sim.rotations import length
-from rlcli.task import Command, ContactSensor, Entity, Joints, Range
+from rlcli.task import Joints, Range
 
 if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv

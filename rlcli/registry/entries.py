@@ -14,11 +14,14 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rlcli.config.settings import setting, settings_file
 from rlcli.errors import TaskError, did_you_mean, listing
+from rlcli.settings import setting, settings_file
 
 TASKS = "rlcli.tasks"
 TRAINERS = "rlcli.trainers"
+FORMATS = "rlcli.formats"
+GROUPS = (TASKS, TRAINERS, FORMATS)
+"""The groups of entry points that plugins offer."""
 OWN = "rlcli"
 """The distribution of the built-in tasks and trainers; a plugin cannot take their names."""
 
@@ -56,7 +59,7 @@ def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], l
     """
     entries: dict[tuple[str, str], Entry] = {}
     broken: dict[str, Broken] = {}
-    wanted = None if hidden else _wanted()
+    wanted = None if hidden else _enabled_distributions()
     for distribution in metadata.distributions():
         folder = Path(str(getattr(distribution, "_path", "?"))).name
         try:
@@ -66,11 +69,11 @@ def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], l
             name, version = distribution.metadata["Name"], distribution.version
             if not name or not version:
                 raise ValueError("no Name and Version in its METADATA")
-            if wanted is not None and _normal(name) not in wanted:
+            if wanted is not None and _normalized(name) not in wanted:
                 continue
             for point in _entry_points(distribution):
                 if point.group == group:
-                    entries.setdefault((point.name, _normal(name)), Entry(point.name, point.value, name, version))
+                    entries.setdefault((point.name, _normalized(name)), Entry(point.name, point.value, name, version))
         except Exception as error:
             broken.setdefault(folder, Broken(folder, f"malformed metadata ({type(error).__name__}: {error})"))
     return sorted(entries.values(), key=lambda e: (e.name, e.distribution)), list(broken.values())
@@ -116,10 +119,11 @@ def unreadable_distributions() -> list[Broken]:
 
 def unknown_wanted() -> list[str]:
     """Names of plugins to use, of the variable or the user's settings, that have no tasks or trainers here."""
-    wanted = _wanted()
+    wanted = _enabled_distributions()
     if not wanted:
         return []
-    installed = {_normal(entry.distribution) for group in (TASKS, TRAINERS) for entry in catalog(group, hidden=True)[0]}
+    entries = [entry for group in GROUPS for entry in catalog(group, hidden=True)[0]]
+    installed = {_normalized(entry.distribution) for entry in entries}
     return sorted(wanted - installed - {OWN})
 
 
@@ -150,14 +154,14 @@ def malformed_metadata_ignored() -> Iterator[None]:
         setattr(metadata.Distribution, "entry_points", before)  # noqa: B010
 
 
-def _wanted() -> set[str] | None:
+def _enabled_distributions() -> set[str] | None:
     """Distributions that RLCLI_PLUGINS or the user's settings allow (`none` leaves the built-ins), or None for all."""
     value = os.environ.get("RLCLI_PLUGINS", "").strip()
     names = value.split(",") if value else setting("plugins")
     if names is None:
         return None
-    return {"rlcli", *(_normal(name.strip()) for name in names if name.strip().lower() != "none")}
+    return {"rlcli", *(_normalized(name.strip()) for name in names if name.strip().lower() != "none")}
 
 
-def _normal(distribution: str) -> str:
+def _normalized(distribution: str) -> str:
     return re.sub(r"[-_.]+", "-", distribution).lower()

@@ -45,11 +45,11 @@ def chosen_model(root: Path, model: str) -> str:
             reasons.append(f"no file '{choice}' in {root}")
         except TaskError as error:
             reasons.append(error.message)
-            hints.append(_remedy(choice))
+            hints.append(_install_hint(choice))
     raise MissingModelError(f"the model is not on this machine: {'; '.join(reasons)}", hint=", or ".join(hints) or None)
 
 
-def _remedy(model: str) -> str:
+def _install_hint(model: str) -> str:
     """What makes a model available."""
     kind, _, file = model.partition(":")
     if kind == "models":
@@ -66,23 +66,26 @@ def _model_file(root: Path, model: str) -> Path:
     if task == "package":
         return _package_file(file)
     if task == "models":
-        return _users_file(file)
+        return _file_of_user_models(file)
     home = installed_task(find_entry(TASKS, task, what="task")).root
-    if not (home / file).resolve().is_relative_to(home.resolve()):
-        raise TaskError(f"'{file}' lies outside the folder {home} of task '{task}'")
-    return home / file
+    return _inside(home, file, f"the folder {home} of task '{task}'")
 
 
-def _users_file(file: str) -> Path:
+def _inside(folder: Path, file: str, what: str) -> Path:
+    if not (folder / file).resolve().is_relative_to(folder.resolve()):
+        raise TaskError(f"'{file}' lies outside {what}")
+    return folder / file
+
+
+def _file_of_user_models(file: str) -> Path:
     """A file in one of the folders that the user keeps models in."""
     named = [Path(place).expanduser() for place in os.environ.get(MODELS, "").split(os.pathsep) if place]
     for place in named:
-        if not (place / file).resolve().is_relative_to(place.resolve()):
-            raise TaskError(f"'{file}' lies outside the folder {place} of {MODELS}")
-        if (place / file).is_file():
-            return place / file
+        found = _inside(place, file, f"the folder {place} of {MODELS}")
+        if found.is_file():
+            return found
     where = f"no file '{file}' in {listing(map(str, named))} of {MODELS}" if named else f"{MODELS} is not set"
-    raise MissingModelError(where, hint=_remedy(f"models:{file}"))
+    raise MissingModelError(where, hint=_install_hint(f"models:{file}"))
 
 
 def _package_file(model: str) -> Path:
@@ -96,8 +99,7 @@ def _package_file(model: str) -> Path:
     if not places:
         raise TaskError(f"no Python package '{package}' is installed", hint="write package:PACKAGE/FILE")
     place = next((place for place in places if (place / file).is_file()), places[0])
-    if not (place / file).resolve().is_relative_to(place.resolve()):
-        raise TaskError(f"'{file}' lies outside the package '{package}' in {place}")
-    if not (place / file).is_file():
+    path = _inside(place, file, f"the package '{package}' in {place}")
+    if not path.is_file():
         raise TaskError(f"no file '{file}' in the package '{package}' in {place}")
-    return place / file
+    return path

@@ -7,7 +7,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 from rlcli.errors import TaskError
-from rlcli.registry.entries import TASKS, TRAINERS, Entry, catalog
+from rlcli.registry.entries import GROUPS, Entry, catalog
 from rlcli.registry.imports import contained, load_entry, place_of
 from rlcli.registry.source import TaskSource
 from rlcli.task import API_VERSION, TaskSpec
@@ -85,7 +85,7 @@ def is_offered(module: str, source: TaskSource) -> bool:
     top = module.partition(".")[0]
     if not top.isidentifier():
         return False
-    entries = [entry for group in (TASKS, TRAINERS) for entry in catalog(group)[0]]
+    entries = [entry for group in GROUPS for entry in catalog(group)[0]]
     if top in {entry.value.partition(":")[0].partition(".")[0] for entry in entries}:
         return True
     try:

@@ -40,10 +40,5 @@ class TaskSource:
     def record(self) -> dict[str, str | None]:
         """What a run stores to find the task again."""
         folder = None if self.distribution else str(self.root)
-        record = {
-            "name": self.name,
-            "distribution": self.distribution,
-            "version": self.version,
-            "folder": folder,
-        }
+        record = {"name": self.name, "distribution": self.distribution, "version": self.version, "folder": folder}
         return record | ({"python": self.python} if self.python and folder else {})

@@ -1,7 +1,7 @@
-"""Several processes that train one policy: who they are, what they agree on, and how PyTorch's launcher starts them.
+"""Data-parallel training of one policy in several processes, started by PyTorch's launcher.
 
-Every process has environments of its own and the same networks: gradients, divergences, statistics of observations and
-metrics are means over all of them. The one of rank 0 leads: it alone writes the run and prints.
+Every process has its own environments and the same networks. Gradients, divergences, statistics of observations and
+metrics are means over all processes. Rank 0 alone writes the run and prints.
 """
 
 from __future__ import annotations
@@ -19,115 +19,115 @@ from rlcli.errors import MachineError
 if TYPE_CHECKING:
     from torch import Tensor
 
-_JOIN_WITHIN = timedelta(minutes=10)
-"""A process that waits longer for the others gives up: kernels may be compiling, but not for ever."""
+_TIMEOUT = timedelta(minutes=10)
+"""Longest wait for the other processes: kernels may be compiling."""
 
 
 @dataclass(frozen=True, slots=True)
-class Peers:
-    """The processes of a run, as one of them sees them; of a single process, all of this does nothing."""
+class ProcessGroup:
+    """The processes of a run, from the view of one of them; with one process, every method does nothing."""
 
     rank: int = 0
-    size: int = 1
+    world_size: int = 1
     device: str = "cpu"
 
     @property
-    def leads(self) -> bool:
-        """Whether this process writes and prints."""
+    def is_rank_zero(self) -> bool:
+        """Whether this process writes the run and prints."""
         return self.rank == 0
 
-    def seed(self, seed: int, what: str) -> int:
-        """The seed of a process's own draws: the leader's is the one given."""
-        if self.leads:
+    def seed(self, seed: int, purpose: str) -> int:
+        """Return the seed of this process: rank 0 uses `seed` itself, the others derive theirs from it."""
+        if self.is_rank_zero:
             return seed
         from rlcli.random import derive
 
-        return derive(seed, f"{what} of process {self.rank}")
+        return derive(seed, f"{purpose} of process {self.rank}")
 
     def average_(self, values: Tensor) -> Tensor:
-        """Put the mean over all processes in place."""
-        if self.size > 1:
+        """Replace values by their mean over all processes, in place."""
+        if self.world_size > 1:
             import torch.distributed as dist
 
-            with _together():
+            with _lost_process_as_error():
                 dist.all_reduce(values)
-            values /= self.size
+            values /= self.world_size
         return values
 
-    def lead_(self, values: Tensor) -> None:
-        """Put the leader's values in place."""
-        if self.size > 1:
+    def broadcast_(self, values: Tensor) -> None:
+        """Replace values by those of rank 0, in place."""
+        if self.world_size > 1:
             import torch.distributed as dist
 
-            with _together():
+            with _lost_process_as_error():
                 dist.broadcast(values, 0)
 
-    def total(self, *numbers: float) -> tuple[float, ...]:
-        """Each number summed over all processes."""
-        if self.size == 1:
+    def sum(self, *numbers: float) -> tuple[float, ...]:
+        """Return each number summed over all processes."""
+        if self.world_size == 1:
             return numbers
         import torch
 
         values = torch.tensor(numbers, dtype=torch.float64, device=self.device)
-        return tuple((self.average_(values) * self.size).tolist())
+        return tuple((self.average_(values) * self.world_size).tolist())
 
-    def share(self, value: Any = None) -> Any:
-        """What the leader gives, in every process."""
-        if self.size == 1:
+    def broadcast_object(self, value: object = None) -> Any:
+        """Return the value of rank 0 in every process."""
+        if self.world_size == 1:
             return value
         import torch.distributed as dist
 
         values = [value]
-        with _together():
+        with _lost_process_as_error():
             dist.broadcast_object_list(values, 0)
         return values[0]
 
-    def gather(self, value: Any) -> list[Any]:
-        """What each process gives, by rank; for the leader alone."""
-        if self.size == 1:
+    def gather_object(self, value: object) -> list[Any]:
+        """Return the values of all processes by rank, on rank 0; an empty list elsewhere."""
+        if self.world_size == 1:
             return [value]
         import torch.distributed as dist
 
-        values: list[Any] | None = [None] * self.size if self.leads else None
-        with _together():
+        values: list[Any] | None = [None] * self.world_size if self.is_rank_zero else None
+        with _lost_process_as_error():
             dist.gather_object(value, values, 0)
         return values or []
 
 
-_peers = Peers()
+_current = ProcessGroup()
 
 
-def current() -> Peers:
-    """The processes of this run."""
-    return _peers
+def current() -> ProcessGroup:
+    """Return the processes of this run."""
+    return _current
 
 
 def launched() -> bool:
-    """Whether a launcher started this process as one of several."""
+    """Return whether a launcher started this process as one of several."""
     return "RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
 
 
-def leads() -> bool:
-    """Whether this process is the only one, or leads the others."""
+def is_rank_zero() -> bool:
+    """Return whether this process is the only one or has rank 0."""
     return not launched() or os.environ["RANK"] == "0"
 
 
-def local() -> tuple[int, int]:
-    """Number of this process on its machine, and how many run there."""
+def local_rank_and_size() -> tuple[int, int]:
+    """Return the rank of this process on its machine, and the number of processes there."""
     if not launched():
         return 0, 1
     return int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
 
 
-def join(device: str) -> Peers:
-    """Meet the other processes; NCCL carries what is on a GPU, gloo the rest.
+def join(device: str) -> ProcessGroup:
+    """Join the process group; NCCL carries tensors on a GPU, gloo all others.
 
     Raises:
-        MachineError: if they cannot be reached.
+        MachineError: if the other processes cannot be reached.
     """
-    global _peers
-    if not launched() or _peers.size > 1:
-        return _peers
+    global _current
+    if not launched() or _current.world_size > 1:
+        return _current
     import torch
     import torch.distributed as dist
     import torch.distributed.nn  # imported later, defaults of its functions would keep the group and its threads alive
@@ -136,23 +136,23 @@ def join(device: str) -> Peers:
     if on_gpu:
         torch.cuda.set_device(device)
     try:
-        dist.init_process_group("cpu:gloo,cuda:nccl" if on_gpu else "gloo", timeout=_JOIN_WITHIN)
+        dist.init_process_group("cpu:gloo,cuda:nccl" if on_gpu else "gloo", timeout=_TIMEOUT)
     except (RuntimeError, ValueError) as error:
         raise MachineError(f"the other processes cannot be reached: {' '.join(str(error).split())}") from error
-    _peers = Peers(dist.get_rank(), dist.get_world_size(), device)
-    return _peers
+    _current = ProcessGroup(dist.get_rank(), dist.get_world_size(), device)
+    return _current
 
 
 def leave() -> None:
-    """Part from the other processes."""
-    global _peers
-    if _peers.size > 1:
+    """Leave the process group."""
+    global _current
+    if _current.world_size > 1:
         import gc
 
         import torch.distributed as dist
 
-        _peers = Peers()
-        gc.collect()  # NCCL waits for ever while a recorded graph uses it
+        _current = ProcessGroup()
+        gc.collect()  # NCCL blocks for ever while a captured graph uses it
         with contextlib.suppress(RuntimeError):
             dist.destroy_process_group()
 
@@ -161,7 +161,7 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     """Run `rlcli ARGUMENTS` in several processes of this machine.
 
     Returns:
-        Their exit code: of several that failed, that of the one that did not fail because of another.
+        Exit code 0, or that of a process that failed by itself and not because another one failed.
     """
     import logging
     import sys
@@ -171,10 +171,10 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch_threads decides; the launcher would only warn
-    logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)  # each process has said what is wrong with it
+    logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)  # each process prints its own error
     options = ["--standalone", f"--nproc-per-node={processes}"]
     try:
-        run.run(run.parse_args([*options, "--no-python", sys.executable, "-m", "rlcli", *arguments]))
+        run.run(run.parse_args([*options, "--no-python", sys.executable, "-m", "rlcli", *arguments]))  # type: ignore[no-untyped-call]  # torch has no type here
     except ChildFailedError as error:
         return _exit_code([failure.exitcode for failure in error.failures.values()])
     except SignalException as error:
@@ -183,13 +183,14 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
 
 
 def _exit_code(codes: Sequence[int]) -> int:
-    """A process killed by the launcher, or left alone by another, has not failed itself."""
+    """Return the exit code of the run: a process killed by the launcher, or one that lost another, did not fail."""
     own = [code for code in codes if code > 0 and code != MachineError.exit_code]
     return next(iter(own), MachineError.exit_code)
 
 
 @contextlib.contextmanager
-def _together() -> Iterator[None]:
+def _lost_process_as_error() -> Iterator[None]:
+    """Turn a failed collective operation into a `MachineError`."""
     try:
         yield
     except RuntimeError as error:

@@ -1,7 +1,7 @@
-"""Plain multilayer perceptrons on a CPU, of what the libraries inside torch and numpy do fastest.
+"""Multilayer perceptrons on a CPU, with the fastest operations of the libraries inside torch and numpy.
 
-The library that torch asks for products, MKL, knows AVX-512 on Intel's processors alone; on AMD's oneDNN is twice as
-fast, on Intel's slower. numpy's expm1 and tanh are three and ten times as fast as torch's.
+torch uses MKL for matrix products. MKL has AVX-512 on Intel's processors alone: on AMD's oneDNN is twice as fast, on
+Intel's slower. numpy's expm1 and tanh are three and ten times as fast as torch's.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rlcli.rl.environment import processor
+from rlcli.machine import has_onednn, processor
 
 _aten = torch.ops.aten
 _AVX512 = torch.backends.cpu.get_cpu_capability() == "AVX512"
-"""Without it, numpy's expm1 goes number by number."""
+"""Without AVX-512, numpy's expm1 is not vectorised."""
 _WORTH, _LARGE = 2**20, 64 * 64
-"""Multiplications from which on a product of oneDNN's is faster; numbers of its result, where it sums over samples."""
+"""Multiplications from which oneDNN's product is faster; and, for sums over samples, elements of the result."""
 
 
 def _onednn() -> Callable[..., Tensor] | None:
-    """`x @ weight.T + bias`, where it pays. The operator is one of torch's own: there may come a torch without it."""
-    if not _AVX512 or "AMD" not in processor()["model"] or not torch.backends.mkldnn.is_available():
+    """Return oneDNN's `x @ weight.T + bias` where it is faster; it is a private operator that torch may remove."""
+    if not _AVX512 or "AMD" not in processor()["model"] or not has_onednn():
         return None
     operator: Any = getattr(torch.ops.mkldnn, "_linear_pointwise", None)
     return operator and (lambda x, weight, bias=None: operator(x, weight, bias, "none", [], ""))
@@ -34,43 +34,43 @@ _linear = _onednn()
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor, out: Tensor | None = None) -> Tensor:
-    """What a linear layer gives, in new memory or in `out`. (n, i), (o, i), (o,) -> (n, o)"""
+    """Return `x @ weight.T + bias`, in new memory or in `out`. (n, i), (o, i), (o,) -> (n, o)"""
     if _linear is not None and len(x) * weight.numel() >= _WORTH:
         return _linear(x, weight, bias)
     return torch.addmm(bias, x, weight.t(), out=out)
 
 
-def to_inputs(slope: Tensor, weight: Tensor, out: Tensor) -> Tensor:
-    """The slope to a layer's inputs, in new memory or in `out`. (n, o), (o, i) -> (n, i)"""
-    if _linear is not None and len(slope) * weight.numel() >= _WORTH:
-        return _linear(slope, weight.t())
-    return torch.mm(slope, weight, out=out)
+def input_gradient(gradient: Tensor, weight: Tensor, out: Tensor) -> Tensor:
+    """Return the gradient of a layer's inputs, in new memory or in `out`. (n, o), (o, i) -> (n, i)"""
+    if _linear is not None and len(gradient) * weight.numel() >= _WORTH:
+        return _linear(gradient, weight.t())
+    return torch.mm(gradient, weight, out=out)
 
 
-def to_weights(inputs: Tensor, slope: Tensor, out: Tensor) -> None:
-    """The slope to a layer's weights, transposed. (n, i), (n, o) -> (i, o)"""
+def weight_gradient(inputs: Tensor, gradient: Tensor, out: Tensor) -> None:
+    """Write the gradient of a layer's weights, transposed. (n, i), (n, o) -> (i, o)"""
     if _linear is not None and out.numel() >= _LARGE and len(inputs) * out.numel() >= _WORTH:
-        out.copy_(_linear(inputs.t(), slope.t()))
+        out.copy_(_linear(inputs.t(), gradient.t()))
     else:
-        torch.mm(inputs.t(), slope, out=out)
+        torch.mm(inputs.t(), gradient, out=out)
 
 
 class Activation(NamedTuple):
-    """An activation and its slope, in memory that is given."""
+    """An activation and its gradient, both on preallocated tensors."""
 
     forward: Callable[[Tensor, Tensor], object]
-    """From what a layer gave to the other tensor."""
+    """forward(inputs, out)"""
     backward: Callable[[Tensor, Tensor, Tensor], object]
-    """A slope, in place, from the result to what the layer gave; that, and the result."""
+    """backward(gradient, inputs, outputs) turns the gradient of the outputs into that of the inputs, in place."""
 
 
-def _elu(given: Tensor, result: Tensor) -> None:
+def _elu(inputs: Tensor, out: Tensor) -> None:
     if not _AVX512:
-        _aten.elu.out(given, out=result)
+        _aten.elu.out(inputs, out=out)
         return
-    torch.clamp(given, max=0.0, out=result)
-    np.expm1(result.numpy(), out=result.numpy())
-    torch.maximum(given, result, out=result)  # expm1(x) is above x below 0, and 0 at it
+    torch.clamp(inputs, max=0.0, out=out)
+    np.expm1(out.numpy(), out=out.numpy())
+    torch.maximum(inputs, out, out=out)  # expm1(x) is above x below 0, and 0 at it
 
 
 FAST_ACTIVATIONS: dict[type[nn.Module], Activation] = {
@@ -91,7 +91,7 @@ FAST_ACTIVATIONS: dict[type[nn.Module], Activation] = {
 
 
 def is_plain(layers: Iterable[nn.Module]) -> bool:
-    """Whether these are linear layers with the same known activation between each two, on a CPU."""
+    """Return whether these are linear layers on a CPU with the same known activation between each two."""
     linears, activations = list(layers)[::2], list(layers)[1::2]
     return (
         all(isinstance(layer, nn.Linear) and layer.bias is not None for layer in linears)
@@ -102,9 +102,9 @@ def is_plain(layers: Iterable[nn.Module]) -> bool:
 
 
 class Mlp(nn.Sequential):
-    """Layers that go the fast way where nobody asks for a gradient, and the usual one where somebody does.
+    """Layers that use the fast operations of this module where autograd is off, and torch's own where it is on.
 
-    The fast way calls no hooks of its layers.
+    The fast path calls no hooks of its layers.
     """
 
     def __init__(self, *layers: Any) -> None:
@@ -112,15 +112,16 @@ class Mlp(nn.Sequential):
         self._plain = is_plain(self)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """(..., d) -> (..., outputs)"""
-        usual = inputs.is_cuda or inputs.dtype != torch.float32 or not inputs.numel() or not self._plain
-        if usual or torch.is_grad_enabled():
-            return super().forward(inputs)
+        """Return the outputs. (..., d) -> (..., outputs)"""
+        slow_path = inputs.is_cuda or inputs.dtype != torch.float32 or not inputs.numel() or not self._plain
+        if slow_path or torch.is_grad_enabled():
+            outputs: Tensor = super().forward(inputs)  # type: ignore[no-untyped-call]  # torch has no type here
+            return outputs
         values = inputs.reshape(-1, inputs.shape[-1])
         for layer in self:
             if isinstance(layer, nn.Linear):
                 values = affine(values, layer.weight, layer.bias)
             else:
-                given, values = values, torch.empty_like(values)
-                FAST_ACTIVATIONS[type(layer)].forward(given, values)
+                linear, values = values, torch.empty_like(values)
+                FAST_ACTIVATIONS[type(layer)].forward(linear, values)
         return values.view(*inputs.shape[:-1], values.shape[-1])

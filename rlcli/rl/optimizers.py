@@ -1,4 +1,4 @@
-"""The state of optimisers and other parts of a learner as the flat tensors of a checkpoint; for authors of trainers."""
+"""The state of optimisers as the flat tensors of a checkpoint; for authors of trainers."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ _SLOTS = {
 
 
 class Adam(torch.optim.Adam):
-    """torch's Adam, number for number; but the first of torch's own imports torch's compiler, which takes as long as
-    torch itself, to keep it out of four methods and to break its graphs around the step. Nobody compiles these.
+    """torch's Adam with the same results, which does not import torch's compiler.
+
+    The first instance of torch's own class imports the compiler, which takes as long as importing torch, to keep it out
+    of four methods and to break its graphs around the step. rlcli compiles none of them.
     """
 
     step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))
@@ -29,12 +31,12 @@ class Adam(torch.optim.Adam):
 
 
 def below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The tensors whose names begin so, without the beginning."""
+    """Return the tensors whose names start with `prefix`, under their names without it."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
-    """A copy of an optimiser's state: PREFIX + number of the parameter + what it is."""
+    """Return a copy of an optimiser's state, as PREFIX + index of the parameter + "." + slot."""
     return {
         f"{prefix}{number}.{slot}": torch.as_tensor(value).clone()
         for number, slots in optimizer.state_dict()["state"].items()
@@ -44,10 +46,10 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], prefix: str) -> None:
-    """Give an optimiser its state back, out of the tensors of a checkpoint; its settings stay.
+    """Restore an optimiser's state from the tensors of a checkpoint; its settings stay.
 
     Raises:
-        ValueError: naming the first value that is missing or of another shape.
+        ValueError: with the first value that is missing or of another shape.
     """
     state: dict[int, dict[str, Tensor]] = {}
     for name, value in below(tensors, prefix).items():
@@ -58,7 +60,7 @@ def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tenso
 
 
 def _require_slots(optimizer: torch.optim.Optimizer, state: Mapping[int, Mapping[str, Tensor]]) -> None:
-    """What an optimiser is given back must be what it steps with: it looks only when it steps."""
+    """Check the shapes of an optimiser's state, which torch itself checks only in the next step."""
     owned = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     for number, slots in state.items():
         if not 0 <= number < len(owned):

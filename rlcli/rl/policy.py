@@ -1,4 +1,4 @@
-"""The policy as it is saved, played and exported: raw observation in, exactly what `env.step` takes out."""
+"""The policy as it is saved, played and exported: from raw observations to the actions that `env.step` takes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationErro
 from torch import Tensor, nn
 
 from rlcli.errors import CheckpointError
-from rlcli.rl.vision import Vision, VisionSpec
+from rlcli.rl.cnn import Vision, VisionSpec
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 _LOG_STD_RANGE = (-20.0, 2.0)
@@ -22,7 +22,7 @@ Layers = Annotated[list[Width], Field(max_length=100)]
 
 
 class PolicySpec(BaseModel):
-    """What, besides the weights, a policy is made of.
+    """Structure of a policy: everything but its weights.
 
     Kinds: `gaussian-mlp`, a mean with a state-independent deviation, clipped to the bound; `gaussian-lstm`, the same
     behind a memory; `gaussian-cnn`, the same behind convolutions over pictures; `squashed-gaussian-mlp`, mean and
@@ -66,11 +66,11 @@ class PolicySpec(BaseModel):
 class Normalizer(nn.Module):
     """Running mean and variance of observations, merged batch by batch (Chan, Golub and LeVeque 1979).
 
-    It belongs to the policy: frozen outside training, and part of what is exported.
+    It is part of the policy: frozen outside of training, and exported with it.
 
     Args:
         size: columns.
-        clip: what it gives lies within +-this; None: anywhere.
+        clip: normalised observations are clipped to +-this; None: they are not.
     """
 
     EPSILON = 1e-8
@@ -88,18 +88,18 @@ class Normalizer(nn.Module):
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     def forward(self, obs: Tensor) -> Tensor:
-        """(obs - mean) / std, clipped. (n, d)"""
+        """Return (obs - mean) / std, clipped. (n, d)"""
         scale = (self.var + self.EPSILON).rsqrt().float()
         normal = (obs - self.mean.float()) * scale
         return normal if self.clip is None else normal.clamp(-self.clip, self.clip)
 
     def update(self, obs: Tensor) -> None:
-        """Take in a batch. (n, d)"""
+        """Update the statistics with a batch. (n, d)"""
         batch = obs.double()
         self.merge(batch.mean(dim=0), batch.var(dim=0, unbiased=False), float(len(batch)))
 
     def merge(self, mean: Tensor, var: Tensor, count: float) -> None:
-        """Take in the mean and the variance of `count` samples. (d,)"""
+        """Update the statistics with the mean and the variance of `count` samples. (d,)"""
         total = self.count + count
         delta = mean - self.mean
         spread = self.var * self.count + var * count + delta.square() * self.count * count / total
@@ -124,8 +124,8 @@ class Lstm(nn.Module):
     """Long short-term memory (Hochreiter and Schmidhuber 1997), one step at a time.
 
     Args:
-        inputs: columns of what it sees.
-        cells: of each layer.
+        inputs: columns of the input.
+        cells: number of cells of each layer.
         wide: compute in float64, as `WideLinear` does.
     """
 
@@ -136,12 +136,12 @@ class Lstm(nn.Module):
         self.cells, self.dtype = list(cells), torch.float64 if wide else torch.float32
 
     def blank(self, rows: int) -> Tensor:
-        """The memory of episodes that begin: of each layer output and cell state. (rows, 2 x cells of all layers)"""
+        """Return zero hidden states: output and cell state of each layer. (rows, 2 x cells of all layers)"""
         return torch.zeros(rows, 2 * sum(self.cells), dtype=self.dtype, device=next(self.parameters()).device)
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """(n, inputs) and memory -> (n, cells of the last layer) and the memory after the step"""
-        parts, after = memory.split([size for size in self.cells for _ in range(2)], dim=1), []
+        """Return the output, (n, cells of the last layer), and the next hidden state. (n, inputs), (n, m)"""
+        parts, after = memory.split_with_sizes([size for size in self.cells for _ in range(2)], dim=1), []
         x = x.to(self.dtype)
         for layer, output, cell in zip(self.layers, parts[::2], parts[1::2], strict=True):
             weights = [value.to(self.dtype) for value in layer.parameters()]
@@ -151,10 +151,10 @@ class Lstm(nn.Module):
 
 
 class Policy(nn.Module):
-    """A multilayer perceptron, with its observation normaliser, its memory or its eyes, and its action bound.
+    """Multilayer perceptron with observation normaliser, LSTM or CNN, and action bound.
 
     Args:
-        spec: its shape.
+        spec: its structure.
     """
 
     def __init__(self, spec: PolicySpec) -> None:
@@ -174,14 +174,14 @@ class Policy(nn.Module):
             self.log_std_head = WideLinear(spec.hidden[-1] if spec.hidden else spec.observation_size, spec.action_size)
 
     def forward(self, obs: Tensor) -> Tensor:
-        """The deterministic action; with a memory, that of an episode's first step.
+        """Return the deterministic action; with an LSTM, that of an episode's first step.
 
         (n, observation_size) -> (n, action_size)
         """
         return self.step(obs, None)[0]
 
     def sample(self, obs: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """A stochastic action, as the policy's distribution has it; a deterministic policy has none.
+        """Return a sampled action; that of a deterministic policy is its only one.
 
         (n, observation_size) -> (n, action_size)
         """
@@ -195,26 +195,26 @@ class Policy(nn.Module):
         stochastic: bool = False,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Tensor | None]:
-        """The action, and the memory after it. (n, observation_size) -> (n, action_size)"""
-        seen = self._seen(obs)
+        """Return the action and the next hidden state. (n, observation_size) -> (n, action_size)"""
+        inputs = self._normalized(obs)
         if self.memory is not None:
-            seen, memory = self.memory(seen, self.memory.blank(len(obs)) if memory is None else memory)
+            inputs, memory = self.memory(inputs, self.memory.blank(len(obs)) if memory is None else memory)
         if self.vision is not None:
-            seen = self.vision(seen)
-        features = self.actor[:-1](seen)
+            inputs = self.vision(inputs)
+        features = self.actor[:-1](inputs)
         mean = self.actor[-1](features).float()
         if not stochastic or self.spec.kind == "deterministic-mlp":
             return self._bounded(mean), memory
         noise = torch.randn(mean.shape, generator=generator, device=mean.device)
         return self._bounded(mean + self._log_std(features).exp() * noise), memory
 
-    def _seen(self, obs: Tensor) -> Tensor:
+    def _normalized(self, obs: Tensor) -> Tensor:
         return obs if self.normalizer is None else self.normalizer(obs)
 
     def _log_std(self, features: Tensor) -> Tensor:
         if self.spec.kind.startswith("gaussian-"):
             return self.log_std
-        log_std = self.log_std_head(features).float()
+        log_std: Tensor = self.log_std_head(features).float()
         if self.spec.log_std_range is None:
             return log_std.clamp(*_LOG_STD_RANGE)
         low, high = self.spec.log_std_range
@@ -224,12 +224,12 @@ class Policy(nn.Module):
         bound = self.spec.action_bound
         if not self.spec.kind.startswith("gaussian-"):
             assert bound is not None
-            action = torch.tanh(action) * bound  # some runtimes' tanh goes beyond 1 by a rounding
+            action = torch.tanh(action) * bound  # some runtimes' tanh exceeds 1 by a rounding error
         return action if bound is None else action.clamp(-bound, bound)
 
 
 def mlp(inputs: int, hidden: list[int], outputs: int, activation: str) -> nn.Sequential:
-    """Linear layers with activations between them, in float64."""
+    """Return linear layers with activations between them, in float64."""
     layers: list[nn.Module] = []
     for width in hidden:
         layers += [WideLinear(inputs, width), ACTIVATIONS[activation]()]
@@ -238,19 +238,19 @@ def mlp(inputs: int, hidden: list[int], outputs: int, activation: str) -> nn.Seq
 
 
 def load_policy(spec: Mapping[str, object], weights: Mapping[str, Tensor]) -> Policy:
-    """A policy from a checkpoint's `policy.json` and `policy.safetensors`, ready to act.
+    """Return a policy from a checkpoint's `policy.json` and `policy.safetensors`, ready to act.
 
     Raises:
-        CheckpointError: if they do not fit each other, or a weight is not finite.
+        CheckpointError: if the weights do not fit the structure, or a weight is not finite.
     """
     return filled(blank_policy(spec), weights)
 
 
 def blank_policy(spec: Mapping[str, object]) -> Policy:
-    """A policy without weights: shapes first, a file must not make anybody allocate what it does not hold.
+    """Return a policy without weights, so that a file cannot cause an allocation larger than itself.
 
     Raises:
-        CheckpointError: if this does not describe a policy.
+        CheckpointError: if the specification is not valid.
     """
     try:
         checked = PolicySpec.model_validate(spec)
@@ -268,12 +268,12 @@ def blank_policy(spec: Mapping[str, object]) -> Policy:
 
 
 def size_of(policy: Policy) -> int:
-    """Bytes of its weights."""
+    """Return the size of a policy's weights in bytes."""
     return sum(value.numel() * value.element_size() for value in policy.state_dict().values())
 
 
 def filled(policy: Policy, weights: Mapping[str, Tensor]) -> Policy:
-    """A blank policy with its weights, ready to act.
+    """Load weights into a policy without weights; return it ready to act.
 
     Raises:
         CheckpointError: if they do not fit, or a weight is not finite.

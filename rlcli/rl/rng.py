@@ -1,4 +1,4 @@
-"""The global random generators of torch, numpy and Python: seeded together, and as tensors of a checkpoint."""
+"""The global random generators of torch, numpy and Python: seeded together, and saved as tensors of a checkpoint."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.sim.saved import require_alike, require_within
+from rlcli.sim.tensor_state import require_in_range, require_matching_tensors
 
 
 def seed_generators(seed: int) -> None:
-    """Seed all three: tasks of others draw from whichever they know, and torch's networks from torch's."""
+    """Seed all three: a task may use any of them, and torch's networks use torch's."""
     torch.manual_seed(seed)
     np.random.seed(seed % 2**32)
     random.seed(seed)
 
 
 def rng_state() -> dict[str, Tensor]:
-    """States of the global generators of torch, numpy and Python."""
+    """Return the states of the global generators of torch, numpy and Python."""
     kind, keys, position, has_gauss, gauss = np.random.get_state()
     assert kind == "MT19937"
     version, words, next_gauss = random.getstate()
@@ -38,10 +38,7 @@ def rng_state() -> dict[str, Tensor]:
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """What is done in here draws from the generators and sets torch's threads without anybody noticing afterwards.
-
-    Torch computes on one thread.
-    """
+    """Run with one torch thread; restore the generators and the number of threads at the end."""
     rng, threads = rng_state(), torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -52,17 +49,19 @@ def undisturbed() -> Iterator[None]:
 
 
 def load_rng_state(state: Mapping[str, Tensor]) -> None:
-    """Take back what `rng_state` gave.
+    """Restore the states returned by `rng_state()`.
 
     Raises:
-        KeyError: if something is missing.
-        ValueError: if something is no state of a generator.
+        KeyError: if a tensor is missing.
+        ValueError: if a tensor is not the state of a generator.
     """
-    require_alike(state, rng_state(), "rng")
-    require_within(state["numpy.position"][:1], 0, len(state["numpy.keys"]), "numpy.position")  # numpy does not look
-    require_within(state["numpy.position"][1:], 0, 1, "numpy.position")
+    require_matching_tensors(state, rng_state(), "rng")
+    require_in_range(
+        state["numpy.position"][:1], 0, len(state["numpy.keys"]), "numpy.position"
+    )  # numpy does not check it
+    require_in_range(state["numpy.position"][1:], 0, 1, "numpy.position")
     for name in ("numpy.keys", "python.words"):
-        require_within(state[name], 0, 2**32 - 1, name)
+        require_in_range(state[name], 0, 2**32 - 1, name)
     torch.set_rng_state(state["torch"])
     position, has_gauss = state["numpy.position"].tolist()
     keys = state["numpy.keys"].numpy().astype(np.uint32)

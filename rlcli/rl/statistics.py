@@ -1,4 +1,4 @@
-"""Statistics of finished episodes, under rsl_rl's metric names, so that its dashboards carry over."""
+"""Statistics of finished episodes, under RSL-RL's metric names, so that its dashboards can be used."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.step import Episodes
-from rlcli.rl.distributed import Peers
+from rlcli.rl.distributed import ProcessGroup
 
 
 class EpisodeStatistics:
-    """Gathers the episodes of an iteration; returns and lengths are means over the last iterations with 100 episodes.
+    """Statistics of an iteration's episodes; returns and lengths are means over the last iterations with 100 episodes.
 
     `Episode_Reward/<term>` is the mean episodic sum over the episode's full length in seconds (Isaac Lab's
     definition); `Episode_Termination/<term>` the share of episodes at whose end the term had fired;
-    `Metrics/<command>/<metric>` the mean of episodes' means. Sums are kept where the episodes are, so that adding them
-    never waits for a device.
+    `Metrics/<command>/<metric>` the mean of episodes' means. Sums stay on the device of the episodes, so that adding
+    to them never synchronises with it.
     """
 
     WINDOW = 100
@@ -30,39 +30,39 @@ class EpisodeStatistics:
         self.total = 0
 
     def add(self, episodes: Episodes | None) -> None:
-        """Take in the episodes that a step finished."""
+        """Add the episodes that a step finished."""
         if episodes is None:
             return
         values = {"return": episodes.returns, **{f"term.{k}": v for k, v in episodes.reward_terms.items()}}
         values |= {f"metric.{k}": v for k, v in episodes.metrics.items()}
-        facts = {f"cause.{k}": v for k, v in episodes.causes.items()}
+        flags = {f"cause.{k}": v for k, v in episodes.causes.items()}
         if episodes.success is not None:
-            facts["success"] = episodes.success
-        facts["count"] = torch.ones_like(episodes.truncated) if episodes.mask is None else episodes.mask
+            flags["success"] = episodes.success
+        flags["count"] = torch.ones_like(episodes.truncated) if episodes.mask is None else episodes.mask
         matrix = torch.cat(
             [
                 torch.stack(list(values.values())),
-                torch.stack(list(facts.values())).float(),
+                torch.stack(list(flags.values())).float(),
                 episodes.lengths.float()[None],
             ]
         )
         weight = torch.ones(matrix.shape[1]) if episodes.mask is None else episodes.mask.float()
-        names = ",".join([*values, *facts, "length"])
+        names = ",".join([*values, *flags, "length"])
         if names not in self._sums:
             with torch.inference_mode(False):  # `flush` writes to it where there is no such mode
                 self._sums[names] = torch.zeros(len(matrix), dtype=torch.float32, device=matrix.device)
         self._sums[names].addmv_(matrix, weight)
 
-    def share(self, peers: Peers) -> None:
-        """Add up what several processes gathered, once each of them has seen an episode end."""
-        known = len(self._sums)
-        (everywhere,) = peers.total(known)
-        if known and everywhere == known * peers.size:
+    def all_reduce(self, process_group: ProcessGroup) -> None:
+        """Sum the episodes of all processes, once an episode has ended in each of them."""
+        own = len(self._sums)
+        (everywhere,) = process_group.sum(own)
+        if own and everywhere == own * process_group.world_size:
             for values in self._sums.values():
-                peers.average_(values).mul_(peers.size)
+                process_group.average_(values).mul_(process_group.world_size)
 
     def flush(self) -> dict[str, float]:
-        """Metrics of the iteration that ends; a mean over no episode is left out."""
+        """Return the metrics of the iteration and reset its sums; a mean over no episode is left out."""
         sums: dict[str, float] = {}
         for names, values in self._sums.items():
             for name, value in zip(names.split(","), values.tolist(), strict=True):
@@ -74,16 +74,16 @@ class EpisodeStatistics:
             self._recent.append([count, sums["return"], sums["length"], sums.get("success", -1.0)])
             while sum(row[0] for row in self._recent) - self._recent[0][0] >= self.WINDOW:
                 self._recent.popleft()
-        return {**self._means(), **self._shares(sums, count)}
+        return {**self._means(), **self._episode_means(sums, count)}
 
     def state(self) -> dict[str, Any]:
-        """The recent iterations, as plain JSON; between iterations nothing else is pending."""
+        """Return the recent iterations as plain JSON; between iterations there is no other state."""
         return {"recent": [list(row) for row in self._recent], "total": self.total}
 
     def load(self, state: dict[str, Any]) -> None:
-        """Take back what `state` gave."""
+        """Restore the state returned by `state()`."""
         for pending in self._sums.values():
-            pending.zero_()  # in place: a recording adds to them
+            pending.zero_()  # in place: a captured graph adds to these tensors
         self._recent = deque(list(row) for row in state["recent"])
         self.total = state["total"]
 
@@ -94,11 +94,11 @@ class EpisodeStatistics:
         means = {"Train/mean_reward": returns / count, "Train/mean_episode_length": lengths / count}
         return means if successes < 0 else {**means, "Train/success_rate": successes / count}
 
-    def _shares(self, sums: dict[str, float], count: float) -> dict[str, float]:
+    def _episode_means(self, sums: dict[str, float], count: float) -> dict[str, float]:
         if not count:
             return {}
         scale = 1.0 / (count * self._episode_length_s)
-        shares = {f"Episode_Reward/{n.removeprefix('term.')}": v * scale for n, v in sums.items() if n[:5] == "term."}
+        rewards = {f"Episode_Reward/{n.removeprefix('term.')}": v * scale for n, v in sums.items() if n[:5] == "term."}
         causes = {f"Episode_Termination/{n.removeprefix('cause.')}": v for n, v in sums.items() if n[:6] == "cause."}
         metrics = {f"Metrics/{n.removeprefix('metric.')}": v for n, v in sums.items() if n[:7] == "metric."}
-        return {**shares, **{name: total / count for name, total in {**causes, **metrics}.items()}}
+        return {**rewards, **{name: total / count for name, total in {**causes, **metrics}.items()}}

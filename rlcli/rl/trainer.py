@@ -1,4 +1,4 @@
-"""What a trainer does: the protocol that the training loop drives, and what passes between them."""
+"""The protocol between the training loop and a trainer, and the data that they exchange."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """The newest rows of something that only grows, such as a replay buffer: each is written to the disk once."""
+    """The newest rows of data that only grows, such as a replay buffer; each row is written to the disk once."""
 
     first: int
-    """The oldest row that is still needed, counted from the first that there ever was."""
+    """The oldest row that is still needed, counted from the first row ever stored."""
     stop: int
     """One after the newest."""
     read: Callable[[int, int], dict[str, Tensor]]
-    """read(start, stop) copies rows of every column, as they were at the boundary. (stop - start, ...)"""
+    """read(start, stop) returns copies of rows by column, as they were at the boundary. (stop - start, ...)"""
 
 
 @dataclass(slots=True)
 class TrainerState:
-    """Everything a trainer needs to go on exactly: tensors by file, plain JSON, and rows by the name of their log."""
+    """State from which training continues exactly: tensors by file, plain JSON, and rows by the name of their log."""
 
     tensors: dict[str, dict[str, Tensor]] = field(default_factory=dict)
     values: dict[str, Any] = field(default_factory=dict)
@@ -35,19 +35,24 @@ class TrainerState:
 
 @dataclass(slots=True)
 class Report:
-    """What one iteration did: losses and rates by metric name, and the seconds it took by part."""
+    """Results of one iteration: metrics by name, and the seconds it took by part."""
 
     metrics: dict[str, float]
     seconds: dict[str, float]
-    notes: list[str] = field(default_factory=list)
-    """What the user should know, said once."""
 
 
 class Trainer(Protocol):
-    """Learns in a `VecEnv`, one iteration at a time; between iterations it can be saved and restored exactly."""
+    """Learner in a `VecEnv`; between two iterations its state can be saved and restored exactly."""
 
-    iteration: int
-    steps_per_iteration: int
+    @property
+    def iteration(self) -> int:
+        """Iterations done."""
+        ...
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps of an iteration, over all environments."""
+        ...
 
     @property
     def env_steps(self) -> int:
@@ -63,17 +68,17 @@ class Trainer(Protocol):
         ...
 
     def policy(self) -> Policy:
-        """The policy as it is now, sharing its weights."""
+        """Return the policy as it is now, with weights of its own."""
         ...
 
     def state(self) -> TrainerState:
-        """A copy of the state at this boundary; rows of logs may be read until the end of the next iteration."""
+        """Return a copy of the state; the rows of its logs may be read until the end of the next iteration."""
         ...
 
     def load(self, state: TrainerState) -> None:
-        """Go back to a boundary."""
+        """Restore a state."""
         ...
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Take only the policy's weights (`--init-from`)."""
+        """Load only the policy's weights (`--init-from`)."""
         ...

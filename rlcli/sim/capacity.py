@@ -7,17 +7,17 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from rlcli.sim.lean import touching
+from rlcli.sim.skippable_work import colliding_pairs
 
 _TRIALS, _STEPS = 8, 100
 _MARGIN = 3
 """How many times what a short random simulation needed is set aside, where the model's own bound is larger."""
-_MANY = 8
+_DEFAULT_CONTACTS = 8
 """Contacts that two geoms may have where nothing better is known (two boxes)."""
-_ON_HILLS = 50
+_HFIELD_CONTACTS = 50
 """Contacts that a geom may have with a height field: MuJoCo keeps no more of a pair."""
 _G = mujoco.mjtGeom
-_POINTS = {
+_PAIR_CONTACTS = {
     (_G.mjGEOM_PLANE, _G.mjGEOM_SPHERE): 1,
     (_G.mjGEOM_PLANE, _G.mjGEOM_ELLIPSOID): 1,
     (_G.mjGEOM_PLANE, _G.mjGEOM_CAPSULE): 2,
@@ -39,7 +39,7 @@ class Capacity:
     constraints: int
 
 
-def capacity(model: mujoco.MjModel, contacts: int | None = None, constraints: int | None = None) -> Capacity:
+def required_capacity(model: mujoco.MjModel, contacts: int | None = None, constraints: int | None = None) -> Capacity:
     """Room for what the model can need: its own bound, or a multiple of what a random simulation needs if that is less.
 
     Args:
@@ -47,25 +47,25 @@ def capacity(model: mujoco.MjModel, contacts: int | None = None, constraints: in
         contacts: a setting that replaces the estimate.
         constraints: likewise.
     """
-    most_contacts, most_rows = _bound(model)
-    seen_contacts, seen_rows = _sample(model)
-    found_contacts = min(most_contacts, max(32, _MARGIN * seen_contacts))
-    found_rows = min(most_rows, max(64, _MARGIN * seen_rows))
+    most_contacts, most_rows = _upper_bound(model)
+    sampled_contacts, sampled_rows = _sampled_maximum(model)
+    found_contacts = min(most_contacts, max(32, _MARGIN * sampled_contacts))
+    found_rows = min(most_rows, max(64, _MARGIN * sampled_rows))
     return Capacity(contacts or max(1, found_contacts), constraints or max(1, found_rows))
 
 
-def _bound(model: mujoco.MjModel) -> tuple[int, int]:
+def _upper_bound(model: mujoco.MjModel) -> tuple[int, int]:
     """Contacts of every pair of geoms that may touch, and all rows that they, joints and equalities can make."""
     contacts = rows = 0
-    for a, b in touching(model):
+    for a, b in colliding_pairs(model):
         kinds = tuple(sorted((_G(model.geom_type[a]), _G(model.geom_type[b])), key=int))
-        points = _ON_HILLS if _G.mjGEOM_HFIELD in kinds else _POINTS.get(kinds, _MANY)
+        points = _HFIELD_CONTACTS if _G.mjGEOM_HFIELD in kinds else _PAIR_CONTACTS.get(kinds, _DEFAULT_CONTACTS)
         condim = int(max(model.geom_condim[a], model.geom_condim[b]))
         contacts += points
         rows += points * _contact_rows(model, condim)
     for pair in range(model.npair):
-        contacts += _MANY
-        rows += _MANY * _contact_rows(model, int(model.pair_dim[pair]))
+        contacts += _DEFAULT_CONTACTS
+        rows += _DEFAULT_CONTACTS * _contact_rows(model, int(model.pair_dim[pair]))
     limits = int(model.jnt_limited.sum() + model.tendon_limited.sum()) * 2
     friction = int((model.dof_frictionloss > 0).sum() + (model.tendon_frictionloss > 0).sum())
     return contacts, rows + limits + friction + 6 * model.neq
@@ -76,14 +76,14 @@ def _contact_rows(model: mujoco.MjModel, condim: int) -> int:
     return 1 if condim == 1 else 2 * (condim - 1) if pyramidal else condim
 
 
-def _sample(model: mujoco.MjModel) -> tuple[int, int]:
+def _sampled_maximum(model: mujoco.MjModel) -> tuple[int, int]:
     """The most contacts and rows seen in short simulations under random controls, from shaken start poses."""
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     contacts = rows = 0
     for _ in range(_TRIALS):
         mujoco.mj_resetData(model, data)
         data.qvel[:] = rng.normal(0.0, 1.0, model.nv)
-        _scatter(model, data, rng)
+        _move_on_height_field(model, data, rng)
         for _ in range(_STEPS):
             data.ctrl[:] = rng.uniform(-1.0, 1.0, model.nu)
             mujoco.mj_step(model, data)
@@ -91,7 +91,7 @@ def _sample(model: mujoco.MjModel) -> tuple[int, int]:
     return contacts, rows
 
 
-def _scatter(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator) -> None:
+def _move_on_height_field(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator) -> None:
     """Put free roots somewhere else on a height field: an environment may start anywhere on it."""
     fields = np.flatnonzero(model.geom_type == int(_G.mjGEOM_HFIELD))
     if not len(fields):

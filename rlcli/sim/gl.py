@@ -17,7 +17,7 @@ from rlcli.errors import MachineError
 _PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6", "glfw": "a running display server"}
 
 
-def unusable_choice(error: BaseException) -> MachineError | None:
+def opengl_import_error(error: BaseException) -> MachineError | None:
     """What to say where MuJoCo could not be imported for what MUJOCO_GL says; None for any other error.
 
     MuJoCo loads the library of its choice at import, whether or not something is drawn.
@@ -69,7 +69,7 @@ def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[A
                 raise MachineError("the display does not answer")
         except Exception as error:  # every backend fails in its own way: missing library, device, display
             tried.append(f"{backend} ({' '.join(str(error).split())[:100] or type(error).__name__})")
-            _forget_opengl()
+            _unload_opengl()
             continue
         return context, backend
     packages = " or ".join(_PACKAGES.get(backend, backend) for backend in candidates())
@@ -104,7 +104,7 @@ def candidates() -> list[str]:
     return ["glfw", "egl", "osmesa"] if has_display() else ["egl", "osmesa"]
 
 
-def _forget_opengl() -> None:
+def _unload_opengl() -> None:
     """PyOpenGL fixes its platform at import; the next backend needs it fresh."""
     os.environ.pop("PYOPENGL_PLATFORM", None)
     for name in [

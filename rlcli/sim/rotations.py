@@ -7,23 +7,27 @@ its vectorised and its scalar loops is used (so no atan2 and no pow).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
+
+cross: Callable[[Tensor, Tensor], Tensor] = torch.linalg.cross
+"""Cross product; torch leaves its function without types. (..., 3), (..., 3) -> (..., 3)"""
 
 
 def rotate(quat: Tensor, vector: Tensor) -> Tensor:
     """Vector in the parent frame of a vector given in the quaternion's frame. (..., 4), (..., 3) -> (..., 3)"""
     w, axis = quat[..., :1], quat[..., 1:]
-    twice = 2.0 * torch.linalg.cross(axis, vector)
-    return vector + w * twice + torch.linalg.cross(axis, twice)
+    twice = 2.0 * cross(axis, vector)
+    return vector + w * twice + cross(axis, twice)
 
 
 def rotate_inverse(quat: Tensor, vector: Tensor) -> Tensor:
     """Vector in the quaternion's frame of a vector given in the parent frame. (..., 4), (..., 3) -> (..., 3)"""
     w, axis = quat[..., :1], quat[..., 1:]
-    twice = 2.0 * torch.linalg.cross(axis, vector)
-    return vector - w * twice + torch.linalg.cross(axis, twice)
+    twice = 2.0 * cross(axis, vector)
+    return vector - w * twice + cross(axis, twice)
 
 
 def multiply(left: Tensor, right: Tensor) -> Tensor:
@@ -90,7 +94,7 @@ def length(vector: Tensor) -> Tensor:
 
 def rotation_vector(quat: Tensor) -> Tensor:
     """Axis times angle, the angle in [0, pi] [rad]. (n, 4) -> (n, 3)"""
-    w, axis = torch.where(quat[:, :1] < 0.0, -quat, quat).split([1, 3], dim=1)
+    w, axis = torch.where(quat[:, :1] < 0.0, -quat, quat).split_with_sizes([1, 3], dim=1)
     x, y, z = axis.unbind(1)
     sine = (x * x + y * y + z * z).sqrt()[:, None]
     angle = 2.0 * atan2(sine, w)

@@ -1,4 +1,4 @@
-"""Some of the environments, as resets and events see them: never ids or masks, only what may be done with them.
+"""Selections of environments for resets and events: neither ids nor masks, only operations on their rows.
 
 On the CPU a selection is a short list of ids; an engine inside a CUDA graph can only use a mask over all. Terms
 written against this interface run on both.
@@ -40,7 +40,7 @@ def one_column(columns: Columns, count: int, parameter: str) -> int:
     found = torch.arange(count)[columns if isinstance(columns, slice) else columns.cpu()].tolist()
     if len(found) != 1:
         raise ValueError(f"'{parameter}' stands for {len(found)} elements, and this term needs one")
-    return found[0]
+    return int(found[0])
 
 
 class Selection(Protocol):
@@ -49,55 +49,42 @@ class Selection(Protocol):
     @property
     def count(self) -> int | Tensor:
         """How many environments are selected."""
-        ...
 
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Uniform in [low, high). (rows, *shape)"""
-        ...
 
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Gaussian. (rows, *shape)"""
-        ...
 
     def choice(self, options: int, shape: tuple[int, ...] = ()) -> Tensor:
         """Whole numbers in [0, options), each as likely. (rows, *shape)"""
-        ...
 
     def read(self, field: Field, columns: Columns = ALL) -> Tensor:
         """The rows of a (num_envs, ...) tensor."""
-        ...
 
-    def peek(self, field: Field, columns: Columns = ALL) -> Tensor:
-        """The same for a moment: it may be the tensor itself, so do not write to it, nor keep it past a write there."""
-        ...
+    def read_view(self, field: Field, columns: Columns = ALL) -> Tensor:
+        """Return the rows, or the tensor itself: do not write to the result, nor keep it past a write to the tensor."""
 
     def write(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
         """Set the rows of a (num_envs, ...) tensor."""
-        ...
 
     def add(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
         """Add to the rows of a (num_envs, ...) tensor."""
-        ...
 
     def mean(self, values: Tensor) -> Tensor:
         """Mean of a (num_envs,) tensor over the rows. ()"""
-        ...
 
     def where(self, mask: Field) -> Selection | None:
-        """Those of the rows where `mask` (num_envs,) holds; None where that is known to be nobody."""
-        ...
+        """Those of the rows where `mask` (num_envs,) holds; None if it is known that there are none."""
 
-    def joined(self, other: Any) -> Selection:
+    def union(self, other: Any) -> Selection:
         """The rows that are in this selection or in another of the same engine."""
-        ...
 
     def env_ids(self) -> Tensor:
         """The rows' numbers, for code that wants ids; on a GPU this waits for the device. (rows,) int64"""
-        ...
 
     def stream(self, stream: np.uint64) -> Selection:
         """The same rows drawing from another stream."""
-        ...
 
 
 def write_rows(field: Field, rows: NDArray[np.int64], values: Tensor | float, columns: Columns = ALL) -> None:
@@ -119,7 +106,7 @@ def ids_of(selection: Selection) -> NDArray[np.int64]:
 class IdSelection:
     """A selection as a sorted list of ids, on the CPU. Its draws may be sent to a device.
 
-    With `lives`, environment i draws as i % lives does.
+    With `shared_streams`, environments i and i % shared_streams draw the same.
     """
 
     def __init__(
@@ -129,10 +116,10 @@ class IdSelection:
         counters: NDArray[np.int64],
         stream: np.uint64 | None = None,
         device: torch.device | None = None,
-        lives: int = 0,
+        shared_streams: int = 0,
     ) -> None:
         self.ids = ids
-        self._lives = lives
+        self._shared_streams = shared_streams
         self._device = device
         self._seed = seed
         self._counters = counters
@@ -168,7 +155,7 @@ class IdSelection:
         values = field if isinstance(field, np.ndarray) else field.numpy()
         return torch.from_numpy(values[self.ids if columns is ALL else _index(self.ids, columns)])
 
-    peek = read
+    read_view = read
 
     def write(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
         """Set the rows of a (num_envs, ...) tensor."""
@@ -193,14 +180,14 @@ class IdSelection:
         if not chosen.any():
             return None
         return IdSelection(
-            self.ids[chosen], self._seed, self._counters[chosen], self._stream, self._device, self._lives
+            self.ids[chosen], self._seed, self._counters[chosen], self._stream, self._device, self._shared_streams
         )
 
-    def joined(self, other: IdSelection) -> IdSelection:
+    def union(self, other: IdSelection) -> IdSelection:
         """The rows that are in either; one that is in both draws as it does here."""
         ids, first = np.unique(np.concatenate([self.ids, other.ids]), return_index=True)
         counters = np.concatenate([self._counters, other._counters])[first]
-        return IdSelection(ids, self._seed, counters, self._stream, self._device, self._lives)
+        return IdSelection(ids, self._seed, counters, self._stream, self._device, self._shared_streams)
 
     def env_ids(self) -> Tensor:
         """The rows' numbers. (rows,) int64"""
@@ -208,12 +195,12 @@ class IdSelection:
 
     def stream(self, stream: np.uint64) -> IdSelection:
         """The same rows drawing from another stream."""
-        other = IdSelection(self.ids, self._seed, self._counters, stream, self._device, self._lives)
+        other = IdSelection(self.ids, self._seed, self._counters, stream, self._device, self._shared_streams)
         other._keys = self._row_keys()
         return other
 
     def _placed(
-        self, drawn: NDArray, scale: float | NDArray, offset: float | NDArray, shape: tuple[int, ...]
+        self, drawn: NDArray[Any], scale: float | NDArray[Any], offset: float | NDArray[Any], shape: tuple[int, ...]
     ) -> Tensor:
         # in numpy: the arrays are short, and its calls cost half of torch's
         values = self._shaped(drawn, shape)
@@ -221,16 +208,16 @@ class IdSelection:
         values += offset
         return self._tensor(values)
 
-    def _shaped(self, drawn: NDArray, shape: tuple[int, ...]) -> NDArray:
+    def _shaped(self, drawn: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
         return drawn if len(shape) == 1 else drawn.reshape(len(self.ids), *shape)
 
-    def _tensor(self, drawn: NDArray) -> Tensor:
+    def _tensor(self, drawn: NDArray[Any]) -> Tensor:
         values = torch.from_numpy(drawn)
         return values if self._device is None else values.to(self._device)
 
     def _row_keys(self) -> random.Keys:
         if self._keys is None:
-            names = self.ids % self._lives if self._lives else self.ids
+            names = self.ids % self._shared_streams if self._shared_streams else self.ids
             self._keys = random.row_keys(self._seed, names, self._counters)
         return self._keys
 

@@ -10,7 +10,9 @@ for finding in check_task("acrobot"):
 ```
 """
 
-from rlcli.testing.kit import CHECKS, Finding, check_task, record_layout
-from rlcli.testing.lint import RULES, Remark, lint_task
+from rlcli.testing.kit import CHECKS, check_task, record_layout
+from rlcli.testing.lint import lint_task
+from rlcli.testing.lint_rules import RULES, Remark
+from rlcli.testing.task_under_test import Finding
 
 __all__ = ["CHECKS", "RULES", "Finding", "Remark", "check_task", "lint_task", "record_layout"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -12,47 +13,44 @@ from rlcli.errors import (
     DependencyError,
     DeviceError,
     MachineError,
-    RlcliError,
     ShapeError,
     TaskError,
-    UsageError,
-    did_you_mean,
+    require_known,
 )
-from rlcli.registry import find_task
-from rlcli.testing import lives, portability, values
-from rlcli.testing.subject import Finding, NotRunError, Subject
+from rlcli.testing import episode_checks, portability_checks, value_checks
+from rlcli.testing.task_under_test import Finding, NotRunError, TaskUnderTest, error_text, open_task
 
-Check = Callable[[Subject], Iterable[Finding]]
+Check = Callable[[TaskUnderTest], Iterable[Finding]]
 OnCheck = Callable[[str, "list[Finding] | None"], None]
 OnNote = Callable[[str, str], None]
 
 CHECKS: dict[str, Check] = {
-    "names": values.names,
-    "yaml-round-trip": values.yaml_round_trip,
-    "finite": values.finite,
-    "shapes": values.shapes,
-    "dtypes": values.dtypes,
-    "random-actions": values.random_actions_stay_stable,
-    "extreme-actions": values.extreme_actions_stay_stable,
-    "same-seed": lives.same_seed,
-    "start-states": lives.start_states,
-    "constant-columns": values.constant_columns,
-    "aliasing": values.aliasing,
-    "partial-reset": lives.partial_reset,
-    "final-observations": lives.final_observations,
-    "truncation": lives.truncation,
-    "termination": lives.termination,
-    "repeated-observation": lives.repeated_observation,
-    "observation-after-reset": lives.observation_after_reset,
-    "back-fill": lives.back_fill,
-    "checkpoint": portability.checkpoint,
-    "layout": portability.layout,
-    "policy": portability.policy,
-    "threads": portability.threads,
-    "num-envs": portability.num_envs,
-    "speed": portability.speed,
-    "engines": portability.engines,
-    "captured": portability.captured,
+    "names": value_checks.names,
+    "yaml-round-trip": value_checks.yaml_round_trip,
+    "finite": value_checks.finite,
+    "shapes": value_checks.shapes,
+    "dtypes": value_checks.dtypes,
+    "random-actions": value_checks.random_actions_stay_stable,
+    "extreme-actions": value_checks.extreme_actions_stay_stable,
+    "same-seed": episode_checks.same_seed,
+    "start-states": episode_checks.start_states,
+    "constant-columns": value_checks.constant_columns,
+    "aliasing": value_checks.aliasing,
+    "partial-reset": episode_checks.partial_reset,
+    "final-observations": episode_checks.final_observations,
+    "truncation": episode_checks.truncation,
+    "termination": episode_checks.termination,
+    "repeated-observation": episode_checks.repeated_observation,
+    "observation-after-reset": episode_checks.observation_after_reset,
+    "back-fill": episode_checks.back_fill,
+    "checkpoint": portability_checks.checkpoint,
+    "layout": portability_checks.layout,
+    "policy": portability_checks.policy,
+    "threads": portability_checks.threads,
+    "num-envs": portability_checks.num_envs,
+    "speed": portability_checks.speed,
+    "engines": portability_checks.engines,
+    "captured": portability_checks.captured,
 }
 """Name -> check, in the order in which they run. The first line of a check's docstring says what it demands."""
 
@@ -87,9 +85,8 @@ def check_task(
         TaskError: if there is no such task, or it cannot be imported.
     """
     for name in only:
-        if name not in CHECKS:
-            raise UsageError(f"no check '{name}'", hint=did_you_mean(name, CHECKS) or f"checks: {', '.join(CHECKS)}")
-    subject = _subject(task, agent, overrides)
+        require_known(name, list(CHECKS), "check", "checks")
+    subject = open_task(task, agent, overrides)
     chosen = [name for name in CHECKS if (not only or name in only) and (subject.is_direct or name not in _DIRECT_ONLY)]
     found: list[Finding] = []
     with torch.random.fork_rng(devices=[]):
@@ -124,15 +121,10 @@ def record_layout(task: str | Path, *, agent: str | None = None, overrides: Sequ
         ConfigError: if the task is not valid.
         TaskError: if there is no such task, or it cannot be imported.
     """
-    return portability.record_layout(_subject(task, agent, overrides))
+    return portability_checks.record_layout(open_task(task, agent, overrides))
 
 
-def _subject(task: str | Path, agent: str | None, overrides: Sequence[str]) -> Subject:
-    path = Path(task)
-    return Subject(find_task(str(path.resolve()) if isinstance(task, Path) else task), agent, overrides)
-
-
-def _build(subject: Subject) -> Iterator[Finding]:
+def _build(subject: TaskUnderTest) -> Iterator[Finding]:
     """Nothing can be checked of a task that cannot be built."""
     try:
         subject.env()
@@ -150,20 +142,18 @@ def _build(subject: Subject) -> Iterator[Finding]:
         yield _stopped("names", subject, error, [])
 
 
-def _run(name: str, subject: Subject, before: list[Finding]) -> Iterator[Finding]:
+def _run(name: str, subject: TaskUnderTest, before: list[Finding]) -> Iterator[Finding]:
     try:
-        yield from CHECKS[name](subject)
+        for finding in CHECKS[name](subject):
+            yield replace(finding, check=name)
     except (NotRunError, MachineError):
         raise
     except Exception as error:
         yield _stopped(name, subject, error, before)
 
 
-def _stopped(name: str, subject: Subject, error: Exception, before: list[Finding]) -> Finding:
-    message = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"
-    message = f"the check was stopped by {' '.join(message.split())}"
+def _stopped(name: str, subject: TaskUnderTest, error: Exception, before: list[Finding]) -> Finding:
+    message = f"the check was stopped by {error_text(error)}"
     earlier = next((f.check for f in before if f.message == message), None)
-    hint = "mend what raises it, then check again"
-    if earlier is not None:
-        hint = f"see {earlier}"
+    hint = "mend what raises it, then check again" if earlier is None else f"see {earlier}"
     return Finding(name, "error", subject.place(error), message, hint)

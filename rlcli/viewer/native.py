@@ -5,9 +5,7 @@ from __future__ import annotations
 import copy
 import sys
 import threading
-import time
 import warnings
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -15,29 +13,26 @@ import mujoco
 import numpy as np
 
 from rlcli.errors import MachineError
-from rlcli.viewer.crowd import Crowd
-from rlcli.viewer.player import Player, View
-from rlcli.viewer.video import free_camera
+from rlcli.viewer.env_grid import EnvGrid
+from rlcli.viewer.offscreen import free_camera
+from rlcli.viewer.playback import Playback, run_in_real_time
+from rlcli.viewer.protocol import Ready, View
 
 KEYS = (
     "Space: pause, go on. Right: one step. Backspace: new episodes. - and =: speed. Up, Down: environment."
     " PageUp, PageDown: newer, older checkpoint. Home, End: choose a command; Insert, Delete: raise, lower it."
     " Double click, then Ctrl and drag: push a body"
 )
-_SPACE, _BACKSPACE, _MINUS, _EQUAL = 32, 259, 45, 61
-_RIGHT, _DOWN, _UP, _PAGE_UP, _PAGE_DOWN = 262, 264, 265, 266, 267
-_INSERT, _DELETE, _HOME, _END = 260, 261, 268, 269
-_FRAME = 1.0 / 60.0
-_REREAD = 1.0
+_REQUESTS = {
+    32: "pause", 262: "step", 259: "reset", 45: "slower", 61: "faster", 265: "next environment",
+    264: "previous environment", 266: "newer checkpoint", 267: "older checkpoint", 268: "previous command",
+    269: "next command", 260: "raise command", 261: "lower command",
+}  # fmt: skip
+"""Number of a key in GLFW -> request of the playback."""
 
 
-def run(player: Player, together: int, ready: Callable[[], None]) -> None:
-    """Play in real time until the window is closed.
-
-    Args:
-        player: what is played.
-        together: how many environments are drawn.
-        ready: called when the window is open.
+def run(playback: Playback, *, title: str, together: int, port: int, ready: Ready) -> None:
+    """Play in real time until the window is closed; see `rlcli.viewer.protocol.Viewer`.
 
     Raises:
         MachineError: if no window opens, as on macOS outside mjpython.
@@ -45,50 +40,39 @@ def run(player: Player, together: int, ready: Callable[[], None]) -> None:
     import mujoco.viewer
 
     _require_windows()
-    env = player.env
-    crowd = Crowd(env, together)
-    shown = player.shown
+    env = playback.env
+    env_grid = EnvGrid(env, together)
+    shown = playback.shown
     model = copy.deepcopy(env.world(shown)[0])
     data = mujoco.MjData(model)
     before = set(threading.enumerate())
     try:
-        handle = mujoco.viewer.launch_passive(model, data, key_callback=partial(press, player), show_left_ui=False)
+        handle = mujoco.viewer.launch_passive(model, data, key_callback=partial(press, playback), show_left_ui=False)
     except RuntimeError as error:
         hint = "start it as: mjpython -m rlcli play ..., or --viewer web" if sys.platform == "darwin" else None
         raise MachineError(f"the window cannot be opened: {error}", hint=hint) from error
     drawing = set(threading.enumerate()) - before
     try:
         with handle as window:
-            camera = crowd.stand_back(free_camera(env.config.viewer, env.origins[shown].tolist()), shown)
+            camera = env_grid.fit_camera(free_camera(env.config.viewer, env.origins[shown].tolist()), shown)
             window.cam.lookat[:], window.cam.distance = camera.lookat, camera.distance
             window.cam.azimuth, window.cam.elevation = camera.azimuth, camera.elevation
-            ready()
-            _loop(window, player, crowd, model, data)
+            ready([KEYS], None)
+
+            def draw() -> None:
+                _draw(window, playback, env_grid, model, data)
+                playback.push(_forces(window, model, data))
+
+            run_in_real_time(playback, window.is_running, draw)
     finally:
         for thread in drawing:  # a process that ends while it draws crashes
             thread.join(timeout=5.0)
 
 
-def press(player: Player, code: int) -> None:
-    """What a key of the window (GLFW's number) asks of the player."""
-    view = player.view
-    asked: dict[int, Callable[[], None]] = {
-        _SPACE: partial(player.pause, not view.paused),
-        _RIGHT: player.single_step,
-        _BACKSPACE: player.reset,
-        _MINUS: partial(player.faster, -1),
-        _EQUAL: partial(player.faster, 1),
-        _UP: partial(player.show, view.shown + 1),
-        _DOWN: partial(player.show, view.shown - 1),
-        _PAGE_UP: partial(player.neighbour, 1),
-        _PAGE_DOWN: partial(player.neighbour, -1),
-        _HOME: partial(player.choose_knob, -1),
-        _END: partial(player.choose_knob, 1),
-        _INSERT: partial(player.turn_knob, 1),
-        _DELETE: partial(player.turn_knob, -1),
-    }
-    if code in asked:
-        player.ask(asked[code])
+def press(playback: Playback, code: int) -> None:
+    """Submit the request that belongs to a key."""
+    if code in _REQUESTS:
+        playback.submit(playback.requests()[_REQUESTS[code]])
 
 
 def captions(view: View) -> tuple[str, str]:
@@ -134,28 +118,14 @@ def _require_windows() -> None:
     glfw.destroy_window(window)
 
 
-def _loop(window: Any, player: Player, crowd: Crowd, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    before, read = time.perf_counter(), 0.0
-    while window.is_running():
-        now = time.perf_counter()
-        if now - read > _REREAD:
-            player.reread()
-            read = now
-        player.advance(now - before)
-        before = now
-        _draw(window, player, crowd, model, data)
-        player.push(_forces(window, model, data))
-        time.sleep(max(0.0, _FRAME - (time.perf_counter() - now)))
-
-
-def _draw(window: Any, player: Player, crowd: Crowd, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+def _draw(window: Any, playback: Playback, env_grid: EnvGrid, model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Copy the environment that is to be shown into what the window looks at."""
-    _, now = player.env.world(player.shown)
+    _, now = playback.env.world(playback.shown)
     with window.lock():
         mujoco.mj_copyData(data, model, now)
         window.user_scn.ngeom = 0
-        crowd.add(window.user_scn, player.shown, window.opt)
-    names, values = captions(player.view)
+        env_grid.add(window.user_scn, playback.shown, window.opt)
+    names, values = captions(playback.view)
     window.set_texts((mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos.mjGRID_TOPLEFT, names, values))
     window.sync()
 

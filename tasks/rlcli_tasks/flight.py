@@ -48,7 +48,7 @@ class FlightTask(DirectTask):
     def reset(self, selection: Selection) -> None:
         """About the default position, level and at rest; the episode's targets are drawn."""
         offset, phases = self.params.start_offset, self.targets.shape[1]
-        default = selection.peek(self.robot.data.default_root_state)
+        default = selection.read_view(self.robot.data.default_root_state)
         self.robot.write_root_pose(
             selection, default[:, :3] + selection.uniform(-offset, offset, (3,)), default[:, 3:7]
         )

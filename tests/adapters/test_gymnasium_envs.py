@@ -7,7 +7,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
-from worlds import PENDULUM, PENDULUM_TASK, write
+from support.worlds import PENDULUM, PENDULUM_TASK, write
 
 import rlcli.gym
 from rlcli.adapters.gymnasium import GymnasiumEnv, open_task

@@ -5,7 +5,7 @@ import torch
 
 from rlcli.adapters.rsl_rl import RslRlVecEnv
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task
 
 CRITIC = "observations.critic={x: {func: joint_pos}, torque: {func: last_action}}"
@@ -26,7 +26,9 @@ def test_sizes_and_groups_are_those_of_the_task(vec):
     assert (vec.num_envs, vec.num_actions, vec.max_episode_length) == (3, 1, 6)
     obs = vec.get_observations()
     assert {group: tuple(values.shape) for group, values in obs.items()} == {"policy": (3, 4), "critic": (3, 3)}
-    assert {group: values.shape for group, values in vec.blank().items()} == {k: v.shape for k, v in obs.items()}
+    assert {group: values.shape for group, values in vec.zero_observations().items()} == {
+        k: v.shape for k, v in obs.items()
+    }
 
 
 def test_looking_twice_starts_one_episode(vec):

@@ -8,7 +8,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from rlcli.adapters.sb3 import Sb3VecEnv, make_sb3
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task
 
 

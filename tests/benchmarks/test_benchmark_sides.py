@@ -17,7 +17,7 @@ import sides  # noqa: E402
 from plain_cartpole import PlainCartpole  # noqa: E402
 
 from rlcli.config.load import resolve  # noqa: E402
-from rlcli.envs.vec_env import make_env  # noqa: E402
+from rlcli.envs.make import make_env  # noqa: E402
 from rlcli.registry import find_task  # noqa: E402
 
 CHILD = f"""

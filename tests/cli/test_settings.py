@@ -9,11 +9,12 @@ import typing
 
 import pytest
 
-from rlcli.cli import viewing
-from rlcli.config.preferences import UserSettings
-from rlcli.config.settings import applied, read_settings, settings_file
-from rlcli.rl.loggers import LOGGERS
-from rlcli.rl.run import default_runs_dir
+from rlcli.cli.ui import viewer_choice
+from rlcli.config.settings_file import read_settings
+from rlcli.config.settings_schema import UserSettings
+from rlcli.runs.run_ref import default_runs_dir
+from rlcli.settings import applied, settings_file
+from rlcli.training.loggers import LOGGERS
 
 
 @pytest.fixture
@@ -72,7 +73,7 @@ def test_quiet_and_verbose_are_settings_that_a_flag_turns_round(
     settings, in_process, monkeypatch, verbosity, flags, loud
 ):
     settings(f"verbosity: {verbosity}\n")
-    monkeypatch.setattr("rlcli.cli.validate.tell_notes", lambda _: viewing.console.detail("a detail"))
+    monkeypatch.setattr("rlcli.cli.commands.validate.log_notes", lambda _: viewer_choice.console.detail("a detail"))
     code, _, err = in_process("validate", "cartpole", *flags)
     assert code == 0
     assert ("a detail" in err) == loud
@@ -82,7 +83,7 @@ def test_a_preferred_viewer_is_opened_only_where_play_may_choose(monkeypatch):
     monkeypatch.setattr("rlcli.sim.gl.has_display", lambda: False)
 
     def first(viewer, port=None, headless=False):
-        return viewing.choose_viewers(viewer, port, headless=headless)[0][0]
+        return viewer_choice.choose_viewers(viewer, port, headless=headless)[0][0]
 
     with applied({"viewer": "web"}):
         assert first(None) == "web"
@@ -167,7 +168,7 @@ def test_what_can_be_set_is_what_the_flags_take():
     def choices(field):
         return set(typing.get_args(UserSettings.model_fields[field].annotation))
 
-    assert choices("viewer") == set(viewing.VIEWERS)
+    assert choices("viewer") == set(viewer_choice.CHOICES)
     for name in (*LOGGERS, "none"):
         UserSettings(loggers=[name])
     assert not {"tasks", "agent", "device", "seed"} & set(UserSettings.model_fields)

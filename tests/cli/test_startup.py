@@ -38,7 +38,9 @@ def test_a_command_that_computes_nothing_imports_nothing_that_does(words, unwant
 
 
 def test_a_command_imports_no_other_command(tmp_path):
-    assert imported(["runs", "--runs-dir", str(tmp_path)], {"rlcli.cli.train", "rlcli.cli.sweep"})[:2] == (0, [])
+    assert imported(["runs", "--runs-dir", str(tmp_path)], {"rlcli.cli.commands.train", "rlcli.cli.commands.sweep"})[
+        :2
+    ] == (0, [])
 
 
 @pytest.mark.slow

@@ -228,7 +228,7 @@ def test_a_term_that_raises_is_named_with_its_line_and_is_no_bug_of_rlcli(in_pro
 
 
 def test_what_rlcli_itself_raises_is_a_bug_with_its_traceback(in_process, monkeypatch):
-    monkeypatch.setattr("rlcli.cli.validate.find_task", None)
+    monkeypatch.setattr("rlcli.cli.commands.validate.task_source", None)
     code, _, err = in_process("validate", "--deep", "cartpole")
     assert code == 1
     assert "this is a bug in rlcli: TypeError" in err

@@ -3,7 +3,7 @@
 import textwrap
 
 import pytest
-from small_task import MODEL, TASK
+from support.small_task import MODEL, TASK
 
 from rlcli.config.load import resolve
 from rlcli.errors import ConfigError

@@ -1,7 +1,7 @@
 """Which agent is chosen, what addresses it, and what a task must have: each in its own words."""
 
 import pytest
-from small_task import TASK
+from support.small_task import TASK
 
 from rlcli.config.load import agent_names, check_all, extensions, resolve, term_entries
 from rlcli.errors import ConfigError, TaskError
@@ -290,12 +290,12 @@ def test_the_agents_patch_is_applied_before_plays_and_after_the_task(task):
 
 
 def test_a_known_trainer_that_is_there_but_cannot_be_found_is_not_called_missing(task, monkeypatch):
-    from rlcli.config import load
+    from rlcli.config import validation
 
     def two(*_, **__):
         raise TaskError("two plugins have a trainer 'ppo'", hint="name one")
 
-    monkeypatch.setattr(load, "find_entry", two)
+    monkeypatch.setattr(validation, "find_entry", two)
     with pytest.raises(ConfigError, match=r"agents\.one\.trainer: two plugins have a trainer 'ppo'; name one"):
         resolve(task(TASK.replace("one: {trainer: sb3", "one: {trainer: ppo")))
 
@@ -303,9 +303,13 @@ def test_a_known_trainer_that_is_there_but_cannot_be_found_is_not_called_missing
 def test_a_trainer_of_a_newer_api_is_refused(task, monkeypatch):
     from dataclasses import replace
 
-    from rlcli.config import load
+    from rlcli.config import validation
 
-    real = load.load_entry
-    monkeypatch.setattr(load, "load_entry", lambda entry, kind: replace(real(entry, kind), api=load.API_VERSION + 1))
-    with pytest.raises(TaskError, match=rf"needs plugin API {load.API_VERSION + 1}; this rlcli has {load.API_VERSION}"):
+    real = validation.load_entry
+    monkeypatch.setattr(
+        validation, "load_entry", lambda entry, kind: replace(real(entry, kind), api=validation.API_VERSION + 1)
+    )
+    with pytest.raises(
+        TaskError, match=rf"needs plugin API {validation.API_VERSION + 1}; this rlcli has {validation.API_VERSION}"
+    ):
         resolve(task())

@@ -7,7 +7,7 @@ import pytest
 import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from small_task import TASK
+from support.small_task import TASK
 
 from rlcli.config import strict_yaml
 from rlcli.config.dump import json_schema, origins, to_data, to_yaml, to_yaml_with_origins

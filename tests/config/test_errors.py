@@ -1,7 +1,7 @@
 """Mistakes in a configuration: all at once, each with its place, what is allowed and the nearest right thing."""
 
 import pytest
-from small_task import TASK
+from support.small_task import TASK
 
 from rlcli.config.load import check_all, resolve
 from rlcli.errors import ConfigError, DependencyError

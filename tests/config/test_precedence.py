@@ -4,7 +4,7 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from small_task import TASK
+from support.small_task import TASK
 
 from rlcli.config.layers import parse_override
 from rlcli.config.load import resolve

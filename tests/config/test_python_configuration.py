@@ -11,7 +11,7 @@ import torch
 
 from rlcli.config.dump import to_data
 from rlcli.config.load import resolve
-from rlcli.config.python import source_of
+from rlcli.config.python_task import source_of
 from rlcli.config.schema import (
     ActionConfig,
     DomeLightConfig,
@@ -29,7 +29,7 @@ from rlcli.config.schema import (
     TerminationConfig,
     ViewerConfig,
 )
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError, TaskError
 from rlcli.mdp import rewards
 from rlcli.registry import find_task
@@ -236,7 +236,7 @@ def test_a_model_of_an_installed_task_is_named_by_that_task(root):
 @pytest.mark.slow
 def test_a_run_of_a_python_task_is_resumed_and_evaluated_from_its_folder(root):
     agent = (
-        'from rlcli.rl.ppo_config import PpoConfig\nTASK = cartpole(rewards={"own": RewardConfig(func=cart_vel,'
+        'from rlcli.rl.ppo.config import PpoConfig\nTASK = cartpole(rewards={"own": RewardConfig(func=cart_vel,'
         ' weight=-0.1)}, agents={"ppo": PpoConfig(trainer="ppo", algorithm="ppo", max_iterations=2)})\n'
     )
     write_task(root, agent)

@@ -5,12 +5,22 @@ import sys
 
 import pytest
 from pydantic import ValidationError
-from small_task import TASK
-from worlds import PENDULUM_TASK, build, edited, pendulum
+from support.small_task import TASK
+from support.worlds import PENDULUM_TASK, build, edited, pendulum
 
 from rlcli.config.load import resolve
-from rlcli.config.terms import SECTIONS, Vocabulary, builtin_terms, params_model, read_params, read_terms, snake_case
+from rlcli.config.terms import (
+    SECTIONS,
+    Vocabulary,
+    builtin_terms,
+    params_model,
+    read_params,
+    read_terms,
+    signature_of,
+    snake_case,
+)
 from rlcli.errors import ConfigError
+from rlcli.mdp.randomization.joints import RandomizeJointDamping
 
 OWN = TASK.replace(
     "near: {func: joint_pos_target_l2, weight: -1.0, joints: [slider], target: 0.0}", "near: {func: own, weight: 1.0}"
@@ -312,3 +322,65 @@ def test_a_class_has_the_parameters_of_a_base_in_the_same_file(tmp_path):
         ("Louder.", "gain", 2.0),
         ("Loudest.", "gain", 2.0),
     ]
+
+
+DATACLASSES = """
+from dataclasses import KW_ONLY, dataclass, field
+from typing import ClassVar
+
+@dataclass
+class _Near:
+    env: object
+    _: KW_ONLY
+    entity: Entity = "robot"
+    gain: float = 1.0
+    memory: ClassVar[int] = 3
+    drawn: list[float] = field(init=False)
+
+@dataclass(kw_only=True)
+class Nearer(_Near):
+    "Nearer."
+    axes: list[int] = field(default_factory=lambda: [2])
+    gain: float = 2.0
+
+class Nearest(Nearer):
+    "Nearest."
+    offset: float = 0.0
+
+@dataclass
+class Positional:
+    env: object
+    gain: float
+"""
+
+
+def test_the_fields_of_a_dataclass_are_its_parameters(tmp_path):
+    file = tmp_path / "terms.py"
+    file.write_text(DATACLASSES)
+    terms = read_terms(file)
+    assert sorted(terms) == ["nearer", "nearest", "positional"]
+    for name in ("nearer", "nearest"):
+        assert [(p.name, p.default) for p in terms[name].parameters] == [
+            ("entity", "robot"),
+            ("gain", 2.0),
+            ("axes", [2]),
+        ]
+    assert terms["positional"].error == "parameter 'gain' must be keyword-only: put it after a '*'"
+
+
+def test_a_class_has_the_parameters_of_a_base_in_rlcli_mdp(tmp_path):
+    file = tmp_path / "terms.py"
+    file.write_text(
+        "from rlcli.mdp.actions import JointEffort\nfrom rlcli.mdp.randomization import RandomizeBodyMass as Mass\n"
+        "from rlcli.envs.direct import DirectTask\n"
+        "class Louder(JointEffort):\n    'Louder.'\nclass Heavier(Mass):\n    'Heavier.'\nclass Own(DirectTask): ...\n"
+    )
+    terms = read_terms(file)
+    assert sorted(terms) == ["heavier", "louder"]
+    assert terms["louder"].parameters == builtin_terms("actions")["joint_effort"].parameters
+    assert terms["heavier"].parameters == builtin_terms("events")["randomize_body_mass"].parameters
+
+
+def test_a_term_given_as_a_class_has_the_parameters_that_it_inherits():
+    own, built_in = signature_of(RandomizeJointDamping, "damping"), builtin_terms("events")["randomize_joint_damping"]
+    assert own.parameters == built_in.parameters

@@ -10,7 +10,7 @@ import torch
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import CRITTER, CRITTER_TASK, build, clone, dump, write
+from support.worlds import CRITTER, CRITTER_TASK, build, clone, dump, write
 
 torch.set_num_threads(1)
 

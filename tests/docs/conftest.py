@@ -1,5 +1,5 @@
 import pytest
-from built_pages import Page, build
+from support.built_pages import Page, build
 
 
 @pytest.fixture(scope="session")

@@ -12,10 +12,10 @@ from functools import cache
 import pytest
 import torch
 import yaml
-from consoles import commands
-from fenced import REPOSITORY, Block, all_blocks, blocks, run_commands, shortened, write_files
-from worlds import CRITTER, CRITTER_TASK, edited, write
-from worlds import build as build_env
+from support.consoles import commands
+from support.fenced import REPOSITORY, Block, all_blocks, blocks, run_commands, shortened, write_files
+from support.worlds import CRITTER, CRITTER_TASK, edited, write
+from support.worlds import build as build_env
 
 from rlcli.cli.app import COMMANDS, GROUPS, build, main
 from rlcli.config.load import resolve
@@ -43,7 +43,7 @@ RUN_BY = {
     "exit-codes.md": "tests/docs/test_exit_codes_page.py::test_what_one_sees_is_what_the_page_says",
     "export.md": f"{HERE}::test_an_exported_file_is_used_as_the_page_says",
     "from-isaac-lab.md": f"{OF_PAGES}::test_the_examples_for_isaac_labs_users_train_as_written",
-    "from-omniisaacgymenvs.md": "tests/oige/test_oige_page.py::"
+    "from-omniisaacgymenvs.md": "plugins/rlcli-oige/tests/test_oige_page.py::"
     "test_the_example_validates_and_a_push_towards_the_middle_earns_more_than_none",
     "gpu.md: On a cluster": f"{HERE}::test_the_script_for_a_cluster_trains_and_goes_on_when_it_is_begun_again",
     "on-a-robot.md": "tests/docs/test_robot_page.py::test_the_loop_of_the_page_balances_the_pole_in_time",

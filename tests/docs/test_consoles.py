@@ -1,7 +1,7 @@
 """The comparison of transcripts notices what it should, and nothing else."""
 
 import pytest
-from consoles import commands, difference
+from support.consoles import commands, difference
 
 TABLE = "         MEAN    95 % INTERVAL\nsuccess  0.9950  0.9900 .. 0.9980\nlength   300\n"
 

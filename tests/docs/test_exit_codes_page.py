@@ -3,8 +3,8 @@
 import shlex
 
 import pytest
-from consoles import commands, difference
-from fenced import REPOSITORY, blocks
+from support.consoles import commands, difference
+from support.fenced import REPOSITORY, blocks
 
 from rlcli.cli.app import main
 

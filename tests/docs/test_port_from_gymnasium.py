@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from fenced import REPOSITORY, Block, blocks, run_commands, success_rate, write_files
+from support.fenced import REPOSITORY, Block, blocks, run_commands, success_rate, write_files
 
 PAGE = REPOSITORY / "docs" / "coming-from-gymnasium-and-sb3.md"
 

@@ -7,9 +7,9 @@ import subprocess
 import sys
 
 import pytest
-from consoles import Command, commands, difference
-from empty_environment import make, requirements_of_rlcli
-from fenced import REPOSITORY
+from support.consoles import Command, commands, difference
+from support.empty_environment import make, requirements_of_rlcli
+from support.fenced import REPOSITORY
 
 LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", "tests", "docs", ".*_cache", ".hypothesis")
 

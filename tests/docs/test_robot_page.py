@@ -4,7 +4,7 @@ import re
 import shutil
 
 import pytest
-from fenced import REPOSITORY, Block, blocks, run_commands, write_files
+from support.fenced import REPOSITORY, Block, blocks, run_commands, write_files
 
 PAGE = REPOSITORY / "docs" / "on-a-robot.md"
 

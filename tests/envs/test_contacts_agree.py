@@ -8,7 +8,7 @@ from collections import Counter
 import mujoco
 import pytest
 import torch
-from worlds import actions, build
+from support.worlds import actions, build
 
 N, STEPS = 16, 25
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl")

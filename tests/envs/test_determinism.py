@@ -1,7 +1,7 @@
 import pytest
 import torch
 import yaml
-from worlds import CRITTER_TASK, build, critter, dump, edited, life, run, same
+from support.worlds import CRITTER_TASK, build, critter, dump, edited, life, run, same
 
 TASKS = ["ant-direct", "cartpole", "cartpole-direct", "critter"]
 

@@ -5,7 +5,7 @@ import re
 
 import pytest
 import torch
-from worlds import CRITTER, PENDULUM, actions, build, clone, edited, run, write
+from support.worlds import CRITTER, PENDULUM, actions, build, clone, edited, run, write
 
 from rlcli.errors import ConfigError, TaskError
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from worlds import PENDULUM, build, clone, life, same, write
+from support.worlds import PENDULUM, build, clone, life, same, write
 
 CODE = '''
 import torch

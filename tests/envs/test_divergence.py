@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from worlds import PENDULUM, PENDULUM_TASK, build, clone, critter, edited, life, pendulum, same, write
+from support.worlds import PENDULUM, PENDULUM_TASK, build, clone, critter, edited, life, pendulum, same, write
 
 from rlcli.errors import DivergedError
 

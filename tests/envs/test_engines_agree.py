@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from worlds import actions, build, critter, pendulum
+from support.worlds import actions, build, critter, pendulum
 
 STEPS, N = 50, 8
 SHORT = {  # episodes end and begin within the run, by time

@@ -3,9 +3,9 @@
 import pytest
 import torch
 import yaml
-from worlds import CRITTER, CRITTER_TASK, build, dump, write
+from support.worlds import CRITTER, CRITTER_TASK, build, dump, write
 
-from rlcli.testing.host import HostReadError, NoHost
+from rlcli.testing.host_sync import HostSyncError, HostSyncGuard
 
 
 def every_term():
@@ -80,7 +80,7 @@ def watched_steps(env, steps):
     env.reset()
     env.step(action)
     ended = torch.zeros((), dtype=torch.int64)
-    with NoHost():
+    with HostSyncGuard():
         for _ in range(steps):
             ended += env.step(action).episodes.mask.sum()
     env.check()
@@ -98,7 +98,7 @@ def test_a_step_of_a_task_with_every_kind_of_term_reads_nothing_back(tmp_path):
     env = build(folder, 4, "episode_length_s=0.1", "sim.forces_after_reset=true")
     assert watched_steps(env, 14) >= 4
     env.engine.field("qvel")[1, 0] = torch.nan
-    with NoHost():
+    with HostSyncGuard():
         result = env.step(torch.zeros(4, env.layout.action_size))
     assert result.terminated[1]
     assert env.divergences == 1
@@ -132,5 +132,5 @@ def sensed(env, *, feet: ContactSensor = "feet", scan: RaySensor = "scan"):
 def test_the_detector_sees_a_mask_and_a_number_read_back():
     values = torch.arange(4.0)
     for reading in (lambda: values[values > 1], lambda: float(values.sum()), lambda: (values > 1).nonzero()):
-        with pytest.raises(HostReadError), NoHost():
+        with pytest.raises(HostSyncError), HostSyncGuard():
             reading()

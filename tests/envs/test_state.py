@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from worlds import CRITTER_TASK, actions, build, clone, critter, edited, life, same
+from support.worlds import CRITTER_TASK, actions, build, clone, critter, edited, life, same
 
 TASKS = ["ant-direct", "cartpole", "cartpole-direct", "critter"]
 

@@ -4,10 +4,10 @@ import itertools
 
 import pytest
 import torch
-from worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, edited, pendulum, run
+from support.worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, edited, pendulum, run
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.errors import DeviceError
 from rlcli.registry import find_task
 
@@ -35,7 +35,7 @@ def explosive(env) -> torch.Tensor:
 
 def note(env, selection, *, tag: str) -> None:
     """Remember who fired when."""
-    env.notes = [*getattr(env, "notes", []), (tag, env.common_step, selection.read(env._ids).tolist())]
+    env.notes = [*getattr(env, "notes", []), (tag, env.common_step, selection.read(env._counters.ids).tolist())]
 
 
 def angle_row(env, *, entity: Entity = "robot") -> torch.Tensor:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import torch
-from worlds import build, write
+from support.worlds import build, write
 
 import rlcli_tasks.cartpole
 

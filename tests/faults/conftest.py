@@ -1,7 +1,7 @@
 """What the suites of faults share."""
 
 import pytest
-from children import warm_parent
+from support.child_processes import warm_parent
 
 
 @pytest.fixture(scope="session")

@@ -7,15 +7,15 @@ import shutil
 import pytest
 import safetensors.torch
 import torch
-from bad_checkpoints import PLAYED, Bomb, Case, forged, named, setting
-from fault_sizes import amount, chosen
-from saved_states import rehash
+from support.bad_checkpoints import PLAYED, Bomb, Case, forged, named, setting
+from support.fault_sizes import amount, chosen
+from support.saved_states import rehash
 from test_bad_checkpoints import command, limited, look
 
 from rlcli.cli.app import main
 from rlcli.errors import CheckpointError
 from rlcli.registry import find_task
-from rlcli.rl.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint import open_checkpoint
 
 HELD = ("manifest.json", "policy.json", "policy.safetensors")
 

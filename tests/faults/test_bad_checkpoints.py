@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from bad_checkpoints import Bomb, Case, cut_and_flipped, forged, named
-from fault_sizes import amount, chosen
+from support.bad_checkpoints import Bomb, Case, cut_and_flipped, forged, named
+from support.fault_sizes import amount, chosen
 
 from rlcli.cli.app import main
 from rlcli.errors import CheckpointError
-from rlcli.rl.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint import open_checkpoint
 
 SMALL = ("scene.num_envs=8", "sim.engine_threads=1", "agent.torch_threads=1", "--logger", "none", "-q")
 SAC = """
@@ -110,7 +110,7 @@ LIMITED = f"""
 import resource, sys
 from pathlib import Path
 import torch
-import rlcli.cli.export, rlcli.cli.play, rlcli.cli.train, rlcli.rl.load
+import rlcli.cli.commands.export, rlcli.cli.commands.play, rlcli.cli.commands.train, rlcli.runs.restore
 from rlcli.cli.app import main
 
 pages = int(Path("/proc/self/statm").read_text().split()[0])

@@ -6,8 +6,8 @@ import random
 from typing import Annotated, Any, get_args
 
 import pytest
-from fault_sizes import amount, chosen
 from pydantic import BaseModel, TypeAdapter, ValidationError
+from support.fault_sizes import amount, chosen
 
 from rlcli.cli.app import main
 from rlcli.config import strict_yaml

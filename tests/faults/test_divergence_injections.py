@@ -4,22 +4,23 @@ import math
 
 import pytest
 import torch
-from diverging_worlds import FAULTS, PLAIN_TASK, WHO, N, faults, lives, machine, pair, untouched
-from fault_sizes import chosen
-from worlds import build, clone
+from support.diverging_worlds import FAULTS, PLAIN_TASK, WHO, N, faults, lives, machine, pair, untouched
+from support.fault_sizes import chosen
+from support.worlds import build, clone
 
 from rlcli.errors import DivergedError
-from rlcli.rl.dump import Watch, read_dump, replay_dump
+from rlcli.replay.crash_dump import CrashDumper
+from rlcli.replay.resimulate import replay_calls
+from rlcli.replay.trajectory import read_trajectory
 
 CASES = [(name, who) for name in FAULTS for who in WHO]
 
 
 @pytest.mark.parametrize(("name", "who"), chosen(CASES, 14))
-def test_a_simulation_that_goes_wrong_is_found_named_dumped_and_kept_from_the_others(tmp_path, name, who):
+def test_a_simulation_that_goes_wrong_is_found_named_dumped_and_kept_from_the_others(tmp_path, caplog, name, who):
     fault = FAULTS[name]
     sound, sick = pair(tmp_path, fault)
-    said = []
-    Watch(sick, tmp_path / "dumps", said.append)
+    CrashDumper(sick, tmp_path / "dumps")
     before = lives((sound, sick), 4, seed=1)
     assert untouched(before, ())
     fault.strike(sick, [who])
@@ -43,29 +44,28 @@ def test_a_simulation_that_goes_wrong_is_found_named_dumped_and_kept_from_the_ot
     assert sick.extras() == {f"Sim/diverged/{fault.cause.replace(' ', '_')}": 1.0}
     assert sick.extras() == {}, "counted since the last call"
 
-    (message,) = said
+    (message,) = caplog.messages
     assert f"environment {who}: {fault.cause}" in message
     assert fault.detail in message
     (file,) = (tmp_path / "dumps").iterdir()
     assert f"rlcli replay {file}" in message
-    dump = read_dump(file)
-    (life,) = dump.document.lives
-    assert (life.env, life.cause) == (who, fault.cause)
-    replayed = replay_dump(dump)
+    dump = read_trajectory(file)
+    (world,) = dump.header.worlds
+    assert (world.env, world.cause) == (who, fault.cause)
+    replayed = replay_calls(dump)
     assert replayed.difference is None
     assert replayed.same_model
     assert replayed.compared >= (1 if name == "reset writes nan" or fault.expands else 3)
-    assert replayed.where[who] == life.where
-    assert life.where is not None
-    assert life.where.call >= life.first
+    assert replayed.diverged_at[who] == world.diverged_at
+    assert world.diverged_at is not None
+    assert world.diverged_at.call >= world.first
 
 
 @pytest.mark.parametrize("name", ["nan qpos", "nan ctrl", "engine error", "reset writes nan", "nan timestep"])
-def test_all_environments_that_go_wrong_at_once_end_and_begin_anew(tmp_path, name):
+def test_all_environments_that_go_wrong_at_once_end_and_begin_anew(tmp_path, caplog, name):
     fault = FAULTS[name]
     _, env = pair(tmp_path, fault)
-    said = []
-    Watch(env, tmp_path / "dumps", said.append)
+    CrashDumper(env, tmp_path / "dumps")
     env.step(torch.zeros(N, 2))
     fault.strike(env, range(N))
     result = env.step(torch.zeros(N, 2))
@@ -77,10 +77,10 @@ def test_all_environments_that_go_wrong_at_once_end_and_begin_anew(tmp_path, nam
     assert result.reward.isfinite().all()
     assert not env.step(torch.zeros(N, 2)).terminated.any()
     (file,) = (tmp_path / "dumps").iterdir()
-    dump = read_dump(file)
-    assert [life.env for life in dump.document.lives] == [0, 1, 2, 3]
-    assert replay_dump(dump).difference is None
-    assert len(said) == 1
+    dump = read_trajectory(file)
+    assert [world.env for world in dump.header.worlds] == [0, 1, 2, 3]
+    assert replay_calls(dump).difference is None
+    assert len(caplog.messages) == 1
 
 
 TERMS = {
@@ -149,7 +149,7 @@ def test_what_is_set_aside_survives_a_checkpoint(tmp_path):
 
 
 @pytest.mark.slow  # compiles kernels
-def test_the_guard_of_warp_names_environment_and_cause(tmp_path):
+def test_the_guard_of_warp_names_environment_and_cause(tmp_path, caplog):
     pytest.importorskip("mujoco_warp")
     task = machine(tmp_path, PLAIN_TASK)
     for who, field, column, value, cause in (
@@ -159,8 +159,8 @@ def test_the_guard_of_warp_names_environment_and_cause(tmp_path):
     ):
         env = build(task, N, "sim.engine=warp")
         env.reset()
-        said = []
-        Watch(env, tmp_path / "dumps", said.append)
+        caplog.clear()
+        CrashDumper(env, tmp_path / "dumps")
         env.step(torch.zeros(N, env.layout.action_size))
         env.engine.field(field)[who, column] = value
         result = env.step(torch.zeros(N, env.layout.action_size))
@@ -168,6 +168,6 @@ def test_the_guard_of_warp_names_environment_and_cause(tmp_path):
         assert result.reward.isfinite().all()
         assert env.causes == {cause: 1}
         env.check()
-        assert len(said) == 1
-        assert f"environment {who}: {cause} (joint 'robot/" in said[0]
+        assert len(caplog.messages) == 1
+        assert f"environment {who}: {cause} (joint 'robot/" in caplog.messages[0]
         assert not (tmp_path / "dumps").exists()

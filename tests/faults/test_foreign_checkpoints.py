@@ -16,22 +16,22 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
-from fault_sizes import amount, chosen
 from rsl_rl.modules import EmpiricalNormalization
 from rsl_rl.runners import OnPolicyRunner
 from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from support.fault_sizes import amount, chosen
 from tensordict import TensorDict
 
 from rlcli.adapters.rsl_rl import RslRlVecEnv
 from rlcli.cli.app import main
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.errors import CheckpointError
 from rlcli.registry import find_task
-from rlcli.rl.checkpoint import open_checkpoint
-from rlcli.rl.foreign import read_rsl_rl, read_sb3
 from rlcli.rl.policy import load_policy
+from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.training.import_checkpoint import read_rsl_rl, read_sb3
 
 ALGORITHMS = {"ppo": PPO, "a2c": A2C, "sac": SAC, "td3": TD3}
 OBSERVATIONS = 4
@@ -558,7 +558,7 @@ def test_what_is_no_plain_matrix_of_numbers_is_refused(name, form):
 
 
 def test_many_names_for_one_tensor_do_not_fill_the_memory(monkeypatch):
-    monkeypatch.setattr("rlcli.rl.foreign.memory", lambda: 2**26)
+    monkeypatch.setattr("rlcli.training.import_checkpoint.memory", lambda: 2**26)
     one = torch.zeros(1000, 1000)
     torch.save({"model_state_dict": {f"actor.{i}.weight": one for i in range(50)}}, "model.pt")
     assert "more than" in refused("rsl-rl", "model.pt")

@@ -2,10 +2,10 @@
 
 from itertools import product
 
-import golden_trajectories as golden
 import pytest
+import support.golden_trajectories as golden
 import torch
-from fault_sizes import chosen
+from support.fault_sizes import chosen
 
 
 @pytest.fixture(autouse=True)

@@ -11,13 +11,13 @@ import time
 from pathlib import Path
 
 import pytest
-from children import SMALL
-from fault_points import KILLED_AT
-from fault_sizes import SIZE, amount, chosen
-from run_comparison import assert_loads, assert_same_run, newest
+from support.child_processes import SMALL
+from support.fault_points import KILLED_AT
+from support.fault_sizes import SIZE, amount, chosen
+from support.run_comparison import assert_loads, assert_same_run, newest
 
-from rlcli.rl.checkpoint import steps
-from rlcli.rl.dump import read_dump
+from rlcli.replay.trajectory import read_trajectory
+from rlcli.runs.checkpoint import steps
 
 SAC = """
 agents:
@@ -127,11 +127,12 @@ def test_a_run_killed_at_this_moment_goes_on_as_if_it_had_not_been(child, whole,
 
 def terminated(run):
     """The episodes of a run that a termination ended, as they were kept."""
-    documents = [read_dump(file).document for file in (run / "autopsy").glob("*.safetensors")]
+    headers = [read_trajectory(file).header for file in (run / "autopsy").glob("*.safetensors")]
     return sorted(
-        (d.ending.step, d.lives[0].env, d.ending.episode, d.ending.length, d.ending.total_reward)
-        for d in documents
-        if d.ending.kind == "terminated"
+        (header.failure.step, e.env, e.index, e.length, e.total_reward)
+        for header in headers
+        for e in header.episodes
+        if header.failure.kind == "terminated"
     )
 
 
@@ -146,7 +147,7 @@ def test_a_run_killed_while_it_writes_kept_episodes_has_each_once_and_whole(chil
         runs.append(run_in(tmp_path / name))
     whole, killed = runs
     for file in (killed / "autopsy").glob("*.safetensors"):
-        read_dump(file)  # also before anything is cleaned away
+        read_trajectory(file)  # also before anything is cleaned away
     resumed = child(tmp_path / "killed", "train", "--resume", "latest", "-q").ended()
     assert resumed.code == 0, resumed.err
     assert_same_run(killed, whole)

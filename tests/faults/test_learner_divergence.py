@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
-from diverging_worlds import LEARNERS, LEARNING_TASK, WHO, N, faults, machine
-from fault_sizes import chosen
+from support.diverging_worlds import LEARNERS, LEARNING_TASK, WHO, N, faults, machine
+from support.fault_sizes import chosen
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.errors import DivergedError
 from rlcli.registry import find_task, load_object
 
@@ -54,7 +54,7 @@ def poison(trainer, what, where):
     """Bring one value about that is not finite; gives what the message must name."""
     with torch.no_grad():
         if what == "normaliser":
-            trainer.normalizer.var[at(range(4), where)] = math.nan
+            getattr(trainer, "collector", trainer).normalizer.var[at(range(4), where)] = math.nan
             return "the observation normaliser's var"
         if what in ("actor weight", "critic weight"):
             name, parameter = at(parameters(trainer, what.split()[0]), where)
@@ -71,18 +71,19 @@ def poison(trainer, what, where):
             gradient.view(-1)[at(range(gradient.numel()), where)] = math.nan
             return gradient
 
-        written = getattr(trainer, "_gradient_of", None)
-        if written is None:
+        if not hasattr(trainer, "learner"):
             parameter.register_hook(spoil)
             return f"the gradient of '{name}'"
 
-        def spoilt(*batch):  # of a gradient that is written out, no hook is told
-            judged = written(*batch)
-            place = parameter.storage_offset() + at(range(parameter.numel()), where)
-            trainer._gradient[place] = math.nan
-            return judged
+        learner, closed_form = trainer.learner, trainer.learner.minibatch_gradient
 
-        trainer._gradient_of = spoilt
+        def spoilt(*batch):  # a closed-form gradient calls no hook
+            result = closed_form(*batch)
+            place = parameter.storage_offset() + at(range(parameter.numel()), where)
+            learner.gradient[place] = math.nan
+            return result
+
+        learner.minibatch_gradient = spoilt
         return f"the gradient of '{name}'"
     if what == "advantage":  # rewards that are finite, and whose discounted sum is not
         who = {"first": WHO[0], "middle": WHO[1], "last": WHO[2]}[where]
@@ -91,7 +92,7 @@ def poison(trainer, what, where):
     assert what == "loss"
     if hasattr(trainer, "networks"):
         key = {"first": "value_coef", "middle": "entropy_coef", "last": "clip_range"}[where]
-        trainer.config = trainer.config.model_copy(update={key: math.nan})
+        trainer.learner.config = trainer.config.model_copy(update={key: math.nan})
         return "surrogate" if where == "last" else "the loss"
     if hasattr(trainer.model, "replay_buffer"):
         trainer.model.gamma = math.nan
@@ -134,7 +135,7 @@ def test_the_first_tensor_that_is_not_finite_is_named_in_its_iteration(tmp_path,
 def test_a_weight_that_a_step_makes_non_finite_is_named_where_the_gradients_are_finite(tmp_path, name):
     trainer = trainer_of(tmp_path, name)
     if name == "ppo":
-        trainer.learning_rate.fill_(math.inf)
+        trainer.learner.learning_rate.fill_(math.inf)
     else:
         trainer._set_learning_rate(math.inf)
     with pytest.raises(DivergedError, match=r"weight|learning rate"):

@@ -7,14 +7,14 @@ import re
 import shutil
 
 import pytest
-from children import SMALL
-from fault_sizes import chosen
-from run_comparison import assert_loads, assert_same_run, newest
+from support.child_processes import SMALL
+from support.fault_sizes import chosen
+from support.run_comparison import assert_loads, assert_same_run, newest
 
 from rlcli.errors import MachineError
-from rlcli.rl.checkpoint import steps
-from rlcli.rl.loggers import read_metrics
-from rlcli.rl.run import open_run
+from rlcli.runs.checkpoint import steps
+from rlcli.runs.run import open_run
+from rlcli.training.loggers import read_metrics
 
 AGENT = """
 agents:
@@ -120,7 +120,10 @@ def test_a_refusal_costs_nothing_that_was_saved(child, whole, folder, aim, call,
 def test_a_limit_on_the_size_of_files_is_met_as_a_full_disk_is(child, whole, folder, aim):
     """A real one: RLIMIT_FSIZE, under which writes come back short and then fail."""
     size = 6000 if aim == "checkpoint" else 1500
-    calls = {"checkpoint": "rlcli.rl.saving:write", "metrics": "rlcli.rl.loggers:JsonLines.write"}
+    calls = {
+        "checkpoint": "rlcli.training.checkpoint_writer:write_checkpoint",
+        "metrics": "rlcli.training.loggers:JsonLines.write",
+    }
     faults = [{"kind": "limit", "call": calls[aim], "pattern": "", "nth": 3, "code": str(size)}]
     ended = child(folder, *TRAIN, faults=faults).ended()
     assert_told(ended, "EFBIG", r"checkpoints/\d{12}" if aim == "checkpoint" else r"checkpoints/\d{12}|metrics\.jsonl")

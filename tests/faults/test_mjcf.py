@@ -6,17 +6,17 @@ import subprocess
 import sys
 import time
 
-import mjcf_mutants
 import pytest
-from fault_sizes import amount, chosen
+from support import mjcf_mutants
+from support.fault_sizes import amount, chosen
 
 from rlcli.cli.app import main
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError
 from rlcli.registry import folder_task
-from rlcli.sim import mjcf
-from rlcli.sim.mjcf import BadModel, read_mjcf
+from rlcli.scene import untrusted_mjcf
+from rlcli.scene.untrusted_mjcf import BadModel, read_mjcf
 
 TASK = """
 summary: A block.
@@ -202,7 +202,7 @@ def test_a_model_that_asks_for_much_is_compiled_under_limits_first(tmp_path, mon
     many = '<replicate count="6000" offset="1 0 0"><geom size="0.1"/></replicate>'
     file.write_text(model(body=many))
     assert len(read_mjcf(file, [tmp_path]).geoms) > 6_000  # much, and within the limits
-    monkeypatch.setattr(mjcf, "TIME_S", 1)
+    monkeypatch.setattr(untrusted_mjcf, "TIME_S", 1)
     file.write_text(model(body=many.replace("6000", "400000")))
     begin = time.perf_counter()
     with pytest.raises(BadModel, match=r"model\.xml: compiling it takes more than"):
@@ -213,9 +213,9 @@ def test_a_model_that_asks_for_much_is_compiled_under_limits_first(tmp_path, mon
 def test_a_machine_without_limits_still_reads_models(tmp_path, monkeypatch):
     file = tmp_path / "model.xml"
     file.write_text(model())
-    monkeypatch.setattr(mjcf, "MUCH", 0)
+    monkeypatch.setattr(untrusted_mjcf, "MUCH", 0)
     hidden = "import sys; sys.modules['resource'] = None\n"
-    monkeypatch.setattr(mjcf, "_APART", hidden + mjcf._APART)
+    monkeypatch.setattr(untrusted_mjcf, "_SUBPROCESS_CODE", hidden + untrusted_mjcf._SUBPROCESS_CODE)
     assert len(read_mjcf(file, [tmp_path]).geoms) == 1
 
 

@@ -7,8 +7,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from rlcli.deploy.export import require_self_contained
 from rlcli.errors import CheckpointError
-from rlcli.rl.export import require_self_contained
 
 
 def elsewhere(where):

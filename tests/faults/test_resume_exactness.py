@@ -7,13 +7,13 @@ from dataclasses import replace
 from itertools import product
 
 import pytest
-from fault_sizes import SIZE, chosen
-from run_comparison import content, leftovers, newest, rows_of
-from small_trainings import AGENTS, ITERATIONS, Case, train
+from support.fault_sizes import SIZE, chosen
+from support.run_comparison import content, leftovers, newest, rows_of
+from support.small_trainings import AGENTS, ITERATIONS, Case, train
 
-from rlcli.rl import train as loop
-from rlcli.rl.checkpoint import open_checkpoint, steps
-from rlcli.rl.saving import Keep
+from rlcli.runs.checkpoint import open_checkpoint, steps
+from rlcli.training import loop
+from rlcli.training.checkpoint_writer import Keep
 
 TASKS = ("everything", "cartpole-direct")
 CUTS = (1, 3, 7, "within")

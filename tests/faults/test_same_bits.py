@@ -10,8 +10,8 @@ from itertools import combinations_with_replacement, product
 import numpy as np
 import pytest
 import torch
-from fault_sizes import SIZE, amount, chosen
-from same_bits import ENVS, STEPS, TASKS, Life, against_plain_steps, live, make, other_work
+from support.fault_sizes import SIZE, amount, chosen
+from support.same_bits import ENVS, STEPS, TASKS, Life, against_plain_steps, live, make, other_work
 
 from rlcli.sim.selection import IdSelection
 
@@ -74,8 +74,8 @@ def test_a_partial_reset_is_the_same_in_any_order_and_in_any_parts(task, order, 
             life.step()
         env.episode_index[ids] += 1
         for group in groups:
-            env._restart(IdSelection(group, env.seed, env.episode_index.numpy()[group]))
-        env.sim.settle()
+            env._reset_envs(IdSelection(group, env.seed, env.episode_index.numpy()[group]))
+        env.sim.forward_moved()
         for _ in range(40):
             life.step()
         hashes.append(life.hashes())

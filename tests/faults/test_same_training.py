@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fault_sizes import amount, chosen
-from same_bits import TASKS, other_work, place_of
-from worlds import write
+from support.fault_sizes import amount, chosen
+from support.same_bits import TASKS, other_work, place_of
+from support.worlds import write
 
 import rlcli_tasks
 from rlcli.cli.app import main
 from rlcli.config import strict_yaml
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task, load_object
 
 OFF_POLICY = "train_freq: 4, gradient_steps: 3, learning_starts: 24, batch_size: 16, buffer_size: 256"

@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
-from children import SMALL
-from fault_sizes import chosen
-from run_comparison import assert_same_run, newest
+from support.child_processes import SMALL
+from support.fault_sizes import chosen
+from support.run_comparison import assert_same_run, newest
 
 import rlcli_tasks.cartpole
 

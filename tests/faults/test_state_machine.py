@@ -6,13 +6,13 @@ import math
 import mujoco
 import numpy as np
 import torch
-from fault_sizes import amount
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from support.fault_sizes import amount
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task
 
 N, LENGTH = 4, 9
@@ -90,7 +90,7 @@ class Lives(RuleBasedStateMachine):
         self._step(pushes, torch.tensor(mask))
 
     def _step(self, pushes, mask):
-        result = self.env.step(torch.tensor(pushes)[:, None], begin=mask)
+        result = self.env.step(torch.tensor(pushes)[:, None], restart=mask)
         self.obs = result.obs["policy"].clone()
         ended, again = [], []
         for i, reference in enumerate(self.references):

@@ -10,9 +10,9 @@ import time
 from types import SimpleNamespace
 
 import pytest
-import strangers
 import torch
-from fault_sizes import chosen
+from support import hostile_runs
+from support.fault_sizes import chosen
 
 from rlcli.cli.app import COMMANDS, GROUPS, main
 
@@ -45,7 +45,7 @@ def good(tmp_path_factory):
 
 @pytest.fixture
 def at(tmp_path, good, monkeypatch):
-    place = strangers.place(tmp_path, good.run)
+    place = hostile_runs.place(tmp_path, good.run)
     monkeypatch.chdir(place.cwd)
     return place
 
@@ -102,13 +102,13 @@ def refused(said, codes, *words):
     assert said.took < 20, said.took
 
 
-ATTACKS = [(kind, name) for kind in ("CODE", "RECORD") for name in getattr(strangers, kind)]
+ATTACKS = [(kind, name) for kind in ("CODE", "RECORD") for name in getattr(hostile_runs, kind)]
 
 
 @pytest.mark.parametrize(("kind", "name"), chosen(ATTACKS, 10))
 def test_what_a_stranger_names_is_not_run_and_a_message_says_so(kind, name, at, good, cli):
-    getattr(strangers, kind)[name](at)
-    before = strangers.outside(at)
+    getattr(hostile_runs, kind)[name](at)
+    before = hostile_runs.outside(at)
     for command, line in commands(at.run, good.run).items():
         said = cli(*line)
         if command == "play latest":
@@ -125,12 +125,12 @@ def test_what_a_stranger_names_is_not_run_and_a_message_says_so(kind, name, at, 
     for line in reading(at.run, good.run).values():
         assert cli(*line).code in (0, 2, 3, 4, 5, 9, 10)
     assert not at.canary.exists()
-    assert {name: held for name, held in strangers.outside(at).items() if name in before} == before
+    assert {name: held for name, held in hostile_runs.outside(at).items() if name in before} == before
 
 
-@pytest.mark.parametrize("name", chosen(list(strangers.CONFIG), 4))
+@pytest.mark.parametrize("name", chosen(list(hostile_runs.CONFIG), 4))
 def test_a_strangers_configuration_reaches_nothing_but_what_is_installed(name, at, good, cli):
-    strangers.CONFIG[name](at)
+    hostile_runs.CONFIG[name](at)
     for command, line in commands(at.run, good.run).items():
         line = [word for word in line if "num_envs" not in str(word)] if "billion" in name else line
         codes = (3, 5, 9) if command == "reproduce" else (3, 5)  # 9: it is not what the record says
@@ -140,14 +140,14 @@ def test_a_strangers_configuration_reaches_nothing_but_what_is_installed(name, a
     assert not at.canary.exists()
 
 
-@pytest.mark.parametrize("name", chosen(list(strangers.LINKS), 2))
+@pytest.mark.parametrize("name", chosen(list(hostile_runs.LINKS), 2))
 def test_nothing_outside_a_strangers_run_is_written_or_removed(name, at, good, cli):
-    strangers.LINKS[name](at)
-    before = strangers.outside(at)
+    hostile_runs.LINKS[name](at)
+    before = hostile_runs.outside(at)
     refused(cli("train", "--resume", at.run, "--max-iterations", "2"), (5,), "stranger")
     for line in ({**commands(at.run, good.run), **reading(at.run, good.run)}).values():
         assert cli(*line).code in (0, 2, 3, 4, 5, 9, 10)
-    after = strangers.outside(at)
+    after = hostile_runs.outside(at)
     assert {file: after.get(file) for file in before} == before
     new = {file for file in after if file not in before and "/stranger" not in file}
     assert not {file for file in new if "victim" in file}, new
@@ -160,7 +160,7 @@ def test_a_planted_link_is_not_what_a_video_or_an_export_is_written_through(part
     (at.run / part).mkdir(exist_ok=True)
     step = max((at.run / "checkpoints").glob("0*")).name
     (at.run / part / {"videos": f"{step}.gif", "exports": "policy.pt2"}[part]).symlink_to(victim)
-    strangers.link(at.run / part, at.cwd)
+    hostile_runs.link(at.run / part, at.cwd)
     line = ["export", "--checkpoint", at.run, "--format", "torch"]
     refused(cli(*(line if command == "export" else ["play", "--checkpoint", at.run, "--video"])), (5,), part)
     assert victim.read_text() == "kept"
@@ -192,7 +192,7 @@ def forge(file, changes, at):
     from safetensors import safe_open
     from safetensors.torch import save
 
-    from rlcli.rl.recording import content_digest
+    from rlcli.replay.trajectory import content_digest
 
     with safe_open(file, "pt") as opened:
         document = json.loads(opened.metadata()["rlcli"])
@@ -222,16 +222,18 @@ def test_a_strangers_recording_runs_nothing(name, at, good, cli):
 @pytest.mark.parametrize("kind", ["a pipe", "a device", "a folder"])
 def test_what_is_no_file_is_no_recording(kind, at, cli):
     file = at.cwd / "recording"
-    {"a pipe": lambda: strangers.pipe(file), "a folder": file.mkdir, "a device": lambda: file.symlink_to("/dev/zero")}[
-        kind
-    ]()
+    {
+        "a pipe": lambda: hostile_runs.pipe(file),
+        "a folder": file.mkdir,
+        "a device": lambda: file.symlink_to("/dev/zero"),
+    }[kind]()
     refused(cli("replay", file), (5,), "recording")
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "policy.json", "policy.safetensors"])
 def test_a_pipe_in_place_of_a_checkpoints_file_is_not_waited_for(name, at, good, cli):
     for folder in (at.run / "checkpoints").glob("0*"):
-        strangers.pipe(folder / name)
+        hostile_runs.pipe(folder / name)
     for command, line in commands(at.run, good.run).items():
         if command != "reproduce":  # which needs no checkpoint
             refused(cli(*line), (5,))
@@ -242,7 +244,7 @@ def test_modules_in_the_current_folder_are_not_imported(at, good):
     """A fresh process in the stranger's folder, with modules of well-known names and a plugin's metadata beside it."""
     shutil.copytree(at.evil, at.run, dirs_exist_ok=True)
     for name in ("yaml", "torch", "numpy", "typer", "json", "pydantic", "rlcli_tasks", "stable_baselines3", "evil"):
-        (at.run / f"{name}.py").write_text(strangers.code(at.canary))
+        (at.run / f"{name}.py").write_text(hostile_runs.code(at.canary))
     metadata = at.run / "evil-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Name: evil\nVersion: 1.0\n")
@@ -277,7 +279,7 @@ def own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "mine"
     folder.mkdir()
-    for name, text in (("task.yaml", TASK), ("terms.py", TERMS), ("model.xml", strangers.MODEL)):
+    for name, text in (("task.yaml", TASK), ("terms.py", TERMS), ("model.xml", hostile_runs.MODEL)):
         (folder / name).write_text(text)
     return folder
 
@@ -303,13 +305,13 @@ def test_a_task_that_was_trained_here_plays_at_once_and_elsewhere_once_it_was_na
 
 
 def test_naming_an_installed_task_allows_no_folder_of_that_name(at, cli):
-    strangers.CODE["a folder"](at)
+    hostile_runs.CODE["a folder"](at)
     refused(cli("play", "cartpole", "--checkpoint", at.run, "--viewer", "none"), (5,), "you have not used")
     assert not at.canary.exists()
 
 
 def test_a_task_is_trusted_by_its_path_and_reference_and_not_beyond(own, cli, tmp_path):
-    from rlcli.rl.trust import is_known, named_task
+    from rlcli.runs.trusted_tasks import is_known, named_task
 
     (own / "task.py").write_text("TASK = None\n")
     (tmp_path / "link").symlink_to(own)

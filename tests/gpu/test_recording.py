@@ -4,11 +4,12 @@ import pytest
 import torch
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task
-from rlcli.rl.capture import Recording
-from rlcli.rl.ppo import PpoTrainer
-from rlcli.rl.ppo_loss import Parts
+from rlcli.rl.cuda_graph import Recording
+from rlcli.rl.ppo.gradient import AutogradGradient
+from rlcli.rl.ppo.loss import minibatch_loss
+from rlcli.rl.ppo.trainer import PpoTrainer
 
 pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU, and there is none here"),
@@ -51,9 +52,10 @@ def test_a_recorded_rollout_goes_on_like_an_eager_one(task):
             for action in actions:
                 obs.copy_(env.step(action).obs["policy"])
 
-        run = Recording(work, torch.device("cuda"), env.holders(), pytest.fail) if record else work
+        run = Recording(work, torch.device("cuda"), env.stateful_objects()) if record else work
         for _ in range(6):  # 48 steps, over an end of all episodes
             run()
+        assert not record or run.refusal is None
         finals.append(obs.cpu())
         env.check()
     torch.testing.assert_close(finals[0], finals[1], rtol=1e-2, atol=2e-2)
@@ -61,6 +63,10 @@ def test_a_recorded_rollout_goes_on_like_an_eager_one(task):
 
 def _generator():
     return torch.Generator("cuda").manual_seed(0)
+
+
+def warnings_in(caplog):
+    return [record.message for record in caplog.records if record.name.startswith("rlcli")]
 
 
 class Counter:
@@ -75,55 +81,56 @@ def test_what_is_bound_anew_is_carried_from_replay_to_replay():
     def work():
         holder.total = holder.total + 1.0
 
-    run = Recording(work, torch.device("cuda"), [holder], pytest.fail)
+    run = Recording(work, torch.device("cuda"), [holder])
     for _ in range(5):
         run()
+    assert run.refusal is None
     assert holder.total.item() == 5.0
 
 
-def test_work_that_waits_for_the_device_is_named_and_runs_as_it_is():
-    holder, said = Counter(), []
+def test_work_that_waits_for_the_device_is_named_and_runs_as_it_is(caplog):
+    holder = Counter()
 
     def work():
         if holder.total.item() < 100.0:
             holder.total += 1.0
 
-    run = Recording(work, torch.device("cuda"), [holder], said.append)
+    run = Recording(work, torch.device("cuda"), [holder])
     for _ in range(3):
         run()
     assert holder.total.item() == 3.0
-    assert len(said) == 1
-    assert "test_recording.py" in said[0]
+    (warning,) = warnings_in(caplog)
+    assert "test_recording.py" in warning
 
 
-def test_work_that_waits_in_its_first_run_alone_is_recorded():
-    holder, made, said = Counter(), [], []
+def test_work_that_waits_in_its_first_run_alone_is_recorded(caplog):
+    holder, made = Counter(), []
 
     def work():
         if not made:  # as a constant that is made when it is first asked for
             made.append(torch.tensor(2.0, device="cuda"))
         holder.total += made[0]
 
-    run = Recording(work, torch.device("cuda"), [holder], said.append)
+    run = Recording(work, torch.device("cuda"), [holder])
     for _ in range(5):
         run()
     assert holder.total.item() == 10.0
-    assert said == []
+    assert not warnings_in(caplog)
     assert run._graph is not None
 
 
-def test_a_number_that_changes_from_step_to_step_is_named():
-    holder, said = Counter(), []
+def test_a_number_that_changes_from_step_to_step_is_named(caplog):
+    holder = Counter()
 
     def work():
         holder.steps += 1
         holder.total += holder.steps
 
-    run = Recording(work, torch.device("cuda"), [holder], said.append)
+    run = Recording(work, torch.device("cuda"), [holder])
     for _ in range(3):
         run()
     assert holder.total.item() == 6.0
-    assert "Counter.steps" in said[0]
+    assert "Counter.steps" in warnings_in(caplog)[0]
 
 
 def trainer_of(**settings):
@@ -138,10 +145,10 @@ def trainer_of(**settings):
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-def test_training_records_rollout_and_update(compiled):
+def test_training_records_rollout_and_update(compiled, caplog):
     trainer = trainer_of(**{"agent.compile": compiled})
     reports = [trainer.iterate() for _ in range(8)]
-    assert not any(report.notes for report in reports)
+    assert not warnings_in(caplog)
     assert all(report.metrics["Loss/learning_rate"] > 0 for report in reports)
     state = trainer.state()
     trainer.load(state)
@@ -152,23 +159,25 @@ def test_training_records_rollout_and_update(compiled):
 def test_a_compiled_minibatch_gives_the_gradient_of_the_plain_one():
     trainer = trainer_of(**{"agent.compile": True, "agent.tf32": False})
     trainer.iterate()
-    trainer._roll_out()
-    trainer._estimate_advantages()
-    trainer._rollout.arrange(trainer._order())
-    found = []
-    for judge in (trainer._parts.judge, Parts().judge):
-        metrics = trainer._differentiate(judge, trainer._rollout.minibatches[1], 1).metrics
-        found.append((metrics.clone(), trainer._shared.clone()))
-    assert trainer._parts.judge is not Parts().judge
+    trainer.collector.collect()
+    trainer.collector.estimate_advantages()
+    trainer.collector.rollout.fill_minibatches(trainer.learner.sample_order())
+    found, learner = [], trainer.learner
+    for loss in (learner.functions.loss, minibatch_loss):
+        gradient = AutogradGradient(trainer.networks, learner.gradient_and_kl, loss)
+        metrics = learner.compute_gradient(gradient, trainer.collector.rollout.minibatches[1], 1).metrics
+        found.append((metrics.clone(), learner.gradient_and_kl.clone()))
+    assert learner.functions.loss is not minibatch_loss
     torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-5)
 
 
-def test_a_task_with_ids_runs_eagerly_and_says_why():
+def test_a_task_with_ids_runs_eagerly_and_says_why(caplog):
     settings = {"scene.num_envs": 64, "agent.max_iterations": 3}
     resolved = resolve(find_task("cartpole-direct"), agent="ppo", device="cuda", flags=settings)
     env = make_env(resolved, seed=1, device="cuda")
     trainer = PpoTrainer(env, resolved.agent, seed=1, device="cuda", torch_threads=1)
     trainer.start()
-    notes = [note for _ in range(3) for note in trainer.iterate().notes]
-    assert len(notes) == 1
-    assert "waits for the GPU" in notes[0]
+    for _ in range(3):
+        trainer.iterate()
+    (warning,) = warnings_in(caplog)
+    assert "waits for the GPU" in warning

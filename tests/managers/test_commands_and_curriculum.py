@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 import yaml
-from worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, dump, pendulum, run
+from support.worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, dump, pendulum, run
 
 from rlcli.errors import ConfigError
 from rlcli.mdp.success import velocity_tracked_on_average

@@ -8,7 +8,7 @@ import torch
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import CRITTER_TASK, PENDULUM_TASK, actions, build, critter, dump, edited, pendulum
+from support.worlds import CRITTER_TASK, PENDULUM_TASK, actions, build, critter, dump, edited, pendulum
 
 from rlcli.config.load import resolve
 from rlcli.errors import ConfigError
@@ -58,7 +58,7 @@ def test_a_throttle_counts_for_each_environment(tmp_path):
     step(env, 7)
     before = damping(env)
     env.episode_index[0] += 1
-    env._restart(env.engine.select(torch.tensor([True, False, False, False]), env.seed, env.episode_index))
+    env._reset_envs(env.engine.select(torch.tensor([True, False, False, False]), env.seed, env.episode_index))
     assert (damping(env) != before).tolist() == [True, False, False, False]
     step(env, 3)  # the episodes of the others end, 10 steps after they fired; that of the first goes on
     assert (damping(env) != before).all()
@@ -255,7 +255,7 @@ def check_partial_reset(crowd, chosen, warm_up, seed):
     env.episode_index += mask
     selection = env.engine.select(mask, env.seed, env.episode_index)
     if selection is not None:
-        env._restart(selection)
+        env._reset_envs(selection)
     before, after = rows_of(state, keep), rows_of(env.state_dict(), keep)
     assert before.keys() == after.keys()
     for name, value in before.items():

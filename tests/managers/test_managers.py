@@ -5,7 +5,7 @@ import re
 import pytest
 import torch
 import yaml
-from worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, edited, pendulum, run
+from support.worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, edited, pendulum, run
 
 from rlcli.errors import ConfigError, RlcliError, TaskError
 

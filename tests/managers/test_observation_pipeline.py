@@ -3,7 +3,7 @@
 import pytest
 import torch
 import yaml
-from worlds import CRITTER_TASK, PENDULUM_TASK, build, clone, critter, dump, edited, pendulum, run
+from support.worlds import CRITTER_TASK, PENDULUM_TASK, build, clone, critter, dump, edited, pendulum, run
 
 from rlcli.errors import ConfigError
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from worlds import PENDULUM, PENDULUM_TASK, build, dump, write
+from support.worlds import PENDULUM, PENDULUM_TASK, build, dump, write
 
 from rlcli.errors import ConfigError
-from rlcli.sim.kinematics import Jacobian
+from rlcli.scene.kinematics import Jacobian
 
 ARM = """
 <mujoco model="arm">

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from worlds import build, edited, write
+from support.worlds import build, edited, write
 
 from rlcli.errors import ConfigError
 from rlcli.mdp.observations import image

@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from worlds import actions, build, dump, write
+from support.worlds import actions, build, dump, write
 
 from rlcli.errors import ConfigError
-from rlcli.sim.model_fields import DERIVED_FROM, FIELDS
+from rlcli.scene.model_fields import DERIVED_FROM, FIELDS
 
 MACHINE = """
 <mujoco model="machine">

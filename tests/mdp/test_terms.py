@@ -5,7 +5,7 @@ from math import acos, cos, pi, sin, sqrt
 import numpy as np
 import pytest
 import torch
-from worlds import CRITTER_TASK, build, critter, edited
+from support.worlds import CRITTER_TASK, build, critter, edited
 
 from rlcli.errors import TaskError
 from rlcli.mdp import events, rewards, terminations
@@ -197,7 +197,7 @@ def test_reset_scene_to_default_puts_everything_back(fresh):
     {"func": "push_by_setting_velocity", "mode": "interval", "interval_range_s": [0.01, 0.01]},
 ])  # fmt: skip
 def test_moving_the_root_of_a_fixed_robot_is_refused_by_name(tmp_path, event):
-    from worlds import PENDULUM_TASK, pendulum
+    from support.worlds import PENDULUM_TASK, pendulum
 
     env = build(pendulum(tmp_path, edited(PENDULUM_TASK, events={"move": event})))
     with pytest.raises(TaskError, match="'robot' is fixed to the world"):  # noqa: PT012
@@ -218,7 +218,7 @@ def test_progress_to_a_target_far_away_is_as_exact_as_to_a_near_one(tmp_path):
 
 
 def test_unlimited_joints_never_violate_their_limits(tmp_path):
-    from worlds import PENDULUM_TASK, pendulum
+    from support.worlds import PENDULUM_TASK, pendulum
 
     terms = {"limits": {"func": "joint_pos_limits", "weight": -1.0},
              "ratio": {"func": "joint_pos_limits_penalty_ratio", "weight": -1.0}}  # fmt: skip

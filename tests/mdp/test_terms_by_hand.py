@@ -2,17 +2,15 @@
 
 import ast
 import inspect
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from mdp_numbers import states
-from mdp_table import OBSERVATIONS, REWARDS, ROWS, SUCCESS, TERMINATIONS
-from mdp_worlds import bound, hand_made, put, sensors
-from worlds import build, edited, write
+from support.mdp_numbers import states
+from support.mdp_table import OBSERVATIONS, REWARDS, ROWS, SUCCESS, TERMINATIONS
+from support.mdp_worlds import bound, hand_made, put, sensors
+from support.worlds import build, edited, write
 
-import rlcli.mdp
 from rlcli.config.terms import builtin_terms
 from rlcli.errors import ConfigError
 from rlcli.mdp import observations, rewards
@@ -88,10 +86,11 @@ def test_every_term_of_the_library_is_worked_out_by_hand():
 
 def test_every_docstring_begins_with_what_the_term_is_and_says_its_shape():
     for section in ("observations", "rewards", "terminations", "success"):
-        for node in ast.parse((Path(rlcli.mdp.__path__[0]) / f"{section}.py").read_text()).body:
-            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
-                text = ast.get_docstring(node)
-                assert "(num_envs," in text, node.name
+        for file in {term.file for term in builtin_terms(section).values()}:
+            for node in ast.parse(file.read_text()).body:
+                if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                    text = ast.get_docstring(node)
+                    assert "(num_envs," in text, node.name
 
 
 def test_terms_do_not_write_to_what_they_read(env):
@@ -197,7 +196,7 @@ def test_action_acceleration_is_the_second_difference_and_starts_anew_with_an_ep
         expected = 4 * (step**2 - 2 * float(history[-1][0, 0]) + float(history[-2][0, 0])) ** 2
         assert term().tolist() == [expected] * 3
         history.append(action)
-    everyone = env._everyone()
+    everyone = env._select_all()
     state = term.state_dict()
     term.reset(everyone)
     manager.prev_action.zero_()
@@ -219,7 +218,7 @@ def test_a_swing_is_judged_by_its_highest_point_when_the_foot_comes_down(env):
     qpos, high = env.engine.field("qpos"), {}
     for lift in (0.0, 0.7, 0.1):  # up and down again
         qpos[1, 2] = states()[1].pos[2] + lift
-        env.engine.forward(env._everyone())
+        env.engine.forward(env._select_all())
         env.sim.refresh()
         assert term().tolist() == [0.0] * 3
         high[lift] = env.entities["robot"].data.site_pos_w[1, 1:, 2] - 0.25

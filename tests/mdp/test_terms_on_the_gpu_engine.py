@@ -7,13 +7,13 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from mdp_table import OBSERVATIONS, REWARDS, ROWS, TERMINATIONS
-from mdp_worlds import FILES, bound, hand_made, sensors, whole_task
-from worlds import build, edited, write
+from support.mdp_table import OBSERVATIONS, REWARDS, ROWS, TERMINATIONS
+from support.mdp_worlds import FILES, bound, hand_made, sensors, whole_task
+from support.worlds import build, edited, write
 
 from rlcli.mdp import observations, rewards
-from rlcli.sim.entity import Entity
-from rlcli.testing.host import NoHost
+from rlcli.scene.entity import Entity
+from rlcli.testing.host_sync import HostSyncGuard
 
 torch.set_num_threads(1)
 
@@ -32,7 +32,7 @@ def test_a_term_can_be_recorded_and_gives_the_cpu_engines_value(both, row):
         call = term(env, **given) if inspect.isclass(term) else lambda env=env, given=given: term(env, **given)
         first = call().clone()
         env.sim.stamp += 1  # nothing is remembered from the first call
-        with NoHost() if env.engine.asynchronous else contextlib.nullcontext():
+        with HostSyncGuard() if env.engine.asynchronous else contextlib.nullcontext():
             again = call()
         assert torch.equal(first, again) or term is rewards.ActionAccL2
         values.append(first.float())
@@ -77,7 +77,7 @@ class _Repeated:
         )  # fmt: skip
         self.sim = SimpleNamespace(
             engine=engine, qpos=self._rows(env.sim.qpos), qvel=self._rows(env.sim.qvel), stamp=0,
-            derived=lambda name: self._rows(env.sim.derived(name)),
+            derived_field=lambda name: self._rows(env.sim.derived_field(name)),
         )  # fmt: skip
         self.entities = {name: Entity(name, e.config, engine, self.sim) for name, e in env.entities.items()}
 
@@ -101,7 +101,7 @@ def test_the_detector_sees_what_a_graph_cannot_record():
         lambda: values + torch.tensor([1.0, 2.0, 3.0, 4.0]),
     ]
     for reading in readings:
-        with pytest.raises(AssertionError), NoHost():
+        with pytest.raises(AssertionError), HostSyncGuard():
             reading()
 
 
@@ -125,7 +125,7 @@ def test_steps_with_terms_of_forces_on_bodies_are_recorded(tmp_path):
     env.reset()
     action = torch.ones(3, 1)
     env.step(action)
-    with NoHost():
+    with HostSyncGuard():
         results = [env.step(action) for _ in range(12)]
     assert all(r.reward.isfinite().all() for r in results)
     assert results[-1].obs["policy"].abs().max() > 0.1
@@ -139,7 +139,7 @@ def test_a_task_with_every_term_and_real_sensors_and_commands_is_recorded(tmp_pa
     env.reset()
     action = 0.3 * torch.ones(3, 4)
     env.step(action)
-    with NoHost():
+    with HostSyncGuard():
         results = [env.step(action) for _ in range(12)]
     env.check()
     assert sum(int(r.episodes.mask.sum()) for r in results) >= 6

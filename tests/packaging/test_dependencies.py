@@ -3,9 +3,9 @@
 import tomllib
 
 import pytest
-from fenced import REPOSITORY
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from support.fenced import REPOSITORY
 
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]

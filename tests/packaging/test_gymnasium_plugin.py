@@ -8,7 +8,7 @@ import sys
 import zipfile
 
 import pytest
-from fenced import REPOSITORY, blocks, run_commands
+from support.fenced import REPOSITORY, blocks, run_commands
 from test_wheels import build, install
 
 PLUGIN = REPOSITORY / "plugins" / "rlcli-gymnasium"

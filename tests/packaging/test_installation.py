@@ -15,8 +15,8 @@ from email.parser import Parser
 from pathlib import Path
 
 import pytest
-from fenced import REPOSITORY
 from packaging.requirements import Requirement
+from support.fenced import REPOSITORY
 from test_wheels import build
 
 VERSIONS = ("3.11", "3.12", "3.13")

@@ -8,12 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 import yaml
-from fenced import REPOSITORY, Block, blocks, run_commands, success_rate, write_files
-from worlds import CRITTER, CRITTER_TASK, build, edited, write
-from written_runs import learning, write_run
+from support.fenced import REPOSITORY, Block, blocks, run_commands, success_rate, write_files
+from support.worlds import CRITTER, CRITTER_TASK, build, edited, write
+from support.written_runs import learning, write_run
 
 import rlcli.errors
-from rlcli.rl.sweeps import PHYSICAL, SIGNALS
+from rlcli.evaluation.stress_params import PHYSICAL, SIGNALS
 from rlcli.testing import CHECKS, RULES
 
 DOCS = REPOSITORY / "docs"

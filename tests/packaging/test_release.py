@@ -11,9 +11,9 @@ import zipfile
 from email.parser import Parser
 
 import pytest
-from fenced import REPOSITORY
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from support.fenced import REPOSITORY
 from test_dependencies import pinned
 
 import rlcli

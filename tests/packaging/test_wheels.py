@@ -12,16 +12,7 @@ from email.parser import Parser
 
 import pytest
 import yaml
-from fenced import (
-    REPOSITORY,
-    Block,
-    blocks,
-    run_commands,
-    shortened,
-    success_rate,
-    success_rates,
-    write_files,
-)
+from support.fenced import REPOSITORY, Block, blocks, run_commands, shortened, success_rate, success_rates, write_files
 
 import rlcli
 
@@ -192,6 +183,23 @@ def test_the_tests_of_a_trainer_plugin_pass_against_the_wheels(name, site, tmp_p
     where = [sys.executable, "-c", f"import {name.replace('-', '_')} as package; print(package.__file__)"]
     place = subprocess.run(where, cwd=folder, env=environment, capture_output=True, text=True, check=True).stdout
     assert place.startswith(str(own))
+
+
+@pytest.mark.parametrize("name", ["rlcli-isaaclab", "rlcli-oige"])
+def test_the_wheel_of_a_format_holds_every_file_of_it_and_its_entry_point(name, wheels, tmp_path):
+    package = name.replace("-", "_")
+    build(REPOSITORY / "plugins" / name, tmp_path)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        inside = set(archive.namelist())
+        points = archive.read(next(n for n in inside if n.endswith("entry_points.txt"))).decode()
+    folder = REPOSITORY / "plugins" / name
+    files = {f.relative_to(folder).as_posix() for f in (folder / package).rglob("*") if f.is_file()}
+    assert {f for f in files if "__pycache__" not in f} <= inside
+    assert f"{package}/py.typed" in inside
+    assert f"{name.removeprefix('rlcli-')} = {package}.format:SPEC" in points
+    with zipfile.ZipFile(wheels[0]) as archive:
+        assert not [n for n in archive.namelist() if name.removeprefix("rlcli-") in n]
 
 
 def with_plugin_left_out(name, site, folder):

@@ -9,10 +9,10 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from broken_plugins import BROKEN
+from support.broken_plugins import BROKEN
 
-from rlcli.probe import probe
 from rlcli.registry import catalog
+from rlcli.registry.probe import probe
 
 BUILT_IN = {"cartpole", "cartpole-direct", "ant-direct"}
 TRAIN = ("train", "good-task", "--num-envs", "2", "--max-iterations", "1", "--logger", "none")
@@ -115,7 +115,7 @@ def test_what_a_plugin_prints_is_not_in_the_document(broken_plugins, cli, name):
 
 def test_what_a_task_prints_while_it_runs_is_not_in_the_document(plugins, cli):
     terms = "def one(env):\n    import torch\n    print('hubbub')\n    return torch.ones(env.num_envs)\n"
-    from broken_plugins import FILES, IMPORT
+    from support.broken_plugins import FILES, IMPORT
 
     task = FILES["task.yaml"].replace("func: is_alive", "func: one")
     source = IMPORT + "SPEC = TaskSpec(__name__, 'x', terms=('noisy.terms',))\n"

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from broken_plugins import MODEL, TASK
+from support.broken_plugins import MODEL, TASK
 
 HEAVY = ["torch", "mujoco", "numpy", "stable_baselines3"]
 
@@ -22,7 +22,7 @@ def test_the_index_of_the_built_in_tasks_is_up_to_date():
     import rlcli_tasks
 
     file = Path(rlcli_tasks.__file__).with_name("index.json")
-    command = [sys.executable, "-m", "rlcli.envs.describe", "--index", "rlcli"]
+    command = [sys.executable, "-m", "rlcli.envs.task_index", "--index", "rlcli"]
     fresh = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert json.loads(file.read_text()) == json.loads(fresh), f"run: {' '.join(command[1:])} > {file}"
 
@@ -133,8 +133,8 @@ def test_a_task_that_hangs_is_given_up(plugins, cli):
 def test_a_new_version_of_a_plugin_is_probed_anew(plugins, spec, tmp_path):
     import os
 
-    from rlcli.probe import _key
     from rlcli.registry import catalog
+    from rlcli.registry.probe import _key
 
     plugins("good", spec)
     entry = next(e for e in catalog()[0] if e.name == "good-task")

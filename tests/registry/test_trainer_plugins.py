@@ -6,8 +6,8 @@ import pytest
 
 TRAINER = """
     from rlcli.trainers import TrainerSpec
-    SPEC = TrainerSpec(summary="Twice.", algorithms={"ppo": "rlcli.rl.ppo_config:PpoConfig"},
-                       trainer="rlcli.rl.ppo:PpoTrainer"%s)
+    SPEC = TrainerSpec(summary="Twice.", algorithms={"ppo": "rlcli.rl.ppo.config:PpoConfig"},
+                       trainer="rlcli.rl.ppo.trainer:PpoTrainer"%s)
 """
 POINTS = "[rlcli.trainers]\n%s = %s:SPEC\n"
 

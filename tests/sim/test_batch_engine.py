@@ -4,13 +4,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from worlds import CRITTER, PENDULUM
+from support.worlds import CRITTER, PENDULUM
 
 from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DeviceError
 from rlcli.sim.engine import open_engine
 from rlcli.sim.selection import IdSelection
-from rlcli.sim.state import SimData
+from rlcli.sim.state_cache import SimData
 
 XML = CRITTER.replace("<worldbody>", '<worldbody><geom type="plane" size="5 5 1"/>').replace(
     "</mujoco>",
@@ -183,7 +183,7 @@ def test_a_restored_engine_has_the_last_substep_of_fields_not_asked_for_yet():
 
 def test_reset_restores_the_whole_row_and_only_the_chosen_ones():
     engine = engine_of(model_of(), N)
-    engine.set_default(torch.arange(11, dtype=torch.float64) / 10, torch.full((10,), 0.5, dtype=torch.float64))
+    engine.set_default_state(torch.arange(11, dtype=torch.float64) / 10, torch.full((10,), 0.5, dtype=torch.float64))
     engine.reset(some(0))
     default = engine.state_dict()["state"][0]
     scatter(engine)
@@ -324,5 +324,5 @@ def test_a_field_of_the_state_is_the_state_itself(name):
     field.copy_(torch.arange(field.numel(), dtype=torch.float64).view(field.shape))
     for world in range(N):
         data = mujoco.MjData(engine.model)
-        mujoco.mj_setState(engine.model, data, engine.row(world), int(mujoco.mjtState.mjSTATE_INTEGRATION))
+        mujoco.mj_setState(engine.model, data, engine.state_row(world), int(mujoco.mjtState.mjSTATE_INTEGRATION))
         assert np.array_equal(getattr(data, name), field[world].numpy()), world

@@ -4,11 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from worlds import build
+from support.worlds import build
 
 from rlcli.config.schema import SimConfig
 from rlcli.errors import DivergedError
-from rlcli.sim.capacity import capacity
+from rlcli.sim.capacity import required_capacity
 from rlcli.sim.engine import open_engine
 
 torch.set_num_threads(1)
@@ -45,7 +45,7 @@ def needed(model, steps, shake=2.0):
 
 def test_the_estimate_covers_what_a_longer_simulation_of_the_ant_needs():
     model = ant()
-    room, (contacts, rows) = capacity(model), needed(model, 800)
+    room, (contacts, rows) = required_capacity(model), needed(model, 800)
     assert contacts >= 4
     assert room.contacts >= contacts
     assert room.constraints >= rows
@@ -53,7 +53,7 @@ def test_the_estimate_covers_what_a_longer_simulation_of_the_ant_needs():
 
 def test_the_estimate_covers_a_stack_of_boxes():
     model = mujoco.MjModel.from_xml_string(BOXES)
-    room, (contacts, rows) = capacity(model), needed(model, 400, shake=0.5)
+    room, (contacts, rows) = required_capacity(model), needed(model, 400, shake=0.5)
     assert contacts >= 12
     assert room.contacts >= contacts
     assert room.constraints >= rows
@@ -90,7 +90,7 @@ LYING = {
 @pytest.mark.parametrize("xml", [BALL.format(*parts) for parts in LYING.values()], ids=LYING)
 def test_two_geoms_that_lie_on_each_other_have_room(xml):
     model = mujoco.MjModel.from_xml_string(xml)
-    room, (contacts, rows) = capacity(model), needed(model, 200, shake=0.2)
+    room, (contacts, rows) = required_capacity(model), needed(model, 200, shake=0.2)
     assert contacts > 0
     assert room.contacts >= contacts
     assert room.constraints >= rows
@@ -100,7 +100,7 @@ def test_a_model_whose_parents_and_children_may_touch_has_room_for_that():
     xml = """<mujoco><option><flag filterparent="disable"/></option><worldbody><body><joint/><geom size="0.1"/>
       <body pos="0 0 0.15"><joint axis="0 1 0"/><geom size="0.1"/></body></body></worldbody></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)
-    room, (contacts, rows) = capacity(model), needed(model, 20)
+    room, (contacts, rows) = required_capacity(model), needed(model, 20)
     assert contacts == 1
     assert room.contacts >= contacts
     assert room.constraints >= rows
@@ -108,9 +108,9 @@ def test_a_model_whose_parents_and_children_may_touch_has_room_for_that():
 
 def test_settings_replace_the_estimate():
     model = mujoco.MjModel.from_xml_string(BOXES)
-    estimate, found = capacity(model), capacity(model, contacts=5)
+    estimate, found = required_capacity(model), required_capacity(model, contacts=5)
     assert (found.contacts, found.constraints) == (5, estimate.constraints)
-    assert capacity(model, constraints=9).constraints == 9
+    assert required_capacity(model, constraints=9).constraints == 9
 
 
 def test_a_model_without_contacts_gets_little():
@@ -138,7 +138,7 @@ def test_enough_room_is_no_error():
     for _ in range(40):
         engine.step(1)
         engine.diverged()
-    assert engine.noted() == []
+    assert engine.report_nonfinite() == []
 
 
 def test_room_on_a_height_field_is_what_is_needed_anywhere_on_it():
@@ -155,4 +155,4 @@ def test_room_on_a_height_field_is_what_is_needed_anywhere_on_it():
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0.0, 0.0], pos=place)
     model = spec.compile()
     assert needed(model, 100, shake=0.0)[0] == 0
-    assert capacity(model).contacts >= 60
+    assert required_capacity(model).contacts >= 60

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from worlds import build
+from support.worlds import build
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from rlcli import random
-from rlcli.sim.mask import MaskSelection
+from rlcli.sim.mask_selection import MaskSelection
 from rlcli.sim.selection import IdSelection
 
 N = 11
@@ -234,7 +234,7 @@ def test_joined_selections_hold_the_rows_of_both_and_draw_as_before():
     chosen[[1, 5]] = True
     by_id, by_mask = both()
     others = both(mask=chosen)
-    joined_ids, joined_mask = by_id.joined(others[0]), by_mask.joined(others[1])
+    joined_ids, joined_mask = by_id.union(others[0]), by_mask.union(others[1])
     assert joined_ids.env_ids().tolist() == (MASK | chosen).nonzero()[:, 0].tolist()
     assert joined_mask.env_ids().tolist() == joined_ids.env_ids().tolist()
     assert torch.equal(joined_ids.uniform(0.0, 1.0), joined_mask.uniform(0.0, 1.0)[joined_ids.env_ids()])

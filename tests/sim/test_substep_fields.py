@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from worlds import CRITTER
+from support.worlds import CRITTER
 
 from rlcli.config.schema import SimConfig
 from rlcli.sim.engine import open_engine

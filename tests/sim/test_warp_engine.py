@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from worlds import CRITTER, PENDULUM_TASK, build, critter, edited, pendulum
+from support.worlds import CRITTER, PENDULUM_TASK, build, critter, edited, pendulum
 
 from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DivergedError
 from rlcli.sim.engine import open_engine
-from rlcli.sim.state import SimData
+from rlcli.sim.state_cache import SimData
 
 torch.set_num_threads(1)
 
@@ -135,7 +135,7 @@ def test_a_partial_reset_puts_back_the_chosen_worlds_and_leaves_the_others_bit_f
     device.field("xfrc_applied")[:] = 0.1
     device.step(5)
     kept = snapshot(device, names)
-    device.set_default(torch.from_numpy(device.model.qpos0) + 0.01, torch.full((10,), 0.5))
+    device.set_default_state(torch.from_numpy(device.model.qpos0) + 0.01, torch.full((10,), 0.5))
     device.reset(some(device, 0, 3))
     device.forward(some(device, 0, 3))
     now = snapshot(device, names)
@@ -333,8 +333,8 @@ def test_a_world_that_moves_faster_than_its_task_allows_has_diverged_and_is_judg
     assert result.episodes.ended().causes["diverged"].tolist() == [True]
     assert torch.equal(result.final_obs["critic"][1], torch.cat([last[0][7:], last[1][6:]]))
     assert float(result.reward.abs().max()) < 10.0
-    assert slow.engine.causes == {"qvel out of bounds": 1}
-    assert "root" in slow.engine.found[0].detail
+    assert slow.engine.divergence_causes == {"qvel out of bounds": 1}
+    assert "root" in slow.engine.described_divergences[0].detail
     assert not slow.step(action).terminated.any()
 
 
@@ -413,11 +413,11 @@ def test_check_reports_an_action_that_is_not_finite(tmp_path, task, value):
 def test_any_number_of_things_can_be_watched():
     _, device = pair()
     for i in range(40):
-        device.watch(torch.full((N, 2), math.nan if i in (3, 20, 39) else 0.0), f"thing {i}")
-    assert device.noted() == ["thing 3", "thing 20", "thing 39"]
-    assert device.noted() == []
-    device.watch(torch.full((N,), math.nan), "thing 20")
-    assert device.noted() == ["thing 20"]
+        device.check_finite(torch.full((N, 2), math.nan if i in (3, 20, 39) else 0.0), f"thing {i}")
+    assert device.report_nonfinite() == ["thing 3", "thing 20", "thing 39"]
+    assert device.report_nonfinite() == []
+    device.check_finite(torch.full((N,), math.nan), "thing 20")
+    assert device.report_nonfinite() == ["thing 20"]
 
 
 # --- models that it cannot run ---
@@ -505,13 +505,13 @@ def test_worlds_that_move_twice_are_seen_where_they_are(kind):
     for world, height in ((1, 2.0), (3, 3.0)):
         chosen = some(engine, world)
         engine.field("qpos")[world, 2] = height
-        sim.moved(chosen)
-    sim.settle()
+        sim.on_moved(chosen)
+    sim.forward_moved()
     start = float(engine.model.qpos0[2])
-    torch.testing.assert_close(sim.derived("xpos")[:, 1, 2], torch.tensor([start, 2.0, start, 3.0, start]))
+    torch.testing.assert_close(sim.derived_field("xpos")[:, 1, 2], torch.tensor([start, 2.0, start, 3.0, start]))
     engine.field("qpos")[0, 2] = 4.0
-    sim.moved(some(engine, 0))
-    assert float(sim.derived("xpos")[0, 1, 2]) == pytest.approx(4.0), "what is read is current without more ado"
+    sim.on_moved(some(engine, 0))
+    assert float(sim.derived_field("xpos")[0, 1, 2]) == pytest.approx(4.0), "what is read is current without more ado"
 
 
 HELD = """

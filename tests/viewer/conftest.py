@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from support.command_line import cli, empty_folder, weights
 
 
 @pytest.fixture(scope="session")

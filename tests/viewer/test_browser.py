@@ -7,8 +7,8 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from chromium import CHROMIUM, FLAGS
-from viewer_process import Playing
+from support.chromium import CHROMIUM, FLAGS
+from support.viewer_process import Playing
 
 pytestmark = [
     pytest.mark.slow,

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from worlds import CRITTER_TASK, build, critter, dump, run
+from support.worlds import CRITTER_TASK, build, critter, dump, run
 
-from rlcli.envs.markers import ACTUAL, ASKED, Arrow, Frame, Sphere
 from rlcli.errors import ConfigError
-from rlcli.rl.rollout import zero_policy
+from rlcli.rl.acting import zero_policy
+from rlcli.sim.markers import ACTUAL, COMMANDED, Arrow, Frame, Sphere
 from rlcli.sim.rotations import heading, rotate
 from rlcli.viewer import native
-from rlcli.viewer.clip import film
-from rlcli.viewer.crowd import Crowd
-from rlcli.viewer.markers import add_markers
-from rlcli.viewer.player import Player
-from rlcli.viewer.video import Renderer
+from rlcli.viewer.draw_markers import add_markers
+from rlcli.viewer.env_grid import EnvGrid
+from rlcli.viewer.offscreen import Renderer
+from rlcli.viewer.playback import Playback
+from rlcli.viewer.record_video import record_episode
 
 VIEWER = {"eye": [-1.8, -1.0, 2.2], "lookat": [0.0, 0.0, 0.5], "width": 480, "height": 360}
 VELOCITY = {"func": "uniform_velocity", "resampling_time_s": [9, 9], "lin_vel_x": [-1, 1], "ang_vel_z": [-1, 1]}
@@ -28,7 +28,7 @@ POSE = {"func": "uniform_pose", "resampling_time_s": [9, 9], "bodies": "torso", 
 PLACE = {"func": "uniform_pose2d", "resampling_time_s": [9, 9], "x": [-1, 1], "y": [-1, 1]}
 OWN = """
 import torch
-from rlcli.envs.markers import Arrow, Frame, Sphere
+from rlcli.sim.markers import Arrow, Frame, Sphere
 
 class Beacon:
     \"\"\"A ball at so high a place, and nothing in environment 0.\"\"\"
@@ -113,7 +113,7 @@ def test_the_goal_of_reach_is_seen_where_it_is(number):
     away = np.hypot(columns - center[0], rows - center[1])
     assert len(away) > 150
     assert away.max() < 40  # axes of 0.1 m
-    ball = coloured(seen, bare, ASKED)
+    ball = coloured(seen, bare, COMMANDED)
     assert (np.linalg.norm(ball - center, axis=1) < 6).sum() > 50
     for color, axis in zip(np.eye(3), torch.eye(3), strict=True):
         tip = pixel(env, position + 0.09 * rotate(quat, axis))
@@ -133,7 +133,7 @@ def test_green_points_where_the_velocity_is_asked_and_blue_where_it_is(tmp_path,
     root = data.root_pos_w[0]
     asked = rotate(data.root_quat_w, torch.tensor([[vx, vy, 0.0]]))[0]
     actual = rotate(data.root_quat_w, data.root_lin_vel_b * torch.tensor([1.0, 1.0, 0.0]))[0]
-    for color, velocity, height in ((ASKED, asked, 0.5), (ACTUAL, actual, 0.45)):
+    for color, velocity, height in ((COMMANDED, asked, 0.5), (ACTUAL, actual, 0.45)):
         start = root + torch.tensor([0.0, 0.0, height])
         begin, end = pixel(env, start), pixel(env, start + velocity)
         found = coloured(seen, bare, color)
@@ -149,14 +149,14 @@ def test_a_point_ahead_shows_how_fast_to_turn(tmp_path, wz):
     for name, value in {"vx": 0.0, "vy": 0.0, "wz": wz}.items():
         env.command_manager.hold(name, value)
     env.step(torch.zeros(1, 4))
-    still, turns = [marker for marker in env.markers() if marker.color == ASKED]
+    still, turns = [marker for marker in env.markers() if marker.color == COMMANDED]
     assert torch.equal(still.start, still.end)
     data = env.entities["robot"].data
     ahead, aside = (rotate(data.root_quat_w, torch.tensor([way])) for way in ([0.5, 0.0, 0.0], [0.0, 0.5 * wz, 0.0]))
     torch.testing.assert_close(turns.start, still.start + ahead)
     torch.testing.assert_close(turns.end, turns.start + aside)
     seen, bare = pictures(env)
-    assert len(coloured(seen, bare, ASKED)) > 20
+    assert len(coloured(seen, bare, COMMANDED)) > 20
 
 
 def test_a_place_on_the_ground_is_a_ball_with_an_arrow(tmp_path):
@@ -229,7 +229,7 @@ def test_pictures_change_nothing_of_what_is_simulated(tmp_path):
     for drawn in (False, True):
         env = asking(tmp_path / str(drawn), 3, still=False, **commands)
         results = []
-        with Renderer(env.engine.model, env.config.viewer, Crowd(env, 3)) if drawn else nullcontext() as renderer:
+        with Renderer(env.engine.model, env.config.viewer, EnvGrid(env, 3)) if drawn else nullcontext() as renderer:
             for _ in range(20):
                 if drawn:
                     renderer.picture(env)
@@ -251,21 +251,21 @@ def shapes(scene):
 def test_in_a_crowd_each_has_its_own_at_its_place(tmp_path):
     env = asking(tmp_path, 5, still=False, pose=POSE)
     scene = mujoco.MjvScene(env.engine.model, maxgeom=1000)
-    crowd = Crowd(env, 3)
-    crowd.add(scene, 3, mujoco.MjvOption())
-    centers = env.command_manager.get_term("pose").pose_w[0][[3, 4, 0]].double().numpy() + crowd.offsets()
+    env_grid = EnvGrid(env, 3)
+    env_grid.add(scene, 3, mujoco.MjvOption())
+    centers = env.command_manager.get_term("pose").pose_w[0][[3, 4, 0]].double().numpy() + env_grid.offsets()
     balls = [place for kind, place in shapes(scene) if kind == mujoco.mjtGeom.mjGEOM_SPHERE]
     np.testing.assert_allclose(balls, centers, atol=1e-5)
     assert len(shapes(scene)) == 3 * 4
-    assert np.abs(crowd.offsets()[1:]).max(axis=1).min() > 0.5
+    assert np.abs(env_grid.offsets()[1:]).max(axis=1).min() > 0.5
 
 
 @pytest.mark.slow
 def test_a_crowds_picture_shows_them_all(tmp_path):
     env = asking(tmp_path, 4, "scene.env_spacing=2", own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
-    crowd, counts = Crowd(env, 4), {}
+    env_grid, counts = EnvGrid(env, 4), {}
     env.command_manager.get_term("own").given = []
-    with Renderer(env.engine.model, env.config.viewer, crowd) as renderer:
+    with Renderer(env.engine.model, env.config.viewer, env_grid) as renderer:
         bare = renderer.picture(env).astype(int)
         env.command_manager.get_term("own").given = [Sphere(torch.tensor([[0.0, 0.0, 1.0]] * 4), radius=0.1)]
         seen = renderer.picture(env).astype(int)
@@ -282,26 +282,26 @@ def test_a_crowds_picture_shows_them_all(tmp_path):
 def test_the_browser_gets_them_as_copies(tmp_path):
     env = asking(tmp_path, 2, pose=POSE)
     scene = mujoco.MjvScene(env.engine.model, maxgeom=1024)
-    found = list(Crowd(env, 1).geoms(scene, 1, mujoco.MjvOption()))
+    found = list(EnvGrid(env, 1).geoms(scene, 1, mujoco.MjvOption()))
     kinds = [int(geom.type) for geom in found]
     assert kinds.count(int(mujoco.mjtGeom.mjGEOM_SPHERE)) == 1
     assert len(kinds) == 4
     assert found[0].pos == pytest.approx(env.command_manager.get_term("pose").pose_w[0][1].numpy())
-    assert found[0].rgba == pytest.approx(ASKED)
+    assert found[0].rgba == pytest.approx(COMMANDED)
     assert {int(geom.objid) for geom in found} == {-1}  # of no body
     assert {geom.castshadow for geom in found} == {0}
 
 
 def test_the_window_gets_them_too(tmp_path):
     env = asking(tmp_path, 2, pose=POSE)
-    player = Player(env, zero_policy(env))
+    playback = Playback(env, zero_policy(env))
     model, _ = env.world(0)
     scene = mujoco.MjvScene(model, maxgeom=100)
     window = SimpleNamespace(
         lock=nullcontext, user_scn=scene, opt=mujoco.MjvOption(), set_texts=lambda *_: None, sync=lambda: None
     )
     for _ in range(2):  # anew in each frame, not more and more
-        native._draw(window, player, Crowd(env, 1), model, mujoco.MjData(model))
+        native._draw(window, playback, EnvGrid(env, 1), model, mujoco.MjData(model))
         assert len(shapes(scene)) == scene.ngeom == 4
 
 
@@ -310,7 +310,7 @@ def test_a_film_shows_what_is_asked(tmp_path):
     from PIL import Image
 
     env = asking(tmp_path, 1, pose=POSE)
-    film(env, zero_policy(env), tmp_path / "x.gif", longest_s=0.1)
+    record_episode(env, zero_policy(env), tmp_path / "x.gif", longest_s=0.1)
     with Image.open(tmp_path / "x.gif") as image:
         last = np.asarray(image.convert("RGB")).astype(int)
     assert ((last[..., 1] - np.maximum(last[..., 0], last[..., 2])) > 60).sum() > 20

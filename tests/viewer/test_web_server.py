@@ -6,7 +6,7 @@ import socket
 from pathlib import Path
 
 import pytest
-from viewer_process import PATIENCE, Playing
+from support.viewer_process import PATIENCE, Playing
 
 START = ("cartpole", "--policy", "zero", "--viewer", "web", "--num-envs", 2)
 UPGRADE = (

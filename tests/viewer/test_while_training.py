@@ -1,5 +1,6 @@
 """A policy is watched while it trains."""
 
+import logging
 import os
 import signal
 import subprocess
@@ -10,19 +11,19 @@ import pytest
 import torch
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task
-from rlcli.rl.rollout import zero_policy
-from rlcli.rl.run import open_run
-from rlcli.viewer.player import Player
-from rlcli.viewer.shelf import RunShelf
+from rlcli.rl.acting import zero_policy
+from rlcli.runs.run import open_run
+from rlcli.viewer.checkpoints import RunCheckpoints
+from rlcli.viewer.playback import Playback
 
 WORDS = ["train", "cartpole", "--logger", "none", "-q", "--max-iterations", "5000", "scene.num_envs=4"]
 WORDS += ["sim.engine_threads=1", "agent.torch_threads=1", "agent.save_interval=1"]
 
 
 @pytest.mark.slow
-def test_each_new_checkpoint_of_a_running_training_is_played(tmp_path):
+def test_each_new_checkpoint_of_a_running_training_is_played(tmp_path, caplog):
     torch.set_num_threads(1)
     variables = {**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
     command = [sys.executable, "-m", "rlcli", *WORDS, "--runs-dir", str(tmp_path)]
@@ -34,19 +35,19 @@ def test_each_new_checkpoint_of_a_running_training_is_played(tmp_path):
             time.sleep(0.1)
         (folder,) = tmp_path.glob("*/*")
         env = make_env(resolve(find_task("cartpole"), overrides=["scene.num_envs=2", "sim.engine_threads=1"]))
-        told = []
-        player = Player(env, zero_policy(env), RunShelf(open_run(folder), env), None, told.append, patience=60.0)
-        player.set_follow(True)
+        caplog.set_level(logging.INFO, "rlcli.viewer")
+        playback = Playback(env, zero_policy(env), RunCheckpoints(open_run(folder), env), None, patience=60.0)
+        playback.set_follow(True)
         played = set()
         while len(played) < 4:
-            assert time.monotonic() < end, told
+            assert time.monotonic() < end, caplog.messages
             assert training.poll() is None
-            player.reread()
-            player.advance(0.05)
-            played.add(player.view.checkpoint)
-        steps = player.steps
+            playback.refresh_checkpoints()
+            playback.advance(0.05)
+            played.add(playback.view.checkpoint)
+        steps = playback.steps
         assert steps > 0
-        assert all(said.startswith("now playing step ") for said in told)
+        assert all(said.startswith("now playing step ") for said in caplog.messages)
     finally:
         training.send_signal(signal.SIGINT)
         training.wait(timeout=240)

@@ -19,13 +19,13 @@ import zoo_curves  # noqa: E402
 import zoo_pages  # noqa: E402
 
 from rlcli.config.load import resolve  # noqa: E402
-from rlcli.envs.vec_env import make_env  # noqa: E402
+from rlcli.envs.make import make_env  # noqa: E402
 from rlcli.registry import find_task  # noqa: E402
-from rlcli.rl.bundle import open_bundle  # noqa: E402
-from rlcli.rl.checkpoint import open_checkpoint  # noqa: E402
-from rlcli.rl.load import require_fit  # noqa: E402
+from rlcli.runs.bundle import open_bundle  # noqa: E402
+from rlcli.runs.checkpoint import open_checkpoint  # noqa: E402
+from rlcli.runs.restore import require_fit  # noqa: E402
 from rlcli.testing import check_task, lint_task  # noqa: E402
-from rlcli.testing.host import NoHost  # noqa: E402
+from rlcli.testing.host_sync import HostSyncGuard  # noqa: E402
 
 ENTRIES = zoo.entries()
 TASKS = zoo_pages.built_in()
@@ -57,8 +57,8 @@ def test_the_linter_has_nothing_to_remark_on_a_built_in_task(task):
 def test_success_asks_nothing_of_the_host_when_it_is_first_judged_in_a_step(task):
     env = make_env(resolve(find_task(task), flags={"scene.num_envs": 2}))
     env.reset()
-    with NoHost():
-        assert env.succeeding().shape == (2,)
+    with HostSyncGuard():
+        assert env.compute_success().shape == (2,)
 
 
 @pytest.mark.slow

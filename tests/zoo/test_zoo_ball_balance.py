@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from worlds import actions, build
+from support.worlds import actions, build
 
 TASK = "ball-balance"
 RIGHT_ANGLE = math.pi / 4

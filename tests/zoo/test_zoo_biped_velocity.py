@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from worlds import build
+from support.worlds import build
 
 from rlcli_tasks.humanoid.task import EFFORTS, JOINTS
 
@@ -33,8 +33,8 @@ def put(env, row, *, height=1.26, quat=(1.0, 0.0, 0.0, 0.0), linear=(0, 0, 0), a
     qpos[row] = torch.cat([torch.tensor([0.0, 0.0, height, *quat], dtype=torch.float64), joints])
     qvel[row, :6] = torch.tensor([*linear, *angular], dtype=torch.float64)
     qvel[row, 6:] = rates
-    env.sim.moved(env._everyone())
-    env.sim.settle()
+    env.sim.on_moved(env._select_all())
+    env.sim.forward_moved()
 
 
 def ask(env, *command):
@@ -46,7 +46,7 @@ def paid(env, row=0):
     env.reward_manager.compute()
     return {
         term.name: float(value) / 0.02 / term.config.weight
-        for term, value in zip(env.reward_manager.terms, env.reward_manager.paid[:, row], strict=True)
+        for term, value in zip(env.reward_manager.terms, env.reward_manager.step_terms[:, row], strict=True)
     }
 
 
@@ -100,7 +100,7 @@ def test_the_observation_of_a_state():
     quat = (math.cos(0.2), math.sin(0.2), 0.0, 0.0)  # rolled by 0.4 rad
     put(env, 1, quat=quat, linear=(0.5, 0.0, 0.2), angular=(0.1, 0.2, 0.3), joints=POSE + 0.05, rates=0.5)
     ask(env, 0.4, -0.3, 0.2)
-    seen = env._observe()["policy"][1].tolist()
+    seen = env._compute_observations()["policy"][1].tolist()
     assert seen[:3] == pytest.approx([0.5, 0.2 * math.sin(0.4), 0.2 * math.cos(0.4)], abs=1e-5)
     assert seen[3:6] == pytest.approx([0.1, 0.2, 0.3], abs=1e-5)
     assert seen[6:9] == pytest.approx([0.0, -math.sin(0.4), -math.cos(0.4)], abs=1e-5)

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from flight import about, hover_for_a_second, look, pay, put, weight
-from worlds import build
+from support.flight import about, hover_for_a_second, look, pay, put, weight
+from support.worlds import build
 
 HOVER = 2.0 / 1.9 - 1.0
 """Action at which four motors carry the weight."""

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from support.worlds import actions, build
 from torch.utils._python_dispatch import TorchDispatchMode
-from worlds import actions, build
 
 FLYERS = ("quadcopter", "crazyflie", "ingenuity")
 

@@ -5,7 +5,7 @@ import math
 import mujoco
 import pytest
 import torch
-from worlds import actions, build
+from support.worlds import actions, build
 
 from rlcli.sim.rotations import multiply, turn_between
 from rlcli_tasks.hand_reorient.task import FINGERS, GOAL, JOINTS
@@ -33,7 +33,7 @@ def put(env, row=0, position=PLACE, quat=LEVEL, linear=(0, 0, 0), angular=(0, 0,
     qpos[row, CUBE_POS], qpos[row, CUBE_QUAT] = torch.tensor(position).double(), torch.tensor(quat).double()
     qvel[row, 16:19], qvel[row, 19:22] = torch.tensor(linear).double(), torch.tensor(angular).double()
     env.task.goal_quat[row] = torch.tensor(goal)
-    env.engine.forward(env._everyone())
+    env.engine.forward(env._select_all())
     env.sim.refresh()
 
 

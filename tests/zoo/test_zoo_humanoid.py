@@ -5,7 +5,7 @@ import math
 import mujoco
 import pytest
 import torch
-from worlds import actions, build
+from support.worlds import actions, build
 
 from rlcli_tasks.humanoid.task import EFFORTS, JOINTS
 

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from flight import about, hover_for_a_second, look, pay, put, weight
-from worlds import build
+from support.flight import about, hover_for_a_second, look, pay, put, weight
+from support.worlds import build
 
 LOWER_X, LOWER_Y, LOWER, UPPER_X, UPPER_Y, UPPER = range(6)
 

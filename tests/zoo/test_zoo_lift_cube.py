@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from worlds import actions, build
+from support.worlds import actions, build
 
 torch.set_num_threads(1)
 
@@ -24,7 +24,7 @@ def place(env, cube, row=None):
     rows = slice(None) if row is None else row
     env.engine.field("qpos")[rows, 9:12] = torch.tensor(cube, dtype=torch.float64)
     env.engine.field("qvel")[:] = 0.0
-    env.engine.forward(env._everyone())
+    env.engine.forward(env._select_all())
     env.sim.refresh()
 
 
@@ -120,7 +120,7 @@ def test_nearness_to_the_goal_is_paid_by_its_distance(env):
     fine = [5.0 * 0.02 * (1.0 - math.tanh(off / 0.05)) for off in (0.0, 0.03, 0.1, 0.3)]
     assert paid["goal"].tolist() == pytest.approx(wide, abs=1e-5)
     assert paid["goal_fine"].tolist() == pytest.approx(fine, abs=1e-5)
-    assert env.succeeding().tolist() == [True, True, False, False]
+    assert env.compute_success().tolist() == [True, True, False, False]
 
 
 def test_the_gripper_is_paid_for_coming_near_the_cube(env):

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from worlds import actions, build
+from support.worlds import actions, build
 
 from rlcli_tasks.open_drawer.task import JOINTS
 
@@ -56,7 +56,7 @@ def put(env, joints=HOME, fingers=(0.035, 0.035), drawer=0.0, row=0):
     qpos[row, ARM], qpos[row, FINGERS] = torch.tensor(joints).double(), torch.tensor(fingers).double()
     qpos[row, DRAWER] = drawer
     env.engine.field("qvel")[row] = 0.0
-    env.engine.forward(env._everyone())
+    env.engine.forward(env._select_all())
     env.sim.refresh()
 
 
@@ -201,7 +201,7 @@ def test_an_open_drawer_succeeds_and_does_not_end_the_episode(env):
     env.reset()
     put(env, drawer=0.36, row=0)
     put(env, drawer=0.34, row=1)
-    assert env.succeeding().tolist() == [True, False, False, False]
+    assert env.compute_success().tolist() == [True, False, False, False]
     put(env, drawer=0.4, row=0)
     result = env.step(torch.zeros(4, 9))
     assert not bool(result.terminated.any() | result.truncated.any())

@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
-from worlds import build
+from support.worlds import build
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task
 
 torch.set_num_threads(1)
@@ -32,8 +32,8 @@ def put(env, row, *, position=(0.0, 0.0, 0.34), quat=(1.0, 0.0, 0.0, 0.0), linea
     qpos[row] = torch.tensor(values, dtype=torch.float64)
     qvel[row, :6] = torch.tensor([*linear, *angular], dtype=torch.float64)
     qvel[row, 6:] = rates
-    env.sim.moved(env._everyone())
-    env.sim.settle()
+    env.sim.on_moved(env._select_all())
+    env.sim.forward_moved()
 
 
 def ask(env, *command):
@@ -45,7 +45,7 @@ def paid(env, row=0):
     """Reward terms of the state as it is, weights and the step's 0.02 s taken out."""
     env.reward_manager.compute(torch.zeros(env.num_envs, dtype=torch.bool))
     weights = {term.name: term.config.weight for term in env.reward_manager.terms}
-    values = dict(zip(weights, env.reward_manager.paid[:, row].tolist(), strict=True))
+    values = dict(zip(weights, env.reward_manager.step_terms[:, row].tolist(), strict=True))
     return {name: value / 0.02 / weights[name] for name, value in values.items()}
 
 
@@ -123,7 +123,7 @@ def test_the_observation_of_a_state():
     quat = (math.cos(0.3), math.sin(0.3), 0.0, 0.0)  # rolled by 0.6 rad
     put(env, 1, quat=quat, linear=(0.5, 0.0, 0.0), angular=(0.1, 0.2, 0.3), joints=[q + 0.1 for q in STAND], rates=2.0)
     ask(env, 0.4, -0.3, 0.2)
-    seen = env._observe()["policy"][1].tolist()
+    seen = env._compute_observations()["policy"][1].tolist()
     assert len(seen) == 48
     assert seen[0:3] == pytest.approx([0.5, 0.0, 0.0], abs=1e-5)
     assert seen[3:6] == pytest.approx([0.1, 0.2, 0.3], abs=1e-5)
@@ -209,13 +209,13 @@ def test_the_height_scan_sees_the_ground_about_the_trunk():
     position = env.origins[0] + torch.tensor([0.3, -0.2, 0.6])
     put(env, 0, position=position.tolist())
     env.sensors["scan"].update(0.02)
-    seen = env._observe()["policy"][0]
+    seen = env._compute_observations()["policy"][0]
     assert seen.shape == (48 + 17 * 11,)
     assert seen[48:].tolist() == pytest.approx([0.1] * 187, abs=1e-4)  # 0.6 m above the platform, less 0.5 m
     # a metre further rays reach 1.8 m; stairs of 0.03 m go down from where the platform ends, at 1.6 m
     put(env, 0, position=(env.origins[0] + torch.tensor([1.0, 0.0, 0.6])).tolist())
     env.sensors["scan"].update(0.02)
-    rows = env._observe()["policy"][0, 48:].view(11, 17)
+    rows = env._compute_observations()["policy"][0, 48:].view(11, 17)
     assert rows[:, :15].flatten().tolist() == pytest.approx([0.1] * 165, abs=1e-4)
     assert rows[:, 15:].flatten().tolist() == pytest.approx([0.13] * 22, abs=1e-3)
 

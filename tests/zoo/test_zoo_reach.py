@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from worlds import actions, build
+from support.worlds import actions, build
 
 from rlcli.sim.rotations import turn_between
 
@@ -44,7 +44,7 @@ def put(env, joints):
     """Every arm into one pose, at rest."""
     env.engine.field("qpos")[:, ARM] = torch.tensor(joints, dtype=torch.float64)
     env.engine.field("qvel")[:] = 0.0
-    env.engine.forward(env._everyone())
+    env.engine.forward(env._select_all())
     env.sim.refresh()
 
 
@@ -161,7 +161,7 @@ def test_success_takes_place_and_attitude(env):
     c, s = turned[0], turned[3]
     term.command[2, 3:] = torch.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
     assert float(turn_between(term.command[2:3, 3:], attitude[2:3])) == pytest.approx(0.25, abs=1e-4)
-    assert env.succeeding().tolist() == [True, False, False, True]
+    assert env.compute_success().tolist() == [True, False, False, True]
 
 
 def test_rewards_are_those_of_the_distance_and_the_angle(env):

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from worlds import build
+from support.worlds import build
 
 torch.set_num_threads(1)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.registry import find_task
 
 TASKS = {

@@ -7,10 +7,10 @@ import sys
 
 import pytest
 import torch
-from conftest import go1
+from support.installed_plugins import go1
 
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.errors import MissingModelError
 from rlcli.registry import find_task, model_file
 from rlcli.testing import check_task
@@ -81,8 +81,8 @@ def test_a_g1_that_lies_down_has_fallen(models):
     env = make("g1-velocity", 2, "events.push=null")
     qpos = env.engine.field("qpos")
     qpos[1, 2:7] = torch.tensor([0.3, 0.7071068, 0.0, 0.7071068, 0.0])
-    env.sim.moved(env._everyone())
-    env.sim.settle()
+    env.sim.on_moved(env._select_all())
+    env.sim.forward_moved()
     assert env.step(torch.zeros(2, 29)).terminated.tolist() == [False, True]
 
 

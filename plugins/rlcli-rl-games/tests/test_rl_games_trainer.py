@@ -12,7 +12,7 @@ from rlcli_rl_games.trainer import make_trainer
 
 from rlcli.cli.app import main
 from rlcli.config.load import resolve
-from rlcli.envs.vec_env import make_env
+from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError
 from rlcli.registry import find_task
 from rlcli.rl.policy import load_policy

@@ -5,34 +5,27 @@ from __future__ import annotations
 import contextlib
 import copy
 import io
+import logging
 import math
 import time
 from collections.abc import Mapping
-from importlib import metadata
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import ConfigError, DependencyError, DivergedError
 from rlcli.random import derive
 from rlcli.registry import is_offered, load_object
+from rlcli.rl.nan_check import require_finite_learner
 from rlcli.rl.optimizers import below, load_optimizer, optimizer_tensors
-from rlcli.rl.policy import Policy, PolicySpec
+from rlcli.rl.policy import PolicySpec
 from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
-from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.trainer import Report, TrainerState
+from rlcli.rl.trainer_base import BaseTrainer, agent_error, require_library
 from rlcli_rsl_rl.config import RunnerConfig
 
-NEEDED = "rsl-rl-lib>=5.5,<6"
-try:
-    _VERSION = tuple(int(part) for part in metadata.version("rsl-rl-lib").split(".")[:2])
-except metadata.PackageNotFoundError:
-    _VERSION = (0, 0)
-if not (5, 5) <= _VERSION < (6, 0):
-    _found = f"rsl-rl-lib {'.'.join(map(str, _VERSION))} is" if any(_VERSION) else "rsl-rl-lib is not"
-    raise DependencyError(f"trainer 'rsl-rl' needs {NEEDED}, and {_found} installed", hint=f"pip install '{NEEDED}'")
+require_library("rsl-rl", "rsl-rl-lib>=5.5,<6", at_least=(5, 5), below=(6, 0))
 
 from rsl_rl.algorithms import PPO  # noqa: E402
 from rsl_rl.models import MLPModel, RNNModel  # noqa: E402
@@ -40,31 +33,30 @@ from rsl_rl.modules import GaussianDistribution  # noqa: E402
 
 from rlcli.adapters.rsl_rl import RslRlVecEnv  # noqa: E402
 
-_RECORDED = 256
-"""Recent observations that a checkpoint keeps, for checking what is made of the policy later."""
+_log = logging.getLogger(__name__)
+
 _ACTIVATIONS = {"swish": "silu"}
 _NORMALIZER_EPS = 1e-2
-"""What RSL-RL adds to the deviation of observations."""
+"""RSL-RL adds this to the standard deviation of observations."""
 _LEARNER_HINT = "lower algorithm.learning_rate or algorithm.max_grad_norm; the last good checkpoint is kept"
 
 
-class RslRlTrainer:
-    """Drives RSL-RL's PPO as its runner does, and can stop, save and go on after any iteration.
+class RslRlTrainer(BaseTrainer):
+    """RSL-RL's PPO, driven as its runner does, whose state can be saved after any iteration.
 
     Args:
         env: the environment.
         config: the agent.
         seed: of the networks and of exploration.
-        device: where networks and samples live, as the environment does.
-        torch_threads: threads of the update; the rollout runs torch on one, because two thread pools fight.
+        device: device of the networks and the samples, that of the environment.
+        torch_threads: threads of the update; the rollout runs torch on one thread, since two thread pools compete.
     """
 
     def __init__(self, env: VecEnv, config: RunnerConfig, *, seed: int, device: str, torch_threads: int) -> None:
-        self.env, self.config, self.torch_threads = env, config, torch_threads
+        super().__init__(env, torch_threads)
+        self.config = config
         self.iteration, self.env_steps = 0, 0
         self.steps_per_iteration = config.num_steps_per_env * env.num_envs
-        env.final_obs_of = "truncated"
-        self.statistics = EpisodeStatistics(env.config.episode_length_s)
         self._adapter = RslRlVecEnv(env)
         self._groups = _groups(env, config)
         self.spec = _policy_spec(env, config)
@@ -73,20 +65,21 @@ class RslRlTrainer:
         seed_generators(derive(seed, "trainer"))
         with contextlib.redirect_stdout(io.StringIO()):  # RSL-RL prints its networks; standard output is for data
             settings = _settings(env, config, self._groups)
-            self.alg = PPO.construct_algorithm(self._adapter.blank(), self._adapter, settings, device)
+            self.alg = PPO.construct_algorithm(self._adapter.zero_observations(), self._adapter, settings, device)
         self.alg.train_mode()
-        self._obs = self._adapter.blank()
-        self._recorded = torch.zeros(0, self.spec.observation_size)
-        self._notes = [f"not read by trainer rsl-rl: {said}" for said in config.not_read]
+        self._obs = self._adapter.zero_observations()
 
     def start(self) -> None:
         """Reset the environment to its first episodes."""
-        self._take_in(self.env.reset(seed=self.env.seed))
+        for key in self.config.not_read:
+            _log.warning(f"not read by trainer rsl-rl: {key}")
+        obs = self.env.reset(seed=self.env.seed)
+        self._obs = self._adapter.observations(obs)
+        self._keep_recent_obs(obs["policy"])
 
     def iterate(self) -> Report:
         """Collect experience, then update."""
-        physics, step = self.env.seconds["physics"], self.env.seconds["step"]
-        begin = time.perf_counter()
+        before, begin = dict(self.env.seconds), time.perf_counter()
         torch.set_num_threads(1)
         self._collect()
         collected = time.perf_counter()
@@ -95,27 +88,12 @@ class RslRlTrainer:
         updated = time.perf_counter()
         self.iteration += 1
         self.env_steps += self.steps_per_iteration
-        metrics = self._checked(losses)
-        physics, step = self.env.seconds["physics"] - physics, self.env.seconds["step"] - step
-        seconds = {
-            "physics": physics,
-            "task": step - physics,
-            "policy": collected - begin - step,
-            "update": updated - collected,
-        }
-        task = {name: value for name, value in self.env.extras().items() if math.isfinite(value)}
-        notes, self._notes = self._notes, []
-        return Report({**self.statistics.flush(), **task, **metrics}, seconds, notes)
-
-    def policy(self) -> Policy:
-        """The deployable policy as it is now, with weights of its own."""
-        policy = Policy(self.spec)
-        policy.load_state_dict(self._policy_tensors())
-        return policy.eval().requires_grad_(False)
+        metrics = self._metrics(losses)
+        return self._report(metrics, self._split_seconds(before, collected - begin, updated - collected))
 
     def state(self) -> TrainerState:
-        """A copy of everything that the next iteration depends on."""
-        rest = {"observations": self._recorded.clone()}
+        """Return a copy of everything that the next iteration depends on."""
+        rest = {"observations": self._recent_obs.clone()}
         for part, module in self._modules().items():
             rest |= {f"{part}.{name}": value.detach().clone() for name, value in module.state_dict().items()}
         for name, optimizer in self._optimizers().items():
@@ -132,14 +110,14 @@ class RslRlTrainer:
         }
         if self.alg.rnd:
             values["rnd_updates"] = self.alg.rnd.update_counter
-            average = self._curiosity_average()
+            average = self._rnd_reward_average()
             if average is not None and average.avg is not None:
                 rest["rnd_average"] = average.avg.detach().clone()
         tensors = {"policy": self._policy_tensors(), "trainer": rest, "env": self.env.state_dict(), "rng": rng_state()}
         return TrainerState(tensors, values)
 
     def load(self, state: TrainerState) -> None:
-        """Go back to a boundary: the next iteration gives the same bits as it did then."""
+        """Restore a state: the next iteration gives the same bits as it did then."""
         values, rest = state.values, state.tensors["trainer"]
         for part, module in self._modules().items():
             module.load_state_dict(below(rest, f"{part}."))
@@ -155,16 +133,15 @@ class RslRlTrainer:
         if self.alg.rnd:
             self.alg.rnd.update_counter = values["rnd_updates"]
             if "rnd_average" in rest:
-                self._curiosity_average().avg = rest["rnd_average"].clone()
+                self._rnd_reward_average().avg = rest["rnd_average"].clone()
         self.iteration, self.env_steps = values["iteration"], values["env_steps"]
         self.statistics.load(values["statistics"])
         self._obs = self._adapter.observations(self.env.load_state_dict(state.tensors["env"]))
-        self._recorded = rest["observations"]
-        self._notes = []
+        self._recent_obs = rest["observations"].to(self.env.device)
         load_rng_state(state.tensors["rng"])
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Take a policy's weights, with its normaliser; the critic stays as it is."""
+        """Load a policy's weights, with its normaliser; the critic keeps its own."""
         actor = self.alg.get_policy()
         weights = actor.state_dict()
         for theirs, ours in self._names().items():
@@ -186,56 +163,42 @@ class RslRlTrainer:
     @torch.no_grad()
     def _collect(self) -> None:
         """Take `num_steps_per_env` in every environment; then estimate returns."""
-        bound, before = self.config.action_bound, self.config.bootstrap == "pre_step"
+        bound, pre_step = self.config.action_bound, self.config.bootstrap == "pre_step"
         for _ in range(self.config.num_steps_per_env):
             action = self.alg.act(self._obs)
             step = self.env.step(action if bound is None else action.clamp(-bound, bound))
-            cut = step.truncated & ~step.terminated  # by time alone
+            time_out = step.truncated & ~step.terminated
             reward, extras = step.reward, {}
-            if before:
-                extras["time_outs"] = cut
+            if pre_step:
+                extras["time_outs"] = time_out
             elif step.final_obs is not None:
                 value = self._value(step.final_obs)
-                reward = reward + self.alg.gamma * torch.where(cut, value, 0.0)
+                reward = reward + self.alg.gamma * torch.where(time_out, value, 0.0)
             self._obs = self._adapter.observations(step.obs)
             self.alg.process_env_step(self._obs, reward, step.terminated | step.truncated, extras)
             self.statistics.add(step.episodes)
-        self._record(self._obs["policy"])
+        self._keep_recent_obs(self._obs["policy"])
         self.alg.compute_returns(self._obs)
 
     def _value(self, obs: dict[str, Tensor]) -> Tensor:
-        """What the critic makes of these observations, at this point of its memory. (num_envs,)"""
+        """Return the critic's value, without changing its hidden state. (num_envs,)"""
         memory = self.alg.critic.get_hidden_state()
         value = self.alg.critic(self._adapter.observations(obs)).squeeze(-1)
         self.alg.critic.reset(hidden_state=memory)
         return value
 
-    def _take_in(self, obs: dict[str, Tensor]) -> None:
-        self._obs = self._adapter.observations(obs)
-        self._record(obs["policy"])
-
-    def _record(self, obs: Tensor) -> None:
-        self._recorded = torch.cat([obs[:_RECORDED].cpu(), self._recorded])[:_RECORDED]
-
     # --- metrics ---
 
-    def _checked(self, losses: Mapping[str, float]) -> dict[str, float]:
+    def _metrics(self, losses: Mapping[str, float]) -> dict[str, float]:
         metrics = {f"Loss/{name}": float(value) for name, value in losses.items()}
         metrics["Loss/learning_rate"] = self.alg.learning_rate
         metrics["Policy/mean_std"] = float(self._log_std().exp().mean())
         if self.alg.rnd:
             metrics["Rnd/weight"] = float(self.alg.rnd.weight)
-        for name, value in metrics.items():
-            if not math.isfinite(value):
-                raise DivergedError(f"{name} is not finite in iteration {self.iteration}", hint=_LEARNER_HINT)
-        for part, module in self._modules().items():
-            for name, parameter in module.named_parameters():
-                if not bool(parameter.isfinite().all()):
-                    message = f"weight '{part}.{name}' is not finite in iteration {self.iteration}"
-                    raise DivergedError(message, hint=_LEARNER_HINT)
+        require_finite_learner(metrics, self._modules(), self.iteration, _LEARNER_HINT)
         return metrics
 
-    # --- what a checkpoint holds ---
+    # --- the content of a checkpoint ---
 
     def _modules(self) -> dict[str, torch.nn.Module]:
         modules = {"actor": self.alg._raw_actor, "critic": self.alg._raw_critic}
@@ -245,12 +208,12 @@ class RslRlTrainer:
         optimizers = {"policy": self.alg.optimizer}
         return {**optimizers, "rnd": self.alg.rnd.optimizer} if self.alg.rnd else optimizers
 
-    def _curiosity_average(self) -> Any:
+    def _rnd_reward_average(self) -> Any:
         normalizer = self.alg.rnd.reward_normalizer
         return getattr(normalizer, "disc_avg", None)
 
     def _names(self) -> dict[str, str]:
-        """RSL-RL's name of each weight of the actor -> its name in a saved policy."""
+        """Return the name in a saved policy of each weight of the actor, by RSL-RL's name."""
         names = {}
         for name in self.alg.get_policy().state_dict():
             if name.startswith("mlp."):
@@ -268,12 +231,12 @@ class RslRlTrainer:
         return distribution.std_param.detach().clamp(math.exp(low), math.exp(high)).log()
 
     def _policy_tensors(self) -> dict[str, Tensor]:
-        """Copies of the actor's weights under the names of a saved policy; it computes what RSL-RL computes."""
+        """Return copies of the policy's weights, by their names in a saved policy."""
         weights = self.alg.get_policy().state_dict()
         tensors = {ours: weights[theirs].detach().clone() for theirs, ours in self._names().items()}
         tensors["log_std"] = self._log_std().clone()
         if self.spec.normalize:
-            # RSL-RL divides by the deviation plus a little, a saved policy by the root of a variance plus very little
+            # RSL-RL divides by the std + 1e-2, a saved policy by the root of the variance + 1e-8
             deviation = weights["obs_normalizer._std"][0].double() + _NORMALIZER_EPS
             tensors["normalizer.mean"] = weights["obs_normalizer._mean"][0].double()
             tensors["normalizer.var"] = deviation.square() - 1e-8
@@ -282,7 +245,7 @@ class RslRlTrainer:
 
 
 def _policy_spec(env: VecEnv, config: RunnerConfig) -> PolicySpec:
-    """What the trained policy is made of."""
+    """Return the structure of the trained policy."""
     actor, _ = config.networks
     memory = config.memory or []
     return PolicySpec(
@@ -299,10 +262,10 @@ def _policy_spec(env: VecEnv, config: RunnerConfig) -> PolicySpec:
 
 
 def _groups(env: VecEnv, config: RunnerConfig) -> dict[str, list[str]]:
-    """Observation set of RSL-RL -> groups of the task.
+    """Return the observation groups of the task for each observation set of RSL-RL.
 
     Raises:
-        ConfigError: for a set or group that is not there.
+        ConfigError: for a set or group that does not exist.
     """
     have = env.layout.observations
     sets = {"actor": ["policy"], "critic": ["critic"] if "critic" in have else ["policy"]}
@@ -311,14 +274,14 @@ def _groups(env: VecEnv, config: RunnerConfig) -> dict[str, list[str]]:
     allowed = {"policy": "actor", "actor": "actor", "critic": "critic", "rnd_state": "rnd_state"}
     for name, groups in config.obs_groups.items():
         if name not in allowed:
-            raise _problem(env, ("obs_groups", name), f"no observation set '{name}'", f"sets: {', '.join(allowed)}")
+            raise agent_error(env, ("obs_groups", name), f"no observation set '{name}'", f"sets: {', '.join(allowed)}")
         for group in groups:
             if group not in have:
                 hint = f"groups of the task: {', '.join(have)}"
-                raise _problem(env, ("obs_groups", name), f"no observation group '{group}'", hint)
+                raise agent_error(env, ("obs_groups", name), f"no observation group '{group}'", hint)
         if allowed[name] == "actor" and groups != ["policy"]:
             message = f"the policy acts on the group policy alone, found {', '.join(groups)}"
-            raise _problem(env, ("obs_groups", name), message, "put the terms into observations.policy")
+            raise agent_error(env, ("obs_groups", name), message, "put the terms into observations.policy")
         if allowed[name] in sets:
             sets[allowed[name]] = list(groups)
     return sets
@@ -332,11 +295,11 @@ def _require_batch(env: VecEnv, config: RunnerConfig) -> None:
         what = "environments" if whole > 1 else "samples"
         message = f"{parts} minibatches cannot be made of a rollout of {samples} {what}"
         at = ("algorithm", "num_mini_batches")
-        raise _problem(env, at, message, "more environments, more num_steps_per_env, or fewer minibatches")
+        raise agent_error(env, at, message, "more environments, more num_steps_per_env, or fewer minibatches")
 
 
 def _settings(env: VecEnv, config: RunnerConfig, groups: dict[str, list[str]]) -> dict[str, Any]:
-    """The dictionary that RSL-RL 5 is built from."""
+    """Return the settings in the form of RSL-RL 5."""
     algorithm: dict[str, Any] = config.algorithm.model_dump(exclude={"class_name", "rnd_cfg", "symmetry_cfg"})
     algorithm["class_name"] = PPO
     if config.algorithm.rnd_cfg is not None:
@@ -369,7 +332,7 @@ def _network(config: Any) -> dict[str, Any]:
 
 
 def _mirror(env: VecEnv, reference: str) -> Any:
-    """The function that mirrors observations and actions."""
+    """Load the function that mirrors observations and actions."""
     module, _, name = reference.rpartition(":")
     if not module:
         module, _, name = reference.rpartition(".")
@@ -378,12 +341,12 @@ def _mirror(env: VecEnv, reference: str) -> Any:
         file = (root / module).resolve()
         if not file.is_relative_to(root):
             at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
-            raise _problem(env, at, f"'{module}' lies outside the task's folder {root}", "put it beside the task")
+            raise agent_error(env, at, f"'{module}' lies outside the task's folder {root}", "put it beside the task")
         module = str(file)
     elif not is_offered(module, env.resolved.source):
         at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
         message = f"'{module}' belongs neither to the task nor to an installed plugin"
-        raise _problem(env, at, message, "file.py:function beside the task, or module:function of its package")
+        raise agent_error(env, at, message, "file.py:function beside the task, or module:function of its package")
     try:
         found = load_object(f"{module}:{name}")
     except (ImportError, AttributeError, OSError, ValueError) as error:
@@ -393,9 +356,5 @@ def _mirror(env: VecEnv, reference: str) -> Any:
     if not callable(found):
         at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
         hint = "module:function of the task's package or a plugin, or file.py:function beside the task"
-        raise _problem(env, at, f"there is no function '{reference}'{why}", hint)
+        raise agent_error(env, at, f"there is no function '{reference}'{why}", hint)
     return found
-
-
-def _problem(env: VecEnv, at: tuple[str, ...], message: str, hint: str) -> ConfigError:
-    return ConfigError([env.resolved.problem(("agents", env.resolved.agent_name or "", *at), message, hint)])

@@ -70,7 +70,7 @@ class QuadcopterTask(DirectTask):
 
     def reset(self, selection: Selection) -> None:
         """Somewhere about the target, level and at rest, with tilted rotors and no thrust."""
-        default = selection.peek(self.robot.data.default_root_state)
+        default = selection.read_view(self.robot.data.default_root_state)
         position = default[:, :3] + selection.uniform(self.start_low, self.start_high, (3,))
         tilts = selection.uniform(self.tilt_low, self.tilt_high, (len(JOINTS),))
         self.robot.write_root_pose(selection, position, default[:, 3:7])

@@ -1,0 +1,32 @@
+"""The command `rlcli import isaaclab`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rlcli.formats import Imported
+
+
+def import_run(
+    env: Annotated[Path, typer.Argument(metavar="ENV.yaml", help="params/env.yaml of a run.")],
+    agent: Annotated[Path | None, typer.Argument(metavar="[AGENT.yaml]", help="params/agent.yaml of RSL-RL.")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Folder to write; a new one named after the task if left out."),
+    ] = None,
+    model: Annotated[
+        list[str] | None, typer.Option("--model", help="ENTITY=FILE.xml: the MJCF of a robot or object; repeatable.")
+    ] = None,
+) -> Imported:
+    """Import the settings of an Isaac Lab run. These are its env.yaml and agent.yaml."""
+    from rlcli.errors import UsageError
+    from rlcli_isaaclab.importer import convert
+
+    models = dict(given.partition("=")[::2] for given in model or [])
+    for name, file in models.items():
+        if not file or not Path(file).is_file():
+            raise UsageError(f"--model {name}={file}: there is no such file", hint="--model robot=robot.xml")
+    return convert(env, agent, output or Path("imported"), models)

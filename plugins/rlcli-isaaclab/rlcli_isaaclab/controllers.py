@@ -1,0 +1,18 @@
+"""Controllers. Names as in `isaaclab.controllers`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rlcli_isaaclab.config_class import MISSING, configclass
+
+
+@configclass
+class DifferentialIKControllerCfg:
+    """Inverse kinematics by the Jacobian; here always damped least squares."""
+
+    class_type: Any = "DifferentialIKController"
+    command_type: str = MISSING
+    use_relative_mode: bool = False
+    ik_method: str = "dls"
+    ik_params: Any = None

@@ -1,0 +1,81 @@
+"""The environment and its configuration. Names as in `isaaclab.envs`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rlcli_isaaclab import mdp
+from rlcli_isaaclab.config_class import MISSING, configclass, to_dict
+from rlcli_isaaclab.runtime import ManagerBasedRLEnv
+from rlcli_isaaclab.sim import SimulationCfg
+
+
+@configclass
+class ViewerCfg:
+    """Where the camera stands."""
+
+    eye: Any = (7.5, 7.5, 7.5)
+    lookat: Any = (0.0, 0.0, 0.0)
+    cam_prim_path: str = "/OmniverseKit_Persp"
+    resolution: Any = (1280, 720)
+    origin_type: str = "world"
+    env_index: int = 0
+    asset_name: Any = None
+    body_name: Any = None
+
+
+@configclass
+class ManagerBasedEnvCfg:
+    """An environment without rewards."""
+
+    viewer: Any = ViewerCfg()
+    sim: Any = SimulationCfg()
+    ui_window_class_type: Any = None
+    seed: Any = None
+    decimation: int = MISSING
+    scene: Any = MISSING
+    recorders: Any = None
+    observations: Any = MISSING
+    actions: Any = MISSING
+    events: Any = None
+    rerender_on_reset: bool = False
+    wait_for_textures: bool = True
+    xr: Any = None
+    teleop_devices: Any = None
+    export_io_descriptors: bool = False
+    log_dir: Any = None
+
+
+@configclass
+class ManagerBasedRLEnvCfg(ManagerBasedEnvCfg):
+    """A manager-based task."""
+
+    is_finite_horizon: bool = False
+    episode_length_s: float = MISSING
+    rewards: Any = MISSING
+    terminations: Any = MISSING
+    curriculum: Any = None
+    commands: Any = None
+
+    def __rlcli_task__(self, root: Path) -> Any:
+        """The task that this is here."""
+        from rlcli.config.python_task import PythonTask
+        from rlcli_isaaclab.convert import task
+        from rlcli_isaaclab.settings import Report
+
+        report = Report()
+        data = task(to_dict(self), report, root)
+        return PythonTask(data, notes=report.news())
+
+
+ManagerBasedEnv = ManagerBasedRLEnv
+
+__all__ = [
+    "ManagerBasedEnv",
+    "ManagerBasedEnvCfg",
+    "ManagerBasedRLEnv",
+    "ManagerBasedRLEnvCfg",
+    "ViewerCfg",
+    "mdp",
+]

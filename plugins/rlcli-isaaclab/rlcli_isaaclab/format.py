@@ -1,0 +1,73 @@
+"""The format of Isaac Lab's manager-based tasks: how a folder of them is recognised."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rlcli.formats import FormatSpec
+
+if TYPE_CHECKING:
+    from rlcli.registry import TaskSource
+
+_RUNNER = b"RslRlOnPolicyRunnerCfg"
+
+SPEC = FormatSpec(
+    summary="tasks of Isaac Lab",
+    find="rlcli_isaaclab.format:find",
+    importer="rlcli_isaaclab.command:import_run",
+    hint="rlcli_isaaclab.import_hints:import_hint",
+    agents_beside="rlcli_isaaclab.format:agents_beside",
+    aliases={"rlcli.isaaclab": "rlcli_isaaclab"},
+)
+
+
+def find(path: Path) -> TaskSource | None:
+    """Return the task of a folder whose Python files have one class of an environment; None for another one.
+
+    Raises:
+        TaskError: if there are several.
+    """
+    from rlcli.errors import TaskError, listing
+    from rlcli.registry import python_config, python_task
+
+    if not path.is_dir() or python_config(path) is not None:
+        return None
+    classes = _environments(path)
+    if len(classes) > 1:
+        names = listing(f"{path.name}/{found}" for found in classes)
+        raise TaskError(f"'{path}' holds several tasks", hint=f"name one: {names}")
+    return python_task(f"{path / classes[0]}", path.name) if classes else None
+
+
+def agents_beside(folder: Path) -> list[Path]:
+    """Return the Python files of a folder that hold a runner."""
+    return sorted(file for file in folder.glob("*.py") if _RUNNER in file.read_bytes())
+
+
+def _environments(root: Path) -> list[str]:
+    """Return `file.py:Class` of every environment in a folder, without the classes that its files build upon."""
+    classes = [
+        (file.name, node.name, {ast.unparse(base).rpartition(".")[2] for base in node.bases})
+        for file in sorted(root.glob("*.py"))
+        for node in _body(file)
+        if isinstance(node, ast.ClassDef)
+    ]
+    kinds, before = {"ManagerBasedRLEnvCfg"}, 0
+    while len(kinds) > before:
+        before = len(kinds)
+        kinds |= {name for _, name, bases in classes if bases & kinds}
+    inner = {(file, base) for file, _, bases in classes for base in bases}
+    return [
+        f"{file}:{name}"
+        for file, name, bases in classes
+        if bases & kinds and (file, name) not in inner and not name.upper().endswith("_PLAY")
+    ]
+
+
+def _body(file: Path) -> list[ast.stmt]:
+    try:
+        return ast.parse(file.read_bytes()).body
+    except (OSError, SyntaxError, ValueError):
+        return []

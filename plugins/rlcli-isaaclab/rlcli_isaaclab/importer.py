@@ -1,0 +1,208 @@
+"""The YAML files that Isaac Lab writes into a run's `params/`, as a task of rlcli's own."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from rlcli.config.dump import to_yaml
+from rlcli.config.load import check_all
+from rlcli.errors import ConfigError, Problem, UsageError
+from rlcli.formats import Imported
+from rlcli.machine import read_plain
+from rlcli.registry import folder_task, model_file
+from rlcli_isaaclab.config_class import to_dict
+from rlcli_isaaclab.convert import agent, task
+from rlcli_isaaclab.envs import ManagerBasedRLEnvCfg
+from rlcli_isaaclab.settings import Report
+
+MAX_BYTES = 4 * 1024 * 1024
+MAX_VALUES = 100_000
+_PYTHON = "tag:yaml.org,2002:python/"
+
+
+def read(file: Path) -> dict[str, Any]:
+    """A dump: plain YAML, Python's tuples and slices; other Python objects are text, nothing is ever constructed.
+
+    Raises:
+        ConfigError: if it is not such a file.
+    """
+    try:
+        text = read_plain(file, MAX_BYTES)  # a pipe is not waited for
+    except OSError as error:
+        raise ConfigError([Problem(str(file), "", f"cannot be read: {error.strerror or error}")]) from None
+    try:
+        data = yaml.load(text, Loader=_Loader)
+        _count(data)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f"{file}:{mark.line + 1}:{mark.column + 1}" if mark else str(file)
+        raise ConfigError([Problem(place, "", error.problem or "not YAML")]) from None
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        raise ConfigError([Problem(str(file), "", str(error) or "nested too deeply")]) from None
+    if not isinstance(data, dict):
+        raise ConfigError([Problem(str(file), "", "the top level must be a mapping (key: value)")])
+    return data
+
+
+def convert(env: Path, agent_file: Path | None, folder: Path, models: Mapping[str, str]) -> Imported:
+    """Write a task folder. `models` name an MJCF for entities whose USD file the table does not know.
+
+    Raises:
+        ConfigError: if the files do not make a valid task; nothing is written then.
+        UsageError: if there is a task in the folder already.
+    """
+    if (folder / "task.yaml").exists():
+        raise UsageError(f"{folder / 'task.yaml'} exists", hint="name another folder with -o")
+    report, agent_report = Report(), None
+    here = {name: str(Path(model).resolve()) for name, model in models.items()}
+    data: dict[str, Any] = {"summary": f"Imported from {env.name} of Isaac Lab."}
+    source = read(env)
+    problems: list[Problem] = []
+    try:
+        data |= task(source, report, Path.cwd(), to_dict(ManagerBasedRLEnvCfg()), here)
+    except ConfigError as error:
+        problems += [Problem(str(env), p.path, p.message, p.hint) for p in error.problems]
+    if agent_file is not None:
+        agent_report = Report()
+        try:
+            data["agents"] = {"default": "rsl-rl", "rsl-rl": _agent(agent_file, agent_report)}
+        except ConfigError as error:
+            problems += [Problem(str(agent_file), p.path, p.message, p.hint) for p in error.problems]
+    if problems:
+        raise ConfigError(problems)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".import-") as place:
+        draft = Path(place) / folder.name
+        draft.mkdir()
+        names = _write(draft, data, report)
+        check_all(folder_task(draft))
+        folder.mkdir(exist_ok=True)
+        for name in names:
+            shutil.move(draft / name, folder / name)
+    notes = report.notes(where=str(env))
+    if agent_report is not None:
+        notes += agent_report.notes("agent", str(agent_file))
+    return Imported(folder, [folder / name for name in names], notes)
+
+
+def _write(folder: Path, data: dict[str, Any], report: Report) -> list[str]:
+    """The files of the task, models that stand alone among them."""
+    files = ["task.yaml"]
+    for entity in data["scene"]["entities"].values():
+        model = model_file(Path.cwd(), entity["model"])
+        if _stands_alone(model, folder):
+            entity["model"] = model.name
+            files += [model.name] if model.name not in files else []
+    (folder / "task.yaml").write_text(to_yaml(data), encoding="utf-8")
+    if report.stubs:
+        (folder / "terms.py").write_text(_stubs(report), encoding="utf-8")
+        files.append("terms.py")
+    return files
+
+
+def _stands_alone(model: Path, folder: Path) -> bool:
+    """Whether a copy of an MJCF compiles; one with meshes beside it does not."""
+    from rlcli.scene.untrusted_mjcf import read_mjcf
+
+    copy = folder / model.name
+    if copy.exists():
+        return True
+    try:
+        shutil.copyfile(model, copy)
+        read_mjcf(copy, [folder]).compile()
+    except (OSError, ValueError):
+        copy.unlink(missing_ok=True)
+        return False
+    return True
+
+
+def _stubs(report: Report) -> str:
+    """Terms to be written: their names and parameters, as the files say."""
+    lines = ['"""Terms to write: their code is not in the files that were imported."""', ""]
+    lines += ["from rlcli.task import Bodies, Entity, Joints"]
+    for name, (section, params) in report.stubs.items():
+        given = "".join(f", {key}: {_annotation(key, value)}" for key, value in params.items())
+        star = ", *" if given else ""
+        to_do = [f'    """A term of {section}, to be written."""', f'    raise NotImplementedError("{name}")']
+        if section == "commands":
+            lines += ["", "", f"class {name}:", to_do[0], "", f"    def __init__(self, env{star}{given}):"]
+            lines += ["        # self.command is a tensor (num_envs, k) that stays the same", f"    {to_do[1]}", ""]
+            lines += [
+                "    def resample(self, selection):",
+                '        """selection.write(self.command, selection.uniform(...))"""',
+            ]
+            lines += ["", "    def update(self):", '        """Once a step."""']
+            continue
+        selection = ", selection" if section in ("events", "curriculum") else ""
+        lines += ["", "", f"def {name}(env{selection}{star}{given}):", *to_do]
+    return "\n".join(lines) + "\n"
+
+
+def _annotation(key: str, value: Any) -> str:
+    alias = {"entity": "Entity", "joints": "Joints", "bodies": "Bodies"}.get(key)
+    if alias:
+        return alias
+    if isinstance(value, bool | int | float | str):
+        return type(value).__name__
+    if isinstance(value, list) and len({type(item) for item in value} & {int, float}) == 2:
+        return "list[float]"
+    if isinstance(value, list) and value:
+        return f"list[{_annotation('', value[0])}]"
+    if isinstance(value, dict) and value:
+        return f"dict[str, {_annotation('', next(iter(value.values())))}]"
+    return "str | None"
+
+
+def _agent(file: Path, report: Report) -> dict[str, Any]:
+    data = read(file)
+    if "algorithm" not in data or "num_steps_per_env" not in data:
+        hint = "rl_games, skrl and Stable-Baselines3 have files of their own form: write an agent by hand"
+        raise ConfigError([Problem(str(file), "", "is not RSL-RL's agent.yaml", hint)])
+    return agent(data, report)
+
+
+def _count(value: Any) -> None:
+    """Refuse what aliases make larger than it looks.
+
+    Raises:
+        ValueError: beyond MAX_VALUES.
+    """
+    left, waiting = MAX_VALUES, [value]
+    while waiting:
+        item = waiting.pop()
+        left -= 1
+        if left < 0:
+            raise ValueError(f"more than {MAX_VALUES} values")
+        if isinstance(item, Mapping):
+            waiting += item.values()
+        elif isinstance(item, list | tuple):
+            waiting += item
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader that knows tuples and slices."""
+
+
+def _tuple(loader: _Loader, node: yaml.SequenceNode) -> tuple[Any, ...]:
+    return tuple(loader.construct_sequence(node, deep=True))
+
+
+def _slice(loader: _Loader, node: yaml.SequenceNode) -> slice:
+    return slice(*loader.construct_sequence(node, deep=True))
+
+
+def _opaque(loader: _Loader, suffix: str, node: yaml.Node) -> Any:
+    """Any other Python object as text: of a name its reference, of anything else nothing."""
+    kind, _, name = suffix.partition(":")
+    return ":".join(name.rsplit(".", 1)) if kind == "name" else None
+
+
+_Loader.add_constructor(f"{_PYTHON}tuple", _tuple)
+_Loader.add_constructor(f"{_PYTHON}object/apply:builtins.slice", _slice)
+_Loader.add_multi_constructor(_PYTHON, _opaque)

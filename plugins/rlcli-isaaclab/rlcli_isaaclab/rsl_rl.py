@@ -1,0 +1,99 @@
+"""RSL-RL's settings, read as those of the `ppo` trainer in RSL-RL's dialect. Names as in `isaaclab_rl.rsl_rl`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rlcli.formats import Note
+from rlcli_isaaclab.config_class import MISSING, configclass, to_dict
+
+
+@configclass
+class RslRlPpoActorCriticCfg:
+    """The networks."""
+
+    class_name: str = "ActorCritic"
+    init_noise_std: float = MISSING
+    noise_std_type: str = "scalar"
+    state_dependent_std: bool = False
+    actor_obs_normalization: Any = MISSING
+    critic_obs_normalization: Any = MISSING
+    actor_hidden_dims: Any = MISSING
+    critic_hidden_dims: Any = MISSING
+    activation: str = MISSING
+
+
+@configclass
+class RslRlPpoActorCriticRecurrentCfg(RslRlPpoActorCriticCfg):
+    """The networks with a memory."""
+
+    class_name: str = "ActorCriticRecurrent"
+    rnn_type: str = MISSING
+    rnn_hidden_dim: int = MISSING
+    rnn_num_layers: int = MISSING
+
+
+@configclass
+class RslRlPpoAlgorithmCfg:
+    """The update."""
+
+    class_name: str = "PPO"
+    num_learning_epochs: int = MISSING
+    num_mini_batches: int = MISSING
+    learning_rate: float = MISSING
+    schedule: str = MISSING
+    gamma: float = MISSING
+    lam: float = MISSING
+    entropy_coef: float = MISSING
+    desired_kl: Any = MISSING
+    max_grad_norm: float = MISSING
+    value_loss_coef: float = MISSING
+    use_clipped_value_loss: bool = MISSING
+    clip_param: float = MISSING
+    normalize_advantage_per_mini_batch: bool = False
+    rnd_cfg: Any = None
+    symmetry_cfg: Any = None
+
+
+@configclass
+class RslRlBaseRunnerCfg:
+    """What all runners have."""
+
+    seed: int = 42
+    device: str = "cuda:0"
+    num_steps_per_env: int = MISSING
+    max_iterations: int = MISSING
+    empirical_normalization: Any = None
+    obs_groups: Any = MISSING
+    clip_actions: Any = None
+    save_interval: int = MISSING
+    experiment_name: str = MISSING
+    run_name: str = ""
+    logger: str = "tensorboard"
+    neptune_project: str = "isaaclab"
+    wandb_project: str = "isaaclab"
+    resume: bool = False
+    load_run: str = ".*"
+    load_checkpoint: str = "model_.*.pt"
+
+
+@configclass
+class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
+    """A whole training run."""
+
+    __rlcli_library__ = "rsl-rl"
+
+    class_name: str = "OnPolicyRunner"
+    policy: Any = MISSING
+    algorithm: Any = MISSING
+
+    def __rlcli_agent__(self, notes: list[Note] | None = None) -> dict[str, Any]:
+        """The settings of the agent that this is here."""
+        from rlcli_isaaclab.convert import agent
+        from rlcli_isaaclab.settings import Report
+
+        report = Report()
+        data = agent(to_dict(self), report)
+        if notes is not None:
+            notes += report.news("agent")
+        return data

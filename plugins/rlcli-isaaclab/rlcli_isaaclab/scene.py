@@ -1,0 +1,17 @@
+"""The scene. Names as in `isaaclab.scene`."""
+
+from __future__ import annotations
+
+from rlcli_isaaclab.config_class import MISSING, configclass
+
+
+@configclass
+class InteractiveSceneCfg:
+    """What stands in each environment; its further members are assets, sensors and lights."""
+
+    num_envs: int = MISSING
+    env_spacing: float = MISSING
+    lazy_sensor_update: bool = True
+    replicate_physics: bool = True
+    filter_collisions: bool = True
+    clone_in_fabric: bool = False

@@ -1,0 +1,78 @@
+"""Sensors. Names as in `isaaclab.sensors`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rlcli_isaaclab.config_class import MISSING, configclass
+from rlcli_isaaclab.runtime import Sensor as ContactSensor
+from rlcli_isaaclab.runtime import Sensor as RayCaster
+from rlcli_isaaclab.sensors import patterns
+
+
+@configclass
+class SensorBaseCfg:
+    """What all sensors have."""
+
+    class_type: Any = "SensorBase"
+    prim_path: str = MISSING
+    update_period: float = 0.0
+    history_length: int = 0
+    debug_vis: bool = False
+
+
+@configclass
+class ContactSensorCfg(SensorBaseCfg):
+    """Forces of contacts on bodies."""
+
+    class_type: Any = "ContactSensor"
+    track_pose: bool = False
+    track_contact_points: bool = False
+    track_friction_forces: bool = False
+    track_air_time: bool = False
+    force_threshold: float = 1.0
+    filter_prim_paths_expr: Any = []  # noqa: RUF012  (every object gets its own)
+    max_contact_data_count_per_prim: int = 4
+    visualizer_cfg: Any = None
+
+
+@configclass
+class RayCasterCfg(SensorBaseCfg):
+    """Distances along rays."""
+
+    @configclass
+    class OffsetCfg:
+        """Where the sensor sits in its body's frame."""
+
+        pos: Any = (0.0, 0.0, 0.0)
+        rot: Any = (1.0, 0.0, 0.0, 0.0)
+
+    class_type: Any = "RayCaster"
+    mesh_prim_paths: Any = MISSING
+    offset: Any = OffsetCfg()
+    attach_yaw_only: Any = None
+    ray_alignment: str = "base"
+    pattern_cfg: Any = MISSING
+    max_distance: float = 1e6
+    drift_range: Any = (0.0, 0.0)
+    ray_cast_drift_range: Any = None
+    visualizer_cfg: Any = None
+
+
+@configclass
+class ImuCfg(SensorBaseCfg):
+    """Orientation, rates and acceleration of a body; an MJCF has sensors for them."""
+
+    class_type: Any = "Imu"
+    offset: Any = None
+
+
+__all__ = [
+    "ContactSensor",
+    "ContactSensorCfg",
+    "ImuCfg",
+    "RayCaster",
+    "RayCasterCfg",
+    "SensorBaseCfg",
+    "patterns",
+]

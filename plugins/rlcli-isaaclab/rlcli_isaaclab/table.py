@@ -1,0 +1,154 @@
+"""Isaac Lab's terms and which of rlcli's each is; a term that is not named here has the same name in both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+Translate = Callable[[Any], dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A term under another name, or with parameters under other names (or computed from theirs)."""
+
+    name: str | None = None
+    params: Mapping[str, str | Translate] = field(default_factory=dict)
+    note: str | None = None
+    """What is not quite the same."""
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters that theirs does not have because it knows them."""
+
+
+def _pose(value: Mapping[str, Any]) -> dict[str, Any]:
+    return {axis: value[axis] for axis in ("x", "y", "z", "roll", "pitch", "yaw") if axis in value}
+
+
+def _velocity(value: Mapping[str, Any]) -> dict[str, Any]:
+    still = (0.0, 0.0)
+    made = {
+        "linear_velocity": [value.get(axis, still) for axis in ("x", "y", "z")],
+        "angular_velocity": [value.get(axis, still) for axis in ("roll", "pitch", "yaw")],
+    }
+    return {key: ranges for key, ranges in made.items() if any(tuple(r) != still for r in ranges)}
+
+
+def _position(value: Mapping[str, Any]) -> dict[str, Any]:
+    return {axis: value[axis] for axis in ("x", "y", "z") if axis in value}
+
+
+def _names(value: Any) -> dict[str, Any]:
+    return {"terms": [value] if isinstance(value, str) else list(value)}
+
+
+def _only(value: Any) -> dict[str, Any]:
+    """Of a list of one the one; what is wrong with several is said where the term is checked."""
+    return {"sensor": value[0] if len(value) == 1 else list(value)}
+
+
+def _bounds(value: Mapping[str, Any]) -> dict[str, Any]:
+    return {axis: value[axis] for axis in ("x", "y", "z") if axis in value}
+
+
+_JOINTS: dict[str, str | Translate] = {"position_range": "position", "velocity_range": "velocity"}
+_ROOT: dict[str, str | Translate] = {"pose_range": _pose, "velocity_range": _velocity}
+_TARGET: dict[str, str | Translate] = {"target_pos": "target"}
+
+TERMS: dict[str, dict[str, Entry]] = {
+    "observations": {
+        "base_heading_proj": Entry(params=_TARGET),
+        "base_angle_to_target": Entry(params=_TARGET),
+        "fingertips_pos": Entry("ee_pos"),
+        "ee_frame_pos": Entry("ee_pos"),
+        "ee_frame_quat": Entry("ee_quat"),
+        "object_pos_b": Entry("object_position_in_robot_root_frame"),
+        "object_obs": Entry("rel_ee_object_distance"),
+        "gripper_pos": Entry("joint_pos"),
+        "fingers_contact_force_b": Entry(params={"contact_sensor_names": _only}),
+        "cube_positions_in_world_frame": Entry("root_pos_w"),
+        "cube_orientations_in_world_frame": Entry("root_quat_w"),
+    },
+    "rewards": {
+        "is_terminated_term": Entry(params={"term_keys": _names}),
+        "move_to_target_bonus": Entry(params=_TARGET),
+        "progress_reward": Entry(params=_TARGET),
+        "GaitReward": Entry("gait_reward"),
+        "action_l2_clamped": Entry("action_l2"),
+        "action_rate_l2_clamped": Entry("action_rate_l2"),
+    },
+    "terminations": {
+        "out_of_bound": Entry(params={"in_bound_range": _bounds}),
+        "terrain_out_of_bounds": Entry(
+            "out_of_bound", {"distance_buffer": lambda value: {}}, "without bounds: give out_of_bound its x and y"
+        ),
+    },
+    "events": {
+        "reset_joints_by_offset": Entry(params=_JOINTS),
+        "reset_joints_around_default": Entry("reset_joints_by_offset", _JOINTS),
+        "reset_joints_within_limits_range": Entry("reset_joints_within_limits", _JOINTS),
+        "reset_joints_by_scale": Entry(params=_JOINTS),
+        "reset_root_state_uniform": Entry(params=_ROOT),
+        "reset_root_state_with_random_orientation": Entry(params=_ROOT | {"pose_range": _position}),
+        "push_by_setting_velocity": Entry(params={"velocity_range": _velocity}),
+        "apply_external_force_torque": Entry(params={"force_range": "force", "torque_range": "torque"}),
+        "reset_scene_to_default": Entry(params={"reset_joint_targets": lambda value: {}}),
+        "randomize_rigid_body_scale": Entry("randomize_geom_size"),
+        "randomize_rigid_body_material": Entry("randomize_geom_friction"),
+        "randomize_rigid_body_mass": Entry("randomize_body_mass"),
+        "randomize_rigid_body_com": Entry("randomize_body_com"),
+        "randomize_rigid_body_collider_offsets": Entry("randomize_model_field"),
+        "randomize_physics_scene_gravity": Entry("randomize_gravity"),
+        "randomize_joint_parameters": Entry("randomize_joint_armature"),
+        "randomize_fixed_tendon_parameters": Entry("randomize_tendon_stiffness"),
+        "randomize_joint_by_gaussian_offset": Entry("reset_joints_by_gaussian"),
+        "randomize_object_pose": Entry("reset_root_state_uniform", _ROOT),
+    },
+    "curriculum": {
+        "modify_reward_weight": Entry("stages"),
+        "modify_env_param": Entry("stages"),
+        "modify_term_cfg": Entry("stages"),
+        "initial_final_interpolate_fn": Entry("interpolate"),
+        "terrain_levels_vel": Entry("terrain_levels", fixed={"command": "base_velocity"}),
+    },
+}
+"""Section -> Isaac Lab's name -> what it is here; `rlcli_isaaclab.randomization` translates the parameters of some."""
+
+ACTIONS: dict[str, str] = {
+    "JointEffortAction": "joint_effort",
+    "JointPositionAction": "joint_position",
+    "RelativeJointPositionAction": "relative_joint_position",
+    "JointVelocityAction": "joint_velocity",
+    "JointPositionToLimitsAction": "joint_position_to_limits",
+    "EMAJointPositionToLimitsAction": "ema_joint_position_to_limits",
+    "BinaryJointPositionAction": "binary_joint_position",
+    "BinaryJointVelocityAction": "binary_joint_velocity",
+    "AbsBinaryJointPositionAction": "binary_joint_position",
+    "DifferentialInverseKinematicsAction": "differential_inverse_kinematics",
+}
+"""Isaac Lab's class -> the action term."""
+
+COMMANDS: dict[str, Entry] = {
+    "NullCommand": Entry("null_command"),
+    "UniformVelocityCommand": Entry(
+        "uniform_velocity",
+        {
+            "heading_control_stiffness": "heading_stiffness",
+            "rel_standing_envs": "rel_standing",
+            "rel_heading_envs": "rel_heading",
+        },
+    ),
+    "NormalVelocityCommand": Entry("normal_velocity", {"rel_standing_envs": "rel_standing"}),
+    "UniformPoseCommand": Entry("uniform_pose", {"body_name": "bodies", "pos_x": "x", "pos_y": "y", "pos_z": "z"}),
+    "UniformPose2dCommand": Entry("uniform_pose2d", {"pos_x": "x", "pos_y": "y"}),
+}
+"""Isaac Lab's class -> the command term; its `ranges` are parameters like the others."""
+
+NEVER = 1.0e9
+"""An interval that no episode lasts [s], for an infinite one."""
+
+
+def seconds(value: Any) -> Any:
+    """A range of times without infinities."""
+    return [NEVER if math.isinf(end) else end for end in value]

@@ -1,0 +1,62 @@
+"""Noise on observations. Names as in `isaaclab.utils.noise`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rlcli_isaaclab.config_class import MISSING, configclass
+
+
+@configclass
+class NoiseCfg:
+    """What all noise has: `operation` is add, scale or abs."""
+
+    func: Any = "noise"
+    operation: str = "add"
+
+
+@configclass
+class ConstantNoiseCfg(NoiseCfg):
+    """The same value in every step."""
+
+    func: Any = "constant_noise"
+    bias: Any = 0.0
+
+
+@configclass
+class UniformNoiseCfg(NoiseCfg):
+    """Uniform in [n_min, n_max)."""
+
+    func: Any = "uniform_noise"
+    n_min: Any = -1.0
+    n_max: Any = 1.0
+
+
+@configclass
+class GaussianNoiseCfg(NoiseCfg):
+    """Gaussian."""
+
+    func: Any = "gaussian_noise"
+    mean: Any = 0.0
+    std: Any = 1.0
+
+
+@configclass
+class NoiseModelCfg:
+    """Noise drawn anew in every step."""
+
+    class_type: Any = "NoiseModel"
+    noise_cfg: Any = MISSING
+
+
+@configclass
+class NoiseModelWithAdditiveBiasCfg(NoiseModelCfg):
+    """The same with a bias drawn when an episode begins."""
+
+    class_type: Any = "NoiseModelWithAdditiveBias"
+    bias_noise_cfg: Any = MISSING
+    sample_bias_per_component: bool = True
+
+
+AdditiveUniformNoiseCfg, AdditiveGaussianNoiseCfg = UniformNoiseCfg, GaussianNoiseCfg
+ConstantBiasNoiseCfg = ConstantNoiseCfg

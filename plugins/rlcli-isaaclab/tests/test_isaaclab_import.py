@@ -1,0 +1,226 @@
+"""`rlcli import isaaclab`: the files of a run become a task of rlcli's own, every key accounted for."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from rlcli.cli.app import main
+from rlcli.config.dump import to_data
+from rlcli.config.load import resolve
+from rlcli.envs.make import make_env
+from rlcli.registry import find_task, folder_task
+
+torch.set_num_threads(1)
+HERE = Path(__file__).parent
+ENV, AGENT = HERE / "env.yaml", HERE / "agent.yaml"
+
+
+@pytest.fixture
+def imported(tmp_path, capsys):
+    """imported(env text, ...) -> exit code, the JSON document, stderr, the folder."""
+
+    def run(text=None, *words, agent=True):
+        env = tmp_path / "env.yaml"
+        env.write_text(ENV.read_text() if text is None else text, encoding="utf-8")
+        folder = tmp_path / "task"
+        agents = [str(AGENT)] if agent else []
+        code = main(["import", "isaaclab", str(env), *agents, "-o", str(folder), "--json", *words])
+        out, err = capsys.readouterr()
+        return code, json.loads(out) if out.strip() else {}, err, folder
+
+    return run
+
+
+def test_a_cartpole_run_gives_our_cartpole_field_by_field(imported):
+    code, _, _, folder = imported()
+    assert code == 0
+    ours = to_data(resolve(folder_task(folder)))
+    theirs = to_data(resolve(find_task("cartpole"), flags={"scene.num_envs": 4096}))
+    for key in ("decimation", "episode_length_s", "sim", "scene", "actions", "observations", "rewards", "terminations"):
+        assert ours[key] == theirs[key], key
+    assert list(ours["events"].values()) == list(theirs["events"].values())
+    assert ours["viewer"]["eye"] == theirs["viewer"]["eye"]
+    assert ours["reward_dt_scaling"] is theirs["reward_dt_scaling"]
+    agent = ours["agents"]["rsl-rl"]
+    assert (agent["trainer"], agent["dialect"], agent["num_steps"], agent["entropy_coef"]) == (
+        "ppo",
+        "rsl_rl",
+        16,
+        0.005,
+    )
+    assert agent["actor"] == {"hidden": [32, 32], "activation": "elu"}
+
+
+def test_the_imported_task_takes_the_steps_of_cartpole(imported):
+    _, _, _, folder = imported()
+    ours = make_env(resolve(folder_task(folder), flags={"scene.num_envs": 4}))
+    other = make_env(resolve(find_task("cartpole"), flags={"scene.num_envs": 4}))
+    ours.reset(seed=0), other.reset(seed=0)
+    for field in ("qpos", "qvel"):
+        ours.engine.field(field).copy_(other.engine.field(field))
+    ours.engine.forward(ours._select_all())
+    ours.sim.refresh()
+    for _ in range(30):
+        a, b = (env.step(torch.full((4, 1), 0.02)) for env in (ours, other))
+        assert torch.equal(a.obs["policy"], b.obs["policy"])
+        assert torch.equal(a.reward, b.reward)
+
+
+def leaves(value, key=()):
+    if isinstance(value, dict) and value:
+        for name, item in value.items():
+            yield from leaves(item, (*key, str(name)))
+    else:
+        yield key
+
+
+def test_every_key_is_accounted_for(imported):
+    _, document, _, _ = imported()
+    told = {tuple(row["key"].split(".")): row for row in document["keys"]}
+    text = ENV.read_text().replace("!!python/tuple", "").replace("!!python/object/apply:builtins.slice", "")
+    text = text.replace("!!python/object/apply:isaaclab.managers.recorder_manager.DatasetExportMode", "")
+    missing = []
+    for key in leaves(yaml.safe_load(text)):
+        above = [".".join(key[:length]) for length in range(1, len(key) + 1)]
+        if not any(".".join(known) in above for known in told):
+            missing.append(key)
+    assert missing == []
+    status = {row["key"]: row["status"] for row in document["keys"]}
+    assert status["sim.dt"] == status["rewards.alive.weight"] == "mapped"
+    assert status["scene.robot.spawn.rigid_props"] == status["sim.physx"] == "ignored"
+    assert status["scene.robot.spawn.collision_props"] == "default"
+
+
+def test_a_function_that_only_its_author_has_becomes_a_stub(imported):
+    own = "func: my_robots.mdp:wobble\n    params:\n      strength: 2.0"
+    text = ENV.read_text().replace("func: isaaclab.envs.mdp.rewards:is_alive\n    params: {}", own)
+    code, _, err, folder = imported(text)
+    assert code == 0
+    assert "rewards.alive.func: to do: write 'wobble' in terms.py" in err
+    assert "def wobble(env, *, strength: float):" in (folder / "terms.py").read_text()
+    assert resolve(folder_task(folder)).task.rewards["alive"].params == {"strength": 2.0}
+
+
+def test_a_command_and_a_curriculum_that_only_their_author_has_become_stubs_that_load(imported):
+    own = """commands:
+  place:
+    class_type: my_robots.mdp:PlaceCommand
+    resampling_time_range: !!python/tuple [2.0, 4.0]
+    asset_name: robot
+    debug_vis: true
+    ranges: {x: [-1, 1.0]}
+curriculum:
+  ramp: {func: 'my_robots.mdp:ramp', params: {term_name: alive, weight: 2.0}}
+"""
+    lines = [line for line in ENV.read_text().split("\n") if not line.startswith(("commands:", "curriculum:"))]
+    code, _, err, folder = imported("\n".join(lines) + own)
+    assert code == 0
+    assert "commands.place.class_type: to do: write 'PlaceCommand' in terms.py" in err
+    text = (folder / "terms.py").read_text()
+    assert "def __init__(self, env, *, entity: Entity, ranges: dict[str, list[float]]):" in text
+    assert "def ramp(env, selection, *, term_name: str, weight: float):" in text
+    task = resolve(folder_task(folder)).task
+    assert task.commands["place"].params == {"entity": "robot", "ranges": {"x": [-1.0, 1.0]}}
+
+
+def test_an_own_model_stands_for_a_usd_file_that_is_not_known(imported, tmp_path):
+    text = ENV.read_text().replace("Classic/Cartpole/cartpole.usd", "Own/wobbly.usd")
+    code, document, _, folder = imported(text)
+    assert code == 3
+    assert "scene.robot.spawn.usd_path" in json.dumps(document)
+    assert not folder.exists()
+    model = tmp_path / "wobbly.xml"
+    model.write_text((find_task("cartpole").root / "cartpole.xml").read_text())
+    code, _, _, folder = imported(text, "--model", f"robot={model}")
+    assert code == 0
+    assert resolve(folder_task(folder)).task.scene.entities["robot"].model == "wobbly.xml"
+    assert make_env(resolve(folder_task(folder), flags={"scene.num_envs": 2})).num_envs == 2
+
+
+def test_nothing_of_a_file_is_run_or_constructed(imported, tmp_path):
+    mark = tmp_path / "ran"
+    evil = f"evil: !!python/object/apply:os.system ['touch {mark}']\n"
+    code, _, _, _ = imported(evil + ENV.read_text())
+    assert code == 0
+    assert not mark.exists()
+
+
+BOMB = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + "".join(
+    f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdef", "bcdefg", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a: [", "env.yaml:"),
+        ("- 1", "the top level must be a mapping"),
+        ("a: 1", "missing 'decimation'"),
+        (BOMB, "more than"),
+        ("[" * 3000, "env.yaml"),
+    ],
+)  # fmt: skip
+def test_what_is_not_such_a_file_is_refused(imported, text, said):
+    code, document, _, folder = imported(text)
+    assert code == 3
+    assert said in json.dumps(document)
+    assert not folder.exists()
+
+
+def test_a_task_that_is_there_is_not_overwritten(imported):
+    assert imported()[0] == 0
+    code, document, _, _ = imported()
+    assert code == 2
+    assert "exists" in json.dumps(document)
+
+
+def test_a_file_of_another_library_is_refused(imported, tmp_path):
+    other = tmp_path / "agent.yaml"
+    other.write_text("params:\n  seed: 42\n")
+    code, document, _, _ = imported(None, str(other), agent=False)
+    assert code == 3
+    assert "is not RSL-RL's agent.yaml" in json.dumps(document)
+
+
+def test_settings_beyond_cartpoles_are_translated(imported):
+    noise = "noise: {func: isaaclab.utils.noise.noise_model:uniform_noise, operation: add, n_min: -0.1, n_max: 0.1}"
+    softer = "func: isaaclab.envs.mdp.curriculums:modify_reward_weight"
+    softer += ", params: {term_name: alive, weight: 0.5, num_steps: 100}"
+    plain = "clip: null\n      scale: null\n      history_length: 0"
+    motor = "class_type: isaaclab.actuators.actuator_pd:"
+    text = ENV.read_text()
+    for old, new in (
+        ("noise: null", noise),
+        ("enable_corruption: false", "enable_corruption: true"),
+        (plain, "clip: [-5, 5]\n      scale: 2.0\n      history_length: 3"),
+        ("curriculum: null", f"curriculum: {{softer: {{{softer}}}}}"),
+        (f"{motor}ImplicitActuator", f"{motor}IdealPDActuator"),
+        ("effort_limit: null", "effort_limit: 30.0"),
+        ("size: !!python/tuple\n      - 100.0\n      - 100.0", "size: [50.0, 60.0]"),
+    ):
+        assert old in text
+        text = text.replace(old, new, 1)
+    code, document, err, folder = imported(text)
+    assert code == 0, (document, err)
+    data = to_data(resolve(folder_task(folder)))
+    term = data["observations"]["policy"]["joint_pos_rel"]
+    assert (term["noise"]["low"], term["clip"], term["scale"], term["history"]) == (-0.1, [-5.0, 5.0], 2.0, 3)
+    assert data["curriculum"]["softer"]["address"] == "rewards.alive.weight"
+    actuator = data["scene"]["entities"]["robot"]["actuators"]["cart_actuator"]
+    assert (actuator["kind"], actuator["damping"], actuator["effort_limit"]) == ("pd", 10.0, 30.0)
+    assert data["scene"]["ground"]["size"] == 60.0
+
+
+def test_a_pipe_and_a_file_without_end_are_not_read(tmp_path, capsys):
+    pipe, sparse = tmp_path / "pipe.yaml", tmp_path / "sparse.yaml"
+    os.mkfifo(pipe)
+    with sparse.open("wb") as file:
+        file.truncate(2**40)
+    for file, why in ((pipe, "not a plain file"), (sparse, "larger than")):
+        assert main(["import", "isaaclab", str(file), "-o", str(tmp_path / "out")]) == 3
+        assert why in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,51 @@
+"""The page of Isaac Lab's terms tells the truth: what it says is here, is here."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import rlcli
+from rlcli.config.terms import SECTIONS, builtin_terms
+
+PAGE = Path(rlcli.__path__[0]).parent / "docs" / "isaaclab-terms.md"
+ROW = re.compile(r"^\| `([^`]+)` \| (same|not possible|not offered|`[a-z0-9_]+`) \| (.*) \|$")
+
+
+def tables():
+    """Section -> (Isaac Lab's name, what is said to stand for it, remark)."""
+    found, section = {}, None
+    for line in PAGE.read_text().splitlines():
+        if line.startswith("## "):
+            section = None
+        elif re.fullmatch(r"`[a-z]+:`", line):
+            section = line.strip("`:")
+            found[section] = []
+        elif section and line.startswith("| `"):
+            match = ROW.match(line)
+            assert match, line
+            found[section].append(match.groups())
+    return found
+
+
+def test_the_page_has_every_section_of_terms():
+    assert set(tables()) == set(SECTIONS) - {"success"}
+    assert sum(map(len, tables().values())) > 180
+
+
+RANDOMIZATION = Path(rlcli.__path__[0]) / "mdp" / "randomization"
+"""Half of the events; without it their table promises what is to come."""
+HERE = sorted(set(SECTIONS) - {"success"} - (set() if RANDOMIZATION.exists() else {"events"}))
+
+
+@pytest.mark.parametrize("section", HERE)
+def test_what_is_said_to_be_here_is_here(section):
+    terms, rows = builtin_terms(section), tables()[section]
+    names = [name for name, _, _ in rows]
+    assert len(set(names)) == len(names)
+    for name, here, remark in rows:
+        if here in ("not possible", "not offered"):
+            assert remark, f"{name}: why?"
+            assert name not in terms
+        else:
+            assert (name if here == "same" else here.strip("`")) in terms, name

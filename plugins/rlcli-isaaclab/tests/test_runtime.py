@@ -1,0 +1,245 @@
+"""What a term of Isaac Lab's signature reads and writes: against the engine, and rotations against MuJoCo's."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from support.worlds import build, critter
+
+from rlcli_isaaclab import runtime
+from rlcli_isaaclab.utils import math as lab
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory):
+    """Four critters in motion, as Isaac Lab's terms see them."""
+    built = build(critter(tmp_path_factory.mktemp("critter")))
+    yield runtime.facade_of(built)
+    built.close()
+
+
+@pytest.fixture
+def robot(env):
+    env.reset(seed=3)
+    for _ in range(3):
+        env.step(torch.rand(4, 4, generator=torch.Generator().manual_seed(1)))
+    return env.scene["robot"]
+
+
+def some_pose(rows):
+    drawn = torch.Generator().manual_seed(5)
+    place = torch.rand(rows, 3, generator=drawn) + torch.tensor([0.0, 0.0, 1.0])
+    return torch.cat([place, lab.normalize(torch.randn(rows, 4, generator=drawn))], dim=1)
+
+
+def test_a_root_state_that_is_written_is_what_is_read_in_the_rows_that_were_meant(robot):
+    before = robot.data.root_state_w.clone()
+    rows = torch.tensor([3, 1])
+    written = torch.cat(
+        [some_pose(2), torch.tensor([[1.0, -2.0, 0.5, 0.3, -0.7, 2.0], [0.0, 1.0, 0.0, -1.0, 0.2, 0.1]])], 1
+    )
+    robot.write_root_state_to_sim(written, env_ids=rows)
+    assert torch.allclose(robot.data.root_state_w[rows], written, atol=1e-6)
+    assert torch.equal(robot.data.root_state_w[[0, 2]], before[[0, 2]])
+    assert torch.allclose(robot.data.root_pose_w[rows], written[:, :7], atol=1e-6)
+    assert torch.allclose(robot.data.root_vel_w[rows], written[:, 7:], atol=1e-6)
+
+
+def test_a_joint_that_is_written_is_what_is_read_and_the_others_stay(robot):
+    position, velocity = robot.data.joint_pos.clone(), robot.data.joint_vel.clone()
+    ids, names = robot.find_joints(["hip_br", "hip_fl"])
+    assert names == [robot.joint_names[i] for i in ids]
+    asked = torch.tensor([[0.3, -0.2]])
+    robot.write_joint_position_to_sim(asked, joint_ids=torch.tensor(ids), env_ids=[2])
+    robot.write_joint_velocity_to_sim(10 * asked, joint_ids=torch.tensor(ids), env_ids=[2])
+    position[2, ids], velocity[2, ids] = asked[0], 10 * asked[0]
+    assert torch.allclose(robot.data.joint_pos, position)
+    assert torch.allclose(robot.data.joint_vel, velocity)
+    robot.write_joint_state_to_sim(torch.full((4, 4), 0.1), torch.full((4, 4), -1.0))
+    assert torch.allclose(robot.data.joint_pos, torch.tensor(0.1))
+    assert torch.allclose(robot.data.joint_vel, torch.tensor(-1.0))
+
+
+def test_joints_come_in_the_models_order_unless_the_callers_is_kept(robot):
+    model = robot.joint_names
+    assert robot.find_joints(["hip_f.*", "hip_br"])[1] == [n for n in model if n in ("hip_fl", "hip_fr", "hip_br")]
+    assert robot.find_joints(["hip_br", "hip_fl"], preserve_order=True)[1] == ["hip_br", "hip_fl"]
+    assert robot.find_joints(".*l", joint_subset=["hip_bl", "hip_br"])[1] == ["hip_bl"]
+    assert robot.find_bodies("leg_f.")[1] == ["leg_fl", "leg_fr"]
+
+
+def test_bodies_limits_and_directions_are_those_of_the_engine(env, robot):
+    states = robot.data.body_state_w
+    assert states.shape == (4, robot.num_bodies, 13)
+    torso = robot.body_names.index("torso")
+    assert torch.allclose(states[:, torso, :7], robot.data.root_pose_w, atol=1e-5)
+    assert torch.allclose(robot.data.joint_pos_limits, torch.tensor([-math.pi / 3, math.pi / 3]).expand(4, 4, 2))
+    assert (robot.data.soft_joint_pos_limits.abs() <= robot.data.joint_pos_limits.abs()).all()
+    assert torch.equal(robot.data.GRAVITY_VEC_W, torch.tensor([0.0, 0.0, -1.0]).expand(4, 3))
+    robot.write_root_pose_to_sim(torch.tensor([[0, 0, 1, math.cos(0.4), 0, 0, math.sin(0.4)]]).expand(4, 7))
+    assert torch.allclose(robot.data.heading_w, torch.tensor(0.8), atol=1e-6)
+    assert not robot.is_fixed_base
+    assert robot.num_instances == env.scene.num_envs == 4
+
+
+def test_the_scene_is_a_mapping_that_names_what_it_has(env):
+    assert list(env.scene) == ["robot"]
+    assert len(env.scene) == 1
+    assert env.scene.articulations["robot"] is env.scene["robot"]
+    assert env.scene.rigid_objects == {}
+    assert torch.equal(env.scene.env_origins, torch.zeros(4, 3))
+    with pytest.raises(KeyError, match="no 'terrain' in the scene: robot"):
+        env.scene["terrain"]
+    with pytest.raises(AttributeError, match=r"data has no 'joint_poss'; did you mean 'joint_pos"):
+        env.scene["robot"].data.joint_poss  # noqa: B018
+    with pytest.raises(AttributeError, match="an asset has no 'root_physx_view'; there is no PhysX"):
+        env.scene["robot"].root_physx_view  # noqa: B018
+    with pytest.raises(AttributeError, match="env has no 'step_dtt'; did you mean 'step_dt'"):
+        env.step_dtt  # noqa: B018
+    assert not hasattr(env.scene["robot"], "actuators")
+
+
+def test_managers_say_what_they_did_in_the_step(env):
+    env.reset(seed=0)
+    env.scene["robot"].write_root_pose_to_sim(torch.tensor([[0.0, 0.0, 1.0, 0.7, 0.7, 0.0, 0.0]]), env_ids=[1])
+    before = env.common_step_counter.clone()
+    _, _, terminated, truncated, extras = env.step(torch.zeros(4, 4))
+    assert bool(terminated[1])
+    assert torch.equal(env.termination_manager.get_term("tilt"), env.termination_manager.fired["tilt"])
+    assert torch.equal(env.termination_manager.dones, terminated | truncated)
+    assert torch.equal(env.reset_terminated, terminated)
+    assert torch.equal(env.reset_time_outs, truncated)
+    assert torch.equal(env.reset_buf, terminated | truncated)
+    assert extras["log"]["Episode_Termination/tilt"] == 1
+    assert env.common_step_counter == before + 1
+    assert env.termination_manager.active_terms == ["time_out", "tilt", "low"]
+    assert env.reward_manager.active_terms[:2] == ["alive", "fell"]
+    assert env.max_episode_length_s == 0.6
+    with pytest.raises(runtime.NameProblem, match="no action 'arms'; there are legs"):
+        env.action_manager.get_term("arms")
+    with pytest.raises(runtime.NameProblem, match="no termination 'tlit'; there are time_out"):
+        env.termination_manager.get_term("tlit")
+
+
+def test_the_spaces_are_those_of_the_batch(env):
+    obs, _ = env.reset()
+    assert env.single_action_space.shape == (4,)
+    assert env.action_space.shape == (4, 4)
+    for name, rows in obs.items():
+        assert env.observation_space[name].shape == tuple(rows.shape)
+        assert env.single_observation_space[name].shape == tuple(rows.shape[1:])
+
+
+# --- rotations ---
+
+
+def quats(rows=16, seed=0):
+    return lab.normalize(torch.randn(rows, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)))
+
+
+def vectors(rows=16, seed=1):
+    return torch.randn(rows, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def mujocos(function, size, *arguments):
+    """The same of MuJoCo, row by row."""
+    rows = []
+    for row in zip(*(a.numpy() for a in arguments), strict=True):
+        result = np.zeros(size)
+        function(result, *row)
+        rows.append(result)
+    return torch.from_numpy(np.stack(rows))
+
+
+def test_vectors_turn_as_mujoco_turns_them():
+    q, v = quats(), vectors()
+    turned = mujocos(lambda out, quat, vec: mujoco.mju_rotVecQuat(out, vec, quat), 3, q, v)
+    assert torch.allclose(lab.quat_apply(q, v), turned)
+    assert torch.allclose(lab.quat_apply_inverse(q, turned), v)
+    assert torch.allclose(lab.quat_apply(q[:1], v[:5]), lab.quat_apply(q[:1].expand(5, 4), v[:5]))
+    many = lab.quat_apply(q.reshape(4, 4, 4), v.reshape(4, 4, 3))
+    assert torch.allclose(many.reshape(16, 3), turned)
+
+
+def test_the_opposite_rotation_and_the_shortest_way_are_mujocos():
+    a, b = quats(), quats(seed=7)
+    assert torch.allclose(lab.quat_inv(a), mujocos(mujoco.mju_negQuat, 4, a))
+    way = mujocos(mujoco.mju_subQuat, 3, a, b).norm(dim=1)
+    angle = lab.quat_error_magnitude(a, b)
+    assert torch.allclose(angle, torch.minimum(way, 2 * torch.pi - way))
+    assert torch.allclose(lab.quat_error_magnitude(a, -a), torch.zeros(16, dtype=torch.float64), atol=1e-7)
+    assert (lab.quat_unique(torch.cat([a, -a]))[:, 0] >= 0).all()
+    assert torch.equal(lab.quat_unique(a), lab.quat_unique(-a))
+
+
+def test_angles_of_euler_and_back_are_the_same_rotation():
+    q = quats()
+    angles = lab.euler_xyz_from_quat(q)
+    assert all(bool(((a >= 0) & (a < 2 * torch.pi)).all()) for a in angles)
+    again = lab.quat_from_euler_xyz(*angles)
+    assert torch.allclose(lab.quat_unique(again), lab.quat_unique(q), atol=1e-7)
+    roll, pitch, yaw = (torch.tensor([x], dtype=torch.float64) for x in (0.1, -0.2, 0.3))
+    turned = lab.quat_apply(lab.quat_from_euler_xyz(roll, pitch, yaw), torch.tensor([[1.0, 0.0, 0.0]]).double())
+    expected = [math.cos(0.3) * math.cos(0.2), math.sin(0.3) * math.cos(0.2), math.sin(0.2)]
+    assert turned[0].tolist() == pytest.approx(expected)
+
+
+def test_a_turn_about_z_alone_keeps_heights_and_the_heading():
+    q, v = quats(), vectors()
+    level = lab.yaw_quat(q)
+    assert torch.equal(level[:, 1:3], torch.zeros(16, 2, dtype=torch.float64))
+    x = torch.tensor([[1.0, 0.0, 0.0]]).double().expand(16, 3)
+    full, flat = lab.quat_apply(q, x), lab.quat_apply_yaw(q, x)
+    assert torch.allclose(torch.atan2(full[:, 1], full[:, 0]), torch.atan2(flat[:, 1], flat[:, 0]))
+    assert torch.allclose(lab.quat_apply_yaw(q, v)[:, 2], v[:, 2])
+
+
+def test_frames_combined_and_subtracted_are_what_they_were():
+    t01, q01, t12, q12 = vectors(), quats(), vectors(seed=8), quats(seed=9)
+    t02, q02 = lab.combine_frame_transforms(t01, q01, t12, q12)
+    points = vectors(seed=11)
+    through = t01 + lab.quat_apply(q01, t12 + lab.quat_apply(q12, points))
+    assert torch.allclose(t02 + lab.quat_apply(q02, points), through)
+    back, turn = lab.subtract_frame_transforms(t01, q01, t02, q02)
+    assert torch.allclose(back, t12)
+    assert torch.allclose(lab.quat_unique(turn), lab.quat_unique(q12))
+    place, same = lab.combine_frame_transforms(t01, q01)
+    assert torch.equal(place, t01)
+    assert torch.equal(same, q01)
+    origin, turn = lab.subtract_frame_transforms(t01, q01)
+    assert torch.allclose(t01 + lab.quat_apply(q01, origin), torch.zeros(16, 3, dtype=torch.float64), atol=1e-12)
+    assert torch.equal(turn, lab.quat_conjugate(q01))
+
+
+def test_scales_and_bounds_are_each_others_opposite():
+    lower, upper = torch.tensor([-1.0, 0.0]), torch.tensor([3.0, 10.0])
+    ends = torch.stack([lower, upper, 0.5 * (lower + upper)])
+    assert torch.equal(lab.scale_transform(ends, lower, upper), torch.tensor([[-1.0, -1.0], [1.0, 1.0], [0.0, 0.0]]))
+    x = torch.tensor([[0.3, 7.0]])
+    assert torch.allclose(lab.unscale_transform(lab.scale_transform(x, lower, upper), lower, upper), x)
+    assert torch.equal(
+        lab.saturate(torch.tensor([[-5.0, 20.0], [1.0, 1.0]]), lower, upper), torch.tensor([[-1.0, 10.0], [1.0, 1.0]])
+    )
+    assert torch.equal(lab.copysign(-2.0, torch.tensor([-0.5, 3.0])), torch.tensor([-2.0, 2.0]))
+
+
+def test_draws_lie_where_they_should_and_spread():
+    torch.manual_seed(0)
+    even = lab.sample_uniform(-1.0, 3.0, (4000,), "cpu")
+    assert -1.0 <= float(even.min()) < -0.9 < 2.9 < float(even.max()) < 3.0
+    assert lab.sample_uniform(0.0, 1.0, 7, "cpu").shape == (7,)
+    bell = lab.sample_gaussian(2.0, 0.5, (4000,), "cpu")
+    assert float(bell.mean()) == pytest.approx(2.0, abs=0.05)
+    assert float(bell.std()) == pytest.approx(0.5, abs=0.05)
+    wide = lab.sample_log_uniform(0.01, 100.0, (4000,), "cpu")
+    assert float(wide.min()) >= 0.01
+    assert float(wide.max()) <= 100.0
+    assert float(wide.median()) == pytest.approx(1.0, rel=0.3)  # half of the decades lie below 1
+    turns = lab.random_orientation(4000, "cpu")
+    assert torch.allclose(turns.norm(dim=1), torch.ones(4000))
+    up = lab.quat_apply(turns, torch.tensor([0.0, 0.0, 1.0]).expand(4000, 3))
+    assert float(up.mean(dim=0).abs().max()) < 0.05

@@ -1,0 +1,300 @@
+"""An rl_games train YAML, as OmniIsaacGymEnvs has them, as settings of the trainer `ppo`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rlcli.config.layers import Origin, marked
+from rlcli.config.strict_yaml import Document, Path
+from rlcli.errors import ConfigError, Problem, did_you_mean, listing
+from rlcli.formats import Note, Status
+from rlcli_oige.hydra import evaluate
+
+_DIRECT = {
+    "gamma": "gamma",
+    "tau": "lam",
+    "learning_rate": "learning_rate",
+    "horizon_length": "num_steps",
+    "minibatch_size": "minibatch_size",
+    "mini_epochs": "num_epochs",
+    "e_clip": "clip_range",
+    "entropy_coef": "entropy_coef",
+    "bounds_loss_coef": "bounds_coef",
+    "normalize_input": "normalize_observations",
+    "normalize_value": "normalize_value",
+    "max_epochs": "max_iterations",
+    "save_frequency": "save_interval",
+}
+_IGNORED = {
+    "name": "a run is named by its task",
+    "full_experiment_name": "--name",
+    "env_name": "there is one environment loop",
+    "device": "--device decides",
+    "device_name": "--device decides",
+    "multi_gpu": "--gpus decides",
+    "ppo": "",
+    "mixed_precision": "updates are float32",
+    "num_actors": "scene.num_envs",
+    "score_to_win": "training runs to its budget",
+    "save_best_after": "the best checkpoint is always kept",
+    "print_stats": "",
+    "player": "rlcli play",
+    "seq_length": "sequences are whole rollouts",
+    "games_to_track": "",
+    "max_frames": "",
+    "minibatch_size_per_env": "",
+}
+_GRAINS = {"legacy": "minibatch", "standard": "epoch", "standard_epoch": "iteration"}
+_SCHEDULES = {"adaptive": "adaptive", "linear": "linear", "constant": "constant", "identity": "constant"}
+_HANDLED = (
+    "reward_shaper", "normalize_advantage", "lr_schedule", "kl_threshold", "grad_norm", "truncate_grads",
+    "critic_coef", "clip_value", "value_bootstrap", "schedule_type", "clip_actions", "central_value_config",
+    "minibatch_size",
+)  # fmt: skip
+_ACTIVATIONS = ("elu", "relu", "tanh", "silu")
+_MOST_LOG_STD = 20
+
+
+@dataclass(slots=True)
+class Agent:
+    """Settings of the trainer `ppo`, and where each was written."""
+
+    data: dict[str, Any]
+    origin: Callable[[Path], Origin]
+    notes: list[Note]
+
+    def origin_at(self, at: Path) -> Callable[[Path], Origin]:
+        """The same for a document in which the settings stand at `at`."""
+        return lambda path: self.origin(path[len(at) :])
+
+
+def translate(document: Document, label: str, root: Mapping[str, Any]) -> Agent:
+    """Settings of the trainer `ppo` that learn as rl_games does with this file.
+
+    Args:
+        document: the train YAML.
+        label: how messages name it.
+        root: what its interpolations find above it, the evaluated task among it.
+
+    Raises:
+        ConfigError: with every key that is not known or cannot be.
+    """
+    return _Translator(document, label).run(root)
+
+
+@dataclass(slots=True)
+class _Translator:
+    document: Document
+    label: str
+    data: dict[str, Any] = field(default_factory=dict)
+    sources: dict[Path, Path] = field(default_factory=dict)
+    notes: list[Note] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
+
+    def run(self, root: Mapping[str, Any]) -> Agent:
+        train, errors = evaluate({**root, "train": self.document.data}, ("train",))
+        for error in errors:
+            self._problem(error.path[1:], str(error), error.hint)
+        for key in train:
+            if key != "params":
+                self._problem((key,), f"unknown key '{key}'", "keys: params")
+        params = train.get("params")
+        if not isinstance(params, dict) or not isinstance(params.get("config"), dict):
+            self._problem(("params",), "an rl_games YAML has params: {algo, model, network, config}")
+            raise ConfigError(self.problems)
+        self.data = {"trainer": "ppo", "algorithm": "ppo", "dialect": "rl_games"}
+        self._params(params)
+        self._network(params.get("network"))
+        self._config(params["config"])
+        if self.problems:
+            raise ConfigError(self.problems)
+        origin = marked(self.document, self.label, "task")
+
+        def written(path: Path) -> Origin:
+            for length in range(len(path), 0, -1):
+                if path[:length] in self.sources:
+                    return origin(self.sources[path[:length]])
+            return origin(("params",))
+
+        return Agent(self.data, written, self.notes)
+
+    def _params(self, params: Mapping[str, Any]) -> None:
+        known: dict[str, tuple[Status, str]] = {
+            "seed": ("mapped", "--seed"),
+            "load_checkpoint": ("ignored", "--init-from, --resume"),
+            "load_path": ("ignored", "--init-from, --resume"),
+        }
+        for key, value in params.items():
+            at = ("params", key)
+            if key in known:
+                self._note(at, *known[key])
+            elif key in ("algo", "model"):
+                name = value.get("name") if isinstance(value, dict) else value
+                wanted = {"algo": "a2c_continuous", "model": "continuous_a2c_logstd"}[key]
+                if name != wanted:
+                    self._problem(at, f"'{name}' has no counterpart here", f"'{wanted}' has: trainer ppo")
+                else:
+                    self._note(at, "mapped", "trainer ppo")
+            elif key not in ("network", "config"):
+                near = did_you_mean(key, ("seed", "algo", "model", "network", "config", *known))
+                self._problem(at, f"unknown key '{key}'", near)
+
+    def _network(self, network: Any) -> None:
+        at = ("params", "network")
+        if not isinstance(network, dict):
+            self._problem(at, "expected a mapping with mlp: {units, activation}")
+            return
+        for key, value in network.items():
+            if key == "name":
+                self._note((*at, key), "mapped", "actor and critic")
+            elif key == "separate":
+                if value:
+                    self._note((*at, key), "mapped", "actor and critic are networks of their own")
+                else:
+                    self._note((*at, key), "approximated", "actor and critic share nothing here")
+            elif key == "mlp":
+                self._mlp((*at, key), value)
+            elif key == "space":
+                self._space((*at, key), value)
+            elif key == "rnn":
+                self._rnn((*at, key), value)
+            else:
+                self._problem((*at, key), f"unknown key '{key}'", "keys: name, separate, space, mlp, rnn")
+
+    def _mlp(self, at: Path, mlp: Any) -> None:
+        if not isinstance(mlp, dict):
+            self._problem(at, "expected a mapping")
+            return
+        shape: dict[str, Any] = {}
+        for key, value in mlp.items():
+            if key == "units":
+                shape["hidden"] = value
+                self._note((*at, key), "mapped", "actor.hidden, critic.hidden")
+            elif key == "activation":
+                if value not in _ACTIVATIONS:
+                    self._problem((*at, key), f"activation '{value}' is not known", f"known: {listing(_ACTIVATIONS)}")
+                shape["activation"] = value
+                self._note((*at, key), "mapped", "actor.activation, critic.activation")
+            elif key == "d2rl" and value:
+                self._problem((*at, key), "d2rl networks are not built here")
+            elif key in ("d2rl", "initializer", "regularizer"):
+                self._note((*at, key), "mapped" if key == "initializer" else "ignored", "init")
+            else:
+                self._problem((*at, key), f"unknown key '{key}'")
+        for network in ("actor", "critic"):
+            self._put((network,), dict(shape), at)
+
+    def _space(self, at: Path, space: Any) -> None:
+        kinds = space if isinstance(space, dict) else {}
+        continuous = kinds.get("continuous")
+        if not isinstance(continuous, dict):
+            self._problem(at, f"only a continuous space is learned in, found {listing(kinds)}")
+            return
+        for key, value in continuous.items():
+            inner = (*at, "continuous", key)
+            if key == "sigma_init":
+                log_std = value.get("val", 0) if isinstance(value, dict) else 0
+                if not isinstance(log_std, int | float) or abs(log_std) > _MOST_LOG_STD:
+                    self._problem(inner, f"val: expected a number between -{_MOST_LOG_STD} and {_MOST_LOG_STD}")
+                    continue
+                self._put(("init_std",), math.exp(log_std), inner)
+                self._note(inner, "mapped", "init_std")
+            elif key == "fixed_sigma" and value is not True:
+                self._note(inner, "approximated", "the deviation is the same in every state")
+            else:
+                self._note(inner, "mapped")
+
+    def _rnn(self, at: Path, rnn: Any) -> None:
+        if not isinstance(rnn, dict) or rnn.get("name") != "lstm":
+            self._problem(at, "only {name: lstm, units, layers} is built here")
+            return
+        self._put(("rnn",), {"hidden": rnn.get("units", 64), "layers": rnn.get("layers", 1)}, at)
+        for key, value in rnn.items():
+            exact = key in ("name", "units", "layers") or (key == "before_mlp" and value is True) or not value
+            self._note((*at, key), "mapped" if exact else "approximated", "rnn")
+
+    def _config(self, config: Mapping[str, Any]) -> None:
+        at = ("params", "config")
+        for key, value in config.items():
+            if key in _DIRECT:
+                self._put((_DIRECT[key],), value, (*at, key))
+                self._note((*at, key), "mapped", _DIRECT[key])
+            elif key in _IGNORED:
+                self._note((*at, key), "ignored", _IGNORED[key])
+            elif key not in _HANDLED:
+                near = did_you_mean(key, [*_DIRECT, *_HANDLED, *_IGNORED])
+                self._problem((*at, key), f"unknown key '{key}'", near)
+        self._special(at, config)
+
+    def _special(self, at: Path, config: Mapping[str, Any]) -> None:
+        def mapped(key: str, target: str, value: Any, text: str = "") -> None:
+            if key in config:
+                self._put((target,), value, (*at, key))
+                self._note((*at, key), "approximated" if text else "mapped", text or target)
+
+        shaper = config.get("reward_shaper")
+        scale = shaper.get("scale_value", 1.0) if isinstance(shaper, dict) else 1.0
+        mapped("reward_shaper", "reward_scale", scale)
+        if isinstance(shaper, dict) and set(shaper) - {"scale_value"}:
+            others = listing(sorted(set(shaper) - {"scale_value"}))
+            self._problem((*at, "reward_shaper"), f"only scale_value is known, found {others}")
+        mapped("critic_coef", "value_coef", 0.5 * _number(config.get("critic_coef"), 2.0))
+        mapped("clip_value", "clip_value", "larger" if config.get("clip_value") else None)
+        mapped("normalize_advantage", "normalize_advantage", "batch" if config.get("normalize_advantage") else None)
+        norm = config.get("grad_norm", 1.0) if config.get("truncate_grads", False) else None
+        self._put(("max_grad_norm",), norm, (*at, "grad_norm"))
+        for key in ("grad_norm", "truncate_grads"):
+            if key in config:
+                self._note((*at, key), "mapped", "max_grad_norm")
+        self._schedule(at, config)
+        if "value_bootstrap" in config:
+            if config["value_bootstrap"]:
+                self._note((*at, "value_bootstrap"), "mapped", "bootstrap")
+            else:
+                self._note((*at, "value_bootstrap"), "approximated", "a time-out always bootstraps here")
+        if "clip_actions" in config:
+            mapped("clip_actions", "action_bound", 1.0 if config["clip_actions"] else None)
+        if "central_value_config" in config:
+            text = "the critic sees states_buf; its network and schedule are the policy's"
+            self._note((*at, "central_value_config"), "approximated", text)
+
+    def _schedule(self, at: Path, config: Mapping[str, Any]) -> None:
+        schedule = config.get("lr_schedule") or "constant"
+        if str(schedule) == "None":
+            schedule = "constant"
+        if not isinstance(schedule, str) or schedule not in _SCHEDULES:
+            self._problem((*at, "lr_schedule"), f"no schedule '{schedule}'", f"known: {listing(_SCHEDULES)}")
+            return
+        self._put(("schedule",), _SCHEDULES[schedule], (*at, "lr_schedule"))
+        adaptive = schedule == "adaptive"
+        self._put(("desired_kl",), config.get("kl_threshold", 0.008) if adaptive else None, (*at, "kl_threshold"))
+        for key in ("lr_schedule", "kl_threshold"):
+            if key in config:
+                used = adaptive or key == "lr_schedule"
+                self._note((*at, key), "mapped" if used else "ignored", "schedule" if used else "not adaptive")
+        if "schedule_type" in config:
+            grain = _GRAINS.get(str(config["schedule_type"]))
+            if grain is None:
+                self._problem((*at, "schedule_type"), "no such schedule_type", f"known: {listing(_GRAINS)}")
+            self._put(("kl_grain",), grain, (*at, "schedule_type"))
+            self._note((*at, "schedule_type"), "mapped", "kl_grain")
+
+    def _put(self, target: Path, value: Any, source: Path) -> None:
+        self.data[str(target[0])] = value
+        self.sources[target] = source
+
+    def _where(self, path: Path) -> str:
+        return marked(self.document, self.label, "task")(path).where
+
+    def _note(self, path: Path, status: Status, text: str = "") -> None:
+        self.notes.append(Note(self._where(path), ".".join(str(step) for step in path), status, text))
+
+    def _problem(self, path: Path, message: str, hint: str | None = None) -> None:
+        self.problems.append(Problem(self._where(path), ".".join(str(step) for step in path), message, hint))
+
+
+def _number(value: Any, default: float) -> float:
+    return value if isinstance(value, int | float) else default

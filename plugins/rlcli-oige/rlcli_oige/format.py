@@ -1,0 +1,102 @@
+"""The format of OmniIsaacGymEnvs' tasks: how a folder or a YAML file of it is recognised and read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlcli.formats import FormatSpec, Translation
+
+if TYPE_CHECKING:
+    from rlcli.config.strict_yaml import Document
+    from rlcli.registry import TaskSource
+
+SPEC = FormatSpec(
+    summary="tasks of OmniIsaacGymEnvs",
+    find="rlcli_oige.format:find",
+    read="rlcli_oige.format:read",
+    key="oige",
+    check="rlcli_oige.format:check",
+    open_scene=True,
+    environment="rlcli_oige.env:OigeEnv",
+    importer="rlcli_oige.command:import_task",
+    aliases={"rlcli.oige": "rlcli_oige"},
+)
+
+
+def find(path: Path) -> TaskSource | None:
+    """Return the task of a YAML file, or of a folder with one such file in it or in its `cfg/task`.
+
+    Raises:
+        TaskError: if a folder has several, or its Python files hold no class of the task.
+    """
+    from rlcli_oige.task_yaml import task_name
+
+    config = path if path.is_file() else _config(path)
+    name = task_name(config) if config is not None else None
+    return None if config is None or name is None else _task(config.parent, config, name)
+
+
+def read(document: Document, source: TaskSource) -> Translation | None:
+    """Return a YAML document of OmniIsaacGymEnvs as the data of a task; None for another document."""
+    from rlcli_oige.task_yaml import agent_file, is_oige, translate
+
+    if not is_oige(document.data):
+        return None
+    return translate(
+        document,
+        source.label,
+        class_file=source.task_file,
+        class_name=source.task.rpartition(":")[2] if source.task else None,
+        agent_file=agent_file(source.config),
+    )
+
+
+def check(block: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str, str]]:
+    """Yield every key of the block `oige` that has another place in a task file."""
+    from rlcli_oige.task_yaml import MOVED
+
+    for path, target in MOVED.items():
+        section, key = map(str, path)
+        values = block.get(section)
+        if isinstance(values, dict) and values.get(key) is not None:
+            yield (section, key), "this key has another place here", f"set {target}"
+
+
+def _config(folder: Path) -> Path | None:
+    """Return the one YAML of a folder, or of its `cfg/task`, that has the form; None if there is none."""
+    from rlcli.errors import TaskError, listing
+    from rlcli_oige.task_yaml import is_oige_file
+
+    files = sorted(folder.glob("*.yaml")) or sorted(folder.glob("cfg/task/*.yaml"))
+    found = [file for file in files if is_oige_file(file)]
+    if len(found) > 1:
+        names = listing(f"{folder.name}/{file.relative_to(folder)}" for file in found)
+        raise TaskError(f"'{folder}' holds several tasks", hint=f"name one file: {names}")
+    return found[0] if found else None
+
+
+def _task(root: Path, config: Path, name: str) -> TaskSource:
+    from rlcli.errors import TaskError
+    from rlcli.registry import TaskSource
+    from rlcli_oige.task_yaml import find_class, home
+
+    file: Path | None
+    try:
+        file, class_name = find_class(home(config), name)
+    except LookupError as problem:
+        if next(home(config).rglob("*.py"), None) is not None:
+            raise TaskError(f"'{config}' is not a task: {problem.args[0]}") from None
+        file, class_name = None, f"{name}Task"  # the YAML can be checked without
+    return TaskSource(
+        name=root.name if config.name == "task.yaml" else config.stem,
+        root=root,
+        config=config,
+        distribution=None,
+        version=None,
+        term_files=(),
+        term_modules=(),
+        task=f"{file or root / 'task.py'}:{class_name}",
+        task_file=file,
+    )

@@ -1,0 +1,157 @@
+"""`rlcli import oige`: a task of OmniIsaacGymEnvs as a folder of rlcli's own; its class stays its class."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+from rlcli.config.dump import to_yaml
+from rlcli.config.layers import read
+from rlcli.errors import ConfigError, Problem, TaskError, UsageError
+from rlcli.formats import Imported, Note
+from rlcli_oige import task_yaml
+
+_IMPORT = re.compile(r"^(\s*)from\s+(?:omni|pxr|omniisaacgymenvs)(?:\.[\w.]+)?\s+import\s+(.*)$")
+_VOCABULARY = [Path(__file__).parent / name for name in ("vocabulary.py", "maths.py", "rotations.py")]
+_DEFINED = (ast.ClassDef, ast.FunctionDef)
+_WORDS = (*_DEFINED, ast.Constant)
+_MODULE = re.compile(r"^(\s*)import\s+(carb|omni|pxr)\b[\w.]*\s*$")
+
+
+_LONGEST_NAME = 100
+"""Characters of a task's name."""
+
+
+def convert(files: list[Path], output: Path | None) -> Imported:
+    """Write `task.yaml` and, with their import lines changed, the Python files of the task's class.
+
+    Args:
+        files: the task's YAML and, optionally, the rl_games YAML of its agent; without one, `<Task>PPO.yaml`
+            beside it is taken.
+        output: folder to write to.
+
+    Raises:
+        UsageError: for more files, or a folder that holds a task already.
+        ConfigError: with everything in the files that cannot be.
+    """
+    if len(files) > 2:
+        raise UsageError(f"found {len(files)} files", hint="rlcli import oige TASK.yaml [TRAINPPO.yaml]")
+    source = files[0]
+    document = read(source)
+    if not task_yaml.is_oige(document.data):
+        message = "is not a task of OmniIsaacGymEnvs: it has no env: and sim:"
+        raise ConfigError([Problem(str(source), "", message)])
+    name = str(document.data.get("name") or source.stem)
+    if not (name.isidentifier() and name.isascii() and len(name) <= _LONGEST_NAME):  # a class's name, a folder's too
+        raise ConfigError([Problem(str(source), "name", f"'{name[:_LONGEST_NAME]}' is no name of a task's class")])
+    folder = output or Path(_kebab(name))
+    target = folder / "task.yaml"
+    if target.exists():
+        raise UsageError(f"{target} exists", hint="-o another folder")
+    class_file, class_name = _class(task_yaml.home(source), name)
+    found = task_yaml.translate(
+        document,
+        str(source),
+        class_file=class_file,
+        class_name=class_name,
+        agent_file=files[1] if len(files) == 2 else task_yaml.agent_file(source),
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    written = [target]
+    plain = json.loads(json.dumps({**_ordered(found.data), **found.agents}))  # nothing twice: YAML would make anchors
+    target.write_text(to_yaml(plain), encoding="utf-8")
+    written += _models(found.data["oige"]["mjcf"], source.parent, folder)
+    messages = []
+    if class_file is None:
+        messages.append(f"put the Python file of {name}Task into {folder}: it is the task's logic")
+    elif source.parent.resolve() != folder.resolve():
+        written += _code(class_file, task_yaml.home(source), folder)
+    return Imported(folder, written, sorted(found.notes, key=_place), messages)
+
+
+def changed_imports(text: str) -> str:
+    """The source of a task with its import lines, and nothing else, changed to `rlcli_oige`."""
+    lines = []
+    for line in text.splitlines():
+        if match := _IMPORT.match(line):
+            line = f"{match[1]}from rlcli_oige import {match[2]}"
+        elif match := _MODULE.match(line):
+            line = f"{match[1]}from rlcli_oige import {'omni' if match[2] == 'pxr' else match[2]}"
+        lines.append(line)
+    return "\n".join(lines) + "\n"
+
+
+def _class(folder: Path, name: str) -> tuple[Path | None, str | None]:
+    try:
+        return task_yaml.find_class(folder, name)
+    except LookupError:
+        return None, None
+
+
+def _ordered(data: dict[str, Any]) -> dict[str, Any]:
+    first = ("summary", "sim", "decimation", "episode_length_s", "scene", "viewer", "clip_actions", "clip_observations")
+    return {**{key: data[key] for key in first if key in data}, **data}
+
+
+def _models(models: dict[str, Any], source: Path, folder: Path) -> list[Path]:
+    written = []
+    for entry in models.values():
+        file, target = source / entry["model"], folder / entry["model"]
+        if not target.resolve().is_relative_to(folder.resolve()):
+            raise TaskError(f"'{entry['model']}', which mjcf: names, lies outside the task's folder")
+        if not file.is_file():
+            raise TaskError(f"no file '{file}', which mjcf: names")
+        if file.resolve() != target.resolve():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, target)
+            written.append(target)
+    return written
+
+
+def _code(class_file: Path, home: Path, folder: Path) -> list[Path]:
+    """Copy the files beside a task's YAML, and of a package the class's file with what it uses, in their folders."""
+    beside = sorted(home.glob("*.py"))
+    written = []
+    for file in beside if class_file in beside else _used(class_file, home):
+        target = folder / file.relative_to(home)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(changed_imports(file.read_text(encoding="utf-8")), encoding="utf-8")
+        written.append(target)
+    return written
+
+
+def _used(start: Path, home: Path) -> list[Path]:
+    """A file and those of a package that its import lines lead to, and theirs, but not what `rlcli_oige` offers."""
+    words = [node for file in _VOCABULARY for node in ast.walk(_tree(file))]
+    own = {getattr(node, "name", getattr(node, "value", None)) for node in words if isinstance(node, _WORDS)}
+    deepest_first = sorted(home.rglob("*.py"), key=lambda file: (-len(file.parts), file))[-500:]
+    trees = {file: _tree(file) for file in deepest_first}
+    owner = {node.name: file for file in trees for node in trees[file].body if isinstance(node, _DEFINED)}
+    found = [start]
+    for file in found:
+        imports = [node for node in ast.walk(trees[file]) if isinstance(node, ast.ImportFrom)]
+        names = [alias.name for node in imports for alias in node.names]
+        if "*" in names:
+            names += [node.id for node in ast.walk(trees[file]) if isinstance(node, ast.Name)]
+        found += dict.fromkeys(owner[n] for n in names if n in owner and n not in own and owner[n] not in found)
+    return found
+
+
+def _tree(file: Path) -> ast.Module:
+    try:
+        return ast.parse(file.read_text(encoding="utf-8"))
+    except (OSError, SyntaxError, UnicodeDecodeError):
+        return ast.Module([], [])
+
+
+def _place(note: Note) -> tuple[str, int]:
+    file, line, _ = note.where.rsplit(":", 2)
+    return file, int(line)
+
+
+def _kebab(name: str) -> str:
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|_", "-", name).lower()

@@ -1,0 +1,413 @@
+"""`RLTask` and what its constructor is given: the settings, and the environment as the task sees it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rlcli.envs.direct import DirectTask
+from rlcli.errors import TaskError, did_you_mean, listing
+from rlcli_oige.randomization import Randomizer
+from rlcli_oige.stage import BASE, ZERO, GroundPlane, Prim, Stage
+from rlcli_oige.views import ArticulationView, RigidPrimView, XFormPrimView
+
+if TYPE_CHECKING:
+    from rlcli_oige.env import OigeEnv
+
+SIM_DEFAULTS: Mapping[str, Any] = {
+    "gravity": [0.0, 0.0, -9.81], "dt": 1.0 / 60.0, "rendering_dt": -1.0, "substeps": 1, "use_gpu_pipeline": False,
+    "add_ground_plane": True, "add_distant_light": True, "use_fabric": False, "enable_scene_query_support": False,
+    "enable_cameras": False, "disable_contact_processing": False,
+    "default_physics_material": {"static_friction": 1.0, "dynamic_friction": 1.0, "restitution": 0.0},
+}  # fmt: skip
+ACTOR_DEFAULTS: Mapping[str, Any] = {
+    "override_usd_defaults": False, "make_kinematic": -1, "enable_self_collisions": -1, "enable_gyroscopic_forces": -1,
+    "solver_position_iteration_count": -1, "solver_velocity_iteration_count": -1, "sleep_threshold": -1,
+    "stabilization_threshold": -1, "max_depenetration_velocity": -1, "density": -1, "mass": -1, "contact_offset": -1,
+    "rest_offset": -1,
+}  # fmt: skip
+
+
+class SimConfig:
+    """The task's YAML, evaluated, as OmniIsaacGymEnvs' tasks read it."""
+
+    def __init__(self, config: dict[str, Any] | None = None) -> None:
+        self._config = {} if config is None else config
+        self._cfg = self._config.get("task", {})
+        self._sim_params = copy.deepcopy(dict(SIM_DEFAULTS))
+        sim = self._cfg.get("sim", {})
+        self._sim_params.update({key: sim[key] for key in self._sim_params if key in sim})
+        self._physx_params = dict(sim.get("physx", {}))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """All settings; the task's under `task`."""
+        return self._config
+
+    @property
+    def task_config(self) -> dict[str, Any]:
+        """The task's YAML."""
+        return self._cfg
+
+    @property
+    def sim_params(self) -> dict[str, Any]:
+        """Its `sim:`, with defaults."""
+        return self._sim_params
+
+    @property
+    def physx_params(self) -> dict[str, Any]:
+        """Its `sim.physx:`."""
+        return self._physx_params
+
+    def get_physics_params(self) -> dict[str, Any]:
+        """Both."""
+        return {**self._sim_params, **self._physx_params}
+
+    def parse_actor_config(self, actor_name: str) -> dict[str, Any]:
+        """The settings of an actor; -1 stands for what its model says."""
+        given = self._cfg.get("sim", {}).get(actor_name, {})
+        return {**ACTOR_DEFAULTS, **{key: value for key, value in given.items() if key in ACTOR_DEFAULTS}}
+
+    def apply_articulation_settings(self, name: str, prim: Prim, cfg: Mapping[str, Any]) -> None:
+        """Note an actor's settings; its model gets them when the scene is complete."""
+        for key, value in cfg.items():
+            if value is not None and not (isinstance(value, int | float) and value == -1):
+                prim.settings[key] = value
+
+    def apply_rigid_body_settings(
+        self, name: str, prim: Prim, cfg: Mapping[str, Any], is_articulation: bool = False
+    ) -> None:
+        """`apply_articulation_settings`."""
+        self.apply_articulation_settings(name, prim, cfg)
+
+    def apply_rigid_shape_settings(self, name: str, prim: Prim, cfg: Mapping[str, Any]) -> None:
+        """`apply_articulation_settings`."""
+        self.apply_articulation_settings(name, prim, cfg)
+
+    def make_kinematic(self, name: str, prim: Prim, cfg: Any = None, value: Any = None) -> None:
+        """Let a body move only where it is put."""
+        prim.settings["make_kinematic"] = self._value(name, "make_kinematic", value)
+
+    def set_density(self, name: str, prim: Prim, value: float | None = None) -> None:
+        """Density of all geoms of an actor [kg/m^3]."""
+        prim.settings["density"] = self._value(name, "density", value)
+
+    def set_mass(self, name: str, prim: Prim, value: float | None = None) -> None:
+        """Whole mass of an actor [kg]."""
+        prim.settings["mass"] = self._value(name, "mass", value)
+
+    def set_position_iteration(self, name: str, prim: Prim, value: float | None = None) -> None:
+        """Nothing: MuJoCo's solver iterates until it has converged."""
+
+    set_velocity_iteration = set_articulation_position_iteration = set_position_iteration
+    set_articulation_velocity_iteration = set_max_depenetration_velocity = set_position_iteration
+    set_sleep_threshold = set_stabilization_threshold = set_gyroscopic_forces = set_position_iteration
+    set_articulation_sleep_threshold = set_articulation_stabilization_threshold = set_position_iteration
+    set_contact_offset = set_rest_offset = set_position_iteration
+
+    def _value(self, name: str, key: str, value: Any) -> Any:
+        return self.parse_actor_config(name)[key] if value is None else value
+
+
+class SceneRegistry:
+    """Where views are registered: what `set_up_scene` is given."""
+
+    def __init__(self) -> None:
+        self.views: dict[str, XFormPrimView] = {}
+        self.objects: dict[str, Any] = {}
+
+    @property
+    def articulated_views(self) -> dict[str, ArticulationView]:
+        """Registered views of robots."""
+        return {name: view for name, view in self.views.items() if isinstance(view, ArticulationView)}
+
+    @property
+    def rigid_prim_views(self) -> dict[str, RigidPrimView]:
+        """Registered views of bodies."""
+        return {name: view for name, view in self.views.items() if isinstance(view, RigidPrimView)}
+
+    @property
+    def _scene_registry(self) -> SceneRegistry:
+        return self
+
+    def add(self, item: Any) -> Any:
+        """Register a view or an object under its name.
+
+        Raises:
+            TaskError: if another view has that name.
+        """
+        if not isinstance(item, XFormPrimView):
+            self.objects[getattr(item, "name", str(id(item)))] = item
+            return item
+        if item.name in self.views and self.views[item.name] is not item:
+            raise TaskError(f"two views are called '{item.name}'", hint="a view's name is unique in its scene")
+        self.views[item.name] = item
+        return item
+
+    def object_exists(self, name: str) -> bool:
+        """Whether a name is registered."""
+        return name in self.views or name in self.objects
+
+    def get_object(self, name: str) -> Any:
+        """What is registered under a name.
+
+        Raises:
+            TaskError: if nothing is.
+        """
+        found = {**self.objects, **self.views}
+        if name not in found:
+            raise TaskError(f"the scene has no '{name}'", hint=did_you_mean(name, found) or f"names: {listing(found)}")
+        return found[name]
+
+    def remove_object(self, name: str, registry_only: bool = False) -> None:
+        """Forget a name."""
+        self.views.pop(name, None)
+        self.objects.pop(name, None)
+
+    def add_default_ground_plane(self, *args: Any, **kwargs: Any) -> GroundPlane:
+        """Nothing more: `sim.add_ground_plane` of the YAML says whether there is a ground."""
+        return GroundPlane()
+
+    add_ground_plane = add_default_ground_plane
+
+
+class World:
+    """The simulation, as a task sees it."""
+
+    def __init__(self, env: OigeEnv) -> None:
+        self._env = env
+        self.scene = SceneRegistry()
+
+    def is_playing(self) -> bool:
+        """Whether the simulation runs; false while a viewer has paused it."""
+        return self._env.is_playing()
+
+    def is_stopped(self) -> bool:
+        """Never, while a task is there."""
+        return False
+
+    @property
+    def stage(self) -> Stage:
+        """The stage."""
+        return self._env.stage
+
+    def play(self) -> None:
+        """Go on."""
+        self._env.pause(False)
+
+    def pause(self) -> None:
+        """Pause."""
+        self._env.pause(True)
+
+    def render(self) -> None:
+        """Nothing: a viewer draws by itself."""
+
+    def get_physics_dt(self) -> float:
+        """Physics time step [s]."""
+        return self._env.physics_dt
+
+    def get_rendering_dt(self) -> float:
+        """Time between pictures [s]."""
+        return self._env.step_dt
+
+    def get_physics_context(self) -> World:
+        """The simulation itself."""
+        return self
+
+    @property
+    def prim_path(self) -> str:
+        """Where the settings of physics stand."""
+        return "/physicsScene"
+
+    @property
+    def current_time_step_index(self) -> int:
+        """Physics steps since the start."""
+        return self._env.common_step * self._env.config.decimation
+
+
+class EnvHandle:
+    """The environment, as a task sees it: `self._env`."""
+
+    def __init__(self, env: OigeEnv) -> None:
+        self.runner = env
+        self.world = self._world = World(env)
+        self.num_envs = env.num_envs
+        self.render_enabled = self._render = False
+        self.simulation_app = None
+
+    @property
+    def task(self) -> RLTask:
+        """The task."""
+        return self.runner.task
+
+    _task = task
+
+    @property
+    def sim_frame_count(self) -> int:
+        """Physics steps since the start."""
+        return self.world.current_time_step_index
+
+    def render(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing: a viewer draws by itself."""
+
+    create_viewport_render_product = render
+
+
+class RLTask(DirectTask):
+    """Base of a task in OmniIsaacGymEnvs' form.
+
+    A subclass sets `_num_observations`, `_num_actions` and, for a critic's view, `_num_states` before it calls this
+    constructor. `reset_buf` raised where `progress_buf` has reached `_max_episode_length` (or is one short of it) for
+    that reason alone truncates the episode; raised anywhere else, it ends it: `is_done` is asked a second time with
+    `progress_buf` at 1, to tell the two apart.
+    """
+
+    _num_observations: int
+    _num_actions: int
+
+    def __init__(self, name: str, env: EnvHandle, offset: Any = None) -> None:
+        self.name = name
+        self._offset = offset
+        self._env = env
+        self.env = env.runner
+        for attribute in ("_num_observations", "_num_actions"):
+            if not isinstance(getattr(self, attribute, None), int):
+                raise TaskError(f"{type(self).__name__} sets no {attribute}", hint="before it calls RLTask.__init__")
+        if not hasattr(self, "_num_states"):
+            self._num_states = 0
+        if not hasattr(self, "_num_agents"):
+            self._num_agents = 1
+        settings = env.runner.settings
+        if not hasattr(self, "_cfg"):
+            self._cfg = settings
+        if not hasattr(self, "_task_cfg"):
+            self._task_cfg = settings["task"]
+        self._num_envs = env.num_envs
+        self._device = str(env.runner.device)
+        self.rl_device = self._device
+        self._rand_seed = self._cfg.get("seed", 42)
+        self.test = bool(self._cfg.get("test", False))
+        self.is_extension = False
+        self.enable_cameras = False
+        self.control_frequency_inv = env.runner.config.decimation
+        bounds = env.runner.config
+        self.clip_obs = np.inf if bounds.clip_observations is None else bounds.clip_observations
+        self.clip_actions = np.inf if bounds.clip_actions is None else bounds.clip_actions
+        self._dr_randomizer = Randomizer(env.runner)
+        self.dr = self._dr_randomizer.dr
+        self.randomize_actions = self.randomize_observations = False
+        self.cleanup()
+
+    def cleanup(self) -> None:
+        """Make the buffers."""
+        n, device = self._num_envs, self._device
+        self.obs_buf = torch.zeros(n, self._num_observations, device=device)
+        self.states_buf = torch.zeros(n, self._num_states, device=device)
+        self.rew_buf = torch.zeros(n, device=device)
+        self.reset_buf = torch.ones(n, dtype=torch.int64, device=device)
+        self.progress_buf = torch.zeros(n, dtype=torch.int64, device=device)
+        self.extras: dict[str, Any] = {}
+
+    @property
+    def num_envs(self) -> int:  # type: ignore[override]
+        """Environments."""
+        return self._num_envs
+
+    @property
+    def num_observations(self) -> int:  # type: ignore[override]
+        """Columns of obs_buf."""
+        return self._num_observations
+
+    @property
+    def num_actions(self) -> int:  # type: ignore[override]
+        """Columns of the action."""
+        return self._num_actions
+
+    @property
+    def num_states(self) -> int:  # type: ignore[override]
+        """Columns of states_buf."""
+        return self._num_states
+
+    @property
+    def num_agents(self) -> int:
+        """1."""
+        return self._num_agents
+
+    @property
+    def device(self) -> str:  # type: ignore[override]
+        """Where tensors live."""
+        return self._device
+
+    @property
+    def default_base_env_path(self) -> str:
+        """Parent of all environments."""
+        return BASE
+
+    @property
+    def default_zero_env_path(self) -> str:
+        """The first environment."""
+        return ZERO
+
+    @property
+    def world(self) -> World:
+        """The simulation."""
+        return self._env.world
+
+    @property
+    def scene(self) -> SceneRegistry:
+        """The registry of views."""
+        return self._env.world.scene
+
+    @property
+    def cfg(self) -> dict[str, Any]:  # type: ignore[override]
+        """All settings."""
+        return self._cfg
+
+    def set_up_scene(
+        self,
+        scene: Any,
+        replicate_physics: bool = True,
+        collision_filter_global_paths: Any = (),
+        filter_collisions: bool = True,
+        copy_from_source: bool = False,
+    ) -> None:
+        """Called by the task's own, once its robots are made: places the environments on their grid."""
+        self._env_pos = self._env.runner.grid
+
+    def initialize_views(self, scene: Any) -> None:
+        """Not called: views are made in `set_up_scene`."""
+        self._env_pos = self._env.runner.grid
+
+    def set_initial_camera_params(self, camera_position: Any = (10, 10, 3), camera_target: Any = (0, 0, 0)) -> None:
+        """Nothing: the YAML's `viewport:` places the camera."""
+
+    def set_is_extension(self, is_extension: bool) -> None:
+        """Noted."""
+        self.is_extension = is_extension
+
+    def get_states(self) -> Any:
+        """Fill states_buf, if the task has one."""
+        return self.states_buf
+
+    def get_extras(self) -> Any:
+        """Fill extras."""
+
+    def reset(self, selection: Any = None) -> None:
+        """Raise all flags."""
+        self.reset_buf = torch.ones_like(self.reset_buf)
+
+    def post_physics_step(self) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
+        """What the environment does after physics, in one call; the environment itself calls the hooks."""
+        self.progress_buf[:] += 1
+        if self.world.is_playing():
+            self.get_observations()
+            self.get_states()
+            self.calculate_metrics()
+            self.is_done()
+            self.get_extras()
+        return self.obs_buf, self.rew_buf, self.reset_buf, self.extras

@@ -1,0 +1,61 @@
+"""Hydra's interpolations, as OmniIsaacGymEnvs writes them."""
+
+import pytest
+
+from rlcli_oige.hydra import evaluate
+
+TREE = {
+    "num_envs": "",
+    "seed": 42,
+    "pipeline": "GPU",
+    "task": {
+        "name": "Arm",
+        "env": {"a": "${resolve_default:512,${...num_envs}}", "b": "${.a}", "list": ["${..b}", 2]},
+        "sim": {
+            "gpu": '${eq:${...pipeline},"gpu"}',
+            "has": "${contains:arm,${..name}}",
+            "pick": "${if:${.gpu},yes_it_is,${.missing}}",
+            "text": "seed ${seed} of ${task.name}",
+        },
+    },
+}
+
+
+def task(**sim):
+    return evaluate({**TREE, "task": {"name": "Arm", "sim": sim}}, ("task", "sim"))
+
+
+def test_relative_references_absolute_ones_and_the_four_resolvers_are_evaluated():
+    tree = {**TREE, "task": {**TREE["task"], "sim": {**TREE["task"]["sim"], "missing": "no"}}}
+    value, errors = evaluate(tree, ("task",))
+    assert errors == []
+    assert value["env"] == {"a": 512, "b": 512, "list": [512, 2]}
+    assert value["sim"] == {
+        "gpu": True, "has": True, "pick": "yes_it_is", "text": "seed 42 of Arm", "missing": "no",
+    }  # fmt: skip
+
+
+def test_a_value_keeps_its_type_and_a_given_one_beats_the_default():
+    value, errors = evaluate(
+        {"num_envs": 7, "task": {"env": {"n": "${resolve_default:512,${...num_envs}}"}}}, ("task",)
+    )
+    assert (value["env"]["n"], errors) == (7, [])
+
+
+@pytest.mark.parametrize(
+    ("text", "message", "hint"),
+    [
+        ("${....sed}", "leads above the top", None),
+        ("${...sed}", "has no 'sed'", "did you mean 'seed'?"),
+        ("${oc.env:HOME}", "there is no resolver 'oc.env'", "resolvers: eq, contains, if, resolve_default"),
+        ("${eq:1}", "takes 2 arguments, found 1", None),
+        ("${.a}", "refers to itself", None),
+        ("${...seed", "is not closed", "every ${ needs its }"),
+    ],
+)
+def test_what_leads_nowhere_is_said_with_its_key(text, message, hint):
+    _, errors = task(a=text)
+    assert len(errors) == 1
+    assert errors[0].path == ("task", "sim", "a")
+    assert message in str(errors[0])
+    assert errors[0].hint == hint

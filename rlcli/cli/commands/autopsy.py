@@ -1,0 +1,217 @@
+"""`rlcli autopsy`: how the episodes of a training ended that ended badly, or unlike the others."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rlcli.cli.ui.console import console
+from rlcli.cli.ui.options import RunRef, RunsDir, TaskFolder, video_file
+from rlcli.errors import RlcliError, UsageError, require_known
+
+if TYPE_CHECKING:
+    from rlcli.registry import TaskSource
+    from rlcli.replay.failure_cases import Contact, FailureCase
+    from rlcli.runs.run import Run
+
+_BARS = "▁▂▃▄▅▆▇█"
+_WIDTH = 48
+_SORTS = ("when", "return", "length", "kind")
+_MANY = 12
+
+
+def command(
+    run: RunRef,
+    case: Annotated[int | None, typer.Argument(help="Show this case, by its number in the list.", min=0)] = None,
+    sort: Annotated[str, typer.Option(help="Order of the list: when, return, length or kind.")] = "when",
+    steps: Annotated[int, typer.Option(min=1, help="How many last steps of a case to show.")] = 8,
+    video: Annotated[Path | None, typer.Option(help="Draw the case's last seconds to FILE.mp4 or FILE.gif.")] = None,
+    task: TaskFolder = None,
+    runs_dir: RunsDir = None,
+) -> None:
+    """List or show how kept episodes ended."""
+    require_known(sort, _SORTS, "--sort", "orders")
+    if video is not None and case is None:
+        raise UsageError("--video draws one case", hint="rlcli autopsy RUN N --video FILE.mp4")
+    video = video_file(video, "autopsy.mp4")
+    from rlcli.replay.failure_cases import list_failure_cases, why_no_cases
+    from rlcli.runs.bundle import is_bundle
+    from rlcli.runs.run_ref import default_runs_dir, find_run
+    from rlcli.runs.trusted_tasks import named_task
+
+    named = None if task is None else named_task(task)
+    if is_bundle(Path(run)):
+        _refuse_bundle(run, case)
+        return
+    found, why = find_run(run, runs_dir or default_runs_dir())
+    console.info(f"run {found.folder} ({why})")
+    cases = list_failure_cases(found)
+    if case is None:
+        _print_list(found, cases, sort)
+    elif case < len(cases):
+        _print_case(found, cases[case], case, steps, video, named)
+    else:
+        hint = f"it has {len(cases)}, counted from 0" if cases else why_no_cases(found)
+        raise UsageError(f"no case {case} in {found.folder}", hint=hint)
+
+
+def _refuse_bundle(folder: str, case: int | None) -> None:
+    """A policy without its training has no episodes of it."""
+    from rlcli.runs.bundle import open_bundle
+
+    open_bundle(Path(folder))
+    why = (
+        f"it is a policy without its training; rlcli eval --checkpoint {folder} --record FILE --record-mode failed"
+        " keeps episodes of it"
+    )
+    if case is not None:
+        raise UsageError(f"no case {case} in {folder}", hint=why)
+    console.info(f"no episode was kept: {why}")
+    console.document("autopsy", run=folder, cases=[], why_none=why)
+
+
+def _print_list(run: Run, cases: list[FailureCase], sort: str) -> None:
+    """Print a table of the cases."""
+    from rlcli.replay.failure_cases import why_no_cases
+
+    keys: dict[str, Any] = {
+        "when": lambda case: 0,
+        "return": lambda case: case.episode.total_reward,
+        "length": lambda case: case.episode.length,
+        "kind": lambda case: (case.failure.kind, case.ended_by),
+    }
+    rows = sorted(enumerate(cases), key=lambda row: keys[sort](row[1]))
+    why_none = None if cases else why_no_cases(run)
+    if why_none is not None:
+        console.info(f"no episode was kept: {why_none}")
+    else:
+        columns = ["CASE", "ITERATION", "STEP", "ENV", "EPISODE", "LENGTH", "RETURN", "KEPT FOR", "ENDED BY", "HELD"]
+        console.table(columns, [[str(number), *_row(case)] for number, case in rows])
+    listed = [{"case": number, **case.record()} for number, case in rows]
+    console.document("autopsy", run=str(run.folder), cases=listed, why_none=why_none)
+
+
+def _row(case: FailureCase) -> list[str]:
+    episode, failure = case.episode, case.failure
+    numbers = (failure.iteration, failure.step, episode.env, episode.index, episode.length)
+    return [*map(str, numbers), f"{episode.total_reward:.6g}", failure.kind, case.ended_by, f"{case.seconds:.3g} s"]
+
+
+def _print_case(
+    run: Run, case: FailureCase, number: int, steps: int, video: Path | None, named: TaskSource | None
+) -> None:
+    """Print one case; without the task's code, all but its contacts and pictures."""
+    from rlcli.replay.failure_cases import stage_case
+
+    staged, error = None, None
+    try:
+        staged = stage_case(case, named)
+    except RlcliError as raised:
+        if video is not None:
+            raise
+        error = raised
+    _print_facts(case, number)
+    _print_rewards(case)
+    _print_steps(case, steps)
+    contacts = None if staged is None else staged.contacts()
+    if contacts is not None:
+        _print_contacts(contacts)
+    frames = 0
+    if staged is not None and video is not None:
+        from rlcli.viewer.replay_video import film_case
+
+        frames, fps, backend = film_case(staged, video)
+        console.info(f"{frames} frames at {fps:g} a second, drawn with {backend}")
+        console.data(str(video))
+    if error is not None:
+        console.info(f"no contacts: {error.message}{f'; {error.hint}' if error.hint else ''}")
+    console.document(
+        "autopsy",
+        run=str(run.folder),
+        case=number,
+        **case.record(),
+        **case.series(),
+        contacts=None if contacts is None else [asdict(contact) for contact in contacts],
+        no_contacts=None if error is None else error.message,
+        same_model=None if staged is None else staged.staged.same_model,
+        video=video,
+        frames=frames,
+    )
+
+
+def _print_facts(case: FailureCase, number: int) -> None:
+    episode, failure, usual = case.episode, case.failure, case.failure.usual_returns
+    step_dt = case.trajectory.header.step_dt
+    console.data(
+        f"case {number}: environment {episode.env}, episode {episode.index}, ended in iteration {failure.iteration}"
+        f" (step {failure.step}) after {episode.length} steps, {episode.length * step_dt:.3g} s"
+    )
+    others = "" if usual is None else f"; half of the others: {usual[0]:.6g} .. {usual[1]:.6g}"
+    console.data(f"return {episode.total_reward:.6g}{others}")
+    console.data(f"kept for: {failure.kind}; ended by: {case.ended_by}")
+    if case.world.diverged_at is not None:
+        console.data(f"  {case.world.diverged_at}")
+    held = f"its last {episode.kept} steps, {case.seconds:.3g} s"
+    console.data(f"held: {held}; rlcli replay {case.trajectory.file} steps them again")
+
+
+def _print_rewards(case: FailureCase) -> None:
+    """Print each reward term over the kept steps."""
+    console.data("")
+    rows = []
+    for name, values in [*case.columns("reward_terms").items(), ("reward", case.values("rewards"))]:
+        numbers = (values.sum(), values.min(), values.max(), values[-1])
+        rows.append([name, sparkline(values.tolist()), *(f"{x:.4g}" for x in numbers)])
+    times = case.times
+    console.table(["REWARD A STEP", f"{times[0]:.3g} .. {times[-1]:.3g} s", "SUM", "MIN", "MAX", "LAST"], rows)
+
+
+def _print_steps(case: FailureCase, steps: int) -> None:
+    """Print observations, actions and rewards of the last steps."""
+    kept, times = case.episode.kept, case.times
+    last = range(max(0, kept - steps), kept)
+    rows = [["", "end of step [s]", *(f"{times[i]:.4g}" for i in last)]]
+    left = 0
+    for word, part in (("saw", "observations"), ("did", "actions"), ("paid", "reward_terms")):
+        columns = list(case.columns(part).items())
+        rows += [[word, name, *(f"{values[i]:.4g}" for i in last)] for name, values in columns[:_MANY]]
+        left += len(columns[_MANY:])
+    rows.append(["paid", "reward", *(f"{case.values('rewards')[i]:.4g}" for i in last)])
+    console.data("")
+    console.table(["", "", *(f"{i - kept + 1}" for i in last)], rows)
+    if left:
+        console.info(f"{left} further columns are in --json")
+
+
+def _print_contacts(contacts: Sequence[Contact]) -> None:
+    console.data("")
+    if not contacts:
+        console.data("contacts at the end: none")
+        return
+    rows = [[*c.geoms, f"{1e3 * c.distance:.3f}", f"{c.force:.4g}"] for c in contacts[: 2 * _MANY]]
+    console.table(["CONTACT AT THE END", "", "DISTANCE [mm]", "FORCE [N]"], rows)
+    if len(contacts) > 2 * _MANY:
+        console.info(f"{len(contacts) - 2 * _MANY} further contacts are in --json")
+
+
+def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
+    """Values as bars of eight heights, neighbours averaged where there are more than columns; `?` is not finite."""
+    if len(values) > width:
+        edges = [round(i * len(values) / width) for i in range(width + 1)]
+        values = [sum(values[a:b]) / (b - a) for a, b in itertools.pairwise(edges)]
+    finite = [value for value in values if math.isfinite(value)]
+    low, high = min(finite, default=0.0), max(finite, default=0.0)
+    span = high - low
+
+    def bar(value: float) -> str:
+        if not math.isfinite(value):
+            return "?"
+        return _BARS[round((len(_BARS) - 1) * (value - low) / span) if span > 0 else 3]
+
+    return "".join(map(bar, values))

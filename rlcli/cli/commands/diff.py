@@ -1,0 +1,171 @@
+"""`rlcli diff`: where two runs first part, read from their files; or in what two configurations differ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rlcli.cli.ui.completion import runs_and_tasks, words
+from rlcli.cli.ui.console import console
+from rlcli.cli.ui.difference_table import report_differences
+from rlcli.cli.ui.options import Agent, RunsDir
+from rlcli.errors import CheckpointError, TaskError, UsageError, did_you_mean, listing, require_known
+from rlcli.registry import TASKS, catalog, task_source
+
+if TYPE_CHECKING:
+    from rlcli.config.load import Resolved
+    from rlcli.runs.run import Run
+
+Side = tuple[str, list[str]]
+"""What is compared, and the overrides that stand after it."""
+
+
+def command(
+    words: Annotated[
+        list[str],
+        typer.Argument(
+            autocompletion=runs_and_tasks,
+            metavar="A [KEY.PATH=VALUE]... [B [KEY.PATH=VALUE]...]",
+            help="Each a run (RUN, RUN@step:N, RUN@best, a checkpoint, latest), or a task (a name, a folder, a YAML"
+            " file) with the overrides after it. One task with overrides is compared with itself without them.",
+        ),
+    ],
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            autocompletion=words("configuration", "environment", "metrics", "weights", "policy"),
+            help="Of runs: configuration, environment, metrics, weights or policy; repeatable.",
+        ),
+    ] = None,
+    agent: Agent = None,
+    runs_dir: RunsDir = None,
+) -> None:
+    """Tell where two runs or configurations differ. Of each key: physics, MDP, agent or cosmetic."""
+    from rlcli.runs.run_diff import SECTIONS
+    from rlcli.runs.run_ref import default_runs_dir
+
+    for name in only or []:
+        require_known(name, SECTIONS, "--only", "parts")
+    runs = runs_dir or default_runs_dir()
+    left, right = _sides(words)
+    one, other = _task(left, agent), _task(right, agent)
+    try:
+        if one is None and other is None:
+            if agent is not None:
+                raise UsageError("--agent is of tasks; a run has the agent that it was trained with")
+            equal = _compare_runs(left[0], right[0], runs, only)
+        else:
+            if only:
+                raise UsageError("--only is of two runs; of a task there is the configuration alone")
+            both = (one or _find(left[0], runs)[0], other or _find(right[0], runs)[0])
+            equal = _compare_configurations(*both, left, right)
+    except RecursionError:
+        raise CheckpointError(f"{left[0]} or {right[0]} is corrupt: values nested too deeply") from None
+    if not equal:
+        raise typer.Exit(9)
+
+
+def _sides(words: list[str]) -> tuple[Side, Side]:
+    """What stands on the command line, with each one's overrides."""
+    sides: list[Side] = []
+    for word in words:
+        if "=" not in word or Path(word).exists():
+            sides.append((word, []))
+        elif sides:
+            sides[-1][1].append(word)
+        else:
+            raise UsageError(f"what is '{word}' an override of?", hint="rlcli diff TASK key.path=value")
+    if len(sides) == 1 and sides[0][1]:
+        sides.insert(0, (sides[0][0], []))
+    if len(sides) != 2:
+        found = ", ".join(name for name, _ in sides)
+        raise UsageError(
+            f"two are compared, found {len(sides)}: {found}", hint="rlcli diff A B, or TASK key.path=value"
+        )
+    return sides[0], sides[1]
+
+
+def _task(side: Side, agent: str | None) -> Resolved | None:
+    """The task that is meant; None if it is a run."""
+    from rlcli.config.load import resolve
+    from rlcli.runs.run import RECORD
+
+    name, overrides = side
+    place = Path(name)
+    offered = any(name in (entry.name, entry.qualified) for entry in catalog(TASKS)[0])
+    is_run = not offered and ("@" in name or (place / RECORD).is_file() or (place / "manifest.json").is_file())
+    if not is_run:
+        try:
+            return resolve(task_source(name), agent=agent, overrides=overrides)
+        except TaskError:
+            looks_like_task = offered or place.suffix in (".yaml", ".yml", ".py") or (place / "task.yaml").exists()
+            if looks_like_task or (overrides and name != "latest"):
+                raise
+    if overrides:
+        raise UsageError(f"{name} is a run, which has no overrides: {' '.join(overrides)}")
+    return None
+
+
+def _compare_configurations(one: Resolved | Run, other: Resolved | Run, left: Side, right: Side) -> bool:
+    """Compare what two tasks, or a task and a run, resolve to, and their models and code."""
+    from rlcli.runs.config_diff import Values, compare_files, compare_values
+    from rlcli.runs.provenance import sources
+    from rlcli.runs.run import Run
+
+    values, files = [], []
+    for side, opposite in ((one, other), (other, one)):
+        found = Values.of_run(side) if isinstance(side, Run) else Values.of_task(side)
+        if not isinstance(opposite, Run):  # only a run has a seed
+            found = found.without_seed()
+        values.append(found)
+        digests = side.record.get("sources") if isinstance(side, Run) else sources(side)
+        files.append({name: sha for name, sha in (digests or {}).items() if name != "rlcli"})
+    sections = [compare_values(*values), compare_files(*files)]
+    return report_differences("diff", sections, " ".join([left[0], *left[1]]), " ".join([right[0], *right[1]]))
+
+
+def _compare_runs(left: str, right: str, runs: Path, only: list[str] | None) -> bool:
+    from rlcli.runs.run_diff import SECTIONS, compare
+
+    one, step = _find(left, runs)
+    other, twin = _find(right, runs)
+    if step is not None and twin is not None and step != twin:
+        raise UsageError(f"{left} is at step {step}, {right} at step {twin}", hint="compare equal steps")
+    until = step if step is not None else twin
+    if until is not None:
+        for run in (one, other):
+            _require_step(run, until)
+    sections = compare(one, other, sections=only or SECTIONS, until=until)
+    return report_differences("diff", sections, str(one.folder), str(other.folder), step=until)
+
+
+def _find(reference: str, runs: Path) -> tuple[Run, int | None]:
+    """A run, and the step of the checkpoint if one is named."""
+    from rlcli.runs.run_ref import find_checkpoint, find_run, is_checkpoint_ref
+
+    if is_checkpoint_ref(reference):
+        run, folder, _ = find_checkpoint(reference, runs)
+        if not folder.resolve().name.isdecimal():
+            raise CheckpointError(f"{folder} is not named by its step, as a run's checkpoints are")
+        return run, int(folder.resolve().name)
+    try:
+        run, why = find_run(reference, runs)
+    except CheckpointError as error:
+        if near := did_you_mean(reference, [entry.name for entry in catalog(TASKS)[0]]):
+            raise CheckpointError(f"no run and no task '{reference}'", hint=near) from error
+        raise
+    if reference == "latest":
+        console.info(f"{run.folder} ({why})")
+    return run, None
+
+
+def _require_step(run: Run, step: int) -> None:
+    from rlcli.runs.checkpoint import steps
+
+    have = steps(run.checkpoints)
+    if step not in have:
+        raise CheckpointError(
+            f"{run.folder} has no checkpoint at step {step}", hint=f"steps: {listing(map(str, have))}"
+        )

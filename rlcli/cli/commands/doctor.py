@@ -1,0 +1,32 @@
+"""`rlcli doctor`: what works here and what does not, of the machine, the installation and every plugin."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import typer
+
+from rlcli.cli.ui.console import console
+from rlcli.cli.ui.options import ProbeTimeout, RunsDir
+from rlcli.registry.probe import TIMEOUT_S
+
+
+def command(
+    timeout: ProbeTimeout = TIMEOUT_S,
+    runs_dir: RunsDir = None,
+) -> None:
+    """Tell what works here and how to mend the rest. Every part and plugin is looked at; for bug reports."""
+    from rlcli.doctor import run_checks
+    from rlcli.runs.run_ref import default_runs_dir
+
+    checks = run_checks(runs_dir or default_runs_dir(), timeout)
+    console.table(["CHECK", "STATE", "FOUND"], [[check.name, check.state, check.found] for check in checks])
+    for check in checks:
+        if check.hint:
+            console.data(f"{check.state}: {check.name}: {check.hint}")
+    broken, warnings = ([check.name for check in checks if check.state == state] for state in ("broken", "warning"))
+    verdict = [f"{word}: {', '.join(names)}" for word, names in (("broken", broken), ("warnings", warnings)) if names]
+    console.data("; ".join(verdict) or "all good")
+    console.document("doctor", healthy=not broken, all_good=not verdict, checks=[asdict(check) for check in checks])
+    if broken:
+        raise typer.Exit(9)

@@ -1,0 +1,90 @@
+"""`rlcli list-tasks`: what is installed, from metadata and a cache; nothing of a plugin is imported."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import typer
+
+from rlcli.cli.ui.console import console
+from rlcli.cli.ui.options import ProbeTimeout
+from rlcli.errors import did_you_mean
+from rlcli.registry import OWN, Entry, catalog, plugins_chosen_by, unknown_wanted
+from rlcli.registry.probe import TIMEOUT_S, Details, cached, probe
+
+
+def command(
+    pattern: Annotated[str | None, typer.Argument(help="Show only names or summaries that contain this.")] = None,
+    probe_all: Annotated[
+        bool,
+        typer.Option("--probe", help="Load every task shown in a process of its own and refresh what is known of it."),
+    ] = False,
+    timeout: ProbeTimeout = TIMEOUT_S,
+) -> None:
+    """List installed tasks."""
+    entries, broken = catalog()
+    by_name = Counter(entry.name for entry in entries)
+    shared = {name for name, count in by_name.items() if count > 1}
+    built_in = {entry.name for entry in entries if entry.distribution == OWN}
+    details = cached(entries)
+    if pattern:
+        entries = [entry for entry in entries if _matches(entry, details, pattern.lower())]
+    if probe_all:
+        details.update(probe(entries, timeout))
+    rows = [(entry, details.get(entry.qualified, Details())) for entry in entries]
+    if rows or not pattern:
+        _show(rows, shared)
+    else:
+        near = did_you_mean(pattern.lower(), by_name)
+        console.info(f"no task's name or summary contains '{pattern}'; {near or 'rlcli list-tasks shows all'}")
+    for bad in broken:
+        console.warn(f"{bad.distribution}: {bad.reason}; its tasks are not listed")
+    for name in unknown_wanted():
+        console.warn(f"{plugins_chosen_by()} names '{name}', which is no installed distribution with tasks or trainers")
+    console.document(
+        "list-tasks",
+        tasks=[_record(entry, known, ambiguous=entry.name in shared - built_in) for entry, known in rows],
+        broken=[{"distribution": bad.distribution, "reason": bad.reason} for bad in broken],
+    )
+
+
+def _matches(entry: Entry, details: Mapping[str, Details], pattern: str) -> bool:
+    return pattern in f"{entry.name} {details.get(entry.qualified, Details()).summary}".lower()
+
+
+def _record(entry: Entry, known: Details, *, ambiguous: bool) -> dict[str, Any]:
+    return {
+        "name": entry.name,
+        "qualified": entry.qualified,
+        "ambiguous": ambiguous,
+        "distribution": entry.distribution,
+        "version": entry.version,
+        "status": known.status,
+        **known.record(),
+    }
+
+
+def _show(rows: list[tuple[Entry, Details]], shared: set[str]) -> None:
+    console.table(
+        ["TASK", "PLUGIN", "WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "STATUS", "SUMMARY"],
+        [
+            [
+                entry.qualified if entry.name in shared and entry.distribution != OWN else entry.name,
+                f"{entry.distribution} {entry.version}",
+                known.workflow or "?",
+                _number(known.observation_size),
+                _number(known.action_size),
+                _number(known.num_envs),
+                known.agent or "",
+                known.status,
+                known.summary or ("" if known.broken else "(rlcli list-tasks --probe tells more)"),
+            ]
+            for entry, known in rows
+        ],
+    )
+
+
+def _number(value: int | None) -> str:
+    return "?" if value is None else str(value)

@@ -1,0 +1,153 @@
+"""`rlcli plot`: learning curves of runs, those that differ in their seed only taken together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rlcli.cli.ui.completion import runs_and_tasks
+from rlcli.cli.ui.console import console
+from rlcli.cli.ui.options import RunsDir, check_output
+from rlcli.errors import MachineError, UsageError, require_known
+
+if TYPE_CHECKING:
+    from rlcli.reporting.curves import Curve
+    from rlcli.reporting.panels import Panel
+    from rlcli.runs.run import Run
+
+_MANY = Path("curves.png")
+_MOST_PANELS = 60
+"""Of one picture."""
+
+
+def command(
+    runs: Annotated[
+        list[str],
+        typer.Argument(
+            autocompletion=runs_and_tasks,
+            metavar="RUN",
+            help="Runs by folder or name, latest, or a task: all of its runs.",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            help="FILE.png, .svg or .pdf; by default RUN/plots/curves.png of one run, curves.png of several.",
+        ),
+    ] = None,
+    metrics: Annotated[
+        str | None,
+        typer.Option(
+            help="return, success, length, rewards, terminations, any metric of the runs (Loss/value), or what stands "
+            "before its slash (Loss); separated by commas."
+        ),
+    ] = None,
+    x: Annotated[str, typer.Option(help="steps, iterations or time (of training, in seconds).")] = "steps",
+    runs_dir: RunsDir = None,
+) -> None:
+    """Draw learning curves. Of several seeds their interquartile mean and its 95 % interval."""
+    from rlcli.reporting.figures import FORMATS, check_drawing
+    from rlcli.runs.run_ref import default_runs_dir, find_runs
+
+    require_known(x, ("steps", "iterations", "time"), "--x", "axes")
+    names = None if metrics is None else [name.strip() for name in metrics.split(",") if name.strip()]
+    if names == []:
+        raise UsageError("--metrics names none", hint="--metrics return,success")
+    check_output(output, "picture", FORMATS)
+    check_drawing()
+    found = find_runs(runs, runs_dir or default_runs_dir())
+
+    from rlcli.reporting.curves import gather
+
+    curves, notes = gather(found)
+    for note in notes:
+        console.warn(note)
+    panels, file = _choose_panels(curves, names, x), output or _default_file(found)
+    _draw(file, curves, panels, x)
+    console.data(str(file))
+    console.document(
+        "plot",
+        file=str(file),
+        x=x,
+        panels=[panel.title for panel in panels],
+        curves=[_record(curve, x) for curve in curves],
+        notes=notes,
+    )
+
+
+def _choose_panels(curves: list[Curve], names: list[str] | None, x: str) -> list[Panel]:
+    from rlcli.reporting.panels import choose
+
+    panels = choose(curves, names, x)
+    if not panels:
+        raise UsageError("there is nothing to draw: no episode has ended yet", hint="--metrics Loss draws the losses")
+    if len(panels) > _MOST_PANELS:
+        console.warn(f"the first {_MOST_PANELS} of {len(panels)} panels are drawn; --metrics chooses")
+    return panels[:_MOST_PANELS]
+
+
+def _draw(file: Path, curves: list[Curve], panels: list[Panel], x: str) -> None:
+    """Write the picture, and print which seeds each curve has."""
+    from rlcli.reporting.curves import AXES
+    from rlcli.reporting.figures import picture
+    from rlcli.runs.atomic_io import write_atomic
+
+    note = _note(curves)
+    write_atomic(file, picture(panels, AXES[x], file.suffix, title=_title(curves), note=note))
+    for curve in curves:
+        seeds = ", ".join(map(str, curve.seeds))
+        console.info(f"{curve.label}: seed{'s' * (len(curve.seeds) > 1)} {seeds}")
+    if note:
+        console.info("of several seeds: interquartile mean and 95 % bootstrap interval (Agarwal et al. 2021)")
+
+
+def _default_file(runs: list[Run]) -> Path:
+    from rlcli.runs.run import require_own
+
+    if len(runs) > 1:
+        return _MANY
+    file = runs[0].folder / "plots" / _MANY
+    require_own(runs[0], "plots")
+    try:
+        file.parent.mkdir(exist_ok=True)
+    except OSError as error:
+        raise MachineError(f"cannot write {file}: {error.strerror or error}", hint="-o FILE.png") from None
+    return file
+
+
+def _title(curves: list[Curve]) -> str:
+    if len(curves) == 1:
+        return curves[0].label
+    return ", ".join(dict.fromkeys(str(h.run.record["task"]["name"]) for curve in curves for h in curve.histories))
+
+
+def _note(curves: list[Curve]) -> str:
+    if all(len(curve.histories) == 1 for curve in curves):
+        return ""
+    few = "of fewer than 4 their mean; " if any(1 < len(curve.histories) < 4 for curve in curves) else ""
+    return (
+        f"Lines: interquartile mean of the seeds ({few}terminations: mean). Bands: 95 % stratified bootstrap "
+        "interval (Agarwal et al. 2021)."
+    )
+
+
+def _record(curve: Curve, axis: str) -> dict[str, Any]:
+    """A curve as JSON: the last value of each metric."""
+    ends = {}
+    for name in curve.names():
+        line = curve.line(name, axis)
+        if line is None:
+            continue
+        known = line.low is not None and line.high is not None
+        ends[name] = {
+            "x": float(line.x[-1]),
+            "value": float(line.middle[-1]),
+            "low": float(line.low[-1]) if known else None,  # type: ignore[index]
+            "high": float(line.high[-1]) if known else None,  # type: ignore[index]
+        }
+    runs = [{"folder": str(h.run.folder), "seed": h.run.record["seed"]} for h in curve.histories]
+    return {"label": curve.label, "runs": runs, "last": ends}

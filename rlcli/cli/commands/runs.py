@@ -1,0 +1,114 @@
+"""`rlcli runs`: what became of the runs of a folder, newest first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rlcli.cli.ui.completion import tasks
+from rlcli.cli.ui.console import console
+from rlcli.cli.ui.options import RunsDir
+from rlcli.cli.ui.tables import cell
+from rlcli.errors import did_you_mean, listing
+from rlcli.text import shorten
+
+if TYPE_CHECKING:
+    from rlcli.runs.index import Overview
+
+_COLUMNS = [
+    "RUN", "STATE", "PROGRESS", "RETURN", "SUCCESS", "BEST", "EVAL", "AGE", "TRAINED", "SIZE", "AGENT", "SEED",
+    "REMARK",
+]  # fmt: skip
+_LONGEST = 60
+
+
+def command(
+    task: Annotated[
+        str | None, typer.Argument(autocompletion=tasks, help="Only runs of this task: its name, or its folder.")
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Only the N newest.")] = None,
+    runs_dir: RunsDir = None,
+) -> None:
+    """List runs: their state, progress and score."""
+    from rlcli.runs.index import overviews
+    from rlcli.runs.run_ref import default_runs_dir
+
+    place = runs_dir or default_runs_dir()
+    found = overviews(place)
+    wanted = None if task is None else Path(task).resolve().name if "/" in task else task.rpartition(":")[2]
+    chosen = [run for run in found if wanted in (None, run.task)]
+    listed = chosen[:limit]
+    console.document("runs", runs_dir=str(place), count=len(chosen), runs=[run.document() for run in listed])
+    if not chosen:
+        tasks = sorted({run.task for run in found})
+        near = (wanted and did_you_mean(wanted, tasks)) or (f"there are runs of {listing(tasks)}" if tasks else "")
+        console.info(f"no run{f' of {wanted}' if wanted else ''} in {place}" + (f"; {near}" if near else ""))
+        return
+    console.table(_COLUMNS, [_row(run, place) for run in listed])
+    if len(listed) < len(chosen):
+        console.info(f"{len(chosen) - len(listed)} older runs are not shown")
+
+
+def _row(run: Overview, place: Path) -> list[str]:
+    from rlcli.cli.ui.progress_view import clock
+
+    folder = run.folder.relative_to(place) if run.folder.is_relative_to(place) else run.folder
+    resumable = run.resumable and run.state in ("interrupted", "stopped", "diverged", "failed")
+    if run.state == "broken":
+        return [str(folder), run.state, *["-"] * 7, size(run.size_bytes), "-", "-", _one_line(run.reason or "")]
+    of = "?" if run.iterations is None else run.iterations
+    return [
+        str(folder),
+        run.state + (": resumable" if resumable else ""),
+        f"{run.iteration or 0}/{of}",
+        cell(run.last.get("return"), ".4g"),
+        cell(run.last.get("success"), ".1%"),
+        _best(run.best),
+        _best(run.evaluation),
+        "-" if run.age_s is None else age(run.age_s),
+        "-" if run.duration_s is None else clock(run.duration_s),
+        size(run.size_bytes),
+        _one_line(run.agent or "-"),
+        cell(run.seed),
+        _one_line(run.reason or "") or _tags(run),
+    ]
+
+
+def _tags(run: Overview) -> str:
+    """Settings that differ from those of most runs."""
+    tags = []
+    if (device := str(run.tags.get("device", "cpu"))) != "cpu":
+        tags.append(device)
+    if run.tags.get("processes", 1) != 1:
+        tags.append(f"{run.tags['processes']} processes")
+    if run.tags.get("init_from"):
+        tags.append("from weights")
+    return _one_line(", ".join(tags))
+
+
+def _best(best: dict[str, float]) -> str:
+    return cell(best["success"], ".1%") if "success" in best else cell(best.get("return"), ".4g")
+
+
+def _one_line(text: str) -> str:
+    return shorten(" ".join(text.split()), _LONGEST, "…")
+
+
+def age(seconds: float) -> str:
+    """A time in its largest unit."""
+    for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def size(count: int) -> str:
+    """Bytes in a fitting unit."""
+    value = float(count)
+    for unit in ("B", "kB", "MB", "GB"):
+        if value < 1000 or unit == "GB":
+            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+        value /= 1000
+    raise AssertionError("the last unit takes all")

@@ -1,0 +1,46 @@
+"""`rlcli show TASK`: the resolved configuration, where each value comes from, or the schema for editors."""
+
+from __future__ import annotations
+
+import json as json_module
+from typing import Annotated
+
+import typer
+
+from rlcli.cli.ui.console import console
+from rlcli.cli.ui.options import Agent, ConfigFile, NumEnvs, Overrides, TaskName
+
+
+def command(
+    task: TaskName,
+    overrides: Overrides = None,
+    origin: Annotated[bool, typer.Option("--origin", help="Say where each value comes from.")] = False,
+    schema: Annotated[bool, typer.Option("--schema", help="The JSON Schema of this task's YAML instead.")] = False,
+    play: Annotated[bool, typer.Option("--play", help="With the task's play: patch, as play and eval see it.")] = False,
+    agent: Agent = None,
+    num_envs: NumEnvs = None,
+    config: ConfigFile = None,
+) -> None:
+    """Print a task's resolved configuration."""
+    from rlcli.config.dump import json_schema, origins, to_data, to_yaml, to_yaml_with_origins
+    from rlcli.config.layers import flags
+    from rlcli.config.load import extensions, resolve
+    from rlcli.registry import find_task
+
+    source = find_task(task)
+    if schema:
+        content = json_schema(*extensions(source))
+        console.data(json_module.dumps(content, indent=2))
+        console.document("show", schema_document=content)
+        return
+    resolved = resolve(
+        source,
+        agent=agent,
+        play=play,
+        config_file=config,
+        overrides=overrides or (),
+        flags=flags(scene__num_envs=num_envs),
+    )
+    data = to_data(resolved)
+    console.data((to_yaml_with_origins(resolved) if origin else to_yaml(data)).rstrip("\n"))
+    console.document("show", config=data, **({"origins": origins(resolved)} if origin else {}))

@@ -1,0 +1,147 @@
+"""`rlcli stress`: how far a policy carries when masses, frictions, delays, ... are not what they were."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rlcli.cli.ui import options
+from rlcli.cli.ui.completion import runs_and_tasks
+from rlcli.cli.ui.console import console
+from rlcli.errors import UsageError
+
+if TYPE_CHECKING:
+    from rlcli.evaluation.session import PolicyInTask, PolicyRequest
+    from rlcli.evaluation.stress import StressResult
+    from rlcli.evaluation.stress_params import Sweep
+    from rlcli.reporting.heat_map import HeatMap
+
+_MOST_VARIANTS = 10_000
+
+
+def command(
+    subject: Annotated[
+        str | None,
+        typer.Argument(
+            autocompletion=runs_and_tasks,
+            metavar="RUN|TASK",
+            help="A run, RUN@best, RUN@step:N or latest; or a task: its newest run.",
+        ),
+    ] = None,
+    overrides: options.Overrides = None,
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="NAME[.ELEMENT]=LOW:HIGH[:POINTS] or =A,B,C; repeatable, every combination is tried. Factors on"
+            " body_mass, joint_damping, joint_friction, joint_armature, joint_stiffness, geom_friction, actuator_gain,"
+            " effort_limit, gravity or a field of the model (abs:LOW:HIGH sets it); action_delay and observation_delay"
+            " [control steps], action_noise and observation_noise [std], push [m/s or rad/s]."
+        ),
+    ] = None,
+    points: Annotated[int, typer.Option(min=2, max=1000, help="Values of a range.")] = 5,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes in each variant.")] = 100,
+    worst: Annotated[int, typer.Option(min=0, max=10_000, help="Look for a worse case at so many further points.")] = 0,
+    against: Annotated[str | None, typer.Option(help="A known answer beside it: lqr, zero or random.")] = None,
+    policy: options.Policy = "trained",
+    checkpoint: options.CheckpointRef = None,
+    stochastic: options.Stochastic = False,
+    fail_under: Annotated[
+        list[str] | None,
+        typer.Option(help="success=0.9 and the like, as in eval: exit 9 if it is below in any variant."),
+    ] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Draw the map to FILE.png or FILE.svg.")] = None,
+    num_envs: options.NumEnvs = None,
+    seed: options.Seed = 42,
+    config: options.ConfigFile = None,
+    runs_dir: options.RunsDir = None,
+) -> None:
+    """Evaluate a policy in variants of its task."""
+    from rlcli.evaluation.limits import read_limits, require_success
+    from rlcli.evaluation.session import PolicyRequest, baseline, find_policy, split_overrides
+    from rlcli.reporting.heat_map import check_picture, draw
+
+    task, words = split_overrides(subject, overrides or [])
+    if task is None and checkpoint is None:
+        raise UsageError("stress what?", hint="a RUN, a TASK, or latest")
+    sweeps, limits = _read_sweeps(sweep, points), read_limits(fail_under)
+    if output is not None:
+        check_picture(output)
+    request = PolicyRequest(
+        task, words, checkpoint, policy, stochastic, num_envs, options.draw_seed(seed), config, runs_dir
+    )
+    keys = [limit.key for limit in limits]
+    tested = find_policy(_resolve_run(request), lambda resolved: require_success(resolved, keys))
+    reference = None if against is None else baseline(tested, against)
+    from rlcli.evaluation.stress import stress
+
+    result = stress(tested, sweeps, episodes, worst=worst, reference=reference)
+    failed = result.failures(limits)
+    maps = _show(result, policy, against)
+    if output is not None:
+        draw(output, maps)
+        console.info(f"drawn to {output}")
+    document = {**_record(tested), **result.record(against), "picture": str(output) if output else None}
+    console.document("stress", **document, passed=not failed, failures=failed)
+    options.exit_on_failures(failed)
+
+
+def _record(tested: PolicyInTask) -> dict[str, Any]:
+    return {
+        "task": tested.resolved.source.name,
+        "checkpoint": str(tested.checkpoint) if tested.checkpoint else None,
+        "policy": tested.kind,
+        "stochastic": tested.stochastic,
+        "seed": tested.seed,
+    }
+
+
+def _read_sweeps(texts: list[str] | None, points: int) -> list[Sweep]:
+    from rlcli.evaluation.stress_params import grid, read_sweeps
+
+    if not texts:
+        raise UsageError("sweep what?", hint="--sweep body_mass=0.5:2, --sweep action_delay=0:3")
+    sweeps = read_sweeps(texts, points)
+    count = len(grid(sweeps))
+    if count > _MOST_VARIANTS:
+        raise UsageError(f"{count:,} variants; {_MOST_VARIANTS:,} are run", hint="fewer sweeps or --points")
+    return sweeps
+
+
+def _resolve_run(request: PolicyRequest) -> PolicyRequest:
+    """Take a run that stands where a task would as the checkpoint."""
+    from rlcli.evaluation.session import is_run_name
+
+    task = request.task
+    if task is None or not is_run_name(task, request.runs_dir):
+        return request
+    if request.checkpoint is not None:
+        raise UsageError(f"{task} is a run, and --checkpoint names another", hint="leave one of them out")
+    return replace(request, task=None, checkpoint=task)
+
+
+def _show(result: StressResult, policy: str, against: str | None) -> list[HeatMap]:
+    """Print the table, the maps and the worst variant; return the maps."""
+    from rlcli.cli.ui.evaluation_tables import interval, show_stress
+    from rlcli.evaluation.limits import mean_or_rate
+    from rlcli.evaluation.stress_params import describe_point
+    from rlcli.reporting.heat_map import heat_maps
+
+    show_stress(result, against)
+    metric = result.metric
+    values = [(policy, {point: mean_or_rate(summary[metric]) for point, summary in result.grid.items()})]
+    if against is not None:
+        values.append((against, {point: mean_or_rate(result.reference[point][metric]) for point in result.grid}))
+    maps = heat_maps(result.sweeps, values, metric)
+    for heat_map in maps:
+        console.data("")
+        console.heat_map(heat_map.title, f"{heat_map.row_name} / {heat_map.column_name}".strip(" /"), heat_map)
+    worst = result.worst
+    entry = {**result.grid, **result.searched}[worst][metric]
+    where = "found by the search" if worst in result.searched else "of the grid"
+    text = f"{metric} {mean_or_rate(entry):.4f} ({interval(entry)})"
+    console.data("")
+    console.data(f"worst {where}: {describe_point(result.sweeps, worst)}: {text}")
+    return maps

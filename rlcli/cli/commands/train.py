@@ -1,0 +1,214 @@
+"""`rlcli train TASK`: options -> configuration -> run folder -> environment and trainer -> training loop."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rlcli.cli.ui import options
+from rlcli.cli.ui.completion import checkpoints, runs, tasks, words
+from rlcli.cli.ui.console import console
+from rlcli.errors import Stopped, UsageError
+from rlcli.formats import log_notes
+
+if TYPE_CHECKING:
+    from rlcli.config.load import Resolved
+    from rlcli.registry import TaskSource
+    from rlcli.training.job import TrainingResult
+    from rlcli.training.launch import TrainingRequest
+    from rlcli.training.signals import StopRequest
+
+
+def command(
+    task: Annotated[
+        str | None,
+        typer.Argument(autocompletion=tasks, help="A task's name, distribution:name, or a folder with a task.yaml."),
+    ] = None,
+    overrides: options.Overrides = None,
+    agent: options.Agent = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=-1, max=options.MAX_SEED, help="Seed of everything random; -1 draws one; default 42."),
+    ] = None,
+    seeds: Annotated[
+        str | None, typer.Option(help="Several seeds, a run each, in one study folder: 0..4 or 1,5,9.")
+    ] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="With --seeds: trainings at a time; default 1.")] = None,
+    num_envs: options.NumEnvs = None,
+    max_iterations: options.MaxIterations = None,
+    max_steps: options.MaxSteps = None,
+    device: options.Device = "auto",
+    gpus: Annotated[
+        int | None, typer.Option(min=1, help="Processes on this machine, a GPU each; num_envs is of each.")
+    ] = None,
+    logger: Annotated[
+        list[str] | None,
+        typer.Option(
+            autocompletion=words("tensorboard", "wandb", "mlflow", "trackio", "none"),
+            help="tensorboard, wandb, mlflow, trackio or none; repeatable.",
+        ),
+    ] = None,
+    video_every: Annotated[
+        int | None,
+        typer.Option(
+            min=0, help="Film an episode every N iterations, in an environment of its own, into RUN/videos; 0: never."
+        ),
+    ] = None,
+    config: options.ConfigFile = None,
+    resume: Annotated[
+        str | None,
+        typer.Option(autocompletion=runs, help="Go on with a run: RUN, RUN@step:N or latest. Needs no TASK."),
+    ] = None,
+    init_from: Annotated[
+        str | None, typer.Option(autocompletion=checkpoints, help="Start a new run from a checkpoint's weights.")
+    ] = None,
+    runs_dir: options.RunsDir = None,
+    name: options.RunName = None,
+    headless: options.Headless = True,
+) -> None:
+    """Train a policy."""
+    from rlcli.config.layers import flags
+    from rlcli.machine import wait_calmly
+    from rlcli.rl import distributed
+    from rlcli.runs.run_ref import default_runs_dir
+    from rlcli.training.launch import TrainingRequest, process_device
+    from rlcli.training.signals import StopRequest
+    from rlcli.training.subprocesses import stop_with_parent
+
+    stop_with_parent()
+    wait_calmly()
+    console.follows = not distributed.is_rank_zero()
+    request = TrainingRequest(runs_dir or default_runs_dir(), None, resume, agent, device, gpus, config)
+    request.overrides, request.flags = overrides or [], flags(scene__num_envs=num_envs)
+    request.budget = options.budget(max_iterations, max_steps)
+    request.seed = options.draw_seed(42 if seed is None else seed)
+    request.loggers, request.init_from, request.video_every, request.name = logger, init_from, video_every, name
+    study = _study(request, seeds, jobs, seed)
+    process = process_device(device, gpus)
+    request.source = _source(task, request, seed, seeds)
+    resolved, stop = None, StopRequest(ends_process=console.owns_process)
+    if resume is None:
+        with stop, stop.before_training():
+            resolved, process = request.resolve()
+        log_notes(resolved.notes)
+    if gpus is not None and gpus > 1 and not distributed.launched():
+        raise typer.Exit(distributed.launch(gpus, sys.argv[1:]))
+    if study is not None:
+        _train_seeds(study, request, resolved, process, jobs or 1, stop)
+    else:
+        _train(request, resolved, process, stop)
+
+
+def _study(request: TrainingRequest, seeds: str | None, jobs: int | None, seed: int | None) -> list[int] | Path | None:
+    """Return the seeds of a new study, or the folder of a study to resume; None for a single training."""
+    from rlcli.rl import distributed
+    from rlcli.runs.multi_seed import read_seeds
+    from rlcli.runs.run import STUDY
+
+    study = None
+    if request.resume is not None:
+        places = (Path(request.resume), request.runs / request.resume)
+        study = next((place for place in places if (place / STUDY).is_file()), None)
+    if seeds is None and study is None:
+        if jobs is not None:
+            raise UsageError("--jobs is of several trainings", hint="--seeds 0..4 --jobs 2")
+        return None
+    if seed is not None or request.gpus is not None or distributed.launched():
+        other = "--seed" if seed is not None else "--gpus"
+        raise UsageError(f"--seeds and {other} contradict each other", hint=f"leave out {other}")
+    return study if seeds is None else read_seeds(seeds)
+
+
+def _source(task: str | None, request: TrainingRequest, seed: int | None, seeds: str | None) -> TaskSource | None:
+    """Return the task; of a resumed run it may be left out.
+
+    Raises:
+        UsageError: without a task, or if a resumed run is given another configuration.
+    """
+    from rlcli.runs.trusted_tasks import named_task
+
+    if request.resume is None:
+        if task is None:
+            raise UsageError("which task?", hint="rlcli train TASK (rlcli list-tasks shows them), or --resume RUN")
+        return named_task(task)
+    source = None if task is None or "=" in task else named_task(task)
+    changes = [word for word in [task, *request.overrides] if word and "=" in word]
+    num_envs = request.flags.get("scene.num_envs")
+    only_new = {"--agent": request.agent, "--seed": seed, "--seeds": seeds, "--num-envs": num_envs}
+    only_new |= {"--config": request.config, "--init-from": request.init_from, "--name": request.name}
+    changes += [option for option, value in only_new.items() if value is not None]
+    if changes:
+        raise UsageError(
+            f"a resumed run keeps its configuration: {', '.join(changes)} cannot be given with --resume"
+            " (--max-iterations and --max-steps can)",
+            hint="--init-from starts a new run from its weights",
+        )
+    return source
+
+
+def _train(request: TrainingRequest, resolved: Resolved | None, device: str, stop: StopRequest) -> None:
+    """Train one run, in one process or as one rank of several."""
+    from rlcli.cli.ui.progress_view import TrainingView
+    from rlcli.rl import distributed
+    from rlcli.training.job import Job
+    from rlcli.training.launch import broadcast_job, setup_job
+
+    with stop:
+        try:
+            result = broadcast_job(request, resolved, device)
+            if isinstance(result, Job):
+                job = result
+                trainer, env = setup_job(job, device, stop)
+                from rlcli.training.runner import run_training
+
+                view = TrainingView(f"rlcli train {job.resolved.source.name}")
+                result = run_training(job, trainer, env, stop, view)
+            if result is not None:
+                _print(result)
+        except KeyboardInterrupt:  # the second signal, wherever it came
+            raise Stopped("stopped at once", exit_code=stop.exit_code) from None
+        finally:
+            distributed.leave()
+
+
+def _print(result: TrainingResult) -> None:
+    if result.elapsed_s is not None:
+        console.info(
+            f"trained {result.step:,} steps in {result.elapsed_s:.1f} s; next: rlcli play --checkpoint {result.run}"
+        )
+    console.data(str(result.run))
+    training = {"iteration": result.iteration, "elapsed_s": result.elapsed_s, "seed": result.seed}
+    console.document(
+        "train",
+        run=str(result.run),
+        state="finished",
+        checkpoint=str(result.checkpoint),
+        step=result.step,
+        **{name: value for name, value in training.items() if value is not None},
+    )
+
+
+def _train_seeds(
+    study: list[int] | Path,
+    request: TrainingRequest,
+    resolved: Resolved | None,
+    device: str,
+    jobs: int,
+    stop: StopRequest,
+) -> None:
+    """Train a new study of several seeds, or what is left of one that is resumed."""
+    from rlcli.cli.ui.seeds_view import SeedsView, print_study
+    from rlcli.tuning.train_seeds import new_study, resume_options, train_seeds
+
+    if isinstance(study, Path):
+        place = None if request.device == "auto" else device
+        result = train_seeds(study, place, jobs, stop, SeedsView, bool(request.budget), resume_options(request))
+    else:
+        assert resolved is not None
+        result = train_seeds(new_study(request, resolved, device, study), device, jobs, stop, SeedsView)
+    print_study(result)
+    if result.exit_code:
+        raise typer.Exit(result.exit_code)

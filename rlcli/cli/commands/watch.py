@@ -1,0 +1,93 @@
+"""`rlcli watch RUN`: the live table of a training in another terminal, read from the run's files."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+from rlcli.cli.ui.console import console
+from rlcli.cli.ui.options import RunRef, RunsDir
+
+if TYPE_CHECKING:
+    from rlcli.runs.index import Overview
+    from rlcli.runs.run import Run
+    from rlcli.training.progress import Progress
+
+_EVERY_S = 0.5
+
+
+def command(
+    reference: RunRef = "latest",
+    runs_dir: RunsDir = None,
+) -> None:
+    """Follow a training from another terminal. Ctrl-C leaves it alone. --json says how it stands and ends."""
+    from rlcli.errors import Stopped
+    from rlcli.runs.run_ref import default_runs_dir, find_run
+
+    run, why = find_run(reference, runs_dir or default_runs_dir())
+    if console.json:
+        _document(run)
+        return
+    console.info(f"watching {run.folder} ({why})")
+    try:
+        final = _follow(run)
+    except KeyboardInterrupt:
+        raise Stopped("no longer watching; the run is left alone", exit_code=130) from None
+    _report(final)
+
+
+def _follow(run: Run) -> Overview:
+    """Show the run until it ends; return its final state."""
+    from rlcli.cli.ui.progress_view import TrainingView
+    from rlcli.errors import CheckpointError
+    from rlcli.runs.index import overview_of, state_of
+    from rlcli.runs.run import open_run
+
+    printed = None
+    with TrainingView(f"rlcli train {run.record['task']['name']}") as view:
+        while True:
+            state, _ = state_of(run)
+            progress = _progress(run)  # read after the state: rows written before it are not missed
+            if progress is not None and (progress.iteration, progress.env_steps) != printed:
+                printed = progress.iteration, progress.env_steps
+                view.show(progress)
+            if state != "running":
+                break
+            time.sleep(_EVERY_S)
+            try:
+                run = open_run(run.folder)
+            except CheckpointError:
+                if not run.folder.exists():  # a run that never began is removed
+                    raise
+        return overview_of(open_run(run.folder))
+
+
+def _progress(run: Run) -> Progress | None:
+    from rlcli.runs.index import count, newest_rows, times
+    from rlcli.training.progress import progress_of
+
+    rows = newest_rows(run)
+    if not rows:
+        return None
+    return progress_of(rows, count(run.record.get("iterations")), times(run)[1] or 0.0)
+
+
+def _report(final: Overview) -> None:
+    of = "" if final.iterations is None else f" of {final.iterations}"
+    console.data(f"{final.folder}: {final.state}, iteration {final.iteration}{of}")
+    if final.reason:
+        console.info(final.reason)
+    if final.state != "finished" and final.resumable:
+        console.info(f"rlcli train --resume {final.folder} goes on")
+
+
+def _document(run: Run) -> None:
+    from rlcli.runs.index import overview_of
+
+    document: dict[str, Any] = overview_of(run).document()
+    progress = _progress(run)
+    document |= {"steps_per_s": None, "remaining_s": None, "metrics": {}}
+    if progress is not None:
+        left = progress.remaining_s if document["state"] == "running" else None
+        document |= {"steps_per_s": progress.steps_per_s, "remaining_s": left, "metrics": progress.metrics}
+    console.document("watch", **document)

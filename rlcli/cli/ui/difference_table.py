@@ -1,0 +1,99 @@
+"""Table of the differences of two runs or configurations."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from rlcli.cli.ui.console import console
+from rlcli.text import shorten
+
+if TYPE_CHECKING:
+    from rlcli.runs.config_diff import Difference, Section
+
+_MOST_ROWS = 10
+"""Differences of one kind that the table shows without -v."""
+_WIDTH = 40
+
+
+def report_differences(command: str, sections: Sequence[Section], left: str, right: str, **entries: Any) -> bool:
+    """Print the result of comparing two sides.
+
+    Args:
+        command: the command, for its document.
+        sections: the parts that were compared.
+        left: name of one side.
+        right: name of the other.
+        entries: further entries of the document.
+
+    Returns:
+        Whether the sides are equal but for what is cosmetic.
+    """
+    from rlcli.runs.atomic_io import finite_json
+    from rlcli.runs.config_diff import CATEGORIES
+    from rlcli.runs.run_diff import first_difference
+
+    first = first_difference(sections)
+    counts = Counter(each.category for section in sections for each in section.differences)
+    console.table(["", "WHERE", "A", "B"], [row for section in sections for row in _rows(section)])
+    if kinds := [f"{name} {counts[name]}" for name in CATEGORIES if counts[name]]:
+        console.data(f"differences: {', '.join(kinds)}")
+    if first is None:
+        console.data("no difference that is not cosmetic" if counts else "no difference")
+    else:
+        section, found = first
+        sides = " | ".join(_sides(found))
+        console.data(f"first difference: {section} {_safe(found.where)}: {sides}")
+
+    def document(difference: Difference) -> dict[str, Any]:
+        facts: dict[str, Any] = finite_json(asdict(difference))
+        return facts
+
+    console.document(
+        command,
+        equal=first is None,
+        categories={name: counts[name] for name in CATEGORIES},
+        first=None if first is None else {"section": first[0], **document(first[1])},
+        left=left,
+        right=right,
+        **entries,
+        sections=[
+            {"name": s.name, "compared": s.compared, "differences": [document(d) for d in s.differences]}
+            for s in sections
+        ],
+    )
+    return first is None
+
+
+def _rows(section: Section) -> list[list[str]]:
+    if not section.differences:
+        return [[section.name, f"equal: {section.compared}", "", ""]]
+    rows = []
+    counts: Counter[str] = Counter()
+    for each in section.differences:
+        kind = each.category or section.name
+        counts[kind] += 1
+        if counts[kind] <= _MOST_ROWS or console.verbose:
+            rows.append([kind, _safe(each.where), *_sides(each)])
+    for kind, count in counts.items():
+        if count > _MOST_ROWS and not console.verbose:
+            rows.append([kind, f"and {count - _MOST_ROWS} more (-v shows them)", "", ""])
+    return rows
+
+
+def _sides(difference: Difference) -> list[str]:
+    """The value of each side, and where it was written."""
+    sides = ((difference.left, difference.left_from), (difference.right, difference.right_from))
+    return [f"{cell(value)} ({_safe(origin)})" if origin else cell(value) for value, origin in sides]
+
+
+def cell(value: object) -> str:
+    """Return a value as a cell of the table; `-` for None."""
+    return "-" if value is None else shorten(_safe(value if isinstance(value, str) else repr(value)), _WIDTH)
+
+
+def _safe(text: str) -> str:
+    """Text of an untrusted file, without control characters."""
+    return text.encode("unicode_escape").decode("ascii") if not text.isprintable() else text

@@ -1,0 +1,43 @@
+"""The terminal: whether a stream is one, its colours, and its width."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, TextIO
+
+from rlcli.settings import setting
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_ANY_WIDTH = 10_000
+"""Width of a pipe, where nothing has to fit."""
+
+
+def is_terminal(stream: TextIO | None) -> bool:
+    """Whether a stream is a terminal that can move its cursor."""
+    return stream is not None and stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
+
+
+def supports_styles(stream: TextIO | None) -> bool:
+    """Whether to print styled tables on a stream: it is a terminal, or colours are forced."""
+    return stream is not None and (stream.isatty() or colors() == "always")
+
+
+def colors() -> str:
+    """Return never, always or auto (on a terminal): from NO_COLOR, FORCE_COLOR, or the user's settings."""
+    if os.environ.get("NO_COLOR"):
+        return "never"
+    if os.environ.get("FORCE_COLOR"):
+        return "always"
+    return str(setting("color") or "auto")
+
+
+def screen(stream: TextIO) -> Console:
+    """Return rich's console on a stream, in colours or without."""
+    from rich.console import Console
+
+    chosen, width = colors(), None if stream.isatty() or os.environ.get("COLUMNS") else _ANY_WIDTH
+    if chosen == "never":
+        return Console(file=stream, highlight=False, width=width, color_system=None)
+    return Console(file=stream, highlight=False, width=width, force_terminal=True if chosen == "always" else None)

@@ -1,0 +1,175 @@
+"""Choice of the viewer that `play` opens, and the report when it is closed."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rlcli.cli.ui.console import console
+from rlcli.errors import DependencyError, MachineError, UsageError, require_known
+from rlcli.settings import setting
+from rlcli.viewer.protocol import DEFAULT_PORT, VIEWERS, Viewer
+
+if TYPE_CHECKING:
+    from rlcli.evaluation.session import Session
+    from rlcli.viewer.playback import Playback
+
+CHOICES = ("auto", *VIEWERS, "none")
+"""Values of --viewer."""
+Choice = tuple[str, str]
+"""A viewer, and why it."""
+
+
+def require_viewer(viewer: str | None, port: int | None, *, drawn: bool) -> None:
+    """Refuse flags that contradict each other.
+
+    Raises:
+        UsageError: naming both.
+    """
+    if viewer is not None:
+        require_known(viewer, CHOICES, "viewer", "viewers")
+    if drawn and viewer in VIEWERS:
+        raise UsageError(f"--viewer {viewer} is for watching, --video and --record write files", hint="leave one out")
+    if port is not None and (drawn or viewer in ("native", "none")):
+        raise UsageError("--port is of the viewer in the browser", hint="--viewer web")
+
+
+def read_commands(texts: Sequence[str]) -> dict[str, float]:
+    """Parse `vx=0.5,wz=0` into names and values.
+
+    Raises:
+        UsageError: for anything else.
+    """
+    values = {}
+    for part in ",".join(texts).split(","):
+        name, _, text = part.partition("=")
+        try:
+            values[name.strip()] = float(text)
+        except ValueError:
+            if part or len(texts):
+                raise UsageError(f"--command '{part}' is not NAME=NUMBER", hint="as in --command vx=0.5,wz=0") from None
+    return values
+
+
+def choose_viewers(viewer: str | None, port: int | None, *, headless: bool) -> list[Choice]:
+    """Return the viewers to try, in this order; the last one always works, or raises the reason why it does not.
+
+    Args:
+        viewer: the value of --viewer; None: the user's settings may choose.
+        port: the value of --port.
+        headless: whether nothing may be opened.
+
+    Raises:
+        MachineError: if a window is wanted, and there is no display.
+    """
+    from rlcli.sim.gl import has_display
+
+    if viewer == "native" and not has_display():
+        raise MachineError(
+            "there is no display for a window",
+            hint="--viewer web shows it in the browser, --video FILE.mp4 draws offscreen, --viewer none prints numbers",
+        )
+    if viewer not in (None, "auto"):
+        return [(str(viewer), "as asked")]
+    if headless:
+        return [("none", "nothing is to be opened")]
+    if port is not None:
+        return [("web", "--port is given")]
+    if console.json:
+        return [("none", "with --json nothing is opened unasked")]
+    preferred = setting("viewer") if viewer is None else None
+    if preferred in ("web", "none") or (preferred == "native" and has_display()):
+        return [(preferred, "as your settings say")]
+    watched = all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stdout))
+    display = "no display" if not has_display() else "no window"
+    after: list[Choice] = [("none", f"{display}, and no terminal asks; --viewer web shows it in the browser")]
+    if watched:
+        after = [("web", f"{display}; --viewer none prints numbers"), ("none", "nothing else works here")]
+    return [("native", "there is a display"), *after] if has_display() else after
+
+
+def show(session: Session, viewers: Sequence[Choice], *, port: int | None, drawn: int) -> bool:
+    """Open the first viewer that works and stay until it is closed.
+
+    Args:
+        session: environments and policy.
+        viewers: the viewers to try, in this order.
+        port: of the browser's viewer; None: the usual one.
+        drawn: how many environments are in the picture.
+
+    Returns:
+        Whether there was a viewer; without one numbers are left.
+
+    Raises:
+        MachineError, DependencyError: if the last one does not work.
+    """
+    for position, (name, reason) in enumerate(viewers):
+        if name == "none":
+            console.info(f"viewer: none ({reason})")
+            return False
+        try:
+            _open(session, name, reason, port, drawn)
+        except (MachineError, DependencyError) as error:
+            if position + 1 == len(viewers):
+                raise
+            console.info(f"viewer: not {name}: {error.message}{f'; {error.hint}' if error.hint else ''}")
+            continue
+        return True
+    raise AssertionError("there is always a viewer")
+
+
+def _open(session: Session, name: str, reason: str, port: int | None, drawn: int) -> None:
+    """Show the policy until the viewer is closed, and print the report."""
+    module, _, function = VIEWERS[name].partition(":")
+    run: Viewer = getattr(importlib.import_module(module), function)
+    playback, address = _playback(session), None
+
+    def ready(instructions: Sequence[str], url: str | None) -> None:
+        nonlocal address
+        address = url
+        if url is not None and console.quiet and not console.json:
+            console.data(url)
+        first, *others = instructions
+        console.info(f"viewer: {name} ({reason}){': ' if url else '. '}{first}")
+        for line in others:
+            console.info(line)
+
+    port = DEFAULT_PORT if port is None else port
+    run(playback, title=_title(session), together=drawn, port=port, ready=ready)
+    console.document(
+        "play",
+        video=None,
+        viewer=name,
+        reason=reason,
+        url=address,
+        steps=playback.steps,
+        episodes=int(playback.ended.sum()),
+        checkpoint=playback.checkpoint,
+        chosen=session.policy.reason,
+    )
+
+
+def _playback(session: Session) -> Playback:
+    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.viewer.checkpoints import RunCheckpoints
+    from rlcli.viewer.playback import Playback
+
+    env, policy = session.env, session.policy
+    checkpoint_source = step = None
+    if policy.run is not None and policy.checkpoint is not None and policy.kind == "trained":
+        checkpoint_source = RunCheckpoints(policy.run, env, policy.stochastic, env.seed)
+        step = open_checkpoint(policy.checkpoint).step
+    env_id, obs = session.start or (0, None)
+    return Playback(env, session.act, checkpoint_source, step, shown=env_id, initial_obs=obs)
+
+
+def _title(session: Session) -> str:
+    """Return the task and the run, checkpoint or policy that is shown."""
+    policy = session.policy
+    if policy.run is not None and policy.kind == "trained":
+        shown = policy.run.folder.name
+    else:
+        shown = policy.reason if policy.reason and policy.kind == "trained" else f"policy {policy.kind}"
+    return f"{policy.resolved.source.name}, {shown}"

@@ -1,0 +1,9 @@
+"""The schema of a task: every key of a `task.yaml` with its unit, its range and its default."""
+
+from rlcli.config.schema.agent import *
+from rlcli.config.schema.base import *
+from rlcli.config.schema.scene import *
+from rlcli.config.schema.sensors import *
+from rlcli.config.schema.task import *
+from rlcli.config.schema.terms import *
+from rlcli.config.schema.terrain import *

@@ -1,0 +1,107 @@
+"""Number types and the base class of every configuration model."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from types import ModuleType
+from typing import Annotated, Any, ClassVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+_FRACTION = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*/\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*\Z")
+
+
+def _fraction(value: object) -> Any:
+    """Convert a fraction such as `1/120` to a number; return any other value as it is."""
+    if isinstance(value, str) and (match := _FRACTION.match(value)):
+        try:
+            return float(match[1]) / float(match[2])
+        except (ValueError, ZeroDivisionError):
+            return value
+    return value
+
+
+class _FractionString:
+    """Annotation of a number that may be written as a fraction; it adds the pattern to the JSON Schema."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(_fraction, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"anyOf": [handler(schema), {"type": "string", "pattern": "^" + _FRACTION.pattern.replace(r"\Z", "$")}]}
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise ValueError(f"the lower end {value[0]:g} is above the upper end {value[1]:g}")
+    return value
+
+
+def _rotation(value: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if math.hypot(*value) < 1e-6:
+        raise ValueError("a quaternion must not be zero; no rotation is [1, 0, 0, 0]")
+    return value
+
+
+class _TermFunction:
+    """Annotation of a term's name: a configuration in Python may hold the function instead."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        name = core_schema.str_schema(strict=True)
+        either = core_schema.union_schema([name, core_schema.callable_schema()])
+        return core_schema.json_or_python_schema(json_schema=name, python_schema=either)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"type": "string"}
+
+
+def _nonzero_direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if math.hypot(*value) < 1e-6:
+        raise ValueError("a direction must not be zero; straight down is [0, 0, -1]")
+    return value
+
+
+Number = Annotated[float, _FractionString()]
+Positive = Annotated[float, Field(gt=0), _FractionString()]
+NotNegative = Annotated[float, Field(ge=0), _FractionString()]
+Count = Annotated[int, Field(ge=1)]
+Threads = Annotated[int, Field(ge=1, le=4096)]
+Share = Annotated[float, Field(ge=0, le=1), _FractionString()]
+Vec3 = tuple[Number, Number, Number]
+Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_rotation)]
+Direction = Annotated[Vec3, AfterValidator(_nonzero_direction)]
+Range = Annotated[tuple[Number, Number], AfterValidator(_ordered)]
+ShareRange = Annotated[tuple[Share, Share], AfterValidator(_ordered)]
+StepRange = Annotated[
+    tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0, le=1000)]], AfterValidator(_ordered)
+]
+Names = str | Annotated[list[str], Field(min_length=1)]
+
+
+class StrictModel(BaseModel):
+    """Base of every configuration model: unknown keys, wrong types, NaN and later changes are refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+    _defined_in: ClassVar[ModuleType | None]
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        cls._defined_in = sys.modules.get(cls.__module__)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """Read docstrings only when somebody asks for a schema: pydantic would while the models are made, which then
+        takes half as long again.
+        """
+        from rlcli.config.docstrings import describe
+
+        described = super().__get_pydantic_json_schema__(schema, handler)
+        describe(handler.resolve_ref_schema(described), cls)
+        return described
+
+
+Columns = Number | Annotated[list[Number], Field(min_length=1)]
+"""One number for all columns of a term, or one each."""

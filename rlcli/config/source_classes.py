@@ -1,0 +1,248 @@
+"""Classes in their source text, and the bases that can be found beside them or in `rlcli.mdp`: nothing is imported."""
+
+from __future__ import annotations
+
+import ast
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+_RLCLI = Path(__file__).resolve().parents[1]
+MOST = 64
+"""How many classes one search looks at: a stranger's files may name each other in a circle."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceClass:
+    """A class as a file writes it."""
+
+    file: Path
+    node: ast.ClassDef
+
+    def nested(self, name: str) -> SourceClass | None:
+        """The class of this name in its body."""
+        node = next((n for n in self.node.body if isinstance(n, ast.ClassDef) and n.name == name), None)
+        return None if node is None else SourceClass(self.file, node)
+
+
+def parse(file: Path) -> ast.Module:
+    """The syntax tree of a file.
+
+    Raises:
+        SyntaxError: if the file is not Python.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return ast.parse(file.read_bytes(), filename=str(file))
+    except SyntaxError as error:
+        error.filename = str(file)  # absent where there is a null byte
+        raise
+    except (ValueError, RecursionError, MemoryError) as error:
+        raise SyntaxError(str(error) or "nested too deeply", (str(file), 1, 1, None)) from None
+
+
+def constructor(source: SourceClass, trees: dict[Path, ast.Module]) -> ast.FunctionDef | None:
+    """Return the `__init__` of a class: its own, the one that `@dataclass` writes, or that of a base; None without one.
+
+    `trees` holds the syntax trees of the files read so far, and is added to.
+
+    Raises:
+        SyntaxError: if the file of a base is not Python.
+    """
+    return _constructor(source, _Search(trees))
+
+
+def lineage(file: Path, name: str) -> list[SourceClass]:
+    """A class and those that it inherits from, depth first, each once; empty if the file has no such class.
+
+    Bases are followed where their source is at hand: in the same file, or in another one of the same package.
+
+    Raises:
+        SyntaxError: if one of the files is not Python.
+    """
+    return _Search().lineage(file, name)
+
+
+def nested_lineage(file: Path, name: str, nested: str) -> list[SourceClass]:
+    """The same of a class that is written in the body of another, or of one that the other inherits from.
+
+    Raises:
+        SyntaxError: if one of the files is not Python.
+    """
+    search = _Search()
+    found = search.nested(file, name, nested)
+    return [] if found is None else list(search.walk(found))
+
+
+class _Search:
+    def __init__(self, trees: dict[Path, ast.Module] | None = None) -> None:
+        self._trees = {} if trees is None else trees
+        self._left = MOST
+
+    def lineage(self, file: Path, name: str) -> list[SourceClass]:
+        first = self._find(file, name)
+        return [] if first is None else list(self.walk(first))
+
+    def nested(self, file: Path, outer: str, name: str) -> SourceClass | None:
+        found = (owner.nested(name) for owner in self.lineage(file, outer))
+        return next((inner for inner in found if inner is not None), None)
+
+    def walk(self, first: SourceClass, seen: set[ast.ClassDef] | None = None) -> Iterator[SourceClass]:
+        seen = set() if seen is None else seen
+        if first.node in seen or not self._left:
+            return
+        self._left -= 1
+        seen.add(first.node)
+        yield first
+        for expression in first.node.bases:
+            base = self._base(first.file, expression)
+            if base is not None:
+                yield from self.walk(base, seen)
+
+    def bases(self, source: SourceClass) -> list[SourceClass]:
+        """Return the classes that a class names as its bases, or none once the search has looked at `MOST` classes."""
+        if not self._left:
+            return []
+        self._left -= 1
+        found = (self._base(source.file, expression) for expression in source.node.bases)
+        return [base for base in found if base is not None]
+
+    def _base(self, file: Path, expression: ast.expr) -> SourceClass | None:
+        if isinstance(expression, ast.Name):
+            return self._find(file, expression.id)
+        if isinstance(expression, ast.Attribute) and isinstance(expression.value, ast.Name):
+            return self.nested(file, expression.value.id, expression.attr) if self._left else None
+        return None
+
+    def _find(self, file: Path, name: str) -> SourceClass | None:
+        """The class that a file defines or imports by this name; None for what is not found.
+
+        Of rlcli's own classes only terms are found.
+        """
+        for node in self._tree(file).body:
+            if isinstance(node, ast.ClassDef) and node.name == name:
+                return SourceClass(file, node)
+            if not isinstance(node, ast.ImportFrom):
+                continue
+            imported = {alias.asname or alias.name: alias.name for alias in node.names}
+            real = imported.get(name, name if "*" in imported else None)
+            if real is None:
+                continue
+            for other in _module_files(file, node):
+                if other.is_file() and other != file and self._left:
+                    self._left -= 1
+                    found = self._find(other, real)
+                    if found is not None:
+                        return found
+        return None
+
+    def _tree(self, file: Path) -> ast.Module:
+        if file not in self._trees:
+            self._trees[file] = parse(file)
+        return self._trees[file]
+
+
+def _module_files(file: Path, node: ast.ImportFrom) -> Iterator[Path]:
+    """Where the module that a file imports from may lie."""
+    parts = (node.module or "").split(".")
+    roots: Sequence[Path] = file.parents[node.level - 1 : node.level] if node.level else file.parents
+    if parts[0] == "rlcli" and not node.level:
+        roots = (_RLCLI.parent,) if parts[1:2] == ["mdp"] else ()
+    for root in roots:
+        yield root.joinpath(*parts).with_suffix(".py")
+        yield root.joinpath(*parts, "__init__.py")
+
+
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """A field of a dataclass, as a parameter of its `__init__`."""
+
+    argument: ast.arg
+    default: ast.expr | None
+    keyword_only: bool
+
+
+def _constructor(source: SourceClass, search: _Search) -> ast.FunctionDef | None:
+    node = source.node
+    own = next((n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"), None)
+    if own is not None:
+        return own
+    if _dataclass_decorator(node) is not None:
+        return _dataclass_init(node, list(_fields(source, search).values()))
+    inits = (_constructor(base, search) for base in search.bases(source))
+    return next((init for init in inits if init is not None), None)
+
+
+def _dataclass_init(node: ast.ClassDef, fields: list[_Field]) -> ast.FunctionDef:
+    keywords = [field for field in fields if field.keyword_only]
+    arguments = ast.arguments(
+        posonlyargs=[],
+        args=[ast.arg("self"), *(field.argument for field in fields if not field.keyword_only)],
+        kwonlyargs=[field.argument for field in keywords],
+        kw_defaults=[field.default for field in keywords],
+        defaults=[],
+    )
+    return ast.FunctionDef("__init__", arguments, body=[], decorator_list=[], lineno=node.lineno)
+
+
+def _fields(source: SourceClass, search: _Search) -> dict[str, _Field]:
+    """The fields of a dataclass, in the order of its `__init__`: those of its last base first."""
+    fields: dict[str, _Field] = {}
+    for base in reversed(search.bases(source)):
+        fields.update(_fields(base, search))
+    decorator = _dataclass_decorator(source.node)
+    if decorator is None:  # the annotations of a plain class are no fields
+        return fields
+    keyword_only = _is_true(_keywords(decorator).get("kw_only"))
+    for node in source.node.body:
+        if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
+            continue
+        kind = last_name(node.annotation.value if isinstance(node.annotation, ast.Subscript) else node.annotation)
+        name = node.target.id
+        if kind == "KW_ONLY":
+            keyword_only = True
+        elif kind == "ClassVar" or _is_false(_options(node.value).get("init")):
+            fields.pop(name, None)
+        else:
+            fields[name] = _Field(ast.arg(name, node.annotation), _default(node.value), keyword_only)
+    return fields
+
+
+def _dataclass_decorator(node: ast.ClassDef) -> ast.expr | None:
+    called = ((d, d.func if isinstance(d, ast.Call) else d) for d in node.decorator_list)
+    return next((decorator for decorator, function in called if last_name(function) == "dataclass"), None)
+
+
+def _default(value: ast.expr | None) -> ast.expr | None:
+    """The default of a dataclass's field, also one written as `field(default_factory=lambda: ...)`."""
+    options = _options(value)
+    factory = options.get("default_factory")
+    if factory is not None:
+        return factory.body if isinstance(factory, ast.Lambda) else factory
+    return options.get("default") if options else value
+
+
+def _options(value: ast.expr | None) -> dict[str, ast.expr]:
+    """The keywords of `field(...)`."""
+    return _keywords(value) if isinstance(value, ast.Call) and last_name(value.func) == "field" else {}
+
+
+def _keywords(call: ast.expr | None) -> dict[str, ast.expr]:
+    return {k.arg: k.value for k in call.keywords if k.arg} if isinstance(call, ast.Call) else {}
+
+
+def _is_true(node: ast.expr | None) -> bool:
+    return isinstance(node, ast.Constant) and node.value is True
+
+
+def _is_false(node: ast.expr | None) -> bool:
+    return isinstance(node, ast.Constant) and node.value is False
+
+
+def last_name(node: ast.expr) -> str | None:
+    """Return the name that an expression ends with: `b` of `b` and of `a.b`."""
+    if isinstance(node, ast.Name):
+        return node.id
+    return node.attr if isinstance(node, ast.Attribute) else None

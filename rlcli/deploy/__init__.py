@@ -1,0 +1,1 @@
+"""Exported policies: their files, their metadata, and the check in plain MuJoCo."""

@@ -1,0 +1,150 @@
+"""What an exported file says of itself: everything that whoever runs it must know, and the same in mjlab's words."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+from rlcli.deploy.graph import Deployed
+from rlcli.runs.checkpoint import Checkpoint
+from rlcli.runs.manifest import DeploymentRecord, LayoutRecord
+from rlcli.runs.run import RECORD
+
+SCHEMA = 2
+"""Version of the metadata."""
+
+
+def metadata_of(
+    checkpoint: Checkpoint, graph: Deployed, layout: LayoutRecord, deployment: DeploymentRecord | None
+) -> dict[str, Any]:
+    """The metadata of a checkpoint's policy."""
+    manifest, spec = checkpoint.manifest, graph.policy.spec
+    task, run = manifest.get("task") or {}, checkpoint.folder.resolve().parent.parent
+    normalized = graph.policy.normalizer is not None
+    terms = layout.observations[spec.group]
+    return {
+        "schema": SCHEMA,
+        "input": {
+            "name": "obs",
+            "shape": ["batch", spec.observation_size],
+            "dtype": "float32",
+            "meaning": f"the environment's observation group '{spec.group}': each term's value after its `modifiers`,"
+            " clipped to `clip`, then times `scale`; its last `history` steps, the oldest first, an episode's first"
+            " value in all of them when it begins; side by side in the order of `observations`; nothing else is done"
+            " to it outside",
+        },
+        "outputs": {
+            "action": {
+                "shape": ["batch", spec.action_size],
+                "dtype": "float32",
+                "meaning": "exactly what env.step takes: the deterministic action, within +-`action_bound`",
+            },
+            "command": {
+                "shape": ["batch", spec.action_size],
+                "dtype": "float32",
+                "meaning": "what reaches the actuators, in the `unit` of each term of `actions`: action x `scale` +"
+                " `offset`, then within `clip`, then within `limits`. Where `command` of a term is 'task', the task's"
+                " own code makes the actuators' command of it, and it is the action within `clip`",
+            },
+        },
+        "memory": [
+            {
+                "input": f"{part}_in",
+                "output": f"{part}_out",
+                "shape": [len(spec.memory), "batch", spec.memory[0]],
+                "single": [len(spec.memory), 1, spec.memory[0]],
+                "dtype": "float32",
+                "meaning": f"{what} of the memory's layers: zeros when an episode begins, then what the last step gave",
+            }
+            for part, what in (("h", "outputs"), ("c", "cell states"))
+            if spec.memory
+        ],
+        "observations": [
+            {**term.model_dump(mode="json"), "columns": columns}
+            for term, columns in zip(terms, _columns(terms), strict=True)
+        ],
+        "actions": [
+            {
+                **term.model_dump(mode="json"),
+                "columns": columns,
+                "command": "actuator" if term.scale is not None else "task",
+            }
+            for term, columns in zip(layout.actions, _columns(layout.actions), strict=True)
+        ],
+        "applied": {
+            "before_obs": ["observations.modifiers", "observations.clip", "observations.scale", "observations.history"],
+            "inside": [*(["normalizer"] if normalized else []), "action_bound"],
+            "between_action_and_command": ["actions.scale", "actions.offset", "actions.clip", "actions.limits"],
+        },
+        "deployment": _deployed(deployment, spec.group),
+        "normalizer": normalized,
+        "action_bound": spec.action_bound,
+        "step_dt": layout.step_dt,
+        "dt": layout.dt,
+        "decimation": layout.decimation,
+        "quaternions": "wxyz",
+        "policy": spec.kind,
+        "task": {key: task.get(key) for key in ("name", "distribution", "version")},
+        "agent": manifest.get("agent"),
+        "run": run.name if (run / RECORD).is_file() else None,
+        "step": checkpoint.step,
+        "seed": manifest.get("seed"),
+        "versions": {key: (manifest.get("versions") or {}).get(key) for key in ("rlcli", "torch", "mujoco")},
+    }
+
+
+def _deployed(deployment: DeploymentRecord | None, group: str) -> dict[str, Any] | None:
+    if deployment is None:
+        return None
+    record = deployment.model_dump(mode="json")
+    return {**record, "observations": record["observations"][group]}
+
+
+def mjlab_properties(metadata: dict[str, Any], entity: str = "robot") -> dict[str, str]:
+    """The properties that mjlab 1.6 gives its ONNX files, as it writes them: what reads those reads these.
+
+    Lists are separated by commas, lists in lists by semicolons. What the checkpoint does not know is left out.
+    """
+    terms, actions = metadata["observations"], metadata["actions"]
+    widths = [term["size"] // term["history"] for term in terms]
+    scales = [term["scale"][:width] if term["scale"] else [1.0] for term, width in zip(terms, widths, strict=True)]
+    lists: dict[str, list[Any]] = {
+        "observation_names": [term["name"] for term in terms],
+        "observation_terms_scale": [scale if len(set(scale)) > 1 else scale[0] for scale in scales],
+        "observation_terms_flatten_history_dim": [True for _ in terms],
+        "observation_terms_history_length": [term["history"] if term["history"] > 1 else 0 for term in terms],
+        "observation_terms_clip": [term["clip"] or [float("-inf"), float("inf")] for term in terms],
+    }
+    if all(term["scale"] for term in actions):
+        lists["action_scale"] = [scale for term in actions for scale in term["scale"]]
+    deployment = metadata["deployment"]
+    if deployment is not None:
+        entities = [joint["entity"] for joint in deployment["joints"]]
+        owner = entity if entity in entities else (entities or [None])[0]
+        joints = [joint for joint in deployment["joints"] if joint["entity"] == owner]
+        driven = [joint for joint in joints if joint["stiffness"] is not None]
+        lists |= {
+            "joint_names": [joint["name"] for joint in joints],
+            "joint_stiffness": [joint["stiffness"] for joint in driven],
+            "joint_damping": [joint["damping"] for joint in driven],
+            "default_joint_pos": [joint["default"] for joint in joints],
+            "command_names": [command["name"] for command in deployment["commands"]],
+        }
+    found = {name: ",".join(map(_entry, values)) for name, values in lists.items() if not _ambiguous(values)}
+    return {"run_path": str(metadata["run"] or ""), **found}
+
+
+def _entry(value: object) -> str:
+    if isinstance(value, list):
+        return ";".join(map(_entry, value))
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+def _ambiguous(values: list[Any]) -> bool:
+    """Whether a name holds a separator."""
+    return any(isinstance(value, str) and ("," in value or ";" in value) for value in values)
+
+
+def _columns(terms: list[Any]) -> list[list[int]]:
+    ends = itertools.accumulate((term.size for term in terms), initial=0)
+    return [list(pair) for pair in itertools.pairwise(ends)]

@@ -1,0 +1,101 @@
+"""A policy as one Python file that needs numpy alone: `deployed/policy.py` with the numbers filled in."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import pprint
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from rlcli.deploy.graph import Deployed
+
+_TEMPLATE = Path(__file__).parent / "deployed" / "policy.py"
+
+
+def numpy_bytes(graph: Deployed, metadata: str) -> bytes:
+    """The file: code that one reads, and at its end the weights as base64 of an npz."""
+    weights = io.BytesIO()
+    np.savez(weights, **_weights(graph))  # type: ignore[arg-type]
+    text = _TEMPLATE.read_text(encoding="utf-8")
+    code, _, tail = text.partition("_W = {}\n")
+    lines = textwrap.wrap(base64.b64encode(weights.getvalue()).decode(), 110)
+    packed = "WEIGHTS = (\n" + "\n".join(f'    "{line}"' for line in lines) + "\n)\n"
+    # what a checkpoint says becomes a literal and nothing else, whatever characters it holds
+    code = code.replace("METADATA: dict = {}", f"METADATA = {literal(json.loads(metadata))}")
+    code = code.replace("NETWORK: dict = {}", f"NETWORK = {literal(_network(graph))}").replace('WEIGHTS = ""\n', "")
+    return (code + packed + "_W = {}\n" + tail).encode("ascii")
+
+
+def read_numpy(file: Path) -> tuple[Any, str]:
+    """Run a file that has just been written here: its function, and its metadata as JSON."""
+    space: dict[str, Any] = {"__name__": "policy"}
+    exec(compile(file.read_text(encoding="utf-8"), str(file), "exec"), space)
+
+    def run(inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+        out = space["run"]({name: value.numpy() for name, value in inputs.items()})
+        return {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in out.items()}
+
+    return run, json.dumps(space["METADATA"])
+
+
+def literal(value: object) -> str:
+    """Plain data as Python's source, in ASCII."""
+    return pprint.pformat(value, width=110, sort_dicts=False).encode("ascii", "backslashreplace").decode()
+
+
+def _network(graph: Deployed) -> dict[str, Any]:
+    spec = graph.policy.spec
+    normalizer = graph.policy.normalizer
+    bounds = [values.tolist() for values in (graph.clip, graph.limits) if values is not None]
+    return {
+        "kind": spec.kind,
+        "normalize": normalizer is not None,
+        "normalize_clip": None if normalizer is None else normalizer.clip,
+        "cells": list(spec.memory),
+        "pictures": [] if spec.vision is None else [(p.start, p.steps, *p.shape) for p in spec.vision.pictures],
+        "motion": None if spec.vision is None else spec.vision.motion,
+        "windows": [] if spec.vision is None else list(zip(spec.vision.kernels, spec.vision.strides, strict=True)),
+        "layers": len(spec.hidden) + 1,
+        "activation": spec.activation,
+        "squashed": not spec.kind.startswith("gaussian-"),
+        "bound": spec.action_bound,
+        "scaled": graph.scaled,
+        "bounds": [[[_finite(x) for x in ends] for ends in pair] for pair in bounds],
+    }
+
+
+def _finite(value: float) -> float:
+    """Infinity has no literal."""
+    return math.copysign(3.4e38, value) if math.isinf(value) else value
+
+
+def _weights(graph: Deployed) -> dict[str, np.ndarray]:
+    policy, arrays = graph.policy, {}
+    if policy.normalizer is not None:
+        arrays["mean"] = policy.normalizer.mean.float()
+        arrays["scale"] = (policy.normalizer.var + policy.normalizer.EPSILON).rsqrt().float()
+    if policy.memory is not None:
+        for number, cell in enumerate(policy.memory.layers):
+            assert isinstance(cell, torch.nn.LSTMCell)
+            arrays |= {f"in{number}": cell.weight_ih, f"rec{number}": cell.weight_hh}
+            arrays[f"bias{number}"] = cell.bias_ih.double() + cell.bias_hh.double()
+    if policy.vision is not None:
+        for picture, layers in enumerate(policy.vision.pictures):
+            convolutions = [layer for layer in layers.modules() if isinstance(layer, torch.nn.Conv2d)]
+            for number, conv in enumerate(convolutions):
+                assert conv.bias is not None
+                arrays |= {f"cw{picture}_{number}": conv.weight.flatten(1), f"cb{picture}_{number}": conv.bias}
+    linear = [layer for layer in policy.actor if isinstance(layer, torch.nn.Linear)]
+    for number, layer in enumerate(linear):
+        arrays |= {f"w{number}": layer.weight, f"b{number}": layer.bias}
+    arrays |= {"command_scale": graph.scale, "command_offset": graph.offset}
+    return {name: value.detach().numpy() for name, value in arrays.items()}

@@ -1,0 +1,140 @@
+"""Building the simulation of an environment: engine, entities, actuators, sensors, terrain, start state."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rlcli.config.load import Resolved
+from rlcli.config.schema import InitialStateConfig
+from rlcli.managers.term import Binder
+from rlcli.scene.actuators import ActuatorModel
+from rlcli.scene.entity import Entity
+from rlcli.scene.names import NameProblem
+from rlcli.scene.scene import Scene
+from rlcli.scene.sensors import Sensor, make_sensors
+from rlcli.scene.terrain import Terrain
+from rlcli.sim.engine import Engine, open_engine
+from rlcli.sim.rotations import rotate_inverse
+from rlcli.sim.selection import Selection
+from rlcli.sim.state_cache import SimData
+
+__all__ = ["grid"]
+"""What is public; the rest is for `VecEnv`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Simulation:
+    """The parts of an environment that are built from its compiled scene; `VecEnv` describes them."""
+
+    engine: Engine
+    data: SimData
+    entities: dict[str, Entity]
+    actuators: dict[str, ActuatorModel]
+    sensors: dict[str, Sensor]
+    default_state: dict[str, Tensor]
+    origins: Tensor
+    terrain: Terrain | None
+
+
+def open_scene(resolved: Resolved) -> Scene:
+    """Return the scene of a task, not yet compiled."""
+    config, source = resolved.task, resolved.source
+    return Scene(config.scene, config.sim, source.root, installed=source.distribution is not None)
+
+
+def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: int, shared_streams: int) -> Simulation:
+    """Compile a complete scene and build what simulates it, in its default state.
+
+    Args:
+        scene: the scene, with everything that the task adds.
+        binder: collects the names that do not resolve.
+        device: of the engine.
+        seed: of the terrain's draws.
+        shared_streams: see `VecEnv`.
+
+    Raises:
+        ConfigError: if there is no model to look further names up in.
+    """
+    task = binder.resolved.task
+    for problem in scene.problems:
+        binder.add_problem(problem.path, str(problem), problem.hint)
+    if any(problem.path[-1] == "model" for problem in scene.problems):
+        binder.raise_problems()
+    scene.spec.visual.global_.offwidth = task.viewer.width
+    scene.spec.visual.global_.offheight = task.viewer.height
+    engine = open_engine(scene.compile(), task.scene.num_envs, task.sim, device=str(device))
+    engine.shared_streams = shared_streams
+    data = SimData(engine)
+    entities = _make_entities(scene, binder, engine, data)
+    actuators = _make_actuators(entities, binder)
+    sensors = make_sensors(scene.sensors, data, entities)
+    default_state = _default_state(engine, entities)
+    engine.set_default_state(**default_state)
+    engine.reset(_select_all(engine))
+    data.refresh()
+    origins = torch.zeros(task.scene.num_envs, 3, device=device)
+    terrain = None
+    if task.scene.terrain is not None and scene.ground is not None:
+        terrain = Terrain(scene.ground, task.scene.terrain, origins, seed, shared_streams)
+    return Simulation(engine, data, entities, actuators, sensors, default_state, origins, terrain)
+
+
+def grid(num_envs: int, spacing: float) -> Tensor:
+    """Return origins of environments on a square grid about the world's origin. (num_envs, 3) [m]"""
+    rows = math.ceil(math.sqrt(num_envs))
+    index = torch.arange(num_envs)
+    xy = torch.stack([index // rows, index % rows], dim=1).float() - (rows - 1) / 2
+    return torch.cat([xy * spacing, torch.zeros(num_envs, 1)], dim=1)
+
+
+def _make_entities(scene: Scene, binder: Binder, engine: Engine, data: SimData) -> dict[str, Entity]:
+    entities = {}
+    for name, config in scene.config.entities.items():  # a direct task may have added some
+        try:
+            entities[name] = Entity(name, config, engine, data)
+        except NameProblem as problem:
+            binder.add_problem(("scene", "entities", name, "init"), str(problem), problem.hint)
+            blank = config.model_copy(update={"init": InitialStateConfig()})  # to go on to the other problems
+            entities[name] = Entity(name, blank, engine, data)
+    return entities
+
+
+def _make_actuators(entities: dict[str, Entity], binder: Binder) -> dict[str, ActuatorModel]:
+    actuators = {}
+    for entity in entities.values():
+        for name, config in entity.config.actuators.items():
+            try:
+                model = ActuatorModel(name, config, entity)
+            except NameProblem as problem:
+                path = ("scene", "entities", entity.name, "actuators", name)
+                binder.add_problem(path, str(problem), problem.hint)
+                continue
+            entity.actuators.append(model)
+            actuators[f"{entity.name}.{name}"] = model
+    return actuators
+
+
+def _default_state(engine: Engine, entities: dict[str, Entity]) -> dict[str, Tensor]:
+    qpos, qvel = torch.tensor(engine.model.qpos0), torch.zeros(engine.model.nv, dtype=torch.float64)
+    for entity in entities.values():
+        qpos[entity.qpos_columns.cpu()] = entity.data.default_joint_pos[0].double().cpu()
+        qvel[entity.dof_columns.cpu()] = entity.data.default_joint_vel[0].double().cpu()
+        if entity.is_floating:
+            _, dof = entity.floating()
+            root = entity.data.default_root_state[:1].double().cpu()
+            local = rotate_inverse(root[:, 3:7], root[:, 10:])  # a free joint's is in the body's frame
+            qvel[dof : dof + 6] = torch.cat([root[:, 7:10], local], dim=1)[0]
+    return {"qpos": qpos, "qvel": qvel}
+
+
+def _select_all(engine: Engine) -> Selection:
+    """Return a selection of all environments that must not draw."""
+    mask = torch.ones(engine.num_envs, dtype=torch.bool, device=engine.device)
+    counters = torch.zeros(engine.num_envs, dtype=torch.int64, device=engine.device)
+    selection = engine.select(mask, 0, engine.as_field(counters))
+    assert selection is not None
+    return selection

@@ -1,0 +1,116 @@
+"""`python -m rlcli.envs.task_index GROUP FILE NAME...`: build tasks and print what they are.
+
+`--index DISTRIBUTION` prints the `index.json` that a distribution ships for `list-tasks`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+
+from rlcli.errors import RlcliError
+from rlcli.registry import (
+    FORMATS,
+    TASKS,
+    TRAINERS,
+    catalog,
+    find_entry,
+    find_task,
+    load_entry,
+    malformed_metadata_ignored,
+)
+from rlcli.registry.formats import load_format
+from rlcli.registry.probe import Details
+from rlcli.trainers import TrainerSpec
+
+
+def describe(name: str) -> Details:
+    """Load a task and build one environment of it.
+
+    Raises:
+        RlcliError: if it cannot be built.
+    """
+    from rlcli.config.load import resolve
+    from rlcli.envs.make import make_env
+
+    source = find_task(name)
+    task = resolve(source)
+    env = make_env(resolve(source, flags={"scene.num_envs": 1}))
+    return Details(
+        summary=task.task.summary,
+        workflow="direct" if source.task else "managed",
+        observation_size=env.layout.size("policy"),
+        action_size=env.layout.action_size,
+        num_envs=task.task.scene.num_envs,
+        agent=task.agent_name,
+        policy=source.policy is not None,
+    )
+
+
+def try_trainer(name: str) -> Details:
+    """Load a trainer's record, the models of its settings and its class.
+
+    Raises:
+        RlcliError: if one of them cannot be loaded.
+    """
+    entry = find_entry(TRAINERS, name, what="trainer")
+    spec = load_entry(entry, TrainerSpec)
+    for reference in (*spec.algorithms.values(), spec.trainer):
+        load_entry(replace(entry, value=reference), object)
+    return Details(summary=spec.summary)
+
+
+def try_format(name: str) -> Details:
+    """Load a format's record, and every part that it names.
+
+    Raises:
+        RlcliError: if one of them cannot be loaded.
+    """
+    form = load_format(name)
+    spec = form.spec
+    for reference in (spec.find, spec.read, spec.check, spec.environment, spec.importer, spec.hint, spec.agents_beside):
+        if reference:
+            form.load(reference)
+    return Details(summary=spec.summary)
+
+
+_LOADERS = {TASKS: describe, TRAINERS: try_trainer, FORMATS: try_format}
+
+
+def main(arguments: list[str]) -> None:
+    """Append a line of JSON to a file for each name, or print the index of a distribution."""
+    parser = argparse.ArgumentParser(prog="python -m rlcli.envs.task_index", description=__doc__)
+    parser.add_argument("--index", metavar="DISTRIBUTION", help="print the index.json of this distribution, no more")
+    parser.add_argument("group", nargs="?", choices=_LOADERS)
+    parser.add_argument("file", nargs="?")
+    parser.add_argument("names", nargs="*")
+    options = parser.parse_args(arguments)
+    if options.index:
+        names = [entry.qualified for entry in catalog()[0] if entry.distribution == options.index]
+        index = {name.partition(":")[2]: describe(name).record() for name in names}
+        sys.stdout.write(json.dumps(index, indent=1) + "\n")
+        return
+    if options.file is None:
+        parser.error("the following arguments are required: group, file")
+    with malformed_metadata_ignored():
+        for name in options.names:
+            details = _details(name, _LOADERS[options.group])
+            with open(options.file, "ab") as rows:
+                rows.write(json.dumps(details.record()).encode() + b"\n")
+
+
+def _details(name: str, load: Callable[[str], Details]) -> Details:
+    try:
+        return load(name)
+    except RlcliError as error:
+        first, *more = error.message.splitlines()
+        return Details(broken=f"{first[:300]} (and {len(more)} more)" if more else first[:300])
+    except BaseException as error:
+        return Details(broken=f"{type(error).__name__}: {error}"[:300])
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

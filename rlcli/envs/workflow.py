@@ -1,0 +1,136 @@
+"""The hooks that a workflow (managed or direct) fills in for the environment loop, with their defaults."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rlcli.envs.layout import Layout
+from rlcli.scene.scene import Scene
+from rlcli.scene.terrain import Terrain
+from rlcli.sim.markers import Marker
+from rlcli.sim.selection import Selection
+
+
+class Workflow(ABC):
+    """Base class of the environment loop: what differs between managed and direct tasks.
+
+    `VecEnv` calls the hooks whose names begin with an underscore; the others are for callers of the environment.
+    """
+
+    num_envs: int
+    device: torch.device
+    terrain: Terrain | None
+
+    # --- construction, in this order ---
+
+    @abstractmethod
+    def _prepare_scene(self, scene: Scene) -> None:
+        """Complete the scene before it is compiled."""
+
+    def _bind_terms(self) -> None:
+        """Resolve the names of the configuration, once entities exist."""
+
+    @abstractmethod
+    def _build_workflow(self) -> None:
+        """Make the managers, or start the task."""
+
+    @abstractmethod
+    def _make_layout(self) -> Layout:
+        """Return the observation and action columns."""
+
+    # --- a step, in this order ---
+
+    @abstractmethod
+    def _apply_action(self, action: Tensor) -> None:
+        """Turn the policy's action into controls. action (num_envs, a)"""
+
+    @abstractmethod
+    def _compute_rewards_and_dones(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return reward, terminated and truncated. (num_envs,) each"""
+
+    @abstractmethod
+    def _compute_final_obs(self) -> dict[str, Tensor]:
+        """Return the true last observations, before anything is reset."""
+
+    @abstractmethod
+    def _episode_returns_and_causes(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+        """Return returns, reward terms and causes of the episodes that end. (n,) each"""
+
+    def _episode_metrics(self, ended: Selection) -> dict[str, Tensor]:
+        """Return metrics of the episodes that end, as means over their steps. (n,) each"""
+        return {}
+
+    def _reward_terms(self) -> Tensor:
+        """Return the reward of the step by term. (terms, num_envs)"""
+        return torch.zeros(0, self.num_envs, device=self.device)
+
+    def _before_reset(self, ended: Selection) -> None:
+        """Use the episodes that end, before their environments are reset."""
+
+    @abstractmethod
+    def _reset_workflow(self, selection: Selection) -> None:
+        """Write the start states of new episodes and clear what belongs to the old ones."""
+
+    def _update_commands_and_events(self) -> None:
+        """Update commands and run interval events, after resets and before observations."""
+
+    @abstractmethod
+    def _compute_observations(self) -> dict[str, Tensor]:
+        """Return the observations of the current state."""
+
+    # --- outside of a step ---
+
+    def _before_full_reset(self) -> None:
+        """Prepare for a reset of all environments."""
+
+    def _raise_for_term(self, what: str) -> None:
+        """Raise a `DivergedError` that names the term behind a value that is not finite, if it can be named."""
+
+    def _restore_observations(self) -> dict[str, Tensor]:
+        """Return the observations of the state that has just been loaded."""
+        return self._compute_observations()
+
+    def _task_metrics(self) -> dict[str, float]:
+        """Return the task's own numbers to log, as of the last step."""
+        return {}
+
+    @abstractmethod
+    def _workflow_state(self) -> dict[str, Tensor]:
+        """Return copies of what the workflow carries from step to step."""
+
+    @abstractmethod
+    def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
+        """Restore the state returned by `_workflow_state`."""
+
+    def stateful_objects(self) -> list[Any]:
+        """Return the objects whose attributes a step may change: class terms, a direct task."""
+        return []
+
+    def episode_dependencies(self) -> list[str]:
+        """Return what makes an episode depend on earlier ones, by its place in the configuration; empty: none known."""
+        return ["scene.terrain"] if self.terrain is not None else []
+
+    @property
+    def reward_names(self) -> list[str]:
+        """The terms of the reward, in the order of `StepRecord.reward_terms`; empty for a task with one sum."""
+        return []
+
+    def step_metrics(self) -> dict[str, Tensor]:
+        """Return the task's own numbers to log, of the state before resets, for `StepObserver.on_step`.
+
+        `Episodes.metrics` has the metrics of commands, as means over episodes. (num_envs,) each
+        """
+        return {}
+
+    def unsaved_state(self) -> list[str]:
+        """Return what the task carries from step to step that `state_dict` cannot hold; empty: it resumes exactly."""
+        return []
+
+    def markers(self) -> list[Marker]:
+        """Return the shapes to draw beside the bodies; viewers call it, no step does."""
+        return []

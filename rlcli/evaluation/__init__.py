@@ -1,0 +1,1 @@
+"""Evaluation of policies: sessions, limits, comparisons, stress tests and a known regulator."""

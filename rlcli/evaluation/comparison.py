@@ -1,0 +1,171 @@
+"""Comparison of policies in the same episodes of one task: `rlcli eval --compare RUN1 RUN2 ...`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from rlcli.config.layers import leaves
+from rlcli.config.messages import dotted
+from rlcli.errors import ConfigError, Problem, UsageError
+from rlcli.evaluation.session import (
+    POLICIES,
+    PolicyInTask,
+    PolicyRequest,
+    baseline,
+    find_policy,
+    make_actor,
+)
+from rlcli.text import shorten
+
+if TYPE_CHECKING:
+    from rlcli.config.load import Resolved
+    from rlcli.evaluation.evaluate import Evaluation
+
+METRICS = ("success", "return", "length")
+_WITHOUT_EFFECT = (("scene", "num_envs"), ("sim", "engine_threads"), ("viewer",), ("play",), ("agents",), ("summary",))
+"""Settings that may differ between the tasks: they change no episode."""
+_MISSING = "nothing"
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Evaluations of several policies in the same episodes."""
+
+    names: list[str]
+    policies: list[PolicyInTask]
+    summaries: list[dict[str, Any]]
+    pairs: list[dict[str, Any]]
+    """For each policy but the first: metric -> paired difference and probability of improvement of the first."""
+    num_envs: int
+
+    def record(self) -> dict[str, Any]:
+        """Return the comparison as JSON."""
+        rows = zip(self.names, self.policies, self.summaries, strict=True)
+        return {
+            "compare": self.names,
+            "task": self.policies[0].resolved.source.name,
+            "seed": self.policies[0].seed,
+            "num_envs": self.num_envs,
+            "stochastic": self.policies[0].stochastic,
+            "policies": [
+                {
+                    "name": name,
+                    "policy": policy.kind,
+                    "checkpoint": str(policy.checkpoint) if policy.checkpoint else None,
+                    **summary,
+                }
+                for name, policy, summary in rows
+            ],
+            "comparisons": [
+                {"left": self.names[0], "right": name, **pair}
+                for name, pair in zip(self.names[1:], self.pairs, strict=True)
+            ],
+        }
+
+
+def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyInTask]:
+    """Find the policy of each name; those without a checkpoint act in the first run's task.
+
+    Args:
+        names: runs and other references of checkpoints, or zero, random, lqr.
+        request: everything but the names.
+
+    Raises:
+        UsageError: for fewer than two policies, or if none is a run.
+        ConfigError: if the tasks differ.
+    """
+    from rlcli.runs.policy_ref import SHIPPED
+
+    without_run = [name for name in names if name in POLICIES and name != "trained"]
+    if len(names) < 2 or len(without_run) == len(names):
+        raise UsageError(
+            " ".join(["--compare", *names]) + ": with what?"
+            if len(names) < 2
+            else "none of these is a run, so that there is no task",
+            hint="rlcli eval --compare RUN1 RUN2 [...]; beside a run also shipped, lqr, zero or random",
+        )
+    found: dict[str, PolicyInTask] = {}
+    for name in sorted(dict.fromkeys(names), key=SHIPPED.__eq__):  # last: `shipped` is of the other runs' task
+        if name not in without_run:
+            task = next(iter(found.values())).resolved.source.name if name == SHIPPED and found else None
+            found[name] = find_policy(replace(request, task=task, checkpoint=name))
+    first = next(found[name] for name in names if name in found)
+    policies = [baseline(first, name) if name in without_run else found[name] for name in names]
+    for name, policy in zip(names[1:], policies[1:], strict=True):
+        _require_same_task(names[0], policies[0], name, policy)
+    return policies
+
+
+def compare(names: Sequence[str], policies: Sequence[PolicyInTask], episodes: int) -> Comparison:
+    """Evaluate the policies in the same episodes, and compare each with the first.
+
+    Args:
+        names: of the policies.
+        policies: as `find_policies` returns them.
+        episodes: of each policy.
+    """
+    from rlcli.evaluation.stress import one_each, run_points
+
+    first = policies[0]
+    task = one_each(first.resolved, episodes)
+    found = [run_points(task, make_actor(policy), [], [None], episodes, first.seed)[0] for policy in policies]
+    return Comparison(
+        list(names),
+        list(policies),
+        [evaluation.summary() for evaluation in found],
+        [_compare_pair(found[0], other) for other in found[1:]],
+        task.task.scene.num_envs,
+    )
+
+
+def _require_same_task(name: str, first: PolicyInTask, other_name: str, other: PolicyInTask) -> None:
+    """Check that two policies are in one task.
+
+    Raises:
+        UsageError: if the tasks have other names.
+        ConfigError: with every setting that differs.
+    """
+    ours, theirs = first.resolved.source, other.resolved.source
+    if (ours.distribution, ours.name) != (theirs.distribution, theirs.name):
+        raise UsageError(f"{name} is of the task {ours.name}, and {other_name} of {theirs.name}")
+    left, right = _settings(first.resolved), _settings(other.resolved)
+    problems = []
+    for path in sorted({*left, *right}):
+        ours, theirs = left.get(path, _MISSING), right.get(path, _MISSING)
+        if ours != theirs:
+            message = f"{shorten(theirs, 60)}, and in {name} {shorten(ours, 60)}"
+            problems.append(Problem(other_name, path, message))
+    if problems:
+        hint = "KEY.PATH=VALUE makes both alike, where that is what you want to compare them in"
+        raise ConfigError([*problems[:-1], replace(problems[-1], hint=hint)])
+
+
+def _settings(resolved: Resolved) -> dict[str, Any]:
+    """The task's values by dotted key, without those that change no episode."""
+    from rlcli.config.dump import to_data
+
+    values = leaves(to_data(resolved))
+    return {
+        dotted(path): value
+        for path, value in values
+        if not any(path[: len(prefix)] == prefix for prefix in _WITHOUT_EFFECT)
+    }
+
+
+def _compare_pair(left: Evaluation, right: Evaluation) -> dict[str, Any]:
+    """Paired differences and probabilities of improvement; equal places in the lists are the same episode."""
+    from rlcli.rl.confidence import difference, improvement
+
+    values: dict[str, tuple[Sequence[float], Sequence[float]]] = {
+        "success": (left.successes, right.successes),
+        "return": (left.returns, right.returns),
+        "length": (left.lengths, right.lengths),
+    }
+    found = {}
+    for metric in METRICS:
+        ours, theirs = ([float(value) for value in side] for side in values[metric])
+        if ours:
+            found[metric] = {"difference": difference(ours, theirs), "improvement": improvement(ours, theirs)}
+    return found

@@ -1,0 +1,305 @@
+"""A policy in a task, as play, eval, stress and report use it: find it, check it, and build its environment."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlcli.config.layers import flags
+from rlcli.errors import CheckpointError, MachineError, TaskError, UsageError, require_known
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rlcli.config.load import Resolved
+    from rlcli.envs.vec_env import VecEnv
+    from rlcli.registry import TaskSource
+    from rlcli.rl.acting import Act
+    from rlcli.runs.run import Run
+
+_log = logging.getLogger(__name__)
+
+POLICIES = ("trained", "zero", "random", "lqr")
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyRequest:
+    """A policy and a task as a command line names them."""
+
+    task: str | None
+    overrides: Sequence[str] = ()
+    checkpoint: str | None = None
+    policy: str = "trained"
+    """One of POLICIES."""
+    stochastic: bool = False
+    num_envs: int | None = None
+    seed: int = 42
+    config: Path | None = None
+    runs_dir: Path | None = None
+    min_envs: int = 1
+    """The task gets at least so many environments."""
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyInTask:
+    """A policy in a task, found and checked, and not yet built."""
+
+    resolved: Resolved
+    run: Run | None
+    """The run of the checkpoint; None for a policy without one."""
+    checkpoint: Path | None
+    reason: str | None
+    """Why this checkpoint was chosen."""
+    kind: str
+    """One of POLICIES."""
+    stochastic: bool
+    seed: int
+    as_trained: bool
+    """Whether it is a checkpoint in its own run, in the task as the run has it."""
+
+    def record(self) -> dict[str, Any]:
+        """Return which policy this is, as JSON."""
+        checkpoint = str(self.checkpoint) if self.checkpoint else None
+        return {"checkpoint": checkpoint, "chosen": self.reason, "policy": self.kind}
+
+
+@dataclass(slots=True)
+class Session:
+    """An environment and a policy that acts in it."""
+
+    env: VecEnv
+    act: Act
+    policy: PolicyInTask
+    start: tuple[int, Tensor] | None = None
+    """An environment to watch, and the present observations of all; None: from a reset."""
+
+
+def find_policy(request: PolicyRequest, check: Callable[[Resolved], None] = lambda resolved: None) -> PolicyInTask:
+    """Find the policy and its task, and check the task; nothing heavy is imported.
+
+    Args:
+        request: the policy and the task.
+        check: gets the configuration and may raise.
+
+    Raises:
+        UsageError: if neither a task nor a checkpoint is named, or there is no such policy.
+        CheckpointError: if there is no such checkpoint.
+    """
+    from rlcli.config.load import resolve
+    from rlcli.formats import log_notes
+    from rlcli.runs.run_ref import default_runs_dir
+
+    require_policy(request.policy)
+    task, overrides = split_overrides(request.task, request.overrides)
+    if task is None and request.checkpoint is None:
+        raise UsageError("play what?", hint="a TASK, or --checkpoint RUN|latest")
+    source = None if task is None else named_task_or_run(task, request.runs_dir)
+    run = folder = reason = None
+    as_trained = False
+    configure: Callable[..., Resolved]
+    if request.policy == "trained" or request.checkpoint is not None:
+        from rlcli.runs.policy_ref import choose
+
+        choice = choose(request.checkpoint, request.runs_dir or default_runs_dir(), source)
+        run, folder, reason = choice.run, choice.folder, choice.why
+        _log.info(f"checkpoint {folder} ({reason})")
+        configure = partial(choice.configure, source, config_file=request.config, overrides=overrides)
+        own = run is not None and folder.resolve().parent == run.checkpoints.resolve()
+        as_trained = own and request.policy == "trained" and not overrides and request.config is None
+    else:
+        assert source is not None
+        configure = partial(resolve, source, play=True, config_file=request.config, overrides=overrides)
+    values = flags(scene__num_envs=request.num_envs)
+    resolved = configure(flags=values)
+    if resolved.task.scene.num_envs < request.min_envs:
+        resolved = configure(flags={**values, "scene.num_envs": request.min_envs})
+    check(resolved)
+    log_notes(resolved.notes)
+    return PolicyInTask(resolved, run, folder, reason, request.policy, request.stochastic, request.seed, as_trained)
+
+
+def split_overrides(task: str | None, overrides: Sequence[str]) -> tuple[str | None, list[str]]:
+    """Return the task and the overrides of a command line, on which the task may be left out."""
+    if task is not None and "=" in task:
+        return None, [task, *overrides]
+    return task, list(overrides)
+
+
+def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
+    """Find a task by its name.
+
+    Raises:
+        TaskError: if there is none; the hint says so if the name is that of a run.
+    """
+    from rlcli.runs.run_ref import default_runs_dir, find_run
+    from rlcli.runs.trusted_tasks import named_task
+
+    try:
+        return named_task(task)
+    except TaskError:
+        with contextlib.suppress(CheckpointError):
+            find_run(task.partition("@")[0], runs_dir or default_runs_dir())
+            raise TaskError(f"'{task}' is a run, not a task", hint=f"--checkpoint {task}") from None
+        raise
+
+
+def open_session(request: PolicyRequest, check: Callable[[Resolved], None] = lambda resolved: None) -> Session:
+    """Find, check and build; heavy imports begin only when files and configuration are in order.
+
+    Args:
+        request: the policy and the task.
+        check: gets the configuration and may raise.
+    """
+    policy = find_policy(request, check)
+    session = _build(policy)
+    from rlcli.replay.crash_dump import CrashDumper
+    from rlcli.runs.run_ref import default_runs_dir
+
+    home = request.runs_dir or default_runs_dir() if policy.run is None else policy.run.folder
+    CrashDumper(session.env, home / "dumps")
+    return session
+
+
+def require_policy(policy: str) -> None:
+    """Check that there is such a policy.
+
+    Raises:
+        UsageError: with the valid ones.
+    """
+    require_known(policy, POLICIES, "policy", "policies")
+
+
+def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:
+    """Return another policy in the same task, one that needs no checkpoint.
+
+    Raises:
+        UsageError: if there is no such policy.
+    """
+    require_policy(kind)
+    if kind == "trained":
+        raise UsageError("--against trained: it is compared with what needs no training", hint="lqr, zero or random")
+    return replace(policy, kind=kind, stochastic=False, as_trained=False)
+
+
+def is_run_name(word: str, runs_dir: Path | None) -> bool:
+    """Whether a word names a run or a checkpoint, and not a task."""
+    from rlcli.runs.run import RECORD
+    from rlcli.runs.run_ref import default_runs_dir, list_runs
+
+    runs = runs_dir or default_runs_dir()
+    name = word if Path(word).exists() else word.partition("@")[0]
+    if name == "latest" or (Path(word) / "manifest.json").is_file():
+        return True
+    if any((folder / RECORD).is_file() for folder in (Path(name), runs / name)):
+        return True
+    return any(run.folder.name == name for run in list_runs(runs, None))
+
+
+def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
+    """Return a function that makes the policy act in an environment; its files are read only once."""
+    import torch
+
+    from rlcli.random import derive
+    from rlcli.rl.acting import acting, random_policy, zero_policy
+    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.restore import policy_of, require_fit
+
+    torch.set_num_threads(1)
+    agent, seed = policy.resolved.agent, derive(policy.seed, "play")
+    bound = agent.action_bound if agent else 1.0
+    if policy.kind == "zero":
+        return zero_policy
+    if policy.kind == "random":
+        return lambda env: random_policy(env, bound, seed)
+    if policy.kind == "lqr":
+        from rlcli.evaluation.lqr import regulator
+
+        return regulator(policy.resolved, bound).acting
+    assert policy.checkpoint is not None
+    checkpoint = open_checkpoint(policy.checkpoint)
+    trained = policy_of(checkpoint)
+
+    def make(env: VecEnv) -> Act:
+        require_fit(checkpoint, env.layout)
+        generator = torch.Generator().manual_seed(seed)
+        return acting(env, trained, stochastic=policy.stochastic, generator=generator)
+
+    return make
+
+
+def _build(policy: PolicyInTask) -> Session:
+    from rlcli.envs.make import make_env
+    from rlcli.random import derive
+    from rlcli.rl.rng import seed_generators
+
+    make = make_actor(policy)
+    # evaluation uses other episodes than training did
+    seed_generators(derive(policy.seed, "task"))  # some tasks draw from these generators
+    env = make_env(policy.resolved, seed=derive(policy.seed, "evaluation"))
+    return Session(env, make(env), policy)
+
+
+def check_record(record: Path | None, mode: str) -> None:
+    """Refuse, before anything is built, what cannot be recorded.
+
+    Raises:
+        UsageError: for a mode that there is not.
+        MachineError: if the folder is not there.
+    """
+    modes = ("all", "succeeded", "failed", "separate")
+    require_known(mode, modes, "--record-mode", "modes")
+    if record is None:
+        return
+    if record.is_dir():
+        raise UsageError(f"--record {record} is a folder", hint=f"give a file: {record / 'episodes.safetensors'}")
+    if not record.absolute().parent.is_dir():
+        raise MachineError(f"--record: there is no folder {record.absolute().parent}")
+
+
+def run_episodes(
+    session: Session, episodes: int, record: Path | None = None, mode: str = "all"
+) -> tuple[dict[str, Any], list[str]]:
+    """Evaluate, and record if asked to: the summary, and the files that were written."""
+    from rlcli.evaluation.evaluate import evaluate
+
+    if record is None:
+        return evaluate(session.env, session.act, episodes).summary(), []
+    from rlcli.replay.episode_recorder import EpisodeRecorder
+
+    with EpisodeRecorder(session.env, episodes) as recorder:
+        summary = evaluate(session.env, session.act, episodes).summary()
+    files = [str(file) for file in recorder.save(record, mode)]
+    _log.info(f"recorded {len(recorder.episodes)} episodes to {' and '.join(files)}")
+    return summary, files
+
+
+def evaluation_record(session: Session, summary: dict[str, Any]) -> dict[str, Any]:
+    """Return what `rlcli eval` reports: the policy, how it was evaluated, and the summary."""
+    policy = session.policy
+    settings = {"stochastic": policy.stochastic, "seed": policy.seed, "num_envs": session.env.num_envs}
+    return {**policy.record(), **settings, **summary}
+
+
+def save_evaluation(session: Session, record: dict[str, Any]) -> None:
+    """Write the evaluation of a checkpoint into its run, for `report` and `runs`.
+
+    Only a deterministic policy in the task as it was trained is saved. A run that cannot be written to stays as it is.
+    """
+    from rlcli.runs.eval_store import keep_evaluation
+
+    policy = session.policy
+    if policy.stochastic or not policy.as_trained:
+        return
+    assert policy.run is not None
+    assert policy.checkpoint is not None
+    try:
+        file = keep_evaluation(policy.run, policy.checkpoint.name, record)
+    except (CheckpointError, MachineError) as error:
+        _log.warning(f"the evaluation is not kept in the run: {error.message}")
+        return
+    _log.debug(f"kept in {file}")

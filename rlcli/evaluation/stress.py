@@ -1,0 +1,211 @@
+"""Stress test: a policy evaluated in many variants of its task at once, in the same episodes in each variant."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from rlcli.config.dump import given
+from rlcli.config.load import Resolved
+from rlcli.envs.make import make_env
+from rlcli.envs.vec_env import VecEnv
+from rlcli.evaluation.evaluate import Evaluation, evaluate
+from rlcli.evaluation.limits import Limit
+from rlcli.evaluation.perturbations import Perturbations
+from rlcli.evaluation.session import PolicyInTask, make_actor
+from rlcli.evaluation.stress_params import Point, Sweep, by_name, describe_point, grid
+from rlcli.random import derive
+from rlcli.rl.acting import Act
+from rlcli.rl.rng import seed_generators
+
+_log = logging.getLogger(__name__)
+
+MOST_ENVS = 8192
+"""Environments that run at a time; more are run in several batches."""
+_NEAR = 0.25
+"""Spread of a local search, as a share of the box's edges."""
+
+Actor = Callable[[VecEnv], Act]
+"""Makes a policy act in an environment."""
+Summary = dict[str, Any]
+"""Summary of an evaluation."""
+
+
+@dataclass(frozen=True, slots=True)
+class StressResult:
+    """Summaries of the evaluations of a stress test."""
+
+    sweeps: Sequence[Sweep]
+    nominal: Summary
+    """Of the task as it is."""
+    grid: dict[Point, Summary]
+    """Of every combination of the sweeps' values."""
+    searched: dict[Point, Summary]
+    """Of the points that the search for a worse case tried."""
+    reference: dict[Point | None, Summary]
+    """Of the policy that it is compared with; None: the task as it is. Empty without such a policy."""
+    num_envs: int
+
+    @property
+    def metric(self) -> str:
+        """The number that is compared: success, or return for a task without success."""
+        return "success" if "success" in self.nominal else "return"
+
+    @property
+    def worst(self) -> Point:
+        """The point of the worst variant."""
+        variants = {**self.grid, **self.searched}
+        return min(variants, key=lambda point: score(variants[point]))
+
+    def failures(self, limits: Sequence[Limit]) -> list[str]:
+        """Return which limits fail, each in the variant that is worst in its number."""
+        variants = {**self.grid, **self.searched}
+        found = []
+        for limit in limits:
+            values = {point: limit.value_in(summary) for point, summary in variants.items()}
+            worst = min(values, key=lambda point: -math.inf if (value := values[point]) is None else value)
+            failure = limit.failure(variants[worst])
+            if failure is not None:
+                found.append(f"at {describe_point(self.sweeps, worst)}: {failure}")
+        return found
+
+    def record(self, against: str | None) -> dict[str, Any]:
+        """Return the result as JSON; `against` names the policy that it is compared with."""
+        worst = self.worst
+        reference = {point: summary for point, summary in self.reference.items() if point is not None}
+        return {
+            "metric": self.metric,
+            "num_envs": self.num_envs,
+            "sweeps": [
+                {"name": s.name, "unit": s.unit, "absolute": s.neutral != 1.0, "values": s.values} for s in self.sweeps
+            ],
+            "nominal": self.nominal,
+            "points": self._points(self.grid),
+            "searched": self._points(self.searched),
+            "worst": {
+                "at": by_name(self.sweeps, worst),
+                "found": "search" if worst in self.searched else "grid",
+                **{**self.grid, **self.searched}[worst],
+            },
+            "against": None
+            if not self.reference
+            else {"policy": against, "nominal": self.reference[None], "points": self._points(reference)},
+        }
+
+    def _points(self, summaries: dict[Point, Summary]) -> list[dict[str, Any]]:
+        return [{"at": by_name(self.sweeps, point), **summary} for point, summary in summaries.items()]
+
+
+def stress(
+    policy: PolicyInTask,
+    sweeps: Sequence[Sweep],
+    episodes: int,
+    *,
+    worst: int = 0,
+    reference: PolicyInTask | None = None,
+) -> StressResult:
+    """Evaluate a policy in its task as it is, in every variant of the grid, and in further ones near the worst.
+
+    Args:
+        policy: the policy.
+        sweeps: what is varied.
+        episodes: of each variant.
+        worst: how many further points a search for a worse case tries.
+        reference: a policy that is evaluated in the same variants.
+
+    Raises:
+        UsageError: for a parameter that the task does not have.
+    """
+    task = one_each(policy.resolved, episodes)
+    variants = grid(sweeps)
+
+    def run(which: PolicyInTask, points: Sequence[Point | None]) -> list[Summary]:
+        found = run_points(task, make_actor(which), sweeps, points, episodes, policy.seed)
+        return [evaluation.summary() for evaluation in found]
+
+    _log.info(f"{len(variants) + 1} variants, {episodes} episodes in each, seed {policy.seed}")
+    points: list[Point | None] = [None, *variants]
+    nominal, *summaries = run(policy, points)
+    compared = dict(zip(points, run(reference, points), strict=True)) if reference is not None else {}
+    found = dict(zip(variants, summaries, strict=True))
+    center = min(found, key=lambda point: score(found[point]))
+    further = [point for point in search(sweeps, center, worst, policy.seed) if point not in found] if worst else []
+    searched = dict(zip(further, run(policy, further), strict=True)) if further else {}
+    return StressResult(sweeps, nominal, found, searched, compared, task.task.scene.num_envs)
+
+
+def run_points(
+    resolved: Resolved,
+    actor: Actor,
+    sweeps: Sequence[Sweep],
+    points: Sequence[Point | None],
+    episodes: int,
+    seed: int,
+) -> list[Evaluation]:
+    """Evaluate in the variants of a task, each in as many environments as the task has.
+
+    Environment i draws the same random numbers in every variant, those of environment i in `rlcli eval` with the seed.
+
+    Args:
+        resolved: the task.
+        actor: the policy.
+        sweeps: what is varied.
+        points: the values; None: the task as it is.
+        episodes: of each variant.
+        seed: of the evaluation.
+
+    Raises:
+        UsageError: for a parameter that the task does not have.
+    """
+    torch.set_num_threads(1)
+    size = resolved.task.scene.num_envs
+    at_once = max(1, MOST_ENVS // size)
+    results: list[Evaluation] = []
+    for start in range(0, len(points), at_once):
+        batch = points[start : start + at_once]
+        seed_generators(derive(seed, "task"))  # some tasks draw from them
+        env = make_env(with_envs(resolved, size * len(batch)), seed=derive(seed, "evaluation"), shared_streams=size)
+        try:
+            act = actor(env)
+            if sweeps:
+                as_it_is = (math.nan,) * len(sweeps)
+                values = torch.tensor([point or as_it_is for point in batch], dtype=torch.float64)
+                act = Perturbations(env, sweeps, values.repeat_interleave(size, dim=0)).around(act)
+            found = evaluate(env, act, episodes, groups=len(batch))
+        finally:
+            env.close()
+        results += [
+            found.part(number * size, (number + 1) * size).in_environment_order() for number in range(len(batch))
+        ]
+    return results
+
+
+def search(sweeps: Sequence[Sweep], around: Point, count: int, seed: int) -> list[Point]:
+    """Return further points of the box that the sweeps span: half of them near a point, the others anywhere."""
+    generator = np.random.default_rng(derive(seed, "stress"))
+    middle = np.array([sweep.share(value) for sweep, value in zip(sweeps, around, strict=True)])
+    near = middle + _NEAR * generator.standard_normal(((count + 1) // 2, len(sweeps)))
+    shares = np.concatenate([near.clip(0.0, 1.0), generator.random((count // 2, len(sweeps)))])
+    return list(dict.fromkeys(tuple(s.between(float(x)) for s, x in zip(sweeps, row, strict=True)) for row in shares))
+
+
+def score(summary: Summary) -> tuple[float, float]:
+    """Return what variants are ordered by: success first, then return."""
+    return summary["success"]["rate"] if "success" in summary else 0.0, summary["return"]["mean"]
+
+
+def one_each(resolved: Resolved, episodes: int) -> Resolved:
+    """Return the task with one environment for each episode, unless the user has set the number."""
+    return resolved if "scene.num_envs" in given(resolved) else with_envs(resolved, min(episodes, MOST_ENVS))
+
+
+def with_envs(resolved: Resolved, count: int) -> Resolved:
+    """Return the task with this number of environments."""
+    scene = resolved.task.scene.model_copy(update={"num_envs": count})
+    return replace(resolved, task=resolved.task.model_copy(update={"scene": scene}))

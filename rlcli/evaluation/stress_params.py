@@ -1,0 +1,193 @@
+"""What a stress test varies, as the command line says it: `body_mass.pole=0.5:2`, `action_delay=0:3`."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from rlcli.errors import UsageError, did_you_mean, listing
+
+PHYSICAL = {
+    "body_mass": "body_mass",
+    "joint_damping": "dof_damping",
+    "joint_friction": "dof_frictionloss",
+    "joint_armature": "dof_armature",
+    "joint_stiffness": "jnt_stiffness",
+    "geom_friction": "geom_friction",
+    "actuator_gain": "actuator_gainprm",
+    "effort_limit": "actuator_forcerange",
+    "gravity": "opt.gravity",
+}
+"""Parameter -> the model field behind it. A model field's own name is one, too."""
+SIGNALS = {
+    "action_delay": "control steps",
+    "action_noise": "standard deviation, in the policy's own units",
+    "observation_delay": "control steps",
+    "observation_noise": "standard deviation, in the units that the policy sees",
+    "push": "m/s or rad/s",
+}
+"""Parameter -> its unit."""
+_WHOLE = ("action_delay", "observation_delay")
+_MOST = 1000
+"""Values of a sweep, and steps of a delay."""
+_FORM = re.compile(r"(?P<name>\w+)(?:\.(?P<element>[^=]+))?=(?P<absolute>abs:)?(?P<values>[^=]+)")
+
+Point = tuple[float, ...]
+"""A value of each sweep."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One parameter and the values that it takes."""
+
+    parameter: str
+    element: str | None
+    """Name or regular expression of bodies, joints, geoms, ...; None: all."""
+    absolute: bool
+    """The value is the quantity itself; else the factor on what the task has."""
+    values: tuple[float, ...]
+
+    @property
+    def name(self) -> str:
+        """Parameter and element, as on the command line."""
+        return self.parameter if self.element is None else f"{self.parameter}.{self.element}"
+
+    @property
+    def neutral(self) -> float | None:
+        """The value at which nothing is changed; None where that is not known."""
+        return 0.0 if self.parameter in SIGNALS else None if self.absolute else 1.0
+
+    @property
+    def unit(self) -> str:
+        """What the values are."""
+        return SIGNALS.get(self.parameter, "the model's unit" if self.absolute else "factor")
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it takes whole numbers alone."""
+        return self.parameter in _WHOLE
+
+    @property
+    def spacing(self) -> Literal["linear", "geometric"]:
+        """How values lie between two ends: factors at equal ratios."""
+        return "geometric" if self.neutral == 1.0 and min(self.values) > 0.0 else "linear"
+
+    def between(self, share: float) -> float:
+        """The value at a share of the way from the lowest to the highest."""
+        low, high = min(self.values), max(self.values)
+        if self.is_whole:
+            return float(round(low + (high - low) * share))
+        value = low * (high / low) ** share if self.spacing == "geometric" else low + (high - low) * share
+        return float(f"{value:.12g}")  # the middle of 0.8:1.25 is 1, and not nearly
+
+    def share(self, value: float) -> float:
+        """Where a value lies, the inverse of `between`."""
+        low, high = min(self.values), max(self.values)
+        if high == low:
+            return 0.0
+        if self.spacing == "geometric":
+            return math.log(value / low) / math.log(high / low)
+        return (value - low) / (high - low)
+
+
+def read_sweeps(texts: Sequence[str], points: int) -> list[Sweep]:
+    """`NAME[.ELEMENT]=[abs:]LOW:HIGH[:POINTS]` or `...=A,B,C`, each of another parameter.
+
+    Raises:
+        UsageError: for what is not of this form, or cannot be.
+    """
+    sweeps: list[Sweep] = []
+    for text in texts:
+        sweep = _read(text, points)
+        if any(sweep.name == other.name for other in sweeps):
+            raise UsageError(f"--sweep: {sweep.name} is swept twice")
+        sweeps.append(sweep)
+    return sweeps
+
+
+def grid(sweeps: Sequence[Sweep]) -> list[Point]:
+    """Every combination of the sweeps' values, the last sweep's changing fastest."""
+    return list(itertools.product(*(sweep.values for sweep in sweeps)))
+
+
+def format_value(value: float) -> str:
+    """Return a value of a sweep in few digits."""
+    return f"{value:.4g}"
+
+
+def by_name(sweeps: Sequence[Sweep], point: Point) -> dict[str, float]:
+    """Return the value of each sweep at a point, by the sweep's name."""
+    return {sweep.name: value for sweep, value in zip(sweeps, point, strict=True)}
+
+
+def describe_point(sweeps: Sequence[Sweep], point: Point) -> str:
+    """Return a point as text: each sweep's name and value."""
+    return ", ".join(f"{name} {format_value(value)}" for name, value in by_name(sweeps, point).items())
+
+
+def unknown_parameter(name: str, fields: Sequence[str]) -> UsageError:
+    """Return the error for a parameter that does not exist; `fields` are those of the model."""
+    own = [*PHYSICAL, *SIGNALS]
+    near = did_you_mean(name, [*own, *fields])
+    return UsageError(
+        f"--sweep: there is no parameter '{name}'", hint=near or f"{listing(own)}, or a field of the model"
+    )
+
+
+def _read(text: str, points: int) -> Sweep:
+    found = _FORM.fullmatch(text.strip())
+    if found is None:
+        raise UsageError(
+            f"--sweep '{text}' is not NAME=LOW:HIGH", hint="body_mass.pole=0.5:2, action_delay=0:3, gravity=0.8,1,1.2"
+        )
+    name, absolute = found["name"], found["absolute"] is not None
+    if name in SIGNALS and absolute:
+        raise UsageError(f"--sweep {text}: {name} is absolute anyhow [{SIGNALS[name]}]", hint="leave out abs:")
+    if name == "actuator_gain" and absolute:
+        raise UsageError(f"--sweep {text}: actuator_gain is a factor on all that an actuator does")
+    values = _values(text, found["values"], name, points, absolute)
+    lowest = min(values)
+    if lowest < 0.0:
+        raise UsageError(f"--sweep {text}: {name} cannot be {lowest:g}", hint="0 or more")
+    if name in _WHOLE and (any(v != round(v) for v in values) or max(values) > _MOST):
+        raise UsageError(f"--sweep {text}: {name} takes whole steps", hint=f"0 to {_MOST}")
+    if name == "body_mass" and lowest == 0.0:
+        raise UsageError(f"--sweep {text}: a body cannot have no mass", hint="values above 0")
+    return Sweep(name, found["element"], absolute, values)
+
+
+def _values(text: str, written: str, name: str, points: int, absolute: bool) -> tuple[float, ...]:
+    if ":" not in written:
+        values = tuple(_number(text, part) for part in written.split(","))
+        if len(set(values)) != len(values):
+            raise UsageError(f"--sweep {text}: a value stands there twice")
+        return values
+    ends = written.split(":")
+    if len(ends) not in (2, 3):
+        raise UsageError(f"--sweep {text}: a range is LOW:HIGH or LOW:HIGH:POINTS")
+    low, high = (_number(text, part) for part in ends[:2])
+    if len(ends) == 3:
+        if not re.fullmatch("[0-9]{1,6}", ends[2].strip()):
+            raise UsageError(f"--sweep {text}: '{ends[2]}' is no number of points")
+        points = int(ends[2])
+    if not low < high:
+        raise UsageError(f"--sweep {text}: {low:g} is not below {high:g}", hint="LOW:HIGH, or a single value")
+    if not 2 <= points <= _MOST:
+        raise UsageError(f"--sweep {text}: {points} points", hint=f"2 to {_MOST}, or a single value")
+    box = Sweep(name, None, absolute, (low, high))
+    inner = [box.between(i / (points - 1)) for i in range(1, points - 1)]
+    return tuple(dict.fromkeys((low, *inner, high)))
+
+
+def _number(text: str, part: str) -> float:
+    try:
+        value = float(part)
+        if not math.isfinite(value):
+            raise ValueError
+    except ValueError:
+        raise UsageError(f"--sweep {text}: '{part.strip()}' is not a number") from None
+    return value

@@ -1,0 +1,109 @@
+"""Numbers of the configuration that change while training goes on: each lives in a tensor that its reader keeps.
+
+So a curriculum changes a weight, a range or a limit on the device, within a recorded step, and nobody has to be told.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rlcli.config.layers import parse_address
+from rlcli.config.schema import StrictModel, TaskConfig, TermConfig
+from rlcli.config.strict_yaml import Path
+from rlcli.errors import did_you_mean, listing
+from rlcli.scene.names import NameProblem
+
+_SECTIONS = ("rewards", "terminations", "commands", "events", "observations", "actions")
+_FIXED = {
+    "min_steps_between",
+    "axes",
+    "func",
+    "mode",
+    "time_out",
+    "while_alive",
+    "history",
+    "delay",
+    "modifiers",
+    "interval_range_s",
+    "resampling_time_s",
+}
+"""Settings of terms that are read once."""
+
+
+class TunableValues:
+    """The tensors by the path of the setting they stand for."""
+
+    def __init__(self, task: TaskConfig, device: torch.device) -> None:
+        self._task, self._device = task, device
+        self._tensors: dict[Path, Tensor] = {}
+
+    def __contains__(self, path: Path) -> bool:
+        return path in self._tensors
+
+    def get(self, path: Path, default: object = None) -> Any:
+        """The tensor of a setting that may change, else `default`."""
+        return self._tensors.get(path, default)
+
+    def open(self, address: str) -> Tensor:
+        """The tensor at a dotted address, of the shape that stands there; from now on its reader reads it.
+
+        Raises:
+            NameProblem: if the address leads to no number that may change.
+        """
+        path = parse_address(address)
+        value: Any = self._task
+        for depth, key in enumerate(path):
+            names = _names(value)
+            if depth == 0:
+                names = [name for name in names if name in _SECTIONS]
+            elif isinstance(value, TermConfig):
+                names = [name for name in names if name not in _FIXED]
+            if key not in names:
+                where = f"'{'.'.join(path[:depth])}' has" if depth else "the task has"
+                names = [name for name in names if _may_change(_member(value, name))]
+                near = did_you_mean(key, names)
+                have = f"what may change there: {listing(names)}" if names else None
+                hint = f"{near}; {have}" if near and have else near or have
+                raise NameProblem(f"address '{address}' leads nowhere: {where} no '{key}'", hint)
+            value = _member(value, key)
+            if _is_number(value):
+                try:
+                    return self._opened(path[: depth + 1], value)[tuple(int(index) for index in path[depth + 1 :])]
+                except (ValueError, IndexError):
+                    rest = ".".join(path[depth + 1 :])
+                    raise NameProblem(f"address '{address}' leads nowhere: '{rest}' is no index there") from None
+        raise NameProblem(f"address '{address}' leads to no number, or list of numbers")
+
+    def _opened(self, path: Path, value: object) -> Tensor:
+        if path not in self._tensors:
+            self._tensors[path] = torch.tensor(value, dtype=torch.float32, device=self._device)
+        return self._tensors[path]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors by their dotted path."""
+        return {".".join(map(str, path)): tensor for path, tensor in self._tensors.items()}
+
+
+def _names(value: object) -> list[str]:
+    if isinstance(value, StrictModel):
+        return [*type(value).model_fields, *(value.model_extra or {})]
+    return list(value) if isinstance(value, dict) else []
+
+
+def _member(value: Any, key: str) -> Any:
+    return getattr(value, key) if isinstance(value, StrictModel) else value[key]
+
+
+def _may_change(value: object) -> bool:
+    """Whether a number is there, or further below."""
+    return _is_number(value) or any(_may_change(_member(value, name)) for name in _names(value))
+
+
+def _is_number(value: object) -> bool:
+    """Whether it is a number, or a list of such."""
+    if isinstance(value, list | tuple):
+        return bool(value) and all(_is_number(item) for item in value)
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,0 +1,160 @@
+"""Write the engine calls that led to a divergence into a trajectory file."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rlcli.config.load import Resolved
+from rlcli.envs.observers import StepObserver
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import MachineError
+from rlcli.replay.resimulate import ReplayWorld
+from rlcli.replay.trajectory import Header, World, write_trajectory
+from rlcli.sim.divergence import MAX_DESCRIBED, Call, Divergence
+
+_log = logging.getLogger(__name__)
+CALLS = 64
+"""Engine calls of each environment that a crash dump holds, if memory allows."""
+
+
+class CrashDumper(StepObserver):
+    """Observer that logs and dumps the first divergence of an environment.
+
+    Args:
+        env: the environment; from now on its engine keeps the last calls.
+        folder: folder of the dump; created with the first one.
+    """
+
+    def __init__(self, env: VecEnv, folder: Path) -> None:
+        self._env, self._folder = env, folder
+        if env.engine.replayable is not None:
+            env.engine.replayable.record_calls(CALLS)
+        env.observers.add(self)
+
+    def on_divergence(self, found: list[Divergence], pending: bool) -> None:
+        """Write the dump of the first divergence, log it, and stop observing."""
+        if not found:
+            return
+        env = self._env
+        message = (
+            f"the simulation diverged for the first time, in step {env.common_step + 1}: {found[0]}; its episode ends"
+        )
+        if env.engine.replayable is None:
+            message += "; there is no dump: what a GPU computes cannot be replayed"
+        else:
+            try:
+                file = write_dump(env, found, pending, self._folder)
+                message += f"; dump {file}; see rlcli replay {shlex.quote(str(file))}"
+            except MachineError as error:
+                message += f"; there is no dump: {error.message}"
+        stop_observing_divergences(env, self)
+        _log.warning(message)
+
+
+def stop_observing_divergences(env: VecEnv, observer: StepObserver) -> None:
+    """Remove an observer; without another one of divergences the engine needs only its last call."""
+    env.observers.remove(observer)
+    if not env.observers.on_divergence and env.engine.replayable is not None:
+        env.engine.replayable.record_calls(1)
+
+
+@dataclass(slots=True)
+class CallTrace:
+    """Copies of an environment's last engine calls; they are simulated again later, in another thread."""
+
+    divergence: Divergence
+    """Its cause; for an episode that did not diverge, why the episode is kept."""
+    calls: list[Call]
+    final: NDArray[np.float64]
+    """The state after the last call; if that call is pending, before it."""
+    own_model: dict[str, Tensor]
+    """Model fields of the environment's own."""
+    last: int
+    """How many of the calls belong to the last environment step."""
+    pending: bool
+    """Whether the engine has not made the last call yet."""
+
+
+def trace_calls(env: VecEnv, divergence: Divergence, pending: bool = False) -> CallTrace:
+    """Return the last engine calls of an environment, before it is restored or reset."""
+    engine, number = env.engine.replayable, divergence.env
+    assert engine is not None
+    calls, final = engine.recorded_calls(number), engine.state_row(number)
+    if pending:
+        calls = [*calls, Call(final, env.config.decimation)]
+    own_model = {
+        name: torch.from_numpy(np.atleast_1d(values)) for name, values in engine.own_model_fields(number).items()
+    }
+    return CallTrace(divergence, calls, final, own_model, 1 if pending else env.calls_per_step, pending)
+
+
+def describe_traces(
+    traces: Sequence[CallTrace], model: mujoco.MjModel, resolved: Resolved, follows_constants: bool, *, diverged: bool
+) -> tuple[list[World], dict[str, Tensor]]:
+    """Simulate traces again, and return what a trajectory file holds of them.
+
+    Args:
+        traces: one for each environment.
+        model: the model of all environments.
+        resolved: the configuration.
+        follows_constants: whether MuJoCo's constants are derived from an environment's model fields again.
+        diverged: whether the traces end in a divergence.
+    """
+    worlds, tensors = [], {}
+    for number, trace in enumerate(traces):
+        world, calls = ReplayWorld(model, resolved, trace.own_model, follows_constants), trace.calls
+        final = world.simulate(calls[-1]) if trace.pending else trace.final
+        first = max(0, len(calls) - trace.last)
+        described = World(
+            env=trace.divergence.env,
+            cause=trace.divergence.cause,
+            detail=trace.divergence.detail,
+            nstep=[call.nstep for call in calls],
+            follows=[
+                world.differing_field(following.state, world.simulate(call), final=False) is None
+                for call, following in itertools.pairwise(calls)
+            ],
+            first=first,
+            diverged_at=world.find_divergence(calls, first) if diverged else None,
+        )
+        worlds.append(described)
+        tensors[f"world.{number}.states"] = torch.from_numpy(np.stack([call.state for call in calls]))
+        tensors[f"world.{number}.final"] = torch.from_numpy(final)
+        tensors |= {f"world.{number}.model.{name}": values for name, values in trace.own_model.items()}
+    return worlds, tensors
+
+
+def write_dump(env: VecEnv, found: list[Divergence], pending: bool, folder: Path) -> Path:
+    """Write the last engine calls of environments that diverged.
+
+    Args:
+        env: the environment, before the diverged states are restored.
+        found: the divergences.
+        pending: whether the engine has not made the call that diverges yet.
+        folder: folder of the file; created if it does not exist.
+
+    Raises:
+        MachineError: if the disk refuses.
+    """
+    engine = env.engine.replayable
+    assert engine is not None
+    traces = [trace_calls(env, divergence, pending) for divergence in found[:MAX_DESCRIBED]]
+    for trace in traces:
+        trace.calls = trace.calls[-CALLS - 1 :]
+    constants = engine.own_constants
+    worlds, tensors = describe_traces(traces, engine.model, env.resolved, constants, diverged=True)
+    header = Header.of(env).model_copy(update={"kind": "crash", "worlds": worlds, "follows_constants": constants})
+    file = folder / f"step-{env.common_step:012d}.safetensors"
+    write_trajectory(file, header, tensors)
+    return file

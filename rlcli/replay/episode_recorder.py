@@ -1,0 +1,113 @@
+"""Record whole episodes of an evaluation, with what a replay needs to simulate them again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from rlcli.envs.observers import StepObserver
+from rlcli.envs.step import StepRecord
+from rlcli.envs.vec_env import VecEnv
+from rlcli.replay.resimulate import read_state
+from rlcli.replay.trajectory import STATE_FIELDS, Episode, Header, write_trajectory
+
+
+class EpisodeRecorder(StepObserver):
+    """Observer that records from the first step inside its `with` block on.
+
+    Args:
+        env: the environment.
+        episodes: how many to keep; each environment contributes a fixed number, as in an evaluation.
+        only: the one environment that contributes all of them; None: all environments.
+    """
+
+    def __init__(self, env: VecEnv, episodes: int, *, only: int | None = None) -> None:
+        self._env, count = env, env.num_envs
+        self._quota = [episodes // count + (i < episodes % count) for i in range(count)]
+        if only is not None:
+            self._quota = [episodes * (i == only) for i in range(count)]
+        self._start: dict[str, Tensor] = {}
+        self._new = list(range(count))
+        self._begin = [0] * count
+        self._first: dict[tuple[int, int], dict[str, Tensor]] = {}
+        """(environment, first step) -> the state and the own model fields that an episode begins with."""
+        self._after: list[dict[str, Tensor]] = []
+        self._actions: list[Tensor] = []
+        self._rewards: list[Tensor] = []
+        self.episodes: list[Episode] = []
+        """The recorded episodes, in the order in which they ended."""
+
+    def __enter__(self) -> EpisodeRecorder:
+        self._env.observers.add(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._env.observers.remove(self)
+
+    def before_step(self) -> None:
+        """Copy the state that new episodes begin with."""
+        if not self._start:
+            self._start = self._env.state_dict()
+        if not self._new:
+            return
+        engine = self._env.engine
+        fields = read_state(self._env)
+        fields |= {f"model.{name}": engine.expand(name).detach().cpu() for name in engine.expanded_fields()}
+        for env in self._new:
+            self._begin[env] = len(self._actions)
+            self._first[env, len(self._actions)] = {name: values[env].clone() for name, values in fields.items()}
+        self._new = []
+
+    def after_physics(self) -> None:
+        """Copy the state after the step, before any reset."""
+        self._after.append(read_state(self._env))
+
+    def on_step(self, record: StepRecord) -> None:
+        """Copy actions and rewards, and add the episodes that end."""
+        self._actions.append(record.action.detach().cpu().clone())
+        self._rewards.append(record.reward.detach().cpu().clone())
+        if record.episodes is None:
+            return
+        ended = record.episodes.ended()
+        self._new = ended.ids.tolist()
+        for row, env in enumerate(self._new):
+            if self._quota[env] > 0:
+                self._quota[env] -= 1
+                self.episodes.append(Episode.of(self._env, ended, row, begin=self._begin[env]))
+
+    def save(self, file: Path, mode: str = "all") -> list[Path]:
+        """Write the episodes that a mode keeps: all, succeeded, failed, or separate (a file for each of the two).
+
+        Returns:
+            The files that were written.
+
+        Raises:
+            MachineError: if the disk refuses.
+        """
+        if mode == "all":
+            self._write(file, self.episodes)
+            return [file]
+        files = []
+        for word in ("succeeded", "failed") if mode == "separate" else (mode,):
+            target = file.with_name(f"{file.stem}-{word}{file.suffix}") if mode == "separate" else file
+            self._write(target, [e for e in self.episodes if e.succeeded == (word == "succeeded")])
+            files.append(target)
+        return files
+
+    def _write(self, file: Path, episodes: list[Episode]) -> None:
+        last = max((e.begin + e.length for e in episodes), default=0)
+        actions = torch.stack(self._actions[:last]) if last else torch.zeros(0, self._env.num_envs, 0)
+        tensors = {"actions": actions} | {f"start.{name}": value for name, value in self._start.items()}
+        for number, e in enumerate(episodes):
+            prefix, steps = f"episode.{number}.", slice(e.begin, e.begin + e.length)
+            first = self._first[e.env, e.begin]
+            for name in STATE_FIELDS:
+                tensors[prefix + name] = torch.stack(
+                    [first[name], *(after[name][e.env] for after in self._after[steps])]
+                )
+            tensors |= {prefix + name: values for name, values in first.items() if name.startswith("model.")}
+            tensors[f"{prefix}actions"] = actions[steps, e.env]
+            tensors[f"{prefix}rewards"] = torch.stack(self._rewards[steps])[:, e.env]
+        write_trajectory(file, Header.of(self._env).model_copy(update={"episodes": episodes}), tensors)

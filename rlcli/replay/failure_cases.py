@@ -1,0 +1,223 @@
+"""The failure cases that a training kept, as `rlcli autopsy` reads them; nothing of a run is executed."""
+
+from __future__ import annotations
+
+import logging
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rlcli.errors import CheckpointError
+from rlcli.registry import TaskSource
+from rlcli.replay.resimulate import Staged, stage
+from rlcli.replay.trajectory import Episode, Failure, Trajectory, World, read_trajectory
+from rlcli.runs.atomic_io import finite_json
+from rlcli.runs.run import Run
+from rlcli.runs.safe_io import refuse_links, require_inside
+
+_log = logging.getLogger(__name__)
+FOLDER = "autopsy"
+"""Folder of the files in a run."""
+FILE_NAME = re.compile(r"(\d{12,15})-env-(\d{6,12})-episode-(\d{6,15})\.safetensors")
+"""Environment steps of the run, environment, episode."""
+_MAX_FILES = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class FailureCase:
+    """The last steps of an episode that a training kept."""
+
+    trajectory: Trajectory
+
+    @property
+    def episode(self) -> Episode:
+        """The episode."""
+        return self.trajectory.header.episodes[0]
+
+    @property
+    def failure(self) -> Failure:
+        """Why it was kept."""
+        failure = self.trajectory.header.failure
+        assert failure is not None
+        return failure
+
+    @property
+    def world(self) -> World:
+        """Its engine calls."""
+        return self.trajectory.header.worlds[0]
+
+    @property
+    def ended_by(self) -> str:
+        """The terminations, or the cause of a divergence with its place."""
+        return self.world.ended_by if self.failure.kind == "diverged" else ", ".join(self.episode.causes)
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the kept steps [s]."""
+        return self.episode.kept * self.trajectory.header.step_dt
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Time in the episode at the end of each kept step [s]. (steps,)"""
+        e = self.episode
+        return np.arange(e.length - e.kept + 1, e.length + 1, dtype=np.float64) * self.trajectory.header.step_dt
+
+    def values(self, name: str) -> NDArray[np.float32]:
+        """Return the observations, actions or reward_terms (steps, columns), or the rewards (steps,)."""
+        array: NDArray[np.float32] = self.trajectory.tensors[f"episode.0.{name}"].numpy()
+        return array
+
+    def columns(self, name: str) -> dict[str, NDArray[np.float32]]:
+        """Return each column of the observations, actions or reward_terms by its name. (steps,)"""
+        names = getattr(self.trajectory.header.columns, name)
+        return dict(zip(names, self.values(name).T, strict=True))
+
+    def record(self) -> dict[str, Any]:
+        """Return its facts as plain JSON."""
+        episode, failure = self.episode, self.failure
+        facts = {
+            "file": str(self.trajectory.file),
+            "iteration": failure.iteration,
+            "step": failure.step,
+            "env": episode.env,
+            "episode": episode.index,
+            "length": episode.length,
+            "return": episode.total_reward,
+            "kept_for": failure.kind,
+            "ended_by": episode.causes,
+            "cause": self.ended_by if failure.kind == "diverged" else None,
+            "truncated": episode.truncated,
+            "usual_returns": None if failure.usual_returns is None else list(failure.usual_returns),
+            "steps_kept": episode.kept,
+            "seconds_kept": self.seconds,
+        }
+        finite: dict[str, Any] = finite_json(facts)
+        return finite
+
+    def series(self) -> dict[str, Any]:
+        """Return the values of every kept step as plain JSON."""
+        values = {
+            "time": self.times.tolist(),
+            "reward": self.values("rewards").tolist(),
+            **{
+                name: {column: values.tolist() for column, values in self.columns(name).items()}
+                for name in ("reward_terms", "observations", "actions")
+            },
+        }
+        finite: dict[str, Any] = finite_json(values)
+        return finite
+
+
+def list_failure_cases(run: Run) -> list[FailureCase]:
+    """Return the failure cases of a run, the oldest first; a file that cannot be read is skipped with a warning.
+
+    Raises:
+        CheckpointError: if their folder is not a folder of the run.
+    """
+    folder = run.folder / FOLDER
+    if not folder.is_dir():
+        return []
+    try:
+        require_inside(run.folder, folder)
+    except OSError as error:
+        raise CheckpointError(f"{folder} cannot be read: {error.strerror}") from None
+    refuse_links(folder)
+    cases = []
+    for file in sorted(file for file in folder.iterdir() if FILE_NAME.fullmatch(file.name))[:_MAX_FILES]:
+        try:
+            trajectory = read_trajectory(file)
+        except CheckpointError as error:
+            _log.warning("passed over: %s", error.message)
+            continue
+        if trajectory.header.failure is None:
+            _log.warning("passed over: %s holds no kept episode of a training", file)
+            continue
+        cases.append(FailureCase(trajectory))
+    return sorted(cases, key=lambda case: (case.failure.step, case.episode.env, case.episode.index))
+
+
+def why_no_cases(run: Run) -> str:
+    """Return why a run has no failure cases."""
+    device = str(run.record.get("device", "cpu"))
+    if device.startswith("cuda"):
+        return (
+            f"it was trained on {device}, where a step cannot be stepped again; rlcli eval --checkpoint RUN --record"
+            " FILE --record-mode failed keeps episodes of its policy"
+        )
+    return "training keeps some as they end (agent.autopsy), and writes them with each checkpoint"
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """Two geoms in contact."""
+
+    geoms: tuple[str, str]
+    distance: float
+    """Negative where they penetrate [m]."""
+    force: float
+    """Along the normal [N]."""
+    position: tuple[float, float, float]
+    """[m]"""
+
+
+@dataclass(frozen=True, slots=True)
+class StagedCase:
+    """A failure case in a world of the installed task."""
+
+    staged: Staged
+    states: list[NDArray[np.float64]]
+    """The finite states at the beginning of each kept step, and after the last one."""
+
+    def forward(self, number: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Return MuJoCo's model and data of one of the states, with derived fields."""
+        engine = self.staged.worlds[0].world.engine
+        engine.set_state_row(0, self.states[number])
+        return engine.world(0)
+
+    def contacts(self) -> list[Contact]:
+        """Return the contacts of the last state, the strongest first."""
+        model, data = self.forward(-1)
+        found = []
+        force = np.zeros(6)
+        for index in range(data.ncon):
+            contact = data.contact[index]
+            mujoco.mj_contactForce(model, data, index, force)
+            names = (_geom_name(model, int(contact.geom[0])), _geom_name(model, int(contact.geom[1])))
+            x, y, z = contact.pos.tolist()
+            found.append(Contact(names, float(contact.dist), float(force[0]), (x, y, z)))
+        return sorted(found, key=lambda contact: -contact.force)
+
+
+def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase:
+    """Build the task of a case, for its contacts and pictures.
+
+    Raises:
+        CheckpointError, ConfigError, TaskError: see `rlcli.replay.resimulate.stage`.
+    """
+    torch.set_num_threads(1)
+    staged = stage(case.trajectory, named)
+    if not staged.same_model:
+        _log.warning("the installed task's model is not the one of the training: contacts and pictures are of today's")
+    first, calls = case.world.first, staged.worlds[0].calls
+    calls_per_step = max(1, first // max(1, case.episode.kept - 1))
+    states = [call.state for call in calls[first % calls_per_step : first + 1 : calls_per_step]]
+    if case.failure.kind != "diverged":  # MuJoCo has reset a world that diverged to its default state
+        states.append(staged.worlds[0].final)
+    finite = [state for state in states if np.isfinite(state).all()]
+    if not finite:
+        raise CheckpointError(f"{case.trajectory.file} has no state that is finite")
+    return StagedCase(staged, finite)
+
+
+def _geom_name(model: mujoco.MjModel, index: int) -> str:
+    """Return a geom's name, or its number and its body's name."""
+    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, index)
+    if name:
+        return str(name)
+    body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[index]))
+    return f"geom {index} of {body or 'world'}"

@@ -1,0 +1,352 @@
+"""Keep the last seconds of failed and unusual episodes of a training, for `rlcli autopsy`.
+
+While training steps, the last seconds of all environments lie in ring buffers: the states at the beginning of each
+engine call (`sim.divergence.StateHistory`), observations, actions and rewards. Of the episodes that end in an iteration
+one of every kind is copied: the terminated one of the lowest return, the one whose return is farthest from the
+others', the first that diverged. They become files with the next checkpoint, in the thread that writes it. Files that
+are newer than the checkpoint from which a training resumes are removed: their episodes come again.
+
+Recording draws no random numbers and writes nothing to the environment, so that the trained bits are the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from torch import Tensor
+
+from rlcli.config.schema import AutopsyConfig
+from rlcli.envs.observers import StepObserver
+from rlcli.envs.step import Episodes, StepRecord
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import CheckpointError, RlcliError
+from rlcli.managers.termination import DIVERGED
+from rlcli.replay.crash_dump import CallTrace, describe_traces, stop_observing_divergences, trace_calls
+from rlcli.replay.failure_cases import FILE_NAME, FOLDER
+from rlcli.replay.trajectory import (
+    MAX_SUBSTEPS,
+    Episode,
+    Failure,
+    FailureKind,
+    Header,
+    read_trajectory,
+    write_trajectory,
+)
+from rlcli.runs.atomic_io import write_atomic
+from rlcli.runs.safe_io import read_file
+from rlcli.sim.divergence import Divergence
+
+_log = logging.getLogger(__name__)
+RECENT = 1024
+"""Returns of finished episodes that the next ones are compared with."""
+LEAST = 64
+"""Returns without which nothing is called unusual."""
+FAR = 3.0
+"""How many interquartile ranges beyond the quartiles a return is unusual (Tukey's outer fences)."""
+_RETURNS_FILE = "recent.json"
+_MIN_SPREAD = 1e-3
+"""Least interquartile range, as a share of the quartiles: returns that agree in three digits are not unusual."""
+
+
+@dataclass(frozen=True, slots=True)
+class KeptEpisode:
+    """The end of an episode in memory."""
+
+    value: float
+    """Of several episodes of one kind the lowest value is kept."""
+    kind: FailureKind
+    episode: Episode
+    trace: CallTrace
+    tensors: dict[str, Tensor]
+    follows_constants: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FailureBatch:
+    """The changes of the folder that belong to a checkpoint."""
+
+    step: int
+    write: dict[str, tuple[KeptEpisode, Failure]]
+    """File name -> content."""
+    remove: list[str]
+    returns: list[float]
+
+
+class _RecentReturns(BaseModel):
+    """The returns that the next episodes are compared with, at a checkpoint."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+    step: int
+    returns: list[float] = Field(max_length=RECENT)
+
+
+class FailureRecorder(StepObserver):
+    """Observer that keeps the ends of episodes of a training on a CPU.
+
+    Args:
+        env: the environment; from now on its engine keeps the last seconds.
+        config: how much is kept.
+        folder: folder of the run; files go to `autopsy` in it.
+        step: environment steps of the checkpoint from which training resumes; None: it is new.
+    """
+
+    def __init__(self, env: VecEnv, config: AutopsyConfig, folder: Path, step: int | None) -> None:
+        engine = env.engine.replayable
+        assert engine is not None
+        self._env, self._engine, self._keep = env, engine, config.keep
+        self._folder = folder / FOLDER
+        memory, n, terms = config.memory_mib << 20, env.num_envs, len(env.reward_names)
+        self._slots = slots = self._steps_that_fit(config.seconds, memory)
+        self._rings = {
+            "observations": np.empty((slots, n, env.layout.size()), np.float32),
+            "actions": np.empty((slots, n, env.layout.action_size), np.float32),
+            "rewards": np.empty((slots, n), np.float32),
+            "reward_terms": np.empty((slots, terms, n), np.float32),
+        }
+        self._step = 0
+        self._diverging: dict[int, CallTrace] = {}
+        self._pending: dict[tuple[str, ...], KeptEpisode] = {}
+        """Kind, and causes -> the episode of this iteration that is kept."""
+        self._returns: list[NDArray[np.float32]] = []
+        self._recent = np.zeros(0)
+        self._quartiles: tuple[float, float] | None = None
+        self._files: dict[str, str] = {}
+        """Name -> kind of every file of the folder, written or not, in the order of the names."""
+        self._unwritten: dict[str, tuple[KeptEpisode, Failure]] = {}
+        self._written: set[str] = set()
+        self._failed = ""
+        self._read_folder(step)
+        engine.record_calls(
+            slots * env.calls_per_step, max(0, memory - sum(ring.nbytes for ring in self._rings.values()))
+        )
+        env.observers.add(self)
+
+    @property
+    def seconds(self) -> float:
+        """How much of an episode's end is kept [s]."""
+        return min(self._slots, self._engine.history.calls // self._env.calls_per_step) * self._env.step_dt
+
+    def close(self) -> None:
+        """Stop recording."""
+        stop_observing_divergences(self._env, self)
+
+    # --- between iterations ---
+
+    def commit(self, iteration: int, step: int) -> None:
+        """Keep the episodes of an iteration that has ended with so many environment steps."""
+        if self._failed:
+            _log.warning("ends of episodes are not kept any more: %s", self._failed)
+            self._failed = ""
+            self.close()
+        for kept in self._pending.values():
+            e = kept.episode
+            name = f"{step:012d}-env-{e.env:06d}-episode-{e.index:06d}.safetensors"
+            if name not in self._files:
+                self._files[name] = kept.kind
+                failure = Failure(kind=kept.kind, iteration=iteration, step=step, usual_returns=self._quartiles)
+                self._unwritten[name] = kept, failure
+        self._pending.clear()
+        self._evict()
+        self._update_quartiles()
+
+    def take(self, step: int) -> FailureBatch:
+        """Return what is written with the checkpoint of a step."""
+        names = set(self._files)
+        batch = FailureBatch(step, self._unwritten, sorted(self._written - names), self._recent.tolist())
+        self._unwritten, self._written = {}, names
+        return batch
+
+    def write(self, batch: FailureBatch) -> None:
+        """Write files, in the thread of the checkpoints; a disk that refuses ends the recording, not the training."""
+        try:
+            for name, (kept, failure) in batch.write.items():
+                worlds, tensors = describe_traces(
+                    [kept.trace],
+                    self._engine.model,
+                    self._env.resolved,
+                    kept.follows_constants,
+                    diverged=kept.kind == "diverged",
+                )
+                parts = {"kind": "failure", "episodes": [kept.episode], "worlds": worlds, "failure": failure}
+                header = self._header.model_copy(update={**parts, "follows_constants": kept.follows_constants})
+                write_trajectory(self._folder / name, header, tensors | kept.tensors)
+            if batch.returns:  # the next episodes are compared with them, also if no episode was kept yet
+                self._folder.mkdir(parents=True, exist_ok=True)
+                recent = _RecentReturns(step=batch.step, returns=batch.returns)
+                write_atomic(self._folder / _RETURNS_FILE, recent.model_dump_json(indent=2) + "\n")
+        except (RlcliError, OSError) as error:
+            self._failed = str(error)
+
+    def drop(self, batch: FailureBatch) -> None:
+        """Remove the files that others have replaced."""
+        for name in batch.remove:
+            with contextlib.suppress(OSError):
+                (self._folder / name).unlink(missing_ok=True)
+
+    @cached_property
+    def _header(self) -> Header:
+        return Header.of(self._env)
+
+    # --- in a step ---
+
+    def on_divergence(self, found: list[Divergence], pending: bool) -> None:
+        """Copy the last engine calls of the first divergence of each cause."""
+        for divergence in found:
+            if ("diverged", divergence.cause) not in self._pending:
+                self._diverging[divergence.env] = trace_calls(self._env, divergence, pending)
+
+    def on_step(self, record: StepRecord) -> None:
+        """Write the step into the ring buffers, and choose among the episodes that end."""
+        slot = self._step % self._slots
+        for name, value in (
+            ("observations", record.obs["policy"]),
+            ("actions", record.action),
+            ("rewards", record.reward),
+            ("reward_terms", record.reward_terms),
+        ):
+            np.copyto(self._rings[name][slot], value.detach().numpy())
+        self._step += 1
+        if record.episodes is not None:
+            self._choose(record.episodes)
+        self._diverging.clear()
+
+    def _choose(self, ended: Episodes) -> None:
+        """Keep the episodes that are the first or most remarkable of their kind in this iteration."""
+        returns, rest = ended.returns.detach().numpy().copy(), ~ended.truncated.numpy()
+        self._returns.append(returns)
+        if DIVERGED in ended.causes:
+            diverged = ended.causes[DIVERGED].numpy()
+            for row, env in enumerate(ended.ids.tolist() if self._diverging else ()):
+                trace = self._diverging.get(env)
+                if trace is not None and ("diverged", trace.divergence.cause) not in self._pending:
+                    self._keep_episode(("diverged", trace.divergence.cause), "diverged", 0.0, ended, row, trace)
+        else:
+            diverged = np.zeros(len(returns), bool)
+        low, high = self._fences()
+        unusual: list[tuple[FailureKind, NDArray[np.float32], NDArray[np.bool_]]] = [
+            ("low return", returns, returns < low),
+            ("high return", -returns, returns > high),
+        ]
+        for kind, value, mask in unusual:
+            self._keep_lowest((kind,), kind, value, mask & ~diverged, ended)
+            rest = rest & ~mask
+        rest &= ~diverged
+        if not rest.any():
+            return
+        code = np.zeros(len(rest), np.int64)  # a bit for each termination
+        for number, fired in enumerate(ended.causes.values()):
+            code |= fired.numpy().astype(np.int64) << number % 62
+        for causes in np.unique(code[rest]).tolist():
+            names = [name for number, name in enumerate(ended.causes) if causes >> number % 62 & 1]
+            self._keep_lowest(("terminated", *names), "terminated", returns, rest & (code == causes), ended)
+
+    def _keep_lowest(
+        self,
+        key: tuple[str, ...],
+        kind: FailureKind,
+        value: NDArray[np.float32],
+        mask: NDArray[np.bool_],
+        ended: Episodes,
+    ) -> None:
+        """Keep the episode with the lowest value where a mask holds, if it is lower than the kept one's."""
+        if not mask.any():
+            return
+        row = int(np.where(mask, value, np.inf).argmin())
+        kept = self._pending.get(key)
+        wanted = len(self._pending) < self._keep if kept is None else bool(value[row] < kept.value)
+        if wanted:
+            trace = trace_calls(self._env, Divergence(int(ended.ids[row]), kind))
+            self._keep_episode(key, kind, float(value[row]), ended, row, trace)
+
+    def _keep_episode(
+        self, key: tuple[str, ...], kind: FailureKind, value: float, ended: Episodes, row: int, trace: CallTrace
+    ) -> None:
+        """Copy the last steps of an episode, as many as the ring buffers and the trace hold."""
+        per_step, env = self._env.calls_per_step, trace.divergence.env
+        whole = (len(trace.calls) - trace.last) // per_step
+        steps = min(int(ended.lengths[row]), self._slots, self._step, whole + 1)
+        if steps == 0:
+            return
+        trace.calls = trace.calls[-((steps - 1) * per_step + trace.last) :]
+        slots = np.arange(self._step - steps, self._step) % self._slots
+        arrays = {name: ring[slots, env] for name, ring in self._rings.items() if name != "reward_terms"}
+        arrays["reward_terms"] = self._rings["reward_terms"][slots, :, env]
+        tensors = {f"episode.0.{name}": torch.from_numpy(values) for name, values in arrays.items()}
+        episode = Episode.of(self._env, ended, row, kept=steps)
+        self._pending[key] = KeptEpisode(value, kind, episode, trace, tensors, self._engine.own_constants)
+
+    def _fences(self) -> tuple[float, float]:
+        """Return the bounds beyond which a return is unusual."""
+        if self._quartiles is None:
+            return -np.inf, np.inf
+        first, third = self._quartiles
+        spread = max(third - first, _MIN_SPREAD * max(abs(first), abs(third)))
+        return first - FAR * spread, third + FAR * spread
+
+    def _update_quartiles(self) -> None:
+        if self._returns:
+            self._recent = np.concatenate([self._recent, *self._returns])[-RECENT:]
+            self._returns.clear()
+        if len(self._recent) >= LEAST:
+            first, third = np.quantile(self._recent, [0.25, 0.75]).tolist()
+            self._quartiles = (first, third)
+
+    def _evict(self) -> None:
+        """While there are too many files, drop the oldest of the most frequent kind."""
+        self._files = dict(sorted(self._files.items()))  # the order of a resumed run, which reads the folder
+        while len(self._files) > self._keep:
+            counts = Counter(self._files.values())
+            most = max(counts.values())
+            oldest = next(name for name, kind in self._files.items() if counts[kind] == most)
+            del self._files[oldest]
+            self._unwritten.pop(oldest, None)
+
+    # --- at the beginning ---
+
+    def _steps_that_fit(self, seconds: float, memory: int) -> int:
+        """Return how many environment steps the ring buffers hold."""
+        env, engine = self._env, self._engine
+        columns = env.layout.size() + env.layout.action_size + 1 + len(env.reward_names)
+        bytes_per_step = env.num_envs * (8 * engine.history.width * env.calls_per_step + 4 * columns)
+        most = MAX_SUBSTEPS // env.config.decimation - 1
+        return max(1, min(round(seconds / env.step_dt), most, memory // bytes_per_step))
+
+    def _read_folder(self, step: int | None) -> None:
+        """Take over the files of earlier checkpoints, and remove those of later ones."""
+        if not self._folder.is_dir():
+            return
+        for file in sorted(self._folder.iterdir()):
+            named = FILE_NAME.fullmatch(file.name)
+            if named is None:
+                continue
+            failure = None
+            if step is not None and int(named[1]) <= step:
+                with contextlib.suppress(CheckpointError):
+                    failure = read_trajectory(file).header.failure
+            if failure is None:
+                file.unlink(missing_ok=True)
+            else:
+                self._files[file.name] = failure.kind
+        self._written = set(self._files)
+        self._evict()
+        with contextlib.suppress(CheckpointError, FileNotFoundError, ValidationError):
+            recent = _RecentReturns.model_validate_json(read_file(self._folder / _RETURNS_FILE, 1 << 20))
+            if recent.step == step:
+                self._recent = np.array(recent.returns, dtype=np.float64)
+                self._update_quartiles()
+
+
+def open_failure_recorder(
+    env: VecEnv, config: AutopsyConfig | None, folder: Path, step: int | None
+) -> FailureRecorder | None:
+    """Return a recorder, if one is configured and the engine is replayable: a GPU's steps are not."""
+    return None if config is None or env.engine.replayable is None else FailureRecorder(env, config, folder, step)

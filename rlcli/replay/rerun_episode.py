@@ -1,0 +1,90 @@
+"""Run one episode of an evaluation again from its seed: the episode K of environment E of `rlcli eval`.
+
+A random number depends on the seed, the term, the environment and the number of its episode. If nothing else connects
+the episodes of a task, episode K starts at once. If something does (commands and intervals that follow the clock of all
+episodes, noise, curricula, objects with memory), the episodes before it are run first, in all environments as in the
+evaluation, and the reasons are reported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import ConfigError
+from rlcli.rl.acting import PATIENCE, Act
+from rlcli.rl.rng import load_rng_state, rng_state
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeStart:
+    """An environment at the beginning of an episode."""
+
+    obs: Tensor
+    """Observations of the policy. (num_envs, d)"""
+    episodes_before: int
+    """Episodes of the environment that were run before."""
+    reasons: list[str]
+    """Why they were run."""
+    generators: dict[str, Tensor]
+    """States of the generators that all environments share, before any step."""
+
+    def shared_draws(self) -> bool:
+        """Return whether the task has drawn from them: then the episode depends on the number of environments."""
+        return _has_drawn(self.generators)
+
+
+def start_episode(env: VecEnv, act: Act, env_id: int, episode: int, *, drawn_actions: bool = False) -> EpisodeStart:
+    """Bring an environment to the beginning of one of its episodes.
+
+    Args:
+        env: new environments.
+        act: the policy.
+        env_id: the environment of the episode.
+        episode: its number, from 0.
+        drawn_actions: whether the policy draws its actions.
+
+    Raises:
+        ConfigError: if an episode does not end because the task has no time-out.
+    """
+    reasons = [*env.episode_dependencies(), *(["actions that are drawn"] if drawn_actions else [])]
+    generators, start = rng_state(), env.state_dict()
+    if episode > 0 and not reasons:
+        run_episode(env, act, env.reset(seed=env.seed, episode=episode)["policy"], env_id)
+        if not _has_drawn(generators):
+            return EpisodeStart(env.reset(seed=env.seed, episode=episode)["policy"], 0, [], generators)
+        reasons = ["generators of torch, numpy or Python that some term draws from"]
+        load_rng_state(generators)
+        env.load_state_dict(start)
+    obs = env.reset(seed=env.seed)["policy"]
+    for _ in range(episode):
+        obs = run_episode(env, act, obs, env_id).obs["policy"]
+    return EpisodeStart(obs, episode, reasons if episode else [], generators)
+
+
+def run_episode(env: VecEnv, act: Act, obs: Tensor, env_id: int) -> StepResult:
+    """Step until the running episode of an environment ends, and return the last step.
+
+    Raises:
+        ConfigError: if it does not end because the task has no time-out.
+    """
+    with torch.no_grad():
+        while True:
+            if int(env.episode_length_buf[env_id]) > PATIENCE * env.max_episode_length:
+                message = f"an episode has lasted {int(env.episode_length_buf[env_id])} steps and has not ended"
+                hint = "add a termination with time_out: true"
+                raise ConfigError([env.resolved.problem(("terminations",), message, hint)])
+            step = env.step(act(obs))
+            obs = step.obs["policy"]
+            if bool(step.terminated[env_id] | step.truncated[env_id]):
+                return step
+
+
+def _has_drawn(before: dict[str, Tensor]) -> bool:
+    """Return whether random numbers were drawn from the shared generators since."""
+    after = rng_state()
+    return any(not torch.equal(before[name].nan_to_num(-1.0), after[name].nan_to_num(-1.0)) for name in before)

@@ -1,0 +1,310 @@
+"""Simulate the steps of a trajectory file again and compare every state bit by bit.
+
+A recording is replayed in an environment: its actions are applied to all environments, so that events, rewards and
+resets are computed again. Engine calls are replayed in one world each, without the task's terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rlcli.config.load import Resolved
+from rlcli.envs.make import make_env
+from rlcli.envs.observers import StepObserver
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import UsageError
+from rlcli.registry import TaskSource
+from rlcli.replay.trajectory import STATE_FIELDS, DivergencePoint, Trajectory, World
+from rlcli.runs.provenance import model_digest
+from rlcli.sim.divergence import WARNING_FIELDS, Call, Divergence
+from rlcli.sim.engine import open_cpu_engine
+
+_PHYSICS_FIELDS = ("time", "qpos", "qvel", "act", "qacc_warmstart")
+"""Fields of a state that only physics writes between two engine calls, unless an event does."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """The first value that differs between a replay and its file."""
+
+    env: int
+    episode: int | None
+    """Number of the episode in a recording; None for engine calls."""
+    step: int
+    """State of the episode, counted from 0, or engine call."""
+    field: str
+    recorded: list[float]
+    replayed: list[float]
+
+
+@dataclass(slots=True)
+class Replay:
+    """The result of a replay."""
+
+    steps: int
+    """Environment steps, or engine calls, that were simulated again."""
+    difference: Difference | None = None
+    compared: int = 0
+    """States that were compared after engine calls."""
+    same_model: bool = True
+    """Whether the installed task's model is the recorded one."""
+    diverged_at: dict[int, DivergencePoint | None] = field(default_factory=dict)
+    """Environment -> where its simulation diverges now."""
+
+
+# --- recordings ---
+
+
+def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool = False) -> list[int]:
+    """Return the numbers of the episodes to replay, one or all; none for a file of engine calls.
+
+    Raises:
+        UsageError: if the file does not hold the episode.
+    """
+    count = len(trajectory.header.episodes)
+    if trajectory.header.kind != "recording":
+        if episode is not None or filmed:
+            raise UsageError(
+                "a dump holds no whole episodes: --episode and --video are of recordings",
+                hint="rlcli autopsy RUN N --video FILE.mp4 draws a case of a run",
+            )
+        return []
+    if episode is not None and episode >= count:
+        raise UsageError(f"no episode {episode} in {trajectory.file}", hint=f"it has {count}, counted from 0")
+    if not count:
+        raise UsageError(f"{trajectory.file} has no episodes", hint="record with --record-mode all")
+    return list(range(count)) if episode is None else [episode]
+
+
+class StateReader(StepObserver):
+    """Observer that copies the state after physics, before any reset."""
+
+    def __init__(self, env: VecEnv) -> None:
+        self._env = env
+        self.state: dict[str, Tensor] = {}
+
+    def after_physics(self) -> None:
+        """Copy the state."""
+        self.state = read_state(self._env)
+
+
+def read_state(env: VecEnv) -> dict[str, Tensor]:
+    """Return copies of the fields that a recording holds of each state. (num_envs, n) each"""
+    return {name: env.engine.field(name).detach().cpu().clone() for name in STATE_FIELDS}
+
+
+def replay_episodes(
+    recording: Trajectory, env: VecEnv, episodes: Iterable[int], before_step: Callable[[int], None] = lambda step: None
+) -> Replay:
+    """Apply the actions of a recording again; compare every state and reward of some episodes.
+
+    Args:
+        recording: the recording.
+        env: an environment of its configuration.
+        episodes: numbers of the episodes to compare.
+        before_step: called with the number of each step.
+
+    Raises:
+        CheckpointError: if the recording does not fit the environment.
+    """
+    numbers = sorted(episodes)
+    chosen = [(n, recording.header.episodes[n], recording.part(f"episode.{n}.")) for n in numbers]
+    result = Replay(sum(e.length for _, e, _ in chosen))
+    try:
+        env.load_state_dict(recording.part("start."))
+    except (KeyError, RuntimeError, ValueError) as error:
+        raise recording.misfit(error) from None
+    actions, after = recording.tensors["actions"], StateReader(env)
+    with env.observers.added(after):
+        for t in range(max((e.begin + e.length for _, e, _ in chosen), default=0)):
+            before_step(t)
+            before = read_state(env)
+            rewards = env.step(actions[t].to(env.device)).reward.cpu()
+            for number, e, recorded in chosen:
+                step = t - e.begin
+                if not 0 <= step < e.length:
+                    continue
+                pairs = [(0, n, recorded[n][0], before[n][e.env]) for n in STATE_FIELDS if step == 0]
+                pairs += [(step + 1, n, recorded[n][step + 1], after.state[n][e.env]) for n in STATE_FIELDS]
+                pairs.append((step + 1, "reward", recorded["rewards"][step], rewards[e.env]))
+                for index, name, old, new in pairs:
+                    if not _same_bits(old.numpy(), new.numpy()):
+                        values = old.reshape(-1).tolist(), new.reshape(-1).tolist()
+                        result.difference = Difference(e.env, number, index, name, *values)
+                        return result
+    return result
+
+
+def _same_bits(left: NDArray[np.generic], right: NDArray[np.generic]) -> bool:
+    """Return whether all bits are equal: NaN equals itself, 0 differs from -0."""
+    return left.shape == right.shape and left.tobytes() == right.tobytes()
+
+
+# --- engine calls ---
+
+
+class ReplayWorld:
+    """One world of a model, to simulate the engine calls of one environment again.
+
+    Args:
+        model: the model of all environments.
+        resolved: the configuration.
+        own_model: the model fields of the environment's own.
+        follows_constants: whether MuJoCo's constants are derived from them again.
+
+    Raises:
+        ValueError, RuntimeError: if the fields do not fit the model.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        resolved: Resolved,
+        own_model: Mapping[str, Tensor],
+        follows_constants: bool,
+    ) -> None:
+        config = resolved.task.sim.model_copy(update={"engine": "batch", "engine_threads": 1})
+        engine = open_cpu_engine(model, 1, config)
+        for name, values in own_model.items():
+            engine.load_model_field(name, values.reshape(engine.expand(name).shape))
+        if follows_constants:
+            engine.set_constants()
+        self.engine, self.layout = engine, engine.state_layout
+
+    def simulate(self, call: Call) -> NDArray[np.float64]:
+        """Return the state after an engine call."""
+        self.engine.set_state_row(0, call.state)
+        self.engine.step(call.nstep)
+        self.engine.diverged()
+        return self.engine.state_row(0)
+
+    def differing_field(self, recorded: NDArray[np.float64], now: NDArray[np.float64], *, final: bool) -> str | None:
+        """Return the first field whose bits differ; of a state that is not final, only those that physics writes."""
+        for name, columns in self.layout.fields():
+            if (final or name in _PHYSICS_FIELDS) and not _same_bits(recorded[columns], now[columns]):
+                return name
+        return None
+
+    def find_divergence(self, calls: list[Call], first: int) -> DivergencePoint | None:
+        """Return the first physics step that diverges, from a call on."""
+        for number, call in enumerate(calls[first:], start=first):
+            self.engine.set_state_row(0, call.state)
+            for substep in range(call.nstep):
+                before = self.engine.state_row(0)
+                self.engine.step(1)
+                if self.engine.diverged() is None:
+                    continue
+                found = self.engine.described_divergences[0]
+                place, value = self._diverged_value(found, before)
+                time = float(before[self.layout.columns("time")][0])
+                return DivergencePoint(
+                    call=number, substep=substep, time=time, cause=found.cause, place=place, value=value
+                )
+        return None
+
+    def _diverged_value(self, found: Divergence, before: NDArray[np.float64]) -> tuple[str, str]:
+        """Return the element that shows a divergence, and its value."""
+        warned = WARNING_FIELDS.get(found.cause)
+        if warned is None:
+            name = found.cause.removesuffix(" not finite")
+            values = self.engine.own_model_fields(0).get(name)
+            if values is None and name in dict(self.layout.fields()):
+                values = self.engine.state_row(0)[self.layout.columns(name)]
+            if values is None:
+                return found.detail, ""
+            flat = np.asarray(values).flatten()
+            index = int((~np.isfinite(flat)).argmax())
+            return f"{name}[{index}]", repr(float(flat[index]))
+        if warned == "qacc":
+            self.engine.set_state_row(0, before)
+            values = self.engine.world(0)[1].qacc
+        else:
+            values = before[self.layout.columns(warned)]
+        return found.detail, f"{warned} {float(values[found.index])!r}" if 0 <= found.index < len(values) else ""
+
+
+@dataclass(frozen=True, slots=True)
+class StagedWorld:
+    """The engine calls of one environment, with a world to simulate them in."""
+
+    header: World
+    world: ReplayWorld
+    calls: list[Call]
+    final: NDArray[np.float64]
+    """The state after the last call."""
+
+
+@dataclass(frozen=True, slots=True)
+class Staged:
+    """The worlds of a failure or crash file, built from the installed task."""
+
+    resolved: Resolved
+    model: mujoco.MjModel
+    same_model: bool
+    worlds: list[StagedWorld]
+
+
+def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
+    """Build the task of a failure or crash file, and a world for each of its environments.
+
+    Raises:
+        TaskError: if the task is not installed any more.
+        ConfigError: if the installed task does not take the configuration.
+        CheckpointError: if the states or model fields do not fit it.
+    """
+    header, resolved = trajectory.header, trajectory.resolved(named)
+    env = make_env(resolved)
+    model = env.engine.model
+    env.close()
+    worlds = []
+    for number, described in enumerate(header.worlds):
+        tensors = trajectory.part(f"world.{number}.")
+        states, final = tensors["states"].numpy(), tensors["final"].numpy()
+        try:
+            own_model = trajectory.part(f"world.{number}.model.")
+            world = ReplayWorld(model, resolved, own_model, header.follows_constants)
+            width = len(world.engine.state_row(0))
+            if states.shape[1] != width or len(final) != width:
+                raise ValueError(f"a state has {len(final)} numbers, the model's {width}")
+        except (ValueError, RuntimeError) as error:
+            raise trajectory.misfit(error) from None
+        calls = [Call(state, nstep) for state, nstep in zip(states, described.nstep, strict=True)]
+        worlds.append(StagedWorld(described, world, calls, final))
+    return Staged(resolved, model, model_digest(model) == header.model, worlds)
+
+
+def replay_calls(trajectory: Trajectory, named: TaskSource | None = None) -> Replay:
+    """Simulate every engine call of a failure or crash file again, and compare every state that must follow.
+
+    Raises:
+        CheckpointError, ConfigError, TaskError: see `stage`.
+    """
+    staged = stage(trajectory, named)
+    result = Replay(0, same_model=staged.same_model)
+    diverged = trajectory.header.failure is None or trajectory.header.failure.kind == "diverged"
+    for part in staged.worlds:
+        env, world = part.header.env, part.world
+        following = [call.state for call in part.calls[1:]] + [part.final]
+        for index, (call, recorded) in enumerate(zip(part.calls, following, strict=True)):
+            now, final = world.simulate(call), index == len(part.calls) - 1
+            result.steps += 1
+            if not final and not part.header.follows[index]:
+                continue
+            result.compared += 1
+            name = world.differing_field(recorded, now, final=final)
+            if name is not None:
+                columns = world.layout.columns(name)
+                values = recorded[columns].tolist(), now[columns].tolist()
+                result.difference = Difference(env, None, index, name, *values)
+                break
+        if diverged or result.difference is not None:
+            result.diverged_at[env] = world.find_divergence(part.calls, part.header.first)
+        if result.difference is not None:
+            break
+    return result

@@ -1,0 +1,410 @@
+"""Trajectory files: recorded steps that `rlcli replay` simulates again and compares bit by bit.
+
+A file is in safetensors format with a JSON document under the key `rlcli` of its header; reading it executes nothing.
+There are three kinds of files:
+
+- recording: whole episodes of an evaluation. The tensors `start.*` and `actions` hold the state of all environments at
+  the beginning and every action since then, `episode.K.*` the states, actions and rewards of each kept episode.
+- failure: the last steps of one episode of a training. `episode.0.*` holds observations, actions and rewards,
+  `world.0.*` the engine calls.
+- crash: the last engine calls of environments whose simulation diverged, in `world.K.*`.
+
+`world.K.states` holds the integration state at the beginning of each engine call, `world.K.final` the state after the
+last one, and `world.K.model.*` the model fields that differ between environments.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import mujoco
+import safetensors.torch
+import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+import rlcli
+from rlcli.config.dump import to_data, to_yaml
+from rlcli.config.load import Resolved, resolve
+from rlcli.errors import CheckpointError, ConfigError
+from rlcli.registry import TaskSource
+from rlcli.runs.atomic_io import disk_error, write_atomic
+from rlcli.runs.provenance import model_digest
+from rlcli.runs.restore import recorded_task
+from rlcli.sim.divergence import MAX_DESCRIBED
+
+if TYPE_CHECKING:
+    from rlcli.envs.layout import TermLayout
+    from rlcli.envs.step import Episodes
+    from rlcli.envs.vec_env import VecEnv
+
+FORMAT = 2
+STATE_FIELDS = ("qpos", "qvel", "act", "ctrl")
+"""Fields of the simulation state that a recording holds of each step."""
+MAX_SUBSTEPS = 300_000
+"""Physics steps that a replay of engine calls simulates at most."""
+_MAX_BYTES = 2**28
+"""Size limit of failure and crash files; a recording has none."""
+
+Count = Annotated[int, Field(ge=0, le=2**53)]
+Kind = Literal["recording", "failure", "crash"]
+FailureKind = Literal["diverged", "low return", "high return", "terminated"]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class Columns(_Strict):
+    """Names of the columns of observations, actions and reward terms."""
+
+    observations: list[str]
+    actions: list[str]
+    reward_terms: list[str]
+
+
+class Episode(_Strict):
+    """One recorded episode."""
+
+    env: Count
+    """Environment."""
+    index: Count
+    """Number of the episode in its environment, counted from 0."""
+    begin: Count
+    """Steps of the recording before the episode's first; 0 in a failure file."""
+    length: int = Field(ge=1, le=2**53)
+    """Environment steps."""
+    kept: int = Field(ge=1, le=2**53)
+    """How many of them the file holds, the last ones; all of them in a recording."""
+    total_reward: float
+    """Undiscounted sum of rewards of the whole episode."""
+    truncated: bool
+    """Ended by a time-out alone."""
+    success: bool | None
+    """Met the task's success condition; None where the task has none."""
+    causes: list[str]
+    """Terminations that fired at its end."""
+
+    @staticmethod
+    def of(env: VecEnv, ended: Episodes, row: int, begin: int = 0, kept: int | None = None) -> Episode:
+        """Return the row of episodes that end in the current step of an environment, before its reset."""
+        number, length = int(ended.ids[row]), int(ended.lengths[row])
+        return Episode(
+            env=number,
+            index=int(env.episode_index[number]) - 1,
+            begin=begin,
+            length=length,
+            kept=length if kept is None else kept,
+            total_reward=float(ended.returns[row]),
+            truncated=bool(ended.truncated[row]),
+            success=None if ended.success is None else bool(ended.success[row]),
+            causes=[name for name, fired in ended.causes.items() if bool(fired[row])],
+        )
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether it counts as a success; without a success condition: whether it ended by a time-out alone."""
+        return self.truncated if self.success is None else self.success
+
+
+class DivergencePoint(_Strict):
+    """The physics step in which a simulation diverged, and the value that showed it."""
+
+    call: Count
+    """Number of the engine call in the file."""
+    substep: Count
+    """Physics step of that call, counted from 0."""
+    time: float
+    """Simulated time at its beginning [s]."""
+    cause: str
+    """See `rlcli.sim.divergence.Divergence`."""
+    place: str
+    """The joint, actuator or element."""
+    value: str
+    """Its value as Python prints it: `nan`, `1e+30`."""
+
+    def __str__(self) -> str:
+        """One line."""
+        what = f"{self.place} = {self.value}" if self.value else self.place
+        return f"{self.cause} in physics step {self.substep} of call {self.call}, t = {self.time:.6g} s: {what}"
+
+
+class World(_Strict):
+    """The engine calls of one environment."""
+
+    env: Count
+    """Environment of the run."""
+    cause: str
+    """Cause of the divergence, or why the episode was kept."""
+    detail: str
+    """Where it diverged, as far as the engine reported it."""
+    nstep: list[Annotated[int, Field(ge=1, le=1000)]] = Field(min_length=1, max_length=MAX_SUBSTEPS)
+    """Physics steps of each engine call."""
+    follows: list[bool]
+    """For each call but the first: whether it began in the state in which the one before ended, controls and forces
+    aside. False where an event wrote the state in between."""
+    first: Count
+    """The call that begins the last environment step."""
+    diverged_at: DivergencePoint | None
+    """None if it did not diverge, or if a single world does not reproduce the divergence."""
+
+    @property
+    def ended_by(self) -> str:
+        """The cause and where it was."""
+        return f"{self.cause}{f' ({self.detail})' if self.detail else ''}"
+
+
+class Failure(_Strict):
+    """Why a training kept an episode."""
+
+    kind: FailureKind
+    iteration: Count
+    """Iteration of the run in which the episode ended."""
+    step: Count
+    """Environment steps of the run after that iteration."""
+    usual_returns: tuple[float, float] | None
+    """Quartiles of the returns of earlier episodes; None if there were too few."""
+
+
+class Header(_Strict):
+    """The JSON document of a file."""
+
+    format: int
+    kind: Kind
+    rlcli: str
+    mujoco: str
+    task: dict[str, str | None]
+    config: str
+    model: str
+    """Digest of the compiled model."""
+    device: str
+    num_envs: Count
+    step_dt: float = Field(gt=0, le=1e6)
+    """Control period [s]."""
+    follows_constants: bool
+    """Whether MuJoCo's constants were derived again from model fields that differ between environments."""
+    columns: Columns
+    episodes: list[Episode]
+    worlds: list[World] = Field(max_length=MAX_DESCRIBED)
+    failure: Failure | None
+
+    @staticmethod
+    def of(env: VecEnv) -> Header:
+        """Return the header of a recording without episodes."""
+        columns = Columns(
+            observations=_column_names(env.layout.observations["policy"]),
+            actions=_column_names(env.layout.actions),
+            reward_terms=env.reward_names,
+        )
+        return Header(
+            format=FORMAT,
+            kind="recording",
+            rlcli=rlcli.__version__,
+            mujoco=mujoco.__version__,
+            task=env.resolved.source.record(),
+            config=to_yaml(to_data(env.resolved)),
+            model=model_digest(env.engine.model),
+            device=str(env.device),
+            num_envs=env.num_envs,
+            step_dt=env.step_dt,
+            follows_constants=False,
+            columns=columns,
+            episodes=[],
+            worlds=[],
+            failure=None,
+        )
+
+    @field_validator("task")
+    @classmethod
+    def _check_task(cls, task: dict[str, str | None]) -> dict[str, str | None]:
+        names = [value for value in task.values() if value is not None]
+        if not task.get("name") or not all(name.isprintable() for name in names):
+            raise ValueError("the task is malformed")
+        if not (task.get("folder") or task.get("distribution")):
+            raise ValueError("the origin of the task is missing")
+        return task
+
+    @model_validator(mode="after")
+    def _check_parts(self) -> Header:
+        """Check that the parts fit each other and the kind of the file."""
+        for world in self.worlds:
+            if len(world.follows) != len(world.nstep) - 1 or world.first >= len(world.nstep):
+                raise ValueError(f"the engine calls of environment {world.env} are malformed")
+        if sum(count for world in self.worlds for count in world.nstep) > MAX_SUBSTEPS:
+            raise ValueError(f"more than {MAX_SUBSTEPS} physics steps are not simulated again")
+        for number, e in enumerate(self.episodes):
+            if e.env >= self.num_envs or e.kept > e.length or (self.kind == "recording" and e.kept != e.length):
+                raise ValueError(f"episode {number} is not one of the recording")
+        if self.kind == "failure":
+            if len(self.worlds) != 1 or len(self.episodes) != 1 or self.failure is None:
+                raise ValueError("it does not hold the end of one episode")
+            first, steps_before = self.worlds[0].first, self.episodes[0].kept - 1
+            if first < steps_before or first % max(1, steps_before):
+                raise ValueError("the engine calls are not those of the episode's steps")
+        elif self.failure is not None or bool(self.worlds) != (self.kind == "crash"):
+            raise ValueError(f"it is no {self.kind}")
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """The checked content of a file."""
+
+    file: Path
+    header: Header
+    tensors: dict[str, Tensor]
+
+    def part(self, prefix: str) -> dict[str, Tensor]:
+        """Return the tensors whose names begin with a prefix, without it."""
+        return {n.removeprefix(prefix): tensor for n, tensor in self.tensors.items() if n.startswith(prefix)}
+
+    def resolved(self, named: TaskSource | None = None) -> Resolved:
+        """Return the recorded configuration with the task's installed code and models; engine calls need one world.
+
+        Args:
+            named: the task that the command line names: if the recorded task is not installed, its code is used.
+
+        Raises:
+            TaskError: if the task is not installed any more.
+            CheckpointError: if the task is code that the user has never named.
+            ConfigError: if the installed task does not take the configuration.
+        """
+        source = recorded_task(self.header.task, f"the task of {self.file}", named=named)
+        with tempfile.TemporaryDirectory() as folder:
+            config = Path(folder) / "task.yaml"
+            config.write_text(self.header.config, encoding="utf-8")
+            flags = {"scene.num_envs": 1} if self.header.worlds else {}
+            try:
+                resolved = resolve(replace(source, config=config), flags=flags)
+            except ConfigError as error:
+                raise ConfigError(
+                    replace(p, where=p.where.replace(str(config), str(self.file))) for p in error.problems
+                ) from None
+        if not flags and resolved.task.scene.num_envs != self.header.num_envs:
+            raise CheckpointError(f"{self.file} is corrupt: it and its configuration name different environments")
+        return resolved
+
+    def misfit(self, error: Exception) -> CheckpointError:
+        """Return the error for a file whose states do not fit the installed task."""
+        return CheckpointError(
+            f"{self.file} does not fit the installed task: {' '.join(str(error).split())}",
+            hint=f"install the version that made it: {self.header.task}",
+        )
+
+
+def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor]) -> None:
+    """Write a file; its folder is created if it does not exist.
+
+    Raises:
+        MachineError: if the disk refuses.
+    """
+    document = header.model_dump(mode="json")
+    copies = {
+        name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
+    }
+    document["sha256"] = content_digest(copies, document)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(file.parent, error) from error
+    write_atomic(file, safetensors.torch.save(copies, metadata={"rlcli": json.dumps(document)}))
+
+
+def read_trajectory(file: Path) -> Trajectory:
+    """Read and check a file.
+
+    Raises:
+        CheckpointError: if it is missing, corrupt or of another format.
+    """
+    try:
+        if file.exists() and not file.is_file():
+            raise ValueError("it is no plain file")  # a pipe would block
+        with safe_open(file, "pt") as opened:
+            data = json.loads((opened.metadata() or {}).get("rlcli", "{}"))
+            if not isinstance(data, dict) or "format" not in data:
+                raise ValueError("it has no header of rlcli")
+            if data["format"] != FORMAT:
+                raise CheckpointError(f"{file} has trajectory format {data['format']}; this rlcli reads {FORMAT}")
+            if data.get("kind") != "recording" and file.stat().st_size > _MAX_BYTES:
+                raise ValueError(f"it is larger than {_MAX_BYTES >> 20} MiB")
+            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 (not a mapping)
+        if data.pop("sha256", None) != content_digest(tensors, data):
+            raise CheckpointError(f"{file} is corrupt: it is not what was written")
+        header = Header.model_validate_json(json.dumps(data))
+        _check_tensors(header, tensors)
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"there is no recording or dump {file}", hint="rlcli eval TASK --record FILE makes a recording"
+        ) from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise CheckpointError(f"{file} is corrupt: {f'{place}: ' if place else ''}{first['msg']}") from None
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{file} is corrupt, or no recording or dump: {' '.join(str(error).split())}") from None
+    return Trajectory(file, header, tensors)
+
+
+def content_digest(tensors: Mapping[str, Tensor], document: Mapping[str, Any]) -> str:
+    """Return the sha256 of tensors and a JSON document."""
+    digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode())
+    for name in sorted(tensors):
+        value = tensors[name].contiguous()
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.flatten().view(torch.uint8).numpy().data if value.numel() else b"")  # no copy of it
+    return digest.hexdigest()
+
+
+def _check_tensors(header: Header, tensors: Mapping[str, Tensor]) -> None:
+    """Check the shapes and types of the tensors that a replay reads.
+
+    Raises:
+        ValueError: with the first one that does not fit.
+    """
+    shapes: dict[str, tuple[int | None, ...]] = {}
+    if header.kind == "recording":
+        shapes["actions"] = (None, header.num_envs, None)
+    for number, e in enumerate(header.episodes):
+        prefix = f"episode.{number}."
+        shapes |= {f"{prefix}actions": (e.kept, len(header.columns.actions)), f"{prefix}rewards": (e.kept,)}
+        if header.kind == "recording":
+            shapes |= {prefix + name: (e.length + 1, None) for name in STATE_FIELDS}
+        else:
+            shapes[f"{prefix}observations"] = (e.kept, len(header.columns.observations))
+            shapes[f"{prefix}reward_terms"] = (e.kept, len(header.columns.reward_terms))
+    for number, world in enumerate(header.worlds):
+        shapes[f"world.{number}.states"] = (len(world.nstep), None)
+        shapes[f"world.{number}.final"] = (None,)
+    for name, shape in shapes.items():
+        tensor = tensors.get(name)
+        if (
+            tensor is None
+            or len(shape) != tensor.dim()
+            or any(size not in (None, found) for size, found in zip(shape, tensor.shape, strict=True))
+        ):
+            raise ValueError(f"the tensor {name} is missing or of another shape than its header says")
+        expected = torch.float64 if name.startswith("world.") else torch.float32
+        if tensor.dtype != expected and not name.endswith(STATE_FIELDS):  # those have the engine's precision
+            raise ValueError(f"the tensor {name} holds {tensor.dtype} instead of {expected}")
+    for number, e in enumerate(header.episodes):
+        if header.kind == "recording" and e.begin + e.length > len(tensors["actions"]):
+            raise ValueError(f"episode {number} does not lie in the recording")
+
+
+def _column_names(terms: tuple[TermLayout, ...]) -> list[str]:
+    """Return `joint_pos.hip`, `last_action[2]`, or the term's own name if it has one column, for each column."""
+    names = []
+    for term in terms:
+        for index in range(term.size):
+            if index < len(term.elements):
+                names.append(f"{term.name}.{term.elements[index]}")
+            else:
+                names.append(term.name if term.size == 1 else f"{term.name}[{index}]")
+    return names

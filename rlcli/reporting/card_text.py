@@ -1,0 +1,69 @@
+"""Values of a configuration as a card shows them: short, and as people write them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel
+
+from rlcli.config.schema import ConstantNoiseConfig, EventConfig, GaussianNoiseConfig, UniformNoiseConfig
+
+
+def number(value: float) -> str:
+    """A number as people write it."""
+    return f"{value:.6g}"
+
+
+def columns_text(count: int) -> str:
+    """How many numbers an observation or an action has."""
+    return f"{count} number{'s' * (count != 1)}"
+
+
+def text_of(value: object) -> str:
+    """A value of a configuration, short."""
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "-"}[value]
+    if isinstance(value, int | float):
+        return number(value)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(text_of(item) for item in value)}]"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key}: {text_of(item)}" for key, item in value.items())
+    if isinstance(value, BaseModel):
+        return text_of(value.model_dump(exclude_none=True))
+    return " ".join(str(value).split())
+
+
+def noise_text(config: UniformNoiseConfig | GaussianNoiseConfig | ConstantNoiseConfig | None) -> str:
+    """What is drawn, and what is done with it."""
+    if config is None:
+        return ""
+    verb = {"add": "+", "scale": "x", "set": "="}[config.operation]
+    if isinstance(config, UniformNoiseConfig):
+        return f"{verb} uniform [{text_of(config.low)}, {text_of(config.high)}]"
+    if isinstance(config, GaussianNoiseConfig):
+        return f"{verb} normal, mean {text_of(config.mean)}, std {text_of(config.std)}"
+    return f"{verb} {text_of(config.value)}"
+
+
+def modifier_text(settings: Mapping[str, Any]) -> str:
+    """A modifier of an observation: its kind and its numbers."""
+    rest = {key: value for key, value in settings.items() if key != "kind"}
+    return f"{settings['kind'].replace('_', ' ')} {text_of(rest)}".strip()
+
+
+def when_text(config: EventConfig) -> str:
+    """When an event happens."""
+    if config.mode == "interval" and config.interval_range_s is not None:
+        timer = ", all together" if config.global_time else ""
+        return f"every {span(config.interval_range_s)} s{timer}"
+    if config.mode == "reset" and config.min_steps_between:
+        return f"at resets, at least {config.min_steps_between} steps apart"
+    return {"startup": "once, at the start", "reset": "at every reset"}.get(config.mode, config.mode)
+
+
+def span(pair: tuple[float, float]) -> str:
+    """A range in words."""
+    low, high = number(pair[0]), number(pair[1])
+    return low if low == high else f"{low} to {high}"

@@ -1,0 +1,249 @@
+"""Learning curves as pictures, drawn with matplotlib: without a window, and the same bytes for the same curves."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import math
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rlcli.errors import DependencyError
+from rlcli.reporting.panels import Item, Panel
+from rlcli.text import UNSAFE, shorten
+
+FORMATS = (".png", ".svg", ".pdf")
+
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31", "#777777")
+"""Told apart by most eyes that see colours otherwise: those of Okabe and Ito, and two more."""
+_STYLES = ("-", "--", ":", "-.")
+"""Of the lines where the colours begin anew."""
+
+INK, FAINT, PAPER = "#1b1f24", "#d0d7de", "#fefefe"
+"""Of text, rules and what lies behind a legend, as in `curves.mplstyle`; a page has its own."""
+_WIDTH, _HEIGHT = 5.2, 3.2
+"""Of a panel [inches]."""
+_ON_A_PAGE = (4.1, 2.7)
+"""The same of one on a page, where it is as wide as its place: smaller, so that its text is larger."""
+_FEW = 8
+"""Lines whose legend has one column."""
+_LONGEST = 64
+"""Characters of a label."""
+_NOT_DRAWN = re.compile(f"{UNSAFE.pattern}|[\t\n\ufffe\uffff]")
+"""Characters that a picture cannot show, and those that turn the direction of text."""
+
+_STYLE = Path(__file__).resolve().parent.parent / "templates" / "report" / "curves.mplstyle"
+
+
+def check_drawing() -> None:
+    """Refuse where nothing can be drawn.
+
+    Raises:
+        DependencyError: if matplotlib is not installed.
+    """
+    if importlib.util.find_spec("matplotlib") is None:
+        raise DependencyError("matplotlib is not installed", hint='pip install "rlcli[plot]"')
+
+
+def picture(panels: Sequence[Panel], x_label: str, kind: str, *, title: str = "", note: str = "") -> bytes:
+    """All panels in one file.
+
+    Args:
+        panels: what to draw.
+        x_label: of their x axis.
+        kind: one of `FORMATS`.
+        title: stands above.
+        note: stands below.
+    """
+    columns = 1 if len(panels) == 1 else 2 if len(panels) <= 4 else 3
+    rows = math.ceil(len(panels) / columns)
+    shared = next((panel.items for panel in panels if panel.by_curve and len(panel.items) > 1), [])
+    with _drawing({"svg.fonttype": "path"}):
+        figure = _figure((columns * _WIDTH, rows * _HEIGHT + 0.8))
+        for position, panel in enumerate(panels, start=1):
+            _draw(figure.add_subplot(rows, columns, position), panel, x_label, legend=not (shared and panel.by_curve))
+        if title:
+            figure.suptitle(_text(title), x=0.01, ha="left", fontweight="bold", fontsize=12)
+        if shared:
+            most = max((panel.items for panel in panels if panel.by_curve), key=len)
+            _legend(figure, most, loc="outside upper right", ncols=min(2, len(most)))
+        if note:
+            figure.supxlabel(_text(note, 400), x=0.01, ha="left", fontsize=7.5)
+        return _bytes(figure, kind)
+
+
+def scatter(
+    columns: Sequence[tuple[str, Sequence[Any], bool]], values: Sequence[float], label: str, *, title: str
+) -> bytes:
+    """What trials reached over each thing that they varied in, as SVG.
+
+    Args:
+        columns: name, value of each trial, and whether the axis is logarithmic; what is no number has a place each.
+        values: what the trials reached.
+        label: of it.
+        title: of the picture.
+    """
+    wide = min(3, len(columns))
+    rows = -(-len(columns) // wide)
+    with _drawing({}):
+        figure = _figure((_WIDTH * wide * 0.75, _HEIGHT * rows * 0.85))
+        for place, (name, given, log) in enumerate(columns):
+            axes = figure.add_subplot(rows, wide, place + 1)
+            numbers = all(type(value) in (int, float) for value in given)
+            words = sorted({str(value) for value in given})
+            x = given if numbers else [words.index(str(value)) for value in given]
+            axes.scatter(x, values, s=18.0, color=COLORS[0], alpha=0.8, linewidths=0.0)
+            if log:
+                axes.set_xscale("log")
+            if not numbers:
+                axes.set_xticks(range(len(words)), [_text(word, 16) for word in words])
+            axes.set_xlabel(_text(name))
+            if place % wide == 0:
+                axes.set_ylabel(_text(label))
+        figure.suptitle(_text(title))
+        return _bytes(figure, ".svg")
+
+
+def panel_svg(panel: Panel, x_label: str, name: str) -> str:
+    """One panel as an SVG element for a page, whose text and rules take the page's colours; without a legend.
+
+    Args:
+        panel: what to draw.
+        x_label: of its x axis.
+        name: what its ids begin with, its own in the page.
+    """
+    with _drawing({"svg.fonttype": "none"}):
+        figure = _figure(_ON_A_PAGE)
+        _draw(figure.add_subplot(), panel, x_label, legend=False, title=False)
+        svg = _bytes(figure, ".svg", transparent=True).decode()
+    return _for_page(svg, name, f"{panel.title}, {panel.unit}")
+
+
+def legend_of(panel: Panel) -> list[tuple[str, int, int]]:
+    """What a page puts beside a panel: (label, number of the colour, number of the line's style) each."""
+    if panel.by_curve and len(panel.items) == 1:
+        return []
+    return [(item.label, item.index % len(COLORS), item.index // len(COLORS) % len(_STYLES)) for item in panel.items]
+
+
+@contextmanager
+def _drawing(settings: dict[str, Any]) -> Iterator[None]:
+    check_drawing()
+    import matplotlib as mpl
+
+    with mpl.rc_context(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a letter that the font lacks is drawn as a box
+        mpl.rcdefaults()  # not what the user's matplotlibrc says: the same picture everywhere
+        mpl.rc_file(_STYLE, use_default_template=False)
+        mpl.rcParams.update(settings)
+        yield
+
+
+def _figure(size: tuple[float, float]) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _draw(axes: Any, panel: Panel, x_label: str, *, legend: bool, title: bool = True) -> None:
+    draw = _stack if panel.stacked else _lines
+    draw(axes, panel.items)
+    if panel.share:
+        axes.set_ylim(-0.02, 1.02)
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(panel.unit)
+    axes.margins(x=0.01)
+    axes.xaxis.set_major_formatter(_compact)
+    if title:
+        axes.set_title("\n".join(_text(line, 54) for line in (panel.title, panel.subtitle) if line))
+    if legend and panel.items and not (panel.by_curve and len(panel.items) == 1):
+        many = len(panel.items) > _FEW
+        settings = {"loc": "upper left" if panel.stacked else "best", "fontsize": 6 if many else 8, "ncols": 1 + many}
+        _legend(axes, panel.items, bands=panel.stacked, **settings)
+
+
+def _lines(axes: Any, items: Sequence[Item]) -> None:
+    for item in items:
+        line = item.line
+        marker = "o" if len(line.x) == 1 else ""
+        axes.plot(line.x, line.middle, color=_color(item), linestyle=_style(item), marker=marker, markersize=4)
+        if line.low is not None and line.high is not None:
+            axes.fill_between(line.x, line.low, line.high, color=_color(item), alpha=0.2, linewidth=0)
+
+
+def _stack(axes: Any, items: Sequence[Item]) -> None:
+    """Shares on top of each other; where several causes ended an episode at once they share it."""
+    if not items:
+        return
+    grid = max((item.line.x for item in items), key=len)
+    shares = np.stack([np.interp(grid, item.line.x, item.line.middle, left=0.0) for item in items])
+    shares = shares / np.maximum(1.0, shares.sum(axis=0))
+    axes.stackplot(grid, shares, colors=[_color(item) for item in items], alpha=0.75, linewidth=0)
+
+
+def _legend(place: Any, items: Sequence[Item], *, bands: bool = False, **settings: Any) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles = [
+        Patch(color=_color(item), alpha=0.75) if bands else Line2D([], [], color=_color(item), linestyle=_style(item))
+        for item in items
+    ]
+    # a label that begins with an underscore would be left out
+    labels = [f" {text}" if (text := _text(item.label)).startswith("_") else text for item in items]
+    place.legend(handles, labels, **settings)
+
+
+def _bytes(figure: Any, kind: str, *, transparent: bool = False) -> bytes:
+    nothing = {
+        ".svg": {"Date": None, "Creator": None, "Format": None, "Type": None},
+        ".png": {"Software": None},
+        ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+    }
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=kind[1:], metadata=nothing[kind], transparent=transparent, dpi=130)
+    return buffer.getvalue()
+
+
+def _compact(value: float, _: int | None = None) -> str:
+    """1500000 -> 1.5M."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:g}{letter}"
+    return f"{value:g}"
+
+
+def _color(item: Item) -> str:
+    return COLORS[item.index % len(COLORS)]
+
+
+def _style(item: Item) -> str:
+    return _STYLES[item.index // len(COLORS) % len(_STYLES)]
+
+
+def _text(text: str, limit: int = _LONGEST) -> str:
+    return shorten(_NOT_DRAWN.sub("?", text), limit, "…")
+
+
+def _for_page(svg: str, name: str, label: str) -> str:
+    """The element alone, as wide as its place, its own ids, text and rules in the page's colours."""
+    head, _, rest = svg[svg.index("<svg") :].partition(">")
+    box = re.search(r'viewBox="[\d. ]+"', head)
+    assert box is not None
+    rest = re.sub(r"<metadata>.*?</metadata>|<defs>\s*<style.*?</style>\s*</defs>", "", rest, flags=re.DOTALL)
+    rest = re.sub(r'(?<= id=")|(?<=url\(#)|(?<=xlink:href="#)', f"{name}-", rest)
+    variables = {INK: "currentColor", FAINT: "var(--rule)", PAPER: "var(--paper)"}
+    for color, variable in {**variables, **{color: f"var(--c{i})" for i, color in enumerate(COLORS)}}.items():
+        rest = rest.replace(color, variable)
+    rest = rest.replace("'DejaVu Sans'", "inherit")
+    return f'<svg {box[0]} role="img" aria-label="{escape(label)}">{rest}'.strip()

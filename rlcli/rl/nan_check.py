@@ -1,0 +1,96 @@
+"""Checks of a learner for NaN and infinity: the first tensor in causal order that is not finite is named."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterable, Mapping
+
+import torch
+from torch import Tensor, nn
+
+from rlcli.errors import DivergedError
+from rlcli.rl.policy import Normalizer
+from rlcli.sim.state_cache import is_finite
+
+LEARNER_HINT = "lower learning_rate or max_grad_norm; the last good checkpoint is kept"
+
+
+def require_finite(tensors: Iterable[tuple[str, Tensor]], iteration: int, axes: tuple[str, ...] = ()) -> None:
+    """Check that all tensors are finite.
+
+    Args:
+        tensors: name and values of each, in causal order.
+        iteration: number of the iteration, for the message.
+        axes: names of the leading axes, such as `("step", "environment")`.
+
+    Raises:
+        DivergedError: with the first tensor that is not finite and the position of its first such value.
+    """
+    for name, values in tensors:
+        if is_finite(values):
+            continue
+        bad = ~values.isfinite()
+        place = bad.nonzero()[0].tolist() if bad.dim() else []
+        where = ", ".join(f"{axis} {index}" for axis, index in zip(axes, place, strict=False))
+        where = where or (f"first at [{', '.join(map(str, place))}]" if place else "")
+        count = f" in {int(bad.sum())} of {bad.numel()} values" if bad.numel() > 1 else ""
+        raise DivergedError(
+            f"{name} is not finite{count}{f' ({where})' if where else ''}, in iteration {iteration}; what comes before"
+            " it is",
+            hint=LEARNER_HINT,
+        )
+
+
+def moments(normalizers: Iterable[tuple[str, Normalizer | None]]) -> list[tuple[str, Tensor]]:
+    """Return the running statistics of normalisers with their names."""
+    return [
+        (f"the {name} normaliser's {moment}", getattr(normalizer, moment))
+        for name, normalizer in normalizers
+        if normalizer is not None
+        for moment in ("mean", "var", "count")
+    ]
+
+
+def require_finite_learner(
+    metrics: Mapping[str, float], modules: Mapping[str, nn.Module], iteration: int, hint: str = LEARNER_HINT
+) -> None:
+    """Check the metrics of an update, then all weights.
+
+    Raises:
+        DivergedError: with the first that is not finite.
+    """
+    for name, value in metrics.items():
+        if not math.isfinite(value):
+            raise DivergedError(f"{name} is not finite in iteration {iteration}", hint=hint)
+    for part, module in modules.items():
+        for name, parameter in module.named_parameters():
+            if not is_finite(parameter):
+                raise DivergedError(f"weight '{part}.{name}' is not finite in iteration {iteration}", hint=hint)
+
+
+class GradientWatch:
+    """Finds the first gradient that is not finite, and keeps it from the weights.
+
+    Args:
+        module: the module whose gradients are checked.
+        optimizers: the optimisers of its parameters.
+    """
+
+    def __init__(self, module: nn.Module, optimizers: Iterable[torch.optim.Optimizer]) -> None:
+        self.first: str | None = None
+        """Name of the parameter with that gradient; gradients are computed from the outputs backwards."""
+        for name, parameter in module.named_parameters():
+            if parameter.requires_grad:
+                hook = functools.partial(self._check, name)
+                parameter.register_post_accumulate_grad_hook(hook)  # type: ignore[no-untyped-call]  # torch has no type here
+        for optimizer in optimizers:
+            optimizer.register_step_pre_hook(self._before_step)
+
+    def _check(self, name: str, parameter: Tensor) -> None:
+        if self.first is None and parameter.grad is not None and not is_finite(parameter.grad):
+            self.first = name
+
+    def _before_step(self, optimizer: torch.optim.Optimizer, args: object, kwargs: object) -> None:
+        if self.first is not None:
+            optimizer.zero_grad(set_to_none=True)  # the run ends with the weights that gave this gradient

@@ -1,0 +1,1 @@
+"""PPO: configuration, collector, learner, networks and the trainer."""

@@ -1,0 +1,281 @@
+"""Rollouts of the PPO trainer and their advantages.
+
+`collect` and `estimate_advantages` take and return nothing, and never read a value back from the device: they only read
+and write tensors allocated beforehand, so that a GPU captures each of them once as a CUDA graph and replays it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv
+from rlcli.rl.distributed import ProcessGroup
+from rlcli.rl.nan_check import moments, require_finite
+from rlcli.rl.policy import Normalizer
+from rlcli.rl.ppo.config import PpoConfig
+from rlcli.rl.ppo.loss import log_prob, standardized
+from rlcli.rl.ppo.networks import ActorCritic, ValueNormalizer, unroll
+from rlcli.rl.ppo.rollout_buffer import RolloutBuffer
+from rlcli.rl.ppo.setup import minibatch_sizes
+from rlcli.rl.statistics import EpisodeStatistics
+
+
+class Collector:
+    """Collects rollouts with the current policy, and estimates the advantages of their samples.
+
+    Args:
+        env: the environment.
+        config: the agent.
+        networks: actor and critic.
+        groups: observation groups of the critic.
+        statistics: statistics of the episodes that end.
+        process_group: the processes of the run.
+    """
+
+    def __init__(
+        self,
+        env: VecEnv,
+        config: PpoConfig,
+        networks: ActorCritic,
+        groups: tuple[str, ...],
+        statistics: EpisodeStatistics,
+        process_group: ProcessGroup,
+    ) -> None:
+        self.env, self.config, self.networks = env, config, networks
+        self.statistics, self._process_group = statistics, process_group
+        device, layout = env.device, env.layout
+        self.iteration = 0
+        """Number of rollouts collected so far."""
+        self.checks_every_stage = device.type == "cpu"
+        """Whether tensors are checked for NaN after every stage.
+
+        On a GPU, check once per iteration: each check forces a host sync."""
+        self._critic_groups = groups
+        self._critic_reads_actor_obs = groups == ("policy",)
+        obs_size, critic_size = layout.size("policy"), sum(layout.size(group) for group in groups)
+
+        self.normalizer: Normalizer | None = None
+        self.critic_normalizer: Normalizer | None = None
+        if config.normalize_observations:
+            self.normalizer = Normalizer(obs_size).to(device)
+            if not self._critic_reads_actor_obs:
+                self.critic_normalizer = Normalizer(critic_size).to(device)
+        self.value_normalizer = ValueNormalizer().to(device) if config.normalize_value else None
+
+        self.rollout = RolloutBuffer(
+            config.num_steps,
+            env.num_envs,
+            (obs_size, 0 if self._critic_reads_actor_obs else critic_size, layout.action_size),
+            minibatch_sizes(env, config, config.num_steps * env.num_envs),
+            config.rnn is not None,
+            device,
+        )
+        self.obs = {
+            group: torch.zeros(env.num_envs, layout.size(group), device=device)
+            for group in dict.fromkeys(("policy", *groups))
+        }
+        """Observations that the next action is chosen from, by group. (num_envs, d) each"""
+        self.raw_obs = {
+            group: torch.zeros(config.num_steps, *obs.shape, device=device)
+            for group, obs in self.obs.items()
+            if config.normalize_observations
+        }
+        """The rollout's observations before normalisation, by group. (num_steps, num_envs, d) each"""
+        self.episode_start = torch.ones(env.num_envs, device=device)
+        """1 where `obs` is the first observation of an episode."""
+        self.hidden_state = {name: lstm.blank(env.num_envs) for name, lstm in networks.recurrent_modules().items()}
+        """Current hidden states of the LSTMs of actor and critic. (num_envs, m) each"""
+        self.initial_hidden_state = {name: state.clone() for name, state in self.hidden_state.items()}
+        """Hidden states at the beginning of the rollout."""
+        self.explained_variance = torch.zeros((), device=device)
+        """Share of the variance of the returns that the critic predicted."""
+
+    # --- the rollout ---
+
+    @torch.no_grad()
+    def collect(self) -> None:
+        """Take `num_steps` in every environment with the current policy."""
+        rollout, samples, bound = self.rollout, self.rollout.samples, self.config.action_bound
+        for name, state in self.hidden_state.items():
+            self.initial_hidden_state[name].copy_(state)
+        std, noise = self.networks.std, torch.randn_like(samples.action)
+        deviation = std * noise
+        samples.log_prob.copy_(log_prob(noise, std))
+        raw_obs, episode_start = self.obs, self.episode_start
+        for t in range(self.config.num_steps):
+            obs, critic_obs = self._inputs(t, raw_obs)
+            mean = self.networks.mean(self._actor_features(obs, episode_start))
+            action = mean + deviation[t]
+            step = self.env.step(action if bound is None else action.clamp(-bound, bound))
+            samples.obs[t].copy_(obs)
+            if samples.critic_obs is not samples.obs:
+                samples.critic_obs[t].copy_(critic_obs)
+            samples.action[t].copy_(action)
+            samples.mean[t].copy_(mean)
+            self._store_outcome(t, step)
+            raw_obs, episode_start = step.obs, rollout.done[t]
+        self.set_obs(raw_obs)
+        samples.episode_start[0].copy_(self.episode_start)
+        samples.episode_start[1:].copy_(rollout.done[:-1])
+        self.episode_start.copy_(episode_start)
+        rollout.old_std.copy_(std.expand_as(rollout.old_std))
+
+    def set_obs(self, obs: Mapping[str, Tensor]) -> None:
+        """Set the observations that the next action is chosen from."""
+        for group, own in self.obs.items():
+            own.copy_(obs[group])
+
+    def _inputs(self, t: int, obs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the inputs of actor and critic at step t, normalised."""
+        if self.normalizer is not None:
+            for group, raw in self.raw_obs.items():
+                raw[t].copy_(obs[group])
+            if self.config.normalizer_update == "step":
+                self.update_normalizers(obs)
+        return self.actor_input(obs), self._critic_input(obs)
+
+    def _actor_features(self, obs: Tensor, episode_start: Tensor) -> Tensor:
+        """Return the input of the actor's MLP: the observation, or the output of the LSTM before the MLP."""
+        if self.networks.memory is None:
+            return obs
+        state = self.hidden_state["actor"]
+        features: Tensor
+        features, next_state = self.networks.memory(obs, state * (1.0 - episode_start)[:, None])
+        state.copy_(next_state)
+        return features
+
+    def _store_outcome(self, t: int, step: StepResult) -> None:
+        rollout = self.rollout
+        torch.mul(step.reward, self.config.reward_scale, out=rollout.reward[t])
+        torch.logical_or(step.terminated, step.truncated, out=rollout.done[t])
+        torch.gt(step.truncated, step.terminated, out=rollout.time_out[t])  # truncated and not terminated
+        if step.final_obs is not None and self.config.bootstrap == "final_obs":
+            rollout.final_obs[t].copy_(self._critic_input(step.final_obs))
+        self.statistics.add(step.episodes)
+
+    # --- the advantages ---
+
+    @torch.no_grad()
+    def estimate_advantages(self) -> None:
+        """Generalised advantage estimation, equations 11 and 12 of Schulman et al. 2017 (PPO):
+
+            delta_t = r_t + gamma V(s_t+1) - V(s_t)                             (12)
+            A_t     = delta_t + gamma lambda A_t+1                              (11, as a recursion)
+
+        Both V(s_t+1) and A_t+1 are 0 at the end of an episode. A time-out adds gamma V(its last observation) to
+        r_t. The regression target of the critic is A_t + V(s_t).
+        """
+        config, rollout, samples = self.config, self.rollout, self.rollout.samples
+        values = self._values() if self.networks.memory is None else self._recurrent_values()
+        value, last_value, time_out_value = values
+        if config.bootstrap == "pre_step":
+            time_out_value = value * rollout.time_out
+        reward, not_done = rollout.reward + config.gamma * time_out_value, 1.0 - rollout.done
+        next_value = torch.cat([value[1:], last_value[None]])
+        delta = reward + config.gamma * next_value * not_done - value
+        decay, advantage = config.gamma * config.lam * not_done, torch.zeros_like(last_value)
+        for t in reversed(range(config.num_steps)):
+            advantage = torch.addcmul(delta[t], decay[t], advantage, out=samples.advantage[t])
+        samples.value.copy_(value)
+        torch.add(samples.advantage, value, out=samples.target)
+        if self.checks_every_stage and not rollout.is_finite():
+            require_finite(self.rollout_dependencies(), self.iteration)
+            self.require_finite_rollout()
+        self.explained_variance.copy_(1.0 - (samples.target - value).var() / samples.target.var())
+        if self.value_normalizer is not None:
+            for column in (samples.value, samples.target):
+                self._update_normalizer(self.value_normalizer, column.flatten())
+                column.copy_(self.value_normalizer(column))
+        if config.normalize_advantage == "batch":
+            samples.advantage.copy_(standardized(samples.advantage, self._process_group))
+
+    def _values(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the values of all observations, of those after the rollout, and of the last ones before time-outs."""
+        rollout = self.rollout
+        value, last_value = self._value(rollout.samples.critic_obs), self._value(self._critic_input(self.obs))
+        return value, last_value, self._value_where(rollout.time_out, rollout.final_obs)
+
+    def _recurrent_values(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the same for a critic with an LSTM."""
+        lstm, state, rollout = self.networks.critic_memory, self.hidden_state["critic"], self.rollout
+        assert lstm is not None
+        features, states = unroll(lstm, rollout.samples.critic_obs, rollout.samples.episode_start, state)
+        finals = [lstm(obs, before)[0] for obs, before in zip(rollout.final_obs, states, strict=True)]
+        state.copy_(states[-1])
+        last, _ = lstm(self._critic_input(self.obs), state * (1.0 - self.episode_start)[:, None])
+        time_out_value = torch.where(rollout.time_out, self._value(torch.stack(finals)), 0.0)
+        return self._value(features), self._value(last), time_out_value
+
+    def _value(self, critic_obs: Tensor) -> Tensor:
+        value: Tensor = self.networks.value(critic_obs)
+        return value if self.value_normalizer is None else self.value_normalizer.inverse(value)
+
+    def _value_where(self, mask: Tensor, critic_obs: Tensor) -> Tensor:
+        """Return the value where the mask is set, 0 elsewhere; a GPU computes all, since counting would synchronise."""
+        if self.env.device.type == "cpu":
+            value = torch.zeros(mask.shape)
+            value[mask] = self._value(critic_obs[mask])
+            return value
+        return torch.where(mask, self._value(critic_obs), 0.0)
+
+    # --- observations and their normalisation ---
+
+    def actor_input(self, obs: Mapping[str, Tensor]) -> Tensor:
+        """Return the actor's observation, normalised."""
+        return obs["policy"] if self.normalizer is None else self.normalizer(obs["policy"])
+
+    def _critic_input(self, obs: Mapping[str, Tensor]) -> Tensor:
+        if self._critic_reads_actor_obs:
+            return self.actor_input(obs)
+        critic_obs = self._concatenated(obs)
+        return critic_obs if self.critic_normalizer is None else self.critic_normalizer(critic_obs)
+
+    def _concatenated(self, obs: Mapping[str, Tensor]) -> Tensor:
+        """Return the critic's observation groups side by side."""
+        groups = self._critic_groups
+        return obs[groups[0]] if len(groups) == 1 else torch.cat([obs[group] for group in groups], dim=-1)
+
+    def update_normalizers(self, obs: Mapping[str, Tensor]) -> None:
+        """Update the running statistics of the observations. (..., d) each"""
+        if self.normalizer is not None:
+            self._update_normalizer(self.normalizer, obs["policy"].flatten(0, -2))
+        if self.critic_normalizer is not None:
+            self._update_normalizer(self.critic_normalizer, self._concatenated(obs).flatten(0, -2))
+
+    def _update_normalizer(self, normalizer: Normalizer, values: Tensor) -> None:
+        """Merge the batches of all processes into a normaliser. (n, ...)"""
+        batch, processes = values.double(), self._process_group.world_size
+        mean, var = batch.mean(dim=0), batch.var(dim=0, unbiased=False)
+        if processes > 1:
+            mean, square = self._process_group.average_(torch.stack((mean, var + mean.square())))
+            var = square - mean.square()
+        normalizer.merge(mean, var, float(len(batch) * processes))
+
+    # --- which tensor is not finite ---
+
+    def require_finite_rollout(self) -> None:
+        """Raise `DivergedError` if a sample of the rollout is not finite."""
+        require_finite(self.rollout.in_causal_order(), self.iteration, ("step", "environment"))
+
+    def rollout_dependencies(self) -> list[tuple[str, Tensor]]:
+        """Return the named tensors that a rollout depends on: normalisers, weights and hidden states."""
+        states = [(f"the memory of the {name}", state) for name, state in self.initial_hidden_state.items()]
+        return [*self.normalizer_moments(), *self.named_weights(), *states]
+
+    def named_weights(self) -> list[tuple[str, Tensor]]:
+        """Return the weights with their names."""
+        return [(f"weight '{name}'", parameter.detach()) for name, parameter in self.networks.named_parameters()]
+
+    def normalizer_moments(self) -> list[tuple[str, Tensor]]:
+        """Return the running statistics of all normalisers with their names."""
+        return moments(
+            [
+                ("observation", self.normalizer),
+                ("critic's observation", self.critic_normalizer),
+                ("value", self.value_normalizer),
+            ]
+        )

@@ -1,0 +1,66 @@
+"""Faster updates on a GPU: functions fused by torch's compiler, and matrix products in TF32.
+
+Compiled code is kept in the user's cache folder. No compiler is imported before `compile_update` is called.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+
+from rlcli.rl.ppo.loss import UpdateFunctions
+
+_FOLDER = "TORCHINDUCTOR_CACHE_DIR"
+_log = logging.getLogger(__name__)
+
+
+def compile_update(
+    functions: UpdateFunctions, warm_up: Callable[[UpdateFunctions], None], *, tuned: bool = False
+) -> UpdateFunctions:
+    """Return the functions compiled; if that fails, log a warning and return them as they are.
+
+    Args:
+        functions: the functions to compile.
+        warm_up: calls each of them once with every shape that an update uses, on tensors that may be overwritten.
+        tuned: try out kernels for matrix products, which takes half a minute, once a machine.
+    """
+    _use_user_cache()
+    mode = "max-autotune-no-cudagraphs" if tuned else None
+    compile_ = functools.partial(torch.compile, fullgraph=True, dynamic=False, mode=mode)
+    compiled = UpdateFunctions(*map(compile_, functions))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # advice to the authors of compiled code
+            warm_up(compiled)
+    except (RuntimeError, ImportError, OSError) as error:
+        reason = next(iter(str(error).strip().splitlines()), "")
+        _log.warning(f"the update cannot be compiled and runs as it is: {type(error).__name__}: {reason[:200]}")
+        return functions
+    return compiled
+
+
+@contextlib.contextmanager
+def tf32_matmul(allowed: bool) -> Iterator[None]:
+    """Allow float32 matrix products to round their factors to TF32 (10 bits of mantissa) within the context."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if allowed else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def _use_user_cache() -> None:
+    """Keep compiled code in the user's cache folder; torch sets a temporary one as soon as it is imported."""
+    import platformdirs
+
+    folder = os.environ.get(_FOLDER)
+    if not folder or Path(folder).name.startswith("torchinductor_"):
+        os.environ[_FOLDER] = str(Path(platformdirs.user_cache_dir("rlcli")) / "inductor")

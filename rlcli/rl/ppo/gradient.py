@@ -1,0 +1,164 @@
+"""Gradient of a minibatch's loss: by autograd, or in closed form, which is faster for MLPs on a CPU.
+
+Both are called alike and write the same vector: the gradient of all parameters, followed by the KL divergence. In the
+closed form, where a minimum or a maximum is taken of two equal numbers, each counts half, as in autograd.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+
+from rlcli.rl.mlp import is_plain
+from rlcli.rl.mlp_gradients import MlpGradients
+from rlcli.rl.ppo.config import PpoConfig
+from rlcli.rl.ppo.loss import KL, LossResult, entropy, log_prob, minibatch_loss, policy_divergence
+from rlcli.rl.ppo.networks import ActorCritic
+from rlcli.rl.ppo.rollout_buffer import Samples
+
+_HALF = torch.tensor(0.5)
+
+
+MinibatchGradient = Callable[[PpoConfig, Samples, Tensor, Tensor, Tensor, Tensor], LossResult]
+"""Computes the loss of a minibatch and writes its gradient; the arguments are those of `minibatch_loss`."""
+
+
+class AutogradGradient:
+    """Gradient by autograd: any networks, any device.
+
+    Args:
+        networks: actor and critic.
+        out: vector for the gradient and, behind it, the divergence.
+        loss: `minibatch_loss`, or that compiled.
+    """
+
+    def __init__(self, networks: ActorCritic, out: Tensor, loss: Callable[..., LossResult] = minibatch_loss) -> None:
+        self._networks, self._out, self._loss = networks, out, loss
+
+    def __call__(
+        self, config: PpoConfig, batch: Samples, obs: Tensor, critic_obs: Tensor, advantage: Tensor, old_std: Tensor
+    ) -> LossResult:
+        """Return the loss of a minibatch and write its gradient."""
+        result = self._loss(self._networks, config, batch, obs, critic_obs, advantage, old_std)
+        gradients = torch.autograd.grad(result.loss, list(self._networks.parameters()))
+        torch.cat([*(part.flatten() for part in gradients), result.metrics[KL : KL + 1]], out=self._out)
+        return result
+
+
+def has_closed_form(networks: ActorCritic) -> bool:
+    """Return whether `ClosedFormGradient` can be used: MLPs on a CPU, without RNN, CNN or the `tell_coef` loss."""
+    others = (networks.memory, networks.vision, networks.critic_vision, networks.teller)
+    return all(other is None for other in others) and all(map(is_plain, (networks.actor, networks.critic)))
+
+
+class ClosedFormGradient:
+    """Closed-form gradient for MLPs on a CPU.
+
+    Args:
+        networks: actor and critic, of which `has_closed_form` holds.
+        out: vector for the gradient and, behind it, the divergence.
+        places: where in it each parameter's gradient lies.
+        rows: samples of the largest minibatch.
+        threads: threads that share the work.
+    """
+
+    def __init__(
+        self,
+        networks: ActorCritic,
+        out: Tensor,
+        places: Mapping[str, slice],
+        rows: int,
+        threads: int,
+    ) -> None:
+        self._networks, self._out = networks, out
+        parameters = dict(networks.named_parameters())
+        gradients = {name: out[place].view_as(parameters[name]) for name, place in places.items()}
+        (name,) = (name for name in gradients if name.endswith("_std"))
+        self._std_gradient = gradients.pop(name)
+        self._mlps = MlpGradients(networks.actor, networks.critic, list(gradients.values()), rows, threads)
+
+    def __call__(
+        self, config: PpoConfig, batch: Samples, obs: Tensor, critic_obs: Tensor, advantage: Tensor, old_std: Tensor
+    ) -> LossResult:
+        """Return the loss of a minibatch, without a graph, and write its gradient."""
+        networks = self._networks
+        with torch.no_grad():
+            std, policy_entropy = networks.std, entropy(networks.std)
+            objective = _Objective(config, batch, advantage, std)
+            sums = self._mlps(obs, critic_obs, objective.mean_gradient, objective.value_gradient)
+            actor_means, value_loss = (values / len(advantage) for values in sums)
+            losses, log_std_gradient, distance = actor_means.split_with_sizes([3, len(std), len(std)])
+            surrogate, clip_fraction, bounds = losses
+            self._std_gradient.copy_(networks.std_gradient(log_std_gradient - config.entropy_coef))
+            kl = policy_divergence(config, distance, std, old_std)
+            self._out[-1:].copy_(kl)
+            loss = surrogate + config.value_coef * value_loss - config.entropy_coef * policy_entropy
+            loss = loss + config.bounds_coef * bounds
+            metrics = torch.stack((surrogate, value_loss, policy_entropy, kl, clip_fraction, bounds))
+        return LossResult(loss, metrics, objective.mean, std)
+
+
+class _Objective:
+    """Loss of a minibatch as a function of the networks' outputs, with its gradient with respect to them."""
+
+    def __init__(self, config: PpoConfig, batch: Samples, advantage: Tensor, std: Tensor) -> None:
+        self._config, self._batch, self._advantage, self._std = config, batch, advantage, std
+        self._mean_scale = 1.0 / (std * len(advantage))
+        self.mean = torch.empty_like(batch.mean)
+        """The actor's outputs. (n, a)"""
+
+    def mean_gradient(self, rows: slice, mean: Tensor) -> tuple[Tensor, Tensor]:
+        """`rlcli.rl.mlp_gradients.OutputGradient`; the sums are losses, log-std gradients and square distances."""
+        config, batch = self._config, self._batch
+        self.mean[rows] = mean
+        distance = (batch.mean[rows] - mean).square_().sum(dim=0)
+        noise = (batch.action[rows] - mean).div_(self._std)
+        surrogate, clipped, log_prob_gradient, log_std_gradient = self._surrogate(rows, noise)
+        gradient = noise.mul_(log_prob_gradient[:, None]).mul_(self._mean_scale)
+        bounds = torch.zeros(())
+        if config.bounds_coef:
+            excess = (mean.abs() - config.bounds_margin).clamp_(min=0.0)
+            bounds = excess.square().sum()
+            gradient += excess.mul_(mean.sign()).mul_(2.0 * config.bounds_coef / len(self._advantage))
+        return gradient, torch.cat((torch.stack((surrogate, clipped, bounds)), log_std_gradient, distance))
+
+    def value_gradient(self, rows: slice, value: Tensor) -> tuple[Tensor, Tensor]:
+        """`rlcli.rl.mlp_gradients.OutputGradient`; the sum is that of the square errors."""
+        config, batch = self._config, self._batch
+        error, gradient = _value_error(value.squeeze(-1), batch.value[rows], batch.target[rows], config)
+        return gradient.mul_(2.0 * config.value_coef / len(self._advantage))[:, None], error
+
+    def _surrogate(self, rows: slice, noise: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the clipped surrogate, the count of clipped ratios, the log-prob and the log-std gradients."""
+        limit, advantage, square = self._config.clip_range, self._advantage[rows], noise.square()
+        ratio = (log_prob(noise, self._std) - self._batch.log_prob[rows]).exp_()
+        within = ratio.clamp(1.0 - limit, 1.0 + limit)
+        plain, bounded, clipped = advantage * ratio, advantage * within, ratio != within
+        share = torch.where(clipped, _share_of_minimum(plain, bounded), 1.0)
+        log_prob_gradient = share.mul_(plain).neg_()
+        log_std_gradient = torch.mv(square.t(), log_prob_gradient) - log_prob_gradient.sum()
+        return -torch.min(plain, bounded).sum(), clipped.sum(), log_prob_gradient, log_std_gradient
+
+
+def _value_error(value: Tensor, old: Tensor, target: Tensor, config: PpoConfig) -> tuple[Tensor, Tensor]:
+    """Return the sum of the square errors, and half its gradient for each value. (n,) each -> (), (n,)"""
+    error = value - target
+    if config.clip_value is None:
+        return error.square().sum(), error
+    limit = config.clip_value_range or config.clip_range
+    change = value - old
+    within = change.clamp(-limit, limit)
+    clipped = old + within - target
+    # within the range this is the error but for rounding, and has its gradient
+    gradient, square = torch.where(change == within, clipped, 0.0), clipped.square()
+    if config.clip_value == "larger":
+        plain = error.square()
+        gradient, square = torch.lerp(gradient, error, _share_of_minimum(square, plain)), torch.max(plain, square)
+    return square.sum(), gradient
+
+
+def _share_of_minimum(one: Tensor, other: Tensor) -> Tensor:
+    """Return 1 where `one` is the smaller, 0.5 where they are equal, 0 elsewhere."""
+    return torch.heaviside(other - one, _HALF)

@@ -1,0 +1,237 @@
+"""Update of the PPO trainer: several epochs of minibatches over one rollout.
+
+Like a rollout, `update` takes and returns nothing and never reads a value back from the device, so that a GPU captures
+it once as a CUDA graph and replays it. `metrics` reads one small tensor.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from rlcli.errors import DivergedError
+from rlcli.rl.distributed import ProcessGroup
+from rlcli.rl.nan_check import LEARNER_HINT, require_finite
+from rlcli.rl.ppo.collector import Collector
+from rlcli.rl.ppo.compile import compile_update, tf32_matmul
+from rlcli.rl.ppo.config import PpoConfig
+from rlcli.rl.ppo.gradient import AutogradGradient, ClosedFormGradient, MinibatchGradient, has_closed_form
+from rlcli.rl.ppo.loss import KL, METRICS, LossResult, UpdateFunctions, standardized
+from rlcli.rl.ppo.networks import adam, flatten, unroll
+from rlcli.rl.ppo.rollout_buffer import Samples
+from rlcli.rl.ppo.setup import compilation
+from rlcli.rl.trainer_base import finite_values
+from rlcli.sim.state_cache import is_finite
+
+
+class Learner:
+    """Updates actor and critic from the rollout of a collector.
+
+    Args:
+        collector: the collector.
+        config: the agent.
+        process_group: the processes of the run.
+        torch_threads: threads of the update.
+    """
+
+    def __init__(
+        self, collector: Collector, config: PpoConfig, process_group: ProcessGroup, torch_threads: int
+    ) -> None:
+        self.collector, self.config, self._process_group = collector, config, process_group
+        self._networks, device = collector.networks, collector.env.device
+        self._samples_per_rollout = config.num_steps * collector.env.num_envs
+        self.weights, self.gradient_and_kl, places = flatten(self._networks)
+        self.gradient, self._minibatch_kl = self.gradient_and_kl[:-1], self.gradient_and_kl[-1]
+        process_group.broadcast_(self.weights.data)
+        actor_end = min(place.start for name, place in places.items() if name.startswith("critic"))
+        joint = config.clip_grad == "joint"
+        self._clipped_parts = (self.gradient,) if joint else (self.gradient[:actor_end], self.gradient[actor_end:])
+        self.learning_rate = torch.tensor(config.learning_rate, device=device)
+        self._rate_ceiling = torch.tensor(config.learning_rate_range[1], device=device)
+        self.optimizer = adam(self.weights, self.learning_rate, config.adam_eps)
+
+        self._kl_sum = torch.zeros((), device=device)
+        """Sum of the minibatches' divergences in the current epoch."""
+        self._metric_sums = torch.zeros(len(METRICS), device=device)
+        self.metric_values = torch.zeros(len(METRICS) + 4, device=device)
+        """`METRICS`, then mean action std, learning rate, whether all weights are finite, explained variance."""
+
+        self._tf32 = config.tf32 and device.type == "cuda"
+        self.functions = UpdateFunctions()
+        self.torch_threads = torch_threads
+        """Threads of torch in `update`: one with the closed-form gradient, since that has threads of its own."""
+        self.minibatch_gradient: MinibatchGradient
+        mode = compilation(config, device, self._samples_per_rollout * process_group.world_size)
+        if mode:
+            self.functions = compile_update(self.functions, self._call_all, tuned=mode == "tuned")
+        if not mode and has_closed_form(self._networks):
+            rows = max(len(minibatch.target) for minibatch in collector.rollout.minibatches)
+            self.minibatch_gradient = ClosedFormGradient(
+                self._networks, self.gradient_and_kl, places, rows, torch_threads
+            )
+            self.torch_threads = 1
+        else:
+            self.minibatch_gradient = AutogradGradient(self._networks, self.gradient_and_kl, self.functions.loss)
+
+    def update(self) -> None:
+        """Estimate the advantages, then optimise actor and critic."""
+        collector = self.collector
+        with tf32_matmul(self._tf32):
+            collector.estimate_advantages()
+            if collector.normalizer is not None and self.config.normalizer_update == "rollout":
+                collector.update_normalizers(collector.raw_obs)
+            self.optimize()
+            self._write_metrics()
+
+    def optimize(self) -> None:
+        """Take one optimiser step per minibatch, for several epochs."""
+        config, rollout = self.config, self.collector.rollout
+        self._metric_sums.zero_()
+        for epoch in range(config.num_epochs):
+            if epoch == 0 or config.shuffle == "epoch":
+                rollout.fill_minibatches(self.sample_order())
+            self._kl_sum.zero_()
+            for number, minibatch in enumerate(rollout.minibatches):
+                self.step(minibatch, number)
+            self._adapt_learning_rate(self._kl_sum / len(rollout.minibatches), "epoch")
+        self._adapt_learning_rate(self._kl_sum / len(rollout.minibatches), "iteration")
+
+    def sample_order(self) -> Tensor:
+        """Return the order in which the samples fill the minibatches."""
+        shuffled, rollout = self.config.shuffle != "none", self.collector.rollout
+        device = self.weights.device
+        if self._networks.memory is not None:
+            arrange = torch.randperm if shuffled else torch.arange
+            return rollout.order_by_environment(arrange(self.collector.env.num_envs, device=device))
+        return torch.randperm(self._samples_per_rollout, device=device) if shuffled else rollout.by_environment
+
+    def step(self, batch: Samples, number: int) -> None:
+        """Take one optimiser step on a minibatch."""
+        iteration, checks = self.collector.iteration, self.collector.checks_every_stage
+        result = self.compute_gradient(self.minibatch_gradient, batch, number)
+        self._metric_sums += result.metrics
+        self._process_group.average_(self.gradient_and_kl)
+        if checks and not (is_finite(self.gradient_and_kl) and is_finite(result.metrics)):
+            require_finite(self._gradient_in_causal_order(result), iteration)
+        if self.config.kl_from == "rollout":
+            self._adapt_learning_rate(self._minibatch_kl, "minibatch")
+        self.clip_gradient()
+        self.optimizer.step()
+        if checks and not is_finite(self.weights):
+            weights = self.collector.named_weights()
+            require_finite([("the learning rate", self.learning_rate), *weights], iteration)
+        if self.config.kl_from == "last_pass":
+            self._adapt_learning_rate(self._minibatch_kl, "minibatch")
+            batch.mean.copy_(result.mean)
+            self.collector.rollout.old_std[number].copy_(result.std)
+        if self.config.kl_grain != "minibatch":
+            self._kl_sum += self._minibatch_kl
+
+    def compute_gradient(self, minibatch_gradient: MinibatchGradient, batch: Samples, number: int) -> LossResult:
+        """Return the loss of a minibatch; its gradient and its KL divergence are then in `gradient_and_kl`."""
+        config, old_std = self.config, self.collector.rollout.old_std[number]
+        obs, critic_obs = self.network_inputs(batch, number)
+        advantage = batch.advantage
+        if config.normalize_advantage == "minibatch":
+            advantage = standardized(advantage, self._process_group)
+        return minibatch_gradient(config, batch, obs, critic_obs, advantage, old_std)
+
+    def network_inputs(self, batch: Samples, number: int) -> tuple[Tensor, Tensor]:
+        """Return the inputs of the MLPs: observations, or the outputs of the LSTMs over all steps of the rollout."""
+        if self._networks.memory is None:
+            return batch.obs, batch.critic_obs
+        environments, obs = (
+            self.collector.rollout.environments[number],
+            {"actor": batch.obs, "critic": batch.critic_obs},
+        )
+        shape = (self.config.num_steps, len(environments))
+        features = []
+        for name, lstm in self._networks.recurrent_modules().items():
+            initial_state = self.collector.initial_hidden_state[name].index_select(0, environments)
+            sequences, starts = (torch.unflatten(rows, 0, shape) for rows in (obs[name], batch.episode_start))
+            outputs, _ = unroll(lstm, sequences, starts, initial_state)
+            features.append(outputs.flatten(0, 1))
+        return features[0], features[1]
+
+    def clip_gradient(self) -> None:
+        """Clip the norm of the gradient: joint, or that of the actor and that of the critic."""
+        if self.config.max_grad_norm is not None:
+            self.functions.clip_gradient_(self._clipped_parts, self.config.max_grad_norm)
+
+    def decay_learning_rate(self, remaining: float) -> None:
+        """Set the learning rate, or the ceiling of an adaptive one, by the remaining share of the budget."""
+        if self.config.schedule == "linear":
+            self.learning_rate.fill_(self.config.learning_rate * remaining)
+        elif self.config.schedule == "adaptive_linear":
+            self._rate_ceiling.fill_(self.config.learning_rate_range[1] * remaining)
+            self.learning_rate.clamp_(max=self._rate_ceiling)
+
+    def _adapt_learning_rate(self, kl: Tensor, grain: str) -> None:
+        """Adapt the learning rate, if the schedule is adaptive and this is its grain."""
+        if self.config.desired_kl is not None and grain == self.config.kl_grain:
+            self.functions.adapt_learning_rate_(self.learning_rate, self._rate_ceiling, kl, self.config)
+
+    def _call_all(self, functions: UpdateFunctions) -> None:
+        """Call the functions of an update once with every size of a minibatch, without changing weights or rates."""
+        gradient = AutogradGradient(self._networks, self.gradient_and_kl, functions.loss)
+        minibatches = self.collector.rollout.minibatches
+        with tf32_matmul(self._tf32):
+            for number, minibatch in {len(b.target): (i, b) for i, b in enumerate(minibatches)}.values():
+                self.compute_gradient(gradient, minibatch, number)
+            if self.config.max_grad_norm is not None:
+                functions.clip_gradient_(self._clipped_parts, self.config.max_grad_norm)
+            if self.config.desired_kl is not None:
+                rate = self.learning_rate.clone()
+                functions.adapt_learning_rate_(rate, self._rate_ceiling, self._minibatch_kl, self.config)
+
+    # --- metrics ---
+
+    @torch.no_grad()
+    def _write_metrics(self) -> None:
+        """Write the metrics of the update into one tensor."""
+        updates = self.config.num_epochs * len(self.collector.rollout.minibatches)
+        moments = [values for _, values in self.collector.normalizer_moments()]
+        sums = torch.stack([values.sum().double() for values in (self.weights, *moments)])
+        all_finite = sums.isfinite().all().float()
+        last = (self._networks.std.mean(), self.learning_rate, all_finite, self.collector.explained_variance)
+        self.metric_values[: len(METRICS)].copy_(self._metric_sums / updates)
+        self.metric_values[len(METRICS) :].copy_(torch.stack(last))
+        self._process_group.average_(self.metric_values)
+
+    def metrics(self) -> dict[str, float]:
+        """Return the metrics of the last update.
+
+        Raises:
+            DivergedError: if the learner diverged, naming the first tensor that is not finite.
+        """
+        *losses, std, learning_rate, all_finite, explained = self.metric_values.tolist()
+        metrics = {f"Loss/{name}": value for name, value in zip(METRICS, losses, strict=True)}
+        metrics |= {"Policy/mean_std": std, "Loss/learning_rate": learning_rate, "Loss/explained_variance": explained}
+        required = ("Loss/surrogate", "Loss/value", "Policy/mean_std")
+        not_finite = [name for name in required if not math.isfinite(metrics[name])]
+        if not_finite or all_finite < 1.0:
+            iteration = self.collector.iteration
+            if not self.collector.rollout.is_finite():
+                self.collector.require_finite_rollout()
+            require_finite(self.collector.normalizer_moments(), iteration)
+            if not_finite:
+                raise DivergedError(f"{not_finite[0]} is not finite in iteration {iteration}", hint=LEARNER_HINT)
+            require_finite(self.collector.named_weights(), iteration)
+        if not self.config.bounds_coef:
+            del metrics["Loss/bounds"]
+        return finite_values(metrics)
+
+    def _gradient_in_causal_order(self, result: LossResult) -> list[tuple[str, Tensor]]:
+        """Return the named tensors of a minibatch: the losses, then the gradients from the outputs backwards."""
+        losses = [(f"the loss ({name})", result.metrics[i]) for i, name in enumerate(METRICS) if i != KL]
+        names, parameters = zip(*self._networks.named_parameters(), strict=True)
+        gradients = self.gradient.split_with_sizes([parameter.numel() for parameter in parameters])
+        named = [(f"the gradient of '{name}'", gradient) for name, gradient in zip(names, gradients, strict=True)]
+        return [
+            *losses,
+            ("the loss", result.loss.detach()),
+            *reversed(named),
+            ("the divergence (KL)", self._minibatch_kl),
+        ]

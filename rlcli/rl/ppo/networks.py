@@ -1,0 +1,216 @@
+"""Actor and critic in training: float32, with all parameters in one vector and all gradients in another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from rlcli.rl.cnn import Vision, VisionSpec
+from rlcli.rl.mlp import Mlp
+from rlcli.rl.optimizers import Adam
+from rlcli.rl.policy import ACTIVATIONS, Lstm, Normalizer
+from rlcli.rl.ppo.config import NetworkConfig, PpoConfig
+
+_POLICY = ("memory.", "vision.", "actor.")
+_MIN_STD = 1e-6
+_VALUE_CLIP = 5.0
+_VALUE_EPS = 1e-5
+
+
+class ActorCritic(nn.Module):
+    """Gaussian policy with a state-independent standard deviation, and a value function.
+
+    Args:
+        obs_size: columns of the actor's observation.
+        critic_obs_size: columns of the critic's observation.
+        action_size: columns of the action.
+        config: networks, initial weights, parametrisation of the standard deviation.
+        vision: CNN over the images in the actor's observation.
+        critic_vision: CNN over the images in the critic's observation.
+    """
+
+    def __init__(
+        self,
+        obs_size: int,
+        critic_obs_size: int,
+        action_size: int,
+        config: PpoConfig,
+        vision: VisionSpec | None = None,
+        critic_vision: VisionSpec | None = None,
+    ) -> None:
+        super().__init__()
+        cells = [config.rnn.hidden] * config.rnn.layers if config.rnn else []
+        self.memory = Lstm(obs_size, cells) if cells else None
+        self.vision, obs_size = _make_cnn(vision, obs_size, config.actor, config.init)
+        self.actor = _mlp(cells[-1] if cells else obs_size, config.actor, action_size, config.init, gain=0.01)
+        self.teller = nn.Linear(config.actor.hidden[-1], critic_obs_size) if config.tell_coef else None
+        if config.std == "log":
+            self.log_std = nn.Parameter(torch.full((action_size,), math.log(config.init_std)))
+        else:
+            self.raw_std = nn.Parameter(torch.full((action_size,), config.init_std))
+        self.critic_memory = Lstm(critic_obs_size, cells) if cells else None
+        self.critic_vision, critic_obs_size = _make_cnn(critic_vision, critic_obs_size, config.critic, config.init)
+        self.critic = _mlp(cells[-1] if cells else critic_obs_size, config.critic, 1, config.init, gain=1.0)
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviation of each action. (a,)"""
+        return self.log_std.exp() if hasattr(self, "log_std") else self.raw_std.clamp(min=_MIN_STD)
+
+    def std_gradient(self, log_std_gradient: Tensor) -> Tensor:
+        """Return the gradient of the parameter from that of the logarithm of the standard deviation. (a,) -> (a,)"""
+        if hasattr(self, "log_std"):
+            return log_std_gradient
+        return log_std_gradient / self.std * (self.raw_std >= _MIN_STD)
+
+    def mean(self, obs: Tensor) -> Tensor:
+        """Return the mean action. (n, d) -> (n, a)"""
+        mean: Tensor = self.actor[-1](self.hidden(obs))
+        return mean
+
+    def hidden(self, obs: Tensor) -> Tensor:
+        """Return the activations of the actor's last hidden layer. (n, d) -> (n, h)"""
+        hidden: Tensor = self.actor[:-1](obs if self.vision is None else self.vision(obs))
+        return hidden
+
+    def value(self, critic_obs: Tensor) -> Tensor:
+        """Return the value. (..., c) -> (...)"""
+        value: Tensor
+        if self.critic_vision is not None:
+            *rows, _ = critic_obs.shape
+            value = self.critic(self.critic_vision(critic_obs.flatten(0, -2))).view(rows)
+        else:
+            value = self.critic(critic_obs).squeeze(-1)
+        return value
+
+    def recurrent_modules(self) -> dict[str, Lstm]:
+        """Return the LSTMs of actor and critic; of MLPs, an empty mapping."""
+        modules = {"actor": self.memory, "critic": self.critic_memory}
+        return {name: module for name, module in modules.items() if module is not None}
+
+    def policy_tensors(self) -> dict[str, Tensor]:
+        """Return copies of the policy's weights, by their names in a saved policy."""
+        tensors = {
+            name: value.detach().clone() for name, value in self.state_dict().items() if name.startswith(_POLICY)
+        }
+        log_std = self.log_std if hasattr(self, "log_std") else self.std.log()
+        return {**tensors, "log_std": log_std.detach().clone()}
+
+    def load_policy_tensors(self, policy: Mapping[str, Tensor]) -> None:
+        """Load the weights returned by `policy_tensors()`."""
+        weights = self.state_dict()
+        weights |= {name: policy[name] for name in weights if name.startswith(_POLICY)}
+        self.load_state_dict(weights)
+        with torch.no_grad():
+            if hasattr(self, "log_std"):
+                self.log_std.copy_(policy["log_std"])
+            else:
+                self.raw_std.copy_(policy["log_std"].exp())
+
+
+def unroll(lstm: Lstm, obs: Tensor, episode_start: Tensor, state: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Run an LSTM over several steps; its hidden state is zero where an episode starts.
+
+    Args:
+        lstm: the module.
+        obs: its inputs. (steps, n, d)
+        episode_start: 1 at the first step of an episode. (steps, n)
+        state: hidden state before the first step. (n, m)
+
+    Returns:
+        The outputs, (steps, n, cells), and the hidden state after each step, (n, m) each.
+    """
+    outputs, states = [], []
+    for step_obs, start in zip(obs, episode_start, strict=True):
+        output, state = lstm(step_obs, state * (1.0 - start)[:, None])
+        outputs.append(output)
+        states.append(state)
+    return torch.stack(outputs), states
+
+
+class ValueNormalizer(Normalizer):
+    """Running mean and variance of returns, starting from a count of 1 with mean 0 and variance 1."""
+
+    def __init__(self) -> None:
+        super().__init__(())
+        self.count.fill_(1.0)
+
+    def forward(self, value: Tensor) -> Tensor:
+        """Normalise returns."""
+        return ((value - self.mean.float()) / self._std).clamp(-_VALUE_CLIP, _VALUE_CLIP)
+
+    def inverse(self, value: Tensor) -> Tensor:
+        """Turn normalised values back into returns."""
+        return value.clamp(-_VALUE_CLIP, _VALUE_CLIP) * self._std + self.mean.float()
+
+    @property
+    def _std(self) -> Tensor:
+        return (self.var.float() + _VALUE_EPS).sqrt()
+
+
+def flatten(module: nn.Module) -> tuple[nn.Parameter, Tensor, dict[str, slice]]:
+    """Make a module's parameters views of one vector.
+
+    Returns:
+        The vector, its gradient with room for one more number behind it, and the slice of each parameter.
+    """
+    parameters = dict(module.named_parameters())
+    vector = nn.Parameter(torch.cat([value.detach().flatten() for value in parameters.values()]))
+    gradient = torch.zeros(len(vector) + 1, device=vector.device)
+    vector.grad = gradient[:-1]
+    places, start = {}, 0
+    for name, parameter in parameters.items():
+        place = slice(start, start + parameter.numel())
+        parameter.data = vector.data[place].view_as(parameter)
+        places[name], start = place, place.stop
+    return vector, gradient, places
+
+
+def adam(vector: nn.Parameter, learning_rate: Tensor, eps: float) -> Adam:
+    """Return an Adam optimiser whose state is allocated, since a captured step must not allocate it."""
+    optimizer = Adam([vector], lr=learning_rate, eps=eps, fused=True, capturable=vector.is_cuda)
+    optimizer.step()  # the gradient is zero: no parameter changes
+    optimizer.state[vector]["step"].zero_()
+    return optimizer
+
+
+def _mlp(inputs: int, config: NetworkConfig, outputs: int, init: str, gain: float) -> Mlp:
+    layers: list[nn.Module] = []
+    for width in config.hidden:
+        layers += [_linear(inputs, width, init, math.sqrt(2.0)), _activation(config.activation)]
+        inputs = width
+    return Mlp(*layers, _linear(inputs, outputs, init, gain))
+
+
+def _make_cnn(spec: VisionSpec | None, columns: int, config: NetworkConfig, init: str) -> tuple[Vision | None, int]:
+    """Return the CNN, if there are images, and the number of columns that the MLP behind it reads."""
+    if spec is None:
+        return None, columns
+    vision = Vision(spec, ACTIVATIONS[config.activation])
+    for layer in vision.modules():
+        if isinstance(layer, nn.Conv2d):
+            _initialize(layer, init, math.sqrt(2.0))
+    return vision, spec.features(columns)
+
+
+def _activation(name: str) -> nn.Module:
+    """Return an activation, in place where the gradient needs only its result."""
+    return ACTIVATIONS[name](inplace=True) if name in ("elu", "relu") else ACTIVATIONS[name]()
+
+
+def _linear(inputs: int, outputs: int, init: str, gain: float) -> nn.Linear:
+    layer = nn.Linear(inputs, outputs)
+    _initialize(layer, init, gain)
+    return layer
+
+
+def _initialize(layer: nn.Linear | nn.Conv2d, init: str, gain: float) -> None:
+    """Set the initial weights, where they are not torch's."""
+    if init == "orthogonal":
+        nn.init.orthogonal_(layer.weight, gain)
+    if init != "default":
+        assert layer.bias is not None
+        nn.init.zeros_(layer.bias)

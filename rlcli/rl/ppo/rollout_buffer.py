@@ -1,0 +1,119 @@
+"""Buffer of a rollout's samples, preallocated on the device and written in place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rlcli.sim.state_cache import is_finite
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Columns of one packed array, so that a minibatch is a single gather. (..., d) each, scalars (...)"""
+
+    obs: Tensor
+    """Observation, as the actor's network reads it."""
+    critic_obs: Tensor
+    """Observation, as the critic's network reads it."""
+    action: Tensor
+    """Sampled action, before it is clipped to a bound."""
+    mean: Tensor
+    """Mean of the distribution that the action was sampled from."""
+    log_prob: Tensor
+    value: Tensor
+    advantage: Tensor
+    target: Tensor
+    """Regression target of the critic: advantage + value."""
+    episode_start: Tensor
+    """1 at the first step of an episode, 0 elsewhere."""
+
+    @classmethod
+    def views(cls, packed: Tensor, obs: int, critic_obs: int, action: int) -> Samples:
+        """Return the columns of `packed`; with a `critic_obs` of 0 the critic reads the actor's observation."""
+        parts = packed.split_with_sizes([obs, critic_obs, action, action, 1, 1, 1, 1, 1], dim=-1)
+        scalars = [part.squeeze(-1) for part in parts[4:]]
+        return cls(parts[0], parts[1] if critic_obs else parts[0], parts[2], parts[3], *scalars)
+
+
+class RolloutBuffer:
+    """`num_steps` of every environment, and the same samples in the order of the minibatches.
+
+    Args:
+        steps: steps of every environment.
+        envs: number of environments.
+        sizes: columns of the actor's observation, of the critic's (0: the same) and of the action.
+        minibatches: number of samples of each minibatch.
+        whole_envs: whether a minibatch holds all steps of its environments.
+        device: device of all tensors.
+    """
+
+    def __init__(
+        self,
+        steps: int,
+        envs: int,
+        sizes: tuple[int, int, int],
+        minibatches: list[int],
+        whole_envs: bool,
+        device: torch.device,
+    ) -> None:
+        obs, critic_obs, action = sizes
+        self._packed = torch.zeros(steps, envs, obs + critic_obs + 2 * action + 5, device=device)
+        self._ordered = torch.zeros(self._packed.shape[0] * envs, self._packed.shape[2], device=device)
+        self.samples = Samples.views(self._packed, *sizes)
+        """(num_steps, num_envs, ...)"""
+        self.minibatches = [Samples.views(part, *sizes) for part in self._ordered.split_with_sizes(minibatches)]
+        """(n, ...) each"""
+        self.old_std = torch.ones(len(minibatches), action, device=device)
+        """Standard deviation of the old policy, whose mean is `mean`, by minibatch."""
+        self.reward = torch.zeros(steps, envs, device=device)
+        self.done = torch.zeros(steps, envs, device=device)
+        """1 where the step ended the episode, by termination or truncation."""
+        self.time_out = torch.zeros(steps, envs, dtype=torch.bool, device=device)
+        """Where the episode was truncated and not terminated."""
+        self.final_obs = torch.zeros(steps, envs, critic_obs or obs, device=device)
+        """The episode's last observation, as the critic's network reads it; valid at time-outs."""
+        self._indices = torch.arange(steps * envs, device=device).view(steps, envs)
+        self.by_environment = self._indices.T.flatten()
+        """Order in which the samples of an environment follow each other."""
+        parts = self._indices[0].split_with_sizes([size // steps for size in minibatches]) if whole_envs else ()
+        self.environments = [part.clone() for part in parts]
+        """Environments of each minibatch, with `whole_envs`. (n,) each"""
+
+    def is_finite(self) -> bool:
+        """Return whether all samples are finite."""
+        return is_finite(self._packed)
+
+    def in_causal_order(self) -> list[tuple[str, Tensor]]:
+        """Return all tensors with their names, each after those it is computed from. (num_steps, num_envs, ...)"""
+        samples = self.samples
+        return [
+            ("the observation, as the actor sees it,", samples.obs),
+            ("the mean action", samples.mean),
+            ("the action", samples.action),
+            ("the action's log-probability", samples.log_prob),
+            ("the reward", self.reward),
+            ("the observation, as the critic sees it,", samples.critic_obs),
+            (
+                "the last observation, as the critic sees it,",
+                torch.where(self.time_out[..., None], self.final_obs, 0.0),
+            ),
+            ("the value", samples.value),
+            ("the advantage", samples.advantage),
+            ("the value's target", samples.target),
+        ]
+
+    def order_by_environment(self, environments: Tensor) -> Tensor:
+        """Assign `environments` to the minibatches; return the order of samples, step 0 of a minibatch first."""
+        order, start = [], 0
+        for own in self.environments:
+            own.copy_(environments[start : start + len(own)])
+            order.append(self._indices.index_select(1, own).flatten())
+            start += len(own)
+        return torch.cat(order)
+
+    def fill_minibatches(self, order: Tensor) -> None:
+        """Copy the samples into the minibatches; sample (t, env) has index t * num_envs + env."""
+        torch.index_select(self._packed.view(self._ordered.shape), 0, order, out=self._ordered)

@@ -1,0 +1,134 @@
+"""Stable-Baselines3's algorithms with rollouts that stay in torch: SB3's updates, rlcli's collection.
+
+Only public hooks are used: buffers passed to the constructors, `collect_rollouts` and `train`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from torch import Tensor
+
+from rlcli.envs.vec_env import VecEnv
+from rlcli.rl.policy import Normalizer
+from rlcli.rl.sb3.buffers import TorchReplayBuffer, TorchRolloutBuffer
+from rlcli.rl.statistics import EpisodeStatistics
+
+
+class _Collecting:
+    """Attributes of every collecting algorithm, set once the model is built."""
+
+    source: VecEnv
+    statistics: EpisodeStatistics
+    normalizer: Normalizer | None
+    reward_scale: float
+    action_bound: float | None
+
+    def _normalized(self, obs: Tensor, update: bool) -> Tensor:
+        if self.normalizer is None:
+            return obs
+        if update:
+            self.normalizer.update(obs)
+        normalized: Tensor = self.normalizer(obs)
+        return normalized
+
+
+class _OnPolicy(_Collecting):
+    """On-policy collection; one call of the critic bootstraps all time-outs of a step."""
+
+    rollout_buffer: TorchRolloutBuffer
+    policy: Any
+    gamma: float
+    num_timesteps: int
+    _last_obs: Any
+    _last_episode_starts: Any
+
+    def collect_rollouts(self, env: object, callback: object, rollout_buffer: object, n_rollout_steps: int) -> bool:
+        """Fill the buffer with `n_rollout_steps` of every environment."""
+        buffer, source, policy, bound = self.rollout_buffer, self.source, self.policy, self.action_bound
+        policy.set_training_mode(False)
+        buffer.reset()
+        obs, start = torch.as_tensor(self._last_obs), torch.as_tensor(self._last_episode_starts)
+        done = start
+        with torch.inference_mode():
+            for _ in range(n_rollout_steps):
+                normalized = self._normalized(obs, update=True)
+                action, value, log_prob = policy(normalized)
+                result = source.step(action if bound is None else action.clamp(-bound, bound))
+                reward = result.reward * self.reward_scale
+                if result.final_obs is not None:
+                    timed_out = (result.truncated & ~result.terminated).nonzero().squeeze(1)
+                    final = self._normalized(result.final_obs["policy"].index_select(0, timed_out), update=False)
+                    reward.index_add_(0, timed_out, policy.predict_values(final).flatten(), alpha=self.gamma)
+                buffer.put(normalized, action, reward, start, value.flatten(), log_prob)
+                self.statistics.add(result.episodes)
+                done = result.terminated | result.truncated
+                obs, start = result.obs["policy"], done
+            buffer.finish(policy.predict_values(self._normalized(obs, update=False)).flatten(), done)
+        self.num_timesteps += n_rollout_steps * source.num_envs
+        self._last_obs = obs.numpy()
+        self._last_episode_starts = start.numpy()
+        return True
+
+
+class FastPPO(_OnPolicy, PPO):  # type: ignore[misc]
+    """SB3's PPO."""
+
+
+class FastA2C(_OnPolicy, A2C):  # type: ignore[misc]
+    """SB3's A2C."""
+
+
+class _OffPolicy(_Collecting):
+    """Off-policy collection. Actions in the buffer are in [-1, 1]; the environment receives them times the bound."""
+
+    replay_buffer: TorchReplayBuffer
+    actor: Any
+    learning_starts: int
+    num_timesteps: int
+    exploration_noise: float
+    _last_obs: Any
+
+    def collect(self, steps: int) -> None:
+        """Step every environment `steps` times into the replay buffer; random actions before `learning_starts`."""
+        assert self.action_bound is not None
+        source, buffer = self.source, self.replay_buffer
+        self.policy.set_training_mode(False)  # type: ignore[attr-defined]
+        obs = torch.as_tensor(self._last_obs)
+        with torch.inference_mode():
+            for _ in range(steps):
+                normalized = self._normalized(obs, update=True)
+                if self.num_timesteps < self.learning_starts:
+                    action = torch.rand(source.num_envs, source.layout.action_size) * 2.0 - 1.0
+                else:
+                    action = self._explore(normalized)
+                result = source.step(action * self.action_bound)
+                following = result.obs["policy"]
+                if result.final_obs is not None:
+                    timed_out = result.truncated & ~result.terminated
+                    following = torch.where(timed_out[:, None], result.final_obs["policy"], following)
+                buffer.put(obs, following, action, result.reward * self.reward_scale, result.terminated)
+                self.statistics.add(result.episodes)
+                obs = result.obs["policy"]
+                self.num_timesteps += source.num_envs
+        self._last_obs = obs.numpy()
+
+    def _explore(self, normalized: Tensor) -> Tensor:
+        action: Tensor = self.actor(normalized)  # SAC's samples; the others' are deterministic
+        if not self.exploration_noise:
+            return action
+        return (action + self.exploration_noise * torch.randn_like(action)).clamp_(-1.0, 1.0)
+
+
+class FastSAC(_OffPolicy, SAC):  # type: ignore[misc]
+    """SB3's SAC."""
+
+
+class FastTD3(_OffPolicy, TD3):  # type: ignore[misc]
+    """SB3's TD3."""
+
+
+class FastDDPG(_OffPolicy, DDPG):  # type: ignore[misc]
+    """SB3's DDPG."""

@@ -1,0 +1,95 @@
+"""A `VecEnv` with the interface of Stable-Baselines3: numpy arrays and one info dict per environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv as Sb3Base
+
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv
+
+UNBOUNDED = 1e6
+"""Action bound that stands for none: SB3 requires a finite one."""
+
+
+class Sb3VecEnv(Sb3Base):
+    """The policy group of a `VecEnv`. Environments whose episode goes on share one empty info.
+
+    Args:
+        env: the environment.
+        action_bound: limits of the action space; None for unbounded.
+    """
+
+    def __init__(self, env: VecEnv, action_bound: float | None = 1.0) -> None:
+        self.env = env
+        bound = UNBOUNDED if action_bound is None else action_bound
+        super().__init__(
+            env.num_envs,
+            spaces.Box(-np.inf, np.inf, (env.layout.size("policy"),), np.float32),
+            spaces.Box(-bound, bound, (env.layout.action_size,), np.float32),
+        )
+        self._empty_info: dict[str, Any] = {}
+        self._action = torch.zeros(env.num_envs, env.layout.action_size)
+
+    def reset(self) -> np.ndarray:
+        """Start new episodes in all environments, once with the seed set by `seed`. (num_envs, d)"""
+        seed = self._seeds[0]
+        self._reset_seeds()
+        return self.env.reset(seed=seed)["policy"].numpy()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Store the actions of the next step. (num_envs, a)"""
+        self._action = torch.as_tensor(actions, dtype=torch.float32)
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Step; see SB3's `VecEnv.step`."""
+        result = self.env.step(self._action)
+        dones = (result.terminated | result.truncated).numpy()
+        return result.obs["policy"].numpy(), result.reward.numpy(), dones, self._infos(result)
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return the attribute of the batched environment, once per index."""
+        value = None if attr_name == "render_mode" else getattr(self.env, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
+        """Set an attribute of the batched environment."""
+        setattr(self.env, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Call a method of the batched environment, once."""
+        value = getattr(self.env, method_name)(*args, **kwargs)
+        return [value for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """Return False for every index: no environment is wrapped."""
+        return [False for _ in self._get_indices(indices)]
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seed of the next reset; every environment derives its own stream from it."""
+        self._seeds = [seed] * self.num_envs
+        return self._seeds
+
+    def _infos(self, result: StepResult) -> list[dict[str, Any]]:
+        infos = [self._empty_info] * self.num_envs
+        if result.episodes is not None and result.final_obs is not None:
+            final = result.final_obs["policy"].numpy()
+            ended = result.episodes.ended()
+            for row, env in enumerate(ended.ids.tolist()):
+                infos[env] = {
+                    "terminal_observation": final[env].copy(),
+                    "TimeLimit.truncated": bool(ended.truncated[row]),
+                    "episode": {"r": float(ended.returns[row]), "l": int(ended.lengths[row])},
+                }
+                if ended.success is not None:
+                    infos[env]["is_success"] = bool(ended.success[row])
+        return infos

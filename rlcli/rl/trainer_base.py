@@ -1,0 +1,99 @@
+"""Base class of trainers: what every trainer does in the same way, whichever library learns."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from importlib import metadata
+
+import torch
+from torch import Tensor
+
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import ConfigError, DependencyError
+from rlcli.rl.policy import Policy, PolicySpec
+from rlcli.rl.statistics import EpisodeStatistics
+from rlcli.rl.trainer import Report
+
+_RECENT_OBS = 256
+"""Recent observations that a checkpoint keeps, for comparing an exported policy with the trained one."""
+
+
+class BaseTrainer(ABC):
+    """Environment, episode statistics, recent observations and report of a trainer.
+
+    Args:
+        env: the environment.
+        torch_threads: threads of the update; the rollout runs torch on one thread, since two thread pools compete.
+    """
+
+    spec: PolicySpec
+
+    def __init__(self, env: VecEnv, torch_threads: int) -> None:
+        self.env, self.torch_threads = env, torch_threads
+        env.final_obs_of = "truncated"
+        self.statistics = EpisodeStatistics(env.config.episode_length_s)
+        self._recent_obs = torch.zeros(0, env.layout.size("policy"), device=env.device)
+
+    @abstractmethod
+    def _policy_tensors(self) -> dict[str, Tensor]:
+        """Return copies of the policy's weights, by their names in a saved policy."""
+
+    def policy(self) -> Policy:
+        """Return the deployable policy as it is now, with weights of its own."""
+        policy = Policy(self.spec)
+        policy.load_state_dict(self._policy_tensors())
+        return policy.eval().requires_grad_(False)
+
+    def _keep_recent_obs(self, obs: Tensor) -> None:
+        """Put the newest observations of the policy before the recent ones. (num_envs, d)"""
+        self._recent_obs = torch.cat([obs[:_RECENT_OBS], self._recent_obs])[:_RECENT_OBS]
+
+    def _split_seconds(self, before: Mapping[str, float], rollout: float, update: float) -> dict[str, float]:
+        """Return the seconds of an iteration by part.
+
+        Args:
+            before: `env.seconds` at the beginning of the iteration.
+            rollout: seconds of the rollout.
+            update: seconds of the update.
+        """
+        physics, step = (self.env.seconds[name] - before[name] for name in ("physics", "step"))
+        return {"physics": physics, "task": step - physics, "policy": rollout - step, "update": update}
+
+    def _report(self, losses: Mapping[str, float], seconds: dict[str, float]) -> Report:
+        """Return the report of an iteration: episode statistics, the task's own numbers and the losses."""
+        return Report({**self.statistics.flush(), **finite_values(self.env.extras()), **losses}, seconds)
+
+
+def finite_values(metrics: Mapping[str, float]) -> dict[str, float]:
+    """Return the metrics whose value is finite."""
+    return {name: value for name, value in metrics.items() if math.isfinite(value)}
+
+
+def agent_error(env: VecEnv, path: tuple[str, ...], message: str, hint: str) -> ConfigError:
+    """Return the error for a key of the agent's configuration that does not fit the environment."""
+    return ConfigError([env.resolved.problem(("agents", env.resolved.agent_name or "", *path), message, hint)])
+
+
+def require_library(trainer: str, needed: str, at_least: tuple[int, int], below: tuple[int, int]) -> None:
+    """Check the version of the library that a trainer needs.
+
+    Args:
+        trainer: name of the trainer.
+        needed: the requirement, as pip reads it.
+        at_least: lowest version, major and minor.
+        below: lowest version that is too new.
+
+    Raises:
+        DependencyError: if the library is missing or has another version.
+    """
+    distribution = needed.partition(">")[0]
+    try:
+        version = metadata.version(distribution).split(".")[:2]
+        fits, found = at_least <= tuple(map(int, version)) < below, f"{distribution} {'.'.join(version)} is"
+    except metadata.PackageNotFoundError:
+        fits, found = False, f"{distribution} is not"
+    if not fits:
+        message = f"trainer '{trainer}' needs {needed}, and {found} installed"
+        raise DependencyError(message, hint=f"pip install '{needed}'")

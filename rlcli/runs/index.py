@@ -1,0 +1,290 @@
+"""States and scores of the runs in a folder, from their files alone: fast for thousands, safe for untrusted ones."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from rlcli.errors import CheckpointError
+from rlcli.runs.metric_rows import is_number, parse_row
+from rlcli.runs.run import CONFIG, RECORD, STUDY, WAITING, Run, is_locked, open_run
+from rlcli.runs.safe_io import read_tail
+
+ENDED = {"finished", "stopped", "diverged", "failed"}
+"""States that a run says of itself when it ends; one that says `running` and is not locked was interrupted."""
+_TAIL = 32 * 1024
+_ROWS = 20
+"""Of the newest rows, how many are looked at."""
+_LONGEST_ROW = 1024**2
+_MOST_ROWS = 64 * 1024**2
+"""Bytes of the metrics that are searched for one row."""
+_MOST_FILES = 20_000
+_BEGINNING_S = 5.0
+"""A run that is so young may not have its lock yet."""
+
+
+@dataclass(slots=True)
+class Overview:
+    """One run, or a folder in a run's place."""
+
+    folder: Path
+    task: str
+    state: str
+    """running, waiting, finished, stopped, interrupted, diverged, failed, or broken."""
+    reason: str | None = None
+    """Why it is not in order, where that is known."""
+    resumable: bool = False
+    iteration: int | None = None
+    iterations: int | None = None
+    """Iterations in all."""
+    step: int | None = None
+    last: dict[str, float] = field(default_factory=dict)
+    """`return` and `success` of the newest iteration in which episodes ended."""
+    best: dict[str, float] = field(default_factory=dict)
+    """`step`, `return` and `success` of the best evaluation between iterations."""
+    evaluation: dict[str, Any] = field(default_factory=dict)
+    """`step`, `episodes`, `return` and `success` of the newest checkpoint that `rlcli eval` has looked at."""
+    started: str | None = None
+    age_s: float | None = None
+    """Since it was started."""
+    duration_s: float | None = None
+    """For how long it has trained, over all its resumptions."""
+    size_bytes: int = 0
+    agent: str | None = None
+    seed: int | None = None
+    tags: dict[str, Any] = field(default_factory=dict)
+    """What else sets it apart: device, processes, what its weights are from, its loggers."""
+
+    def document(self) -> dict[str, Any]:
+        """As plain JSON."""
+        names = [name for name in self.__slots__ if name not in ("folder",)]
+        return {"run": str(self.folder), **{name: getattr(self, name) for name in names}}
+
+
+def overviews(runs_dir: Path, task: str | None = None) -> list[Overview]:
+    """All runs under a folder, newest first, those that are broken last.
+
+    Args:
+        runs_dir: the folder of runs.
+        task: only those of this task.
+    """
+    found = [overview(folder) for folder in _folders(runs_dir)]
+    chosen = [run for run in found if task is None or run.task == task]
+    return sorted(chosen, key=lambda run: (run.started or "", run.folder.name), reverse=True)
+
+
+def overview(folder: Path) -> Overview:
+    """Return the overview of a folder; what is wrong with it is its reason."""
+    try:
+        run = open_run(folder)
+    except (CheckpointError, OSError) as error:
+        if _is_new(folder):
+            return Overview(folder, folder.parent.name, "running", "it is being created", age_s=0.0)
+        message = getattr(error, "message", None) or getattr(error, "strerror", None) or str(error)
+        return Overview(folder, folder.parent.name, "broken", message, size_bytes=_size(folder))
+    return overview_of(run)
+
+
+def overview_of(run: Run) -> Overview:
+    """Return the overview of an opened run."""
+    record = run.record
+    state, reason = state_of(run)
+    overview = Overview(
+        run.folder,
+        record["task"]["name"],
+        state,
+        reason,
+        resumable=state != "running" and _resumable(run),
+        iterations=count(record.get("iterations")),
+        started=record.get("started"),
+        size_bytes=_size(run.folder),
+        agent=record.get("agent"),
+        seed=record["seed"],
+        tags=_tags(record),
+    )
+    newest: dict[str, Any] = {}
+    for row in _backwards(run):
+        newest = newest or row
+        overview.last = _score(row, "Train/")
+        if overview.last:  # not in every iteration do episodes end
+            break
+    overview.iteration, overview.step = (count(newest.get(key, record.get(key))) or 0 for key in ("iteration", "step"))
+    if state == "finished" and overview.iterations is None:
+        overview.iterations = overview.iteration
+    best = record.get("best")
+    if best is not None:
+        overview.best = {"step": best, **_score(_row_at(run, best), "Eval/")}
+    overview.evaluation = _evaluation(run)
+    overview.age_s, overview.duration_s = times(run)
+    if not (run.folder / CONFIG).is_file():
+        overview.state, overview.reason, overview.resumable = "broken", f"it has no {CONFIG}", False
+    return overview
+
+
+def state_of(run: Run) -> tuple[str, str | None]:
+    """Return the state of a run, and the reason where it failed or diverged."""
+    recorded = run.record.get("state", "")
+    why = run.record.get("reason")
+    reason = why if isinstance(why, str) and recorded in ("diverged", "failed") else None
+    if is_locked(run.folder) or (recorded == "running" and _age(run.record.get("started")) < _BEGINNING_S):
+        return "running", None
+    if recorded in ENDED or recorded == WAITING:
+        return recorded, reason
+    if recorded == "running":
+        return "interrupted", "its process ended without a word: a kill, or the machine"
+    return "broken", f"{RECORD} says state '{recorded[:40]}'"
+
+
+def newest_rows(run: Run) -> list[dict[str, Any]]:
+    """The newest rows of `metrics.jsonl`, oldest first."""
+    return [*_backwards(run)][::-1]
+
+
+def _backwards(run: Run) -> Iterator[dict[str, Any]]:
+    """The newest rows, newest first, read one by one; a line that is no row is passed over."""
+    for size in (_TAIL, 2 * _LONGEST_ROW):
+        try:
+            data, whole = read_tail(run.metrics, size)
+        except (OSError, CheckpointError):
+            return
+        lines = data.split(b"\n")[0 if whole else 1 : -1]  # what is after the last newline is being written
+        if lines:
+            break
+    yield from (row for line in lines[: -_ROWS - 1 : -1] if (row := _row(line)) is not None)
+
+
+def _is_new(folder: Path) -> bool:
+    """Whether a folder may be that of a run which is just being created: its run.json comes last."""
+    try:
+        young = time.time() - folder.stat().st_mtime < _BEGINNING_S
+        return young and not {RECORD, "metrics.jsonl"} & set(os.listdir(folder))
+    except OSError:
+        return False
+
+
+def _folders(runs_dir: Path) -> Iterator[Path]:
+    """What stands in a run's place: the folders of the folders, those with a dot left out."""
+    for task in _subfolders(runs_dir):
+        for folder in _subfolders(task):
+            if (folder / STUDY).is_file():
+                yield from _subfolders(folder)
+            else:
+                yield folder
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    try:
+        with os.scandir(folder) as entries:
+            return [Path(entry.path) for entry in entries if not entry.name.startswith(".") and entry.is_dir()]
+    except OSError:
+        return []
+
+
+def _row(line: bytes) -> dict[str, Any] | None:
+    row = parse_row(line)
+    if row is None or any(count(row[key]) is None for key in ("iteration", "step")):
+        return None
+    return {name: value for name, value in row.items() if is_number(value)}
+
+
+def _row_at(run: Run, step: int) -> dict[str, Any]:
+    """The row of one step; nothing if it is not there."""
+    try:
+        data, _ = read_tail(run.metrics, _MOST_ROWS)
+    except (OSError, CheckpointError):
+        return {}
+    at = data.find(f'"step": {step},'.encode())
+    line = b"" if at < 0 else data[data.rfind(b"\n", 0, at) + 1 : data.find(b"\n", at)]
+    return _row(line) or {}
+
+
+def _score(row: Mapping[str, Any], prefix: str) -> dict[str, float]:
+    names = {"return": f"{prefix}mean_reward", "success": f"{prefix}success_rate"}
+    return {word: float(row[name]) for word, name in names.items() if name in row}
+
+
+def _evaluation(run: Run) -> dict[str, Any]:
+    try:
+        names = sorted(name for name in os.listdir(run.folder / "evaluations") if name.endswith(".json"))
+    except OSError:
+        return {}
+    from rlcli.runs.eval_store import read_evaluation  # only where there is one: it takes longer than all the rest
+
+    for name in names[: -_ROWS - 1 : -1]:
+        try:
+            found = read_evaluation(run, name.removesuffix(".json"))
+        except CheckpointError:
+            continue
+        if found is not None:
+            score = {"step": int(name.removesuffix(".json")), "episodes": found["episodes"]}
+            score["return"] = found["return"]["mean"]
+            return score | ({"success": found["success"]["rate"]} if "success" in found else {})
+    return {}
+
+
+def count(value: object) -> int | None:
+    """Return a value of untrusted JSON if it is a count; else None."""
+    return value if type(value) is int and 0 <= value < 2**63 else None
+
+
+def times(run: Run) -> tuple[float | None, float | None]:
+    """Return the age of a run, and how long it has trained [s]."""
+    age = _age(run.record.get("started"))
+    if not math.isfinite(age):
+        return None, None
+    before, since = run.record.get("trained_s"), run.record.get("since")
+    trained = max(0.0, float(before)) if type(before) is float and math.isfinite(before) else 0.0
+    if run.record.get("state") in ENDED and before is not None:
+        return age, trained
+    try:
+        written = run.metrics.stat().st_mtime
+    except OSError:
+        return age, trained
+    begin = _age(since if isinstance(since, str) else run.record.get("started"))
+    return age, trained + max(0.0, written - (time.time() - begin))
+
+
+def _age(stamp: Any) -> float:
+    """Seconds since a time stamp; without end for what is none."""
+    try:
+        return max(0.0, time.time() - datetime.fromisoformat(stamp).timestamp())
+    except (TypeError, ValueError, OverflowError, OSError):
+        return math.inf
+
+
+def _resumable(run: Run) -> bool:
+    """Whether there is a checkpoint to go on from, or the run never came to its first."""
+    try:
+        names = os.listdir(run.checkpoints)
+    except OSError:
+        return False
+    have = any(name.isdigit() and os.path.isfile(run.checkpoints / name / "manifest.json") for name in names)
+    return have or "step" not in run.record
+
+
+def _tags(record: Mapping[str, Any]) -> dict[str, Any]:
+    tags = {name: record.get(name) for name in ("device", "processes", "init_from", "loggers", "video_every")}
+    return {name: value for name, value in tags.items() if value and isinstance(value, str | int | list)}
+
+
+def _size(folder: Path) -> int:
+    """Bytes of the files in a folder, links not followed."""
+    total, visited, pending = 0, 0, [str(folder)]
+    while pending and visited < _MOST_FILES:
+        try:
+            with os.scandir(pending.pop()) as entries:
+                for entry in entries:
+                    visited += 1
+                    if entry.is_dir(follow_symlinks=False):
+                        pending.append(entry.path)
+                    elif entry.is_file(follow_symlinks=False):
+                        total += entry.stat(follow_symlinks=False).st_size
+        except OSError:
+            continue
+    return total

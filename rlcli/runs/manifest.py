@@ -1,0 +1,294 @@
+"""What a checkpoint's manifest says of the environment that its policy was trained in, read as a stranger's."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Self
+
+from pydantic import ConfigDict, Field, JsonValue, model_validator
+
+from rlcli.errors import CheckpointError
+from rlcli.rl.policy import Policy
+from rlcli.runs.checkpoint import Checkpoint
+from rlcli.runs.safe_io import FileModel, check_json
+
+Name = Annotated[str, Field(max_length=1000)]
+Columns = Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(max_length=100_000)]
+Numbers = Annotated[list[float], Field(max_length=100_000)]
+
+
+OPS = {
+    "add": 2, "sub": 2, "mul": 2, "div": 2, "clip": 3, "take": 2, "cat": None, "dot": 2, "cross": 2, "sqrt": 1,
+    "rotate": 2, "unrotate": 2, "product": 2, "inverse": 1, "unique": 1, "asin": 1, "angle": 1, "wrap": 1, "below": 4,
+    "filter": 1,
+}  # fmt: skip
+"""Operations of formulas -> how many values they take."""
+FIELDS = {
+    "qpos", "qvel", "xpos", "xquat", "site_xpos", "cvel", "subtree_com", "sensordata", "qfrc_actuator", "mocap_pos",
+    "mocap_quat",
+}  # fmt: skip
+"""Fields of MjData that formulas read."""
+_NO_LAYOUT = "checkpoints of this rlcli say what the policy's columns are: train again"
+_GIVEN = re.compile(r"last_action|steps|action|command|(command|observation)/.{1,1000}", re.DOTALL)
+
+
+def check_formula(value: Any) -> None:
+    """What a file says is a formula, and nothing else.
+
+    Raises:
+        ValueError: where it is not.
+    """
+    if isinstance(value, list):
+        if not all(type(item) in (int, float) for item in value):
+            raise ValueError("a constant is a list of numbers")
+        return
+    keys = set(value) if isinstance(value, dict) else set()
+    at = value.get("at", []) if isinstance(value, dict) else []
+    if not isinstance(at, list) or not all(type(i) is int and 0 <= i < 2**31 for i in at):
+        raise ValueError("at is a list of positions")
+    if keys == {"field", "at"} and value["field"] in FIELDS:
+        return
+    if keys in ({"given"}, {"given", "at"}) and isinstance(value["given"], str) and _GIVEN.fullmatch(value["given"]):
+        return
+    if not isinstance(value, dict):
+        raise ValueError(f"no formula: {str(value)[:60]}")
+    own = {"b", "a", "key"} if value.get("op") == "filter" else set()
+    if keys != {"op", "of"} | own or not isinstance(value["op"], str) or value["op"] not in OPS:
+        raise ValueError(f"no formula: {str(value)[:60]}")
+    count, of = OPS[value["op"]], value["of"]
+    if not isinstance(of, list) or (count is not None and len(of) != count) or not of:
+        raise ValueError(f"'{value['op']}' takes {count or 'some'} values")
+    if own and not (isinstance(value["key"], str) and all(_are_numbers(value[key]) for key in "ab") and value["b"]):
+        raise ValueError("a filter has weights b and a, and a key")
+    for part in of:
+        check_formula(part)
+
+
+def _are_numbers(values: object) -> bool:
+    return isinstance(values, list) and all(type(value) in (int, float) for value in values)
+
+
+def _is_external_input(value: object) -> bool:
+    return isinstance(value, dict) and set(value) == {"given"} and str(value["given"]).startswith("observation/")
+
+
+class _Record(FileModel):
+    model_config = ConfigDict(extra="forbid", strict=False)
+
+
+class _Columns(_Record):
+    """Columns of a term, as the checkpoint's layout has them."""
+
+    name: str
+    size: int = Field(ge=1)
+    elements: list[str]
+    unit: str
+    scale: list[float] | None
+
+    @model_validator(mode="after")
+    def _widths(self) -> Self:
+        own = ("offset", "clip", "limits") if isinstance(self, ActionColumns) else ()
+        for key in ("scale", *own):
+            values = getattr(self, key)
+            if values is not None and len(values) != self.size:
+                raise ValueError(f"{key} has {len(values)} values for {self.size} columns")
+        return self
+
+
+class ObservationColumns(_Columns):
+    """Columns of an observation term; with a history those of the oldest step first."""
+
+    clip: tuple[float, float] | None
+    history: int = Field(ge=1)
+    shape: list[int] = Field(default_factory=list)
+    """Of one step's columns, where they are a picture: (channels, rows, columns)."""
+    modifiers: list[dict[str, Any]]
+
+
+class ActionColumns(_Columns):
+    """Columns of `action` and of `command`. Without a scale the command is the action, within `clip`."""
+
+    offset: list[float] | None
+    clip: list[tuple[float | None, float | None]] | None
+    limits: list[tuple[float | None, float | None]] | None
+
+
+class LayoutRecord(_Record):
+    """The contract between a policy and its environment."""
+
+    observations: dict[str, list[ObservationColumns]]
+    actions: list[ActionColumns]
+    step_dt: float = Field(gt=0)
+    dt: float = Field(gt=0)
+    decimation: int = Field(ge=1)
+
+
+class _Formula(_Record):
+    @model_validator(mode="after")
+    def _good(self) -> Self:
+        value, closed = getattr(self, "value", None), getattr(self, "closed", False)
+        if value is not None:
+            check_formula(value)
+        if closed and value is None:
+            raise ValueError("closed, and without a formula")
+        if not closed and isinstance(self, ObservationFormula) and not _is_external_input(value):
+            raise ValueError("not closed, and yet with a formula")
+        return self
+
+
+class ObservationFormula(_Formula):
+    """How plain code computes some columns of the observation. `value` is that of one step."""
+
+    name: Name
+    func: Name
+    params: dict[str, JsonValue]
+    columns: tuple[int, int]
+    history: int = Field(ge=1)
+    closed: bool
+    value: JsonValue
+
+
+class ControlFormula(_Formula):
+    """How plain code computes some controls of the model from `action` and `command`."""
+
+    name: Name
+    func: Name
+    ctrl: Columns
+    actuators: list[Name]
+    closed: bool
+    value: JsonValue
+
+
+class CommandRecord(_Record):
+    """What is asked of the policy from outside."""
+
+    name: Name
+    func: Name
+    size: int = Field(ge=0, le=100_000)
+
+
+class JointRecord(_Record):
+    """A hinge or slide, and what drives it. Without an actuator of its kind stiffness and damping are 0."""
+
+    name: Name
+    entity: Name
+    qpos: int = Field(ge=0)
+    dof: int = Field(ge=0)
+    default: float
+    stiffness: float | None
+    damping: float | None
+
+
+class ActuatorRecord(_Record):
+    """An actuator of the model, in the order of its controls."""
+
+    name: Name
+    range: tuple[float, float] | None
+
+
+class DeploymentRecord(_Record):
+    """Everything that plain code needs to be the environment of the policy."""
+
+    joints: list[JointRecord]
+    actuators: list[ActuatorRecord]
+    observations: dict[str, list[ObservationFormula]]
+    controls: list[ControlFormula]
+    commands: list[CommandRecord]
+    start: dict[Annotated[str, Field(pattern="^(qpos|qvel)$")], Numbers]
+    forces_after_reset: bool
+    derived: Annotated[str, Field(pattern="^(current|substep)$")]
+
+
+def layout_of(checkpoint: Checkpoint, policy: Policy) -> LayoutRecord:
+    """The layout of a checkpoint, which fits its policy.
+
+    Raises:
+        CheckpointError: if it says none, or another.
+    """
+    file, spec = checkpoint.folder / "manifest.json", policy.spec
+    layout = check_json(LayoutRecord, checkpoint.manifest.get("layout"), file, "layout", hint=_NO_LAYOUT)
+    sizes = (
+        ("observations", sum(t.size for t in layout.observations.get(spec.group, [])), spec.observation_size),
+        ("actions", sum(t.size for t in layout.actions), spec.action_size),
+    )
+    for what, found, expected in sizes:
+        if found != expected:
+            raise CheckpointError(f"{file} does not fit policy.json: {found} columns of {what}, expected {expected}")
+    return layout
+
+
+def deployment_of(checkpoint: Checkpoint, policy: Policy, found: object = None) -> DeploymentRecord | None:
+    """How plain code computes what goes in and comes out; None for a checkpoint that does not know.
+
+    Args:
+        checkpoint: the checkpoint.
+        policy: its policy.
+        found: what is known from elsewhere, if the checkpoint says nothing.
+
+    Raises:
+        CheckpointError: if it makes no sense.
+    """
+    recorded = checkpoint.manifest.get("deployment", found)
+    if recorded is None:
+        return None
+    file = checkpoint.folder / "manifest.json"
+    record = check_json(DeploymentRecord, recorded, file, "deployment", hint=_NO_LAYOUT)
+    terms = record.observations.get(policy.spec.group, [])
+    end = 0
+    for begin, stop, history in ((*term.columns, term.history) for term in terms):
+        if begin != end or stop <= begin or (stop - begin) % history:
+            raise CheckpointError(f"{file}: deployment: its columns are not the policy's")
+        end = stop
+    if end != policy.spec.observation_size:
+        raise CheckpointError(f"{file}: deployment: its columns are not the policy's")
+    return record
+
+
+def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: object, randomized: bool) -> list[str]:
+    """Return the places where a checkpoint and an environment of its task describe different robots; formulas aside.
+
+    Args:
+        checkpoint: the checkpoint.
+        layout: the environment's layout, as plain JSON.
+        deployment: the environment's description, as `rlcli.deploy.env_description.describe` returns it.
+        randomized: leave out gains and the start state, which the task draws at random.
+    """
+    saved_layout, saved = checkpoint.manifest.get("layout"), checkpoint.manifest.get("deployment")
+    found = list(_differing_places(saved_layout, layout, "layout"))
+    if saved is not None:
+        before, now = (_comparable_parts(description, randomized) for description in (saved, deployment))
+        found += _differing_places(before, now, "deployment")
+    return found
+
+
+def _comparable_parts(deployment: Any, randomized: bool) -> dict[str, Any]:
+    """Return the part of a description that depends neither on the engine nor on formulas."""
+    terms = {group: [_without_values(t) for t in found] for group, found in deployment["observations"].items()}
+    rest = {key: deployment[key] for key in ("actuators", "commands", *(() if randomized else ("start",)))}
+    gains = ("default", "stiffness", "damping") if randomized else ()
+    joints = [_without_values(joint, *gains) for joint in deployment["joints"]]
+    controls = [_without_values(term) for term in deployment["controls"]]
+    return {"observations": terms, "controls": controls, "joints": joints, **rest}
+
+
+def _without_values(entry: Mapping[str, Any], *randomized: str) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if key != "value" and key not in randomized}
+
+
+def _differing_places(one: Any, other: Any, place: str) -> Iterator[str]:
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in {**one, **other}:
+            yield from _differing_places(one.get(key, _ABSENT), other.get(key, _ABSENT), f"{place}.{key}")
+    elif isinstance(one, list | tuple) and isinstance(other, list | tuple) and len(one) == len(other):
+        for number, pair in enumerate(zip(one, other, strict=True)):
+            yield from _differing_places(*pair, f"{place}.{number}")
+    elif type(one) in (int, float) and type(other) in (int, float):
+        if not math.isclose(one, other, rel_tol=1e-5, abs_tol=1e-6):  # engines keep other digits
+            yield place
+    elif one != other:
+        yield place
+
+
+_ABSENT = object()

@@ -1,0 +1,63 @@
+"""Rows of a run's `metrics.jsonl`, one for each iteration."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+from rlcli.errors import CheckpointError
+from rlcli.runs.run import Run
+
+_LONGEST_LINE = 2**20
+_MOST_BYTES = 2**30
+_LARGEST = 1e300
+"""A larger number does not count: an integer of many digits has no float."""
+
+
+def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
+    """Yield the rows, the oldest first; a last line that a kill has cut short is left out.
+
+    Args:
+        run: the run.
+        strict: raise at a corrupt line; else stop before it.
+
+    Raises:
+        CheckpointError: if the file cannot be read or is too large, or at a corrupt line.
+    """
+    size = 0
+    try:
+        with run.metrics.open("rb") as file:
+            for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), start=1):
+                size += len(line)
+                if size > _MOST_BYTES:
+                    raise CheckpointError(f"{run.metrics} is too large: at most {_MOST_BYTES:,} bytes are read")
+                if not line.endswith(b"\n") and len(line) < _LONGEST_LINE:
+                    return
+                row = parse_row(line)
+                if row is not None:
+                    yield row
+                elif strict:
+                    raise CheckpointError(f"{run.metrics}:{number} is corrupt: not an iteration's metrics")
+                else:
+                    return
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise CheckpointError(f"{run.metrics} cannot be read: {error.strerror or error}") from None
+
+
+def parse_row(line: bytes) -> dict[str, Any] | None:
+    """Return one line as a row; None if it is not an iteration's metrics."""
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(row, dict) or not all(type(row.get(key)) is int for key in ("iteration", "step")):
+        return None
+    return row
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of untrusted JSON is a finite number, and no bool."""
+    return type(value) in (int, float) and -_LARGEST < value < _LARGEST

@@ -1,0 +1,246 @@
+"""What the bits of a run depend on besides its configuration: versions, sources, processor, threads, settings."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import platform
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import rlcli
+from rlcli.errors import TaskError
+from rlcli.machine import has_onednn, processor
+from rlcli.registry import TRAINERS, find_entry, is_framework, model_file, package_folder
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from rlcli.config.load import Resolved
+
+PACKAGES = ("mujoco", "torch", "numpy", "stable-baselines3", "safetensors")
+VARIABLES = (
+    "ATEN_CPU_CAPABILITY", "CUBLAS_WORKSPACE_CONFIG", "DNNL_MAX_CPU_ISA", "GLIBC_TUNABLES",
+    "KMP_DETERMINISTIC_REDUCTION", "MKL_CBWR", "MKL_DEBUG_CPU_TYPE", "MKL_DYNAMIC", "MKL_ENABLE_INSTRUCTIONS",
+    "MKL_NUM_THREADS", "NVIDIA_TF32_OVERRIDE", "NPY_DISABLE_CPU_FEATURES", "OMP_DYNAMIC", "OMP_NUM_THREADS",
+    "OMP_SCHEDULE", "OMP_THREAD_LIMIT", "ONEDNN_DEFAULT_FPMATH_MODE", "ONEDNN_MAX_CPU_ISA", "OPENBLAS_CORETYPE",
+    "TORCH_ALLOW_TF32_CUBLAS_OVERRIDE",
+)  # fmt: skip
+"""Environment variables that choose kernels or the order of sums. No other variable is recorded."""
+ENTRIES = (
+    "rlcli", "python", "machine", "libc", "versions", "sources", "cpu", "variables", "engine_threads", "torch_threads",
+    "device", "processes", "torch", "model",
+)  # fmt: skip
+"""The entries of run.json that are compared. Its others (command, pid, platform, times) change no bit."""
+
+_ASSETS = re.compile(rb"""\bfile\s*=\s*["']([^"']{1,500})["']""")
+_FOLDERS = re.compile(rb"""\b(?:meshdir|texturedir|assetdir)\s*=\s*["']([^"']{0,500})["']""")
+_MAX_FILES = 256
+_MAX_BYTES = 64 * 1024**2
+"""Of one task: larger models are known by the hash of what they compile to."""
+
+
+def environment_record(resolved: Resolved, engine_threads: int, torch_threads: int) -> dict[str, Any]:
+    """What is known before anything heavy is imported; `built_record` is the rest."""
+    return {
+        "rlcli": rlcli.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "libc": _libc(),
+        "versions": versions(resolved),
+        "sources": sources(resolved),
+        "cpu": processor(),
+        "variables": {name: os.environ[name] for name in VARIABLES if name in os.environ},
+        "engine_threads": engine_threads,
+        "torch_threads": torch_threads,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "pid": os.getpid(),
+    }
+
+
+def built_record(model: mujoco.MjModel, device: str) -> dict[str, Any]:
+    """What is known once the environment is built: how torch computes, and the compiled model."""
+    import torch
+
+    cpu = torch.backends.cpu.get_cpu_capability()
+    settings: dict[str, Any] = {
+        "cpu_capability": cpu,
+        "mkl": torch.backends.mkl.is_available(),  # type: ignore[no-untyped-call]  # torch has no type here
+        "onednn": has_onednn() and bool(torch.backends.mkldnn.enabled),
+        "matmul_precision": torch.get_float32_matmul_precision(),
+        "deterministic": torch.are_deterministic_algorithms_enabled(),
+        "flush_denormal": _flushes_denormals(),
+    }
+    if device != "cpu":
+        settings["gpu"] = torch.cuda.get_device_name(device)
+        settings["cuda"] = torch.version.cuda
+        settings["cudnn"] = torch.backends.cudnn.version()  # type: ignore[no-untyped-call]  # torch has no type here
+    return {"torch": settings, "model": model_digest(model)}
+
+
+def versions(resolved: Resolved) -> dict[str, str]:
+    """Return versions of what computes: packages, the distributions of task, trainer and format, their requirements."""
+    found = {name: _version(name) for name in PACKAGES}
+    owners = []
+    if resolved.source.distribution:
+        owners.append(resolved.source.distribution)
+    if resolved.agent is not None and resolved.trainer and not is_framework(resolved.trainer.trainer):
+        with contextlib.suppress(TaskError):
+            owners.append(find_entry(TRAINERS, resolved.agent.trainer, what="trainer").distribution)
+    if resolved.format is not None:
+        owners.append(resolved.format.entry.distribution)
+    for owner in owners:
+        if owner.lower() == "rlcli" or owner in found:
+            continue
+        found[owner] = _version(owner)
+        for name in _requirements(owner):
+            if name.lower() != "rlcli" and (version := _version(name)):
+                found.setdefault(name, version)
+    return found
+
+
+def sources(resolved: Resolved) -> dict[str, str]:
+    """Return the sha256 of each of the task's own files, one of all of rlcli's, and one of its format's."""
+    root = resolved.source.root.resolve()
+    digests = {}
+    for file in _task_files(resolved):
+        if digest := file_digest(file):
+            digests[_label(file, root)] = digest
+    packages = {"rlcli": _sources_digest(Path(rlcli.__file__).parent)}
+    folder = package_folder(resolved.format.entry) if resolved.format is not None else None
+    if folder is not None:
+        packages[folder.name] = _sources_digest(folder)
+    return packages | dict(sorted(digests.items()))
+
+
+def file_digest(file: Path) -> str | None:
+    """sha256 of a file; None where it cannot be read."""
+    try:
+        with file.open("rb") as handle:
+            return hashlib.file_digest(handle, "sha256").hexdigest()
+    except OSError:
+        return None
+
+
+def model_digest(model: mujoco.MjModel) -> str:
+    """sha256 of the numbers of a compiled model; what is only looked at, and where its files lie, is left out."""
+    import numpy as np
+
+    digest = hashlib.sha256()
+    for name in sorted(vars(type(model))):
+        if name.startswith(("_", "tex_", "paths", "mat_", "vis", "skin_")):
+            continue
+        value = getattr(model, name, None)
+        if isinstance(value, np.ndarray):
+            digest.update(f"{name}{value.dtype}{value.shape}".encode())
+            digest.update(np.ascontiguousarray(value).tobytes())
+    for name in sorted(vars(type(model.opt))):
+        value = getattr(model.opt, name, None)
+        if isinstance(value, int | float | np.ndarray):
+            digest.update(name.encode() + np.asarray(value).tobytes())
+    return digest.hexdigest()
+
+
+def differences(was: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """Entries that both records know and that differ, as (name, was, now), flat."""
+    rows = []
+    for entry in ENTRIES:
+        if entry not in was or entry not in now:
+            continue
+        before, after = _flat(entry, was[entry]), _flat(entry, now[entry])
+        names = dict.fromkeys([*before, *after])
+        rows += [(name, before.get(name), after.get(name)) for name in names if before.get(name) != after.get(name)]
+    return rows
+
+
+def _flat(name: str, value: object) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        return {name: value}
+    return {f"{name}.{key}": item for key, item in value.items()}
+
+
+def _task_files(resolved: Resolved) -> Iterator[Path]:
+    """The task's Python files, its models and what these name, each once. Its YAML is in the run, resolved."""
+    source = resolved.source
+    wanted = [*source.term_files, *([source.task_file] if source.task_file else []), *sorted(source.root.glob("*.py"))]
+    for entity in resolved.task.scene.entities.values():
+        model = getattr(entity, "model", None)
+        if isinstance(model, str):
+            with contextlib.suppress(TaskError):
+                wanted.append(model_file(source.root, model))
+    seen: set[Path] = set()
+    left = _MAX_BYTES
+    while wanted and len(seen) < _MAX_FILES:
+        file = wanted.pop(0)
+        with contextlib.suppress(OSError, ValueError):
+            file = file.resolve()
+            size = file.stat().st_size
+            if file in seen or not file.is_file() or size > left:
+                continue
+            seen.add(file)
+            left -= size
+            yield file
+            if file.suffix == ".xml":
+                wanted += _named_by(file)
+
+
+def _named_by(model: Path) -> Iterable[Path]:
+    """The files that an MJCF names, wherever its folders may have them."""
+    text = model.read_bytes()
+    folders = ["", *(os.fsdecode(name) for name in _FOLDERS.findall(text))]
+    names = dict.fromkeys(os.fsdecode(name) for name in _ASSETS.findall(text))
+    return [model.parent / folder / name for name in names for folder in folders]
+
+
+def _sources_digest(package: Path) -> str:
+    digest = hashlib.sha256()
+    for folder, folders, files in os.walk(package):
+        folders.sort()
+        for name in sorted(files):
+            if name.endswith(".py"):
+                file = os.path.join(folder, name)
+                digest.update(os.path.relpath(file, package).replace(os.sep, "/").encode() + b"\0")
+                with contextlib.suppress(OSError), open(file, "rb") as handle:
+                    digest.update(handle.read())
+    return digest.hexdigest()
+
+
+def _label(file: Path, root: Path) -> str:
+    if file.is_relative_to(root):
+        return file.relative_to(root).as_posix()
+    return f"{file.parent.name}/{file.name}"
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+def _requirements(distribution: str) -> list[str]:
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        lines = metadata.requires(distribution) or []
+        found = [re.match(r"[A-Za-z0-9][\w.-]*", line) for line in lines if "extra ==" not in line]
+        return [match[0] for match in found if match]
+    return []
+
+
+def _libc() -> str:
+    try:
+        return os.confstr("CS_GNU_LIBC_VERSION") or ""  # mathematics that neither torch nor MuJoCo brings along
+    except (AttributeError, ValueError, OSError):
+        return ""
+
+
+def _flushes_denormals() -> bool:
+    import torch
+
+    tiny = torch.tensor([1e-310], dtype=torch.float64)
+    return float(tiny * 1.0) == 0.0

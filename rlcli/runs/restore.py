@@ -1,0 +1,211 @@
+"""From a run to an environment and a policy that fit each other: what play, eval and resume have in common."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlcli.config.load import Resolved, resolve
+from rlcli.errors import CheckpointError, TaskError
+from rlcli.registry import TASKS, TaskSource, find_entry, folder_task, installed_task, python_task
+from rlcli.rl.policy import Policy
+from rlcli.runs import trusted_tasks
+from rlcli.runs.checkpoint import Checkpoint
+from rlcli.runs.run import Run
+from rlcli.runs.safe_io import require_inside
+
+if TYPE_CHECKING:
+    from rlcli.envs.layout import Layout
+
+
+def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
+    """The task of a run: its code and models as installed, its configuration as the run recorded it.
+
+    Args:
+        run: the run.
+        named: the task that the command line names, if it does: of a task that is not installed its code is taken.
+
+    Raises:
+        TaskError: if the task is not installed any more.
+        CheckpointError: if the run names code that the user never has.
+    """
+    source = recorded_task(run.record["task"], f"the task of {run.folder}", str(run.folder), named)
+    try:
+        require_inside(run.folder, run.config)
+    except OSError as error:
+        raise CheckpointError(f"{run.config} cannot be read: {error.strerror}") from None
+    return replace(source, config=run.config)
+
+
+def recorded_task(
+    record: Mapping[str, Any], what: str, run: str | None = None, named: TaskSource | None = None
+) -> TaskSource:
+    """The task that a `TaskSource.record` stands for, as it is installed now.
+
+    Args:
+        record: the record.
+        what: how messages name the task.
+        run: the run that holds the record, if one does.
+        named: see `source_of`.
+
+    Raises:
+        TaskError: if the task is not installed any more.
+        CheckpointError: if the record names code that the user never has.
+    """
+    owner = record.get("distribution")
+    try:
+        if owner:
+            return installed_task(find_entry(TASKS, f"{owner}:{record['name']}", what="task"))
+        if named is not None and named.distribution is None:
+            return named
+        if not trusted_tasks.is_known(record):
+            raise _unknown(record, what, run)
+        if record.get("python"):
+            return python_task(str(record["python"]), str(record["name"]))
+        file = Path(str(record.get("file") or "task.yaml")).name
+        return folder_task(Path(str(record["folder"])), file)
+    except TaskError as error:
+        hint = f"install {owner} {record.get('version')}" if owner else error.hint
+        raise TaskError(f"{what} is not there: {error.message}", hint=hint) from None
+
+
+def _unknown(record: Mapping[str, Any], what: str, run: str | None) -> CheckpointError:
+    place = trusted_tasks.place(record)
+    name = shlex.quote(place if os.sep in place or "/" in place else f"./{place}")
+    allow = f"--task {name}" if run is None else f"rlcli play {name} --checkpoint {shlex.quote(run)}"
+    return CheckpointError(
+        f"{what} is not loaded: it names code that you have not used on this machine, {place}",
+        hint=f"if you trust that code, or have it elsewhere, name it once: {allow}",
+    )
+
+
+def resolve_run(
+    run: Run,
+    *,
+    play: bool,
+    config_file: Path | None = None,
+    overrides: Sequence[str] = (),
+    flags: Mapping[str, Any] | None = None,
+    named: TaskSource | None = None,
+) -> Resolved:
+    """The configuration of a run, with what the command line changes for playing; `named`: see `source_of`."""
+    return resolve(source_of(run, named), play=play, config_file=config_file, overrides=overrides, flags=flags)
+
+
+def policy_of(checkpoint: Checkpoint) -> Policy:
+    """The policy of a checkpoint; nothing of the task or the simulator is needed."""
+    return checkpoint.policy()
+
+
+def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
+    """The environment must be what the policy was trained in.
+
+    Raises:
+        CheckpointError: with a table of what differs, then and now.
+    """
+    try:
+        differing = _differing(checkpoint.manifest["layout"], layout.record())
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise CheckpointError(f"{checkpoint.folder}/manifest.json is corrupt: its layout is malformed") from None
+    if not differing:
+        return
+    table = _table([("field", "in the checkpoint", "now"), *differing])
+    names = "manifest.json" if "bundle" in checkpoint.manifest else "run.json"
+    raise CheckpointError(
+        f"{checkpoint.folder} does not fit the installed task:\n{table}",
+        hint=f"install the task's version that {names} names, or train again",
+    )
+
+
+def require_trainer(checkpoint: Checkpoint, trainer: str) -> None:
+    """A run goes on with the trainer that saved it; checkpoints of older versions do not say which.
+
+    Raises:
+        CheckpointError: naming both.
+    """
+    saved = checkpoint.manifest.get("trainer")
+    if saved is not None and saved != trainer:
+        raise CheckpointError(
+            f"{checkpoint.folder} is a checkpoint of trainer '{saved}', and the run's agent is one of '{trainer}'",
+            hint="--init-from takes only the weights of its policy, in a new run",
+        )
+
+
+def require_same_policy(checkpoint: Checkpoint, policy: Policy, trainer: str) -> None:
+    """Weights go into a policy that computes the same with them; how far actions reach is the new agent's own.
+
+    Raises:
+        CheckpointError: with a table of what differs.
+    """
+    saved, wanted = policy_of(checkpoint).spec.model_dump(), policy.spec.model_dump()
+    rows = [(key, str(saved[key]), str(wanted[key])) for key in wanted if saved[key] != wanted[key]]
+    alike = {"action_bound"} if saved["normalize"] and wanted["normalize"] else {"action_bound", "normalize_clip"}
+    rows = [row for row in rows if row[0] not in alike]
+    if rows:
+        table = _table([("policy", "in the checkpoint", "the agent's"), *rows])
+        owner = checkpoint.manifest.get("trainer") or "?"
+        raise CheckpointError(
+            f"{checkpoint.folder}: the weights do not fit the agent; it is a checkpoint of trainer '{owner}', and the"
+            f" agent is one of '{trainer}':\n{table}",
+            hint="give the agent the network of the checkpoint, or begin without --init-from",
+        )
+
+
+def _table(rows: Sequence[tuple[str, str, str]]) -> str:
+    widths = [max(len(row[column]) for row in rows) for column in range(2)]
+    return "\n".join(f"  {a.ljust(widths[0])}  {b.ljust(widths[1])}  {c}" for a, b, c in rows)
+
+
+def _differing(record: Mapping[str, Any], current: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """The rows of the table."""
+    was, now = _fields(record), _fields(current)
+    names = [name for name in {**was, **now} if _differ(was.get(name), now.get(name))]
+    return [(name, _text(was.get(name)), _text(now.get(name))) for name in names]
+
+
+def _fields(record: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """What must be equal, by the name it has in the table."""
+    fields: dict[str, Mapping[str, Any]] = {}
+    for group, terms in record.get("observations", {}).items():
+        for position, term in enumerate(terms):
+            fields[f"observations.{group}[{position}]"] = term
+    for position, term in enumerate(record.get("actions", [])):
+        fields[f"actions[{position}]"] = term
+    if "step_dt" in record:
+        fields["step_dt"] = {"name": f"{record['step_dt']:.9g} s"}
+    return fields
+
+
+_CONTRACT = ("name", "size", "elements", "scale", "offset", "clip", "history", "modifiers")
+"""Of a term: what a policy was trained with. Units are words, and limits belong to the machine that is driven."""
+
+
+def _differ(was: Mapping[str, Any] | None, now: Mapping[str, Any] | None) -> bool:
+    """Whether something differs that both sides know; older checkpoints do not know everything."""
+    if was is None or now is None:
+        return True
+    known = [key for key in _CONTRACT if key in was and key in now]
+    return any(_rounded(was[key]) != _rounded(now[key]) for key in known if key != "elements" or was[key])
+
+
+def _text(term: Mapping[str, Any] | None) -> str:
+    if term is None:
+        return "-"
+    if "size" not in term:
+        return str(term["name"])
+    elements = ", ".join(term.get("elements", []))
+    factors = [f"{key} {_rounded(term[key])}" for key in ("scale", "offset", "clip", "modifiers") if term.get(key)]
+    if term.get("history", 1) > 1:
+        factors.append(f"history {term['history']}")
+    return ", ".join([f"{term['name']} ({term['size']}{': ' + elements if elements else ''})", *factors])
+
+
+def _rounded(value: object) -> Any:
+    """Numbers as six digits: the last bits of a model's values depend on the machine that compiled it."""
+    if isinstance(value, list):
+        return "[" + ", ".join(str(_rounded(item)) for item in value) + "]"
+    return f"{value:.6g}" if isinstance(value, float) else value

@@ -1,0 +1,306 @@
+"""The folder of a run: its configuration, its record and its checkpoints."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import shutil
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from filelock import FileLock, Timeout
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+
+from rlcli.config import strict_yaml
+from rlcli.errors import CheckpointError, MachineError, UsageError
+from rlcli.runs.atomic_io import disk_error, to_json, write_atomic
+from rlcli.runs.safe_io import FileModel, Word, check_json, read_file, read_json, refuse_links, require_inside
+
+CONFIG = "config.yaml"
+RECORD = "run.json"
+STUDY = "study.json"
+"""What a folder holds whose folders are runs of one study: the seeds of a training, or the trials of a sweep."""
+WAITING = "waiting"
+"""State of a run of a study whose turn has not come."""
+LOCK = ".lock"
+MAX_SEED = 2**62
+_TASK = re.compile(r"(?!\.{1,2}$)[^/\\:]{1,255}")
+_MANY = 100_000
+_PEEK_S = 0.3
+"""For longer than somebody looks whether a run is locked."""
+_NAME = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
+
+
+@dataclass(slots=True)
+class Run:
+    """One training run's folder. `record` is the content of run.json."""
+
+    folder: Path
+    record: dict[str, Any] = field(default_factory=dict)
+    _lock: FileLock | None = None
+
+    @property
+    def config(self) -> Path:
+        """The resolved configuration."""
+        return self.folder / CONFIG
+
+    @property
+    def checkpoints(self) -> Path:
+        """The folder of checkpoints."""
+        return self.folder / "checkpoints"
+
+    @property
+    def metrics(self) -> Path:
+        """One JSON line an iteration."""
+        return self.folder / "metrics.jsonl"
+
+    def read_config(self) -> strict_yaml.Document:
+        """Read the resolved configuration.
+
+        Raises:
+            CheckpointError: if it is missing, corrupt, or no plain file.
+        """
+        try:
+            return strict_yaml.load(read_file(self.config, strict_yaml.MAX_BYTES))
+        except FileNotFoundError:
+            raise CheckpointError(f"{self.folder} has no {CONFIG}") from None
+        except strict_yaml.YamlError as error:
+            raise CheckpointError(f"{self.config}:{error.line}:{error.column} is corrupt: {error.message}") from None
+
+    def update(self, **entries: Any) -> None:
+        """Change entries of run.json."""
+        self.record.update(entries)
+        write_atomic(self.folder / RECORD, to_json(self.record))
+
+    def lock(self) -> None:
+        """Keep a second writer out.
+
+        Raises:
+            MachineError: if another process is writing to this run.
+        """
+        self._lock = FileLock(self.folder / LOCK, timeout=_PEEK_S)
+        try:
+            self._lock.acquire()
+        except Timeout:
+            self._lock = None
+            raise MachineError(f"{self.folder} is being written to by another process") from None
+
+    def unlock(self) -> None:
+        """Let others write again."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def discard(self) -> None:
+        """Remove a run that never began."""
+        self.unlock()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def create_run(runs_dir: Path, task: str, name: str | None, config: str, record: Mapping[str, Any]) -> Run:
+    """Make a new run folder with its configuration in it; two that start in the same second get two folders.
+
+    Raises:
+        UsageError: for a name that cannot be part of a folder's.
+        MachineError: if the folder cannot be made or written.
+    """
+    return begin_run(new_folder(runs_dir, task, name), config, record)
+
+
+def new_folder(runs_dir: Path, task: str, name: str | None) -> Path:
+    """A folder for a run or a study of runs, with the time in its name.
+
+    Raises:
+        UsageError: for a name that cannot be part of a folder's.
+        MachineError: if the folder cannot be made.
+    """
+    require_name(name)
+    parent = runs_dir / task
+    stem = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S") + (f"-{name}" if name else "")
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        return _fresh_folder(parent, stem)
+    except OSError as error:
+        raise disk_error(parent, error) from error
+
+
+def require_name(name: str | None) -> None:
+    """A name can be part of a folder's.
+
+    Raises:
+        UsageError: if it cannot.
+    """
+    if name is not None and not _NAME.fullmatch(name):
+        raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint="letters, digits, - and _")
+
+
+def begin_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
+    """Write what a run is to do into its empty folder, and lock it.
+
+    Raises:
+        MachineError: if it cannot be written; the folder is gone then.
+    """
+    run = Run(folder)
+    try:
+        run.checkpoints.mkdir()
+        write_atomic(run.config, config)
+        run.update(**{"started": datetime.now(UTC).isoformat(timespec="microseconds"), "state": "running", **record})
+        run.lock()
+    except (OSError, MachineError) as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise disk_error(folder, error) if isinstance(error, OSError) else error from error
+    return run
+
+
+def open_run(folder: Path) -> Run:
+    """Open an existing run.
+
+    Raises:
+        CheckpointError: if it is not a run.
+    """
+    try:
+        record = read_json(folder, RECORD)
+    except FileNotFoundError:
+        raise CheckpointError(f"{folder} is not a run: it has no {RECORD}") from None
+    refuse_links(folder)
+    for inner in ("checkpoints", "checkpoints/logs"):
+        if (folder / inner).is_dir():
+            refuse_links(folder / inner)
+    for part in (folder / CONFIG, folder / "metrics.jsonl"):
+        if part.exists() and not part.is_file():
+            raise CheckpointError(f"{part} is no plain file")  # a pipe would be waited for
+    check_json(RunRecord, record, folder / RECORD)
+    return Run(folder, record)
+
+
+def is_locked(folder: Path) -> bool:
+    """Whether a process is writing to the run: asked of the system, without a trace in the folder."""
+    try:
+        handle = os.open(folder / LOCK, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+    except OSError:
+        return False
+    try:
+        return stat.S_ISREG(os.fstat(handle).st_mode) and not _shared(handle)
+    finally:
+        os.close(handle)
+
+
+def _shared(handle: int) -> bool:
+    """Whether a lock file can be locked together with others; the lock is let go with the handle."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        import msvcrt
+
+        try:
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+            msvcrt.locking(handle, msvcrt.LK_UNLCK, 1)  # type: ignore[attr-defined]
+        except OSError:
+            return False
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True
+
+
+def require_own(run: Run, *parts: str) -> None:
+    """What is about to be written lies in the run: no link leads out of it, no pipe or device stands in a file's place.
+
+    Args:
+        run: the run.
+        parts: files and folders in it; of a folder all that it holds.
+
+    Raises:
+        CheckpointError: naming what does not belong in a run.
+    """
+    seen = 0
+    pending = [run.folder / part for part in parts]
+    while pending:
+        path = pending.pop()
+        seen += 1
+        try:
+            require_inside(run.folder, path)
+            mode = path.stat().st_mode
+            if stat.S_ISDIR(mode):
+                pending += path.iterdir()
+            elif not stat.S_ISREG(mode):
+                raise OSError(errno.EINVAL, "it is not a plain file")
+            if seen > _MANY:
+                raise OSError(errno.EFBIG, f"the run holds more than {_MANY} files")
+        except FileNotFoundError:
+            continue
+        except (OSError, RuntimeError) as error:
+            said = getattr(error, "strerror", None) or error
+            raise CheckpointError(f"{path} cannot be written to: {said}", hint="it was not made by rlcli") from None
+
+
+def _require_task_name(name: str) -> str:
+    if not _TASK.fullmatch(name):
+        raise ValueError("a name of a task is part of a path: it has no '/', '\\' or ':'")
+    return name
+
+
+class TaskRecord(FileModel):
+    """The task that a file names. Every entry is a name or a path."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Word | None] = Field(init=False)
+
+    name: Annotated[Word, AfterValidator(_require_task_name)]
+    folder: Word | None = None
+    distribution: Word | None = None
+
+
+class _InstalledTask(TaskRecord):
+    """The task of a run, which says where the task is from."""
+
+    @model_validator(mode="after")
+    def _from_somewhere(self) -> Self:
+        if not (self.folder or self.distribution):
+            raise ValueError("names neither a folder nor a distribution")
+        return self
+
+
+class RunRecord(FileModel):
+    """The entries of run.json that are read again."""
+
+    task: _InstalledTask
+    seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
+    agent: str | None = None
+    best: int | None = None
+    cpu: dict[str, Any] = Field(default_factory=dict)
+    given: dict[str, Any] = Field(default_factory=dict)
+    init_from: str | None = None
+    iteration: int = 0
+    loggers: list[str] = Field(default_factory=list)
+    resumed: list[Any] = Field(default_factory=list)
+    rlcli: str = ""
+    sources: dict[str, Any] = Field(default_factory=dict)
+    started: str = ""
+    state: str = ""
+    step: int = 0
+    torch: dict[str, Any] = Field(default_factory=dict)
+    torch_threads: Annotated[int, Field(ge=1, le=4096)] = 1
+    trained_s: float = 0.0
+    trackers: dict[str, Any] = Field(default_factory=dict)
+    versions: dict[str, Any] = Field(default_factory=dict)
+    video_every: Annotated[int, Field(ge=0, lt=2**31)] = 0
+
+
+def _fresh_folder(parent: Path, stem: str) -> Path:
+    for attempt in range(1, 10_000):
+        folder = parent / (stem if attempt == 1 else f"{stem}-{attempt}")
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+    raise OSError(17, "too many runs of this name", str(parent / stem))

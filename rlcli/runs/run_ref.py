@@ -1,0 +1,170 @@
+"""How a command line names a run or a checkpoint: by folder, by name, `latest`, `RUN@best` or `RUN@step:N`."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from pathlib import Path
+
+from rlcli.errors import CheckpointError, UsageError, did_you_mean, listing
+from rlcli.runs.run import RECORD, STUDY, Run, open_run
+from rlcli.settings import setting
+
+_log = logging.getLogger(__name__)
+
+
+def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[Run, str]:
+    """A run by its folder, its name, or `latest`; and why it was chosen.
+
+    Raises:
+        CheckpointError: if there is none.
+        UsageError: if it is a run of another task than the one given.
+    """
+    run, why = _find_run(reference, runs_dir, task)
+    if task is not None and run.record["task"]["name"] != task:
+        raise UsageError(f"{run.folder} is a run of {run.record['task']['name']}, not of {task}", hint="leave out TASK")
+    return run, why
+
+
+def is_checkpoint_ref(reference: str) -> bool:
+    """Whether a word names one checkpoint (its folder, or RUN@...), and not a run."""
+    return (Path(reference) / "manifest.json").is_file() or ("@" in reference and not Path(reference).exists())
+
+
+def find_runs(references: list[str], runs_dir: Path) -> list[Run]:
+    """Return the runs that words name: a folder, a name, `latest`, a task, or a folder of runs.
+
+    Raises:
+        CheckpointError: if one names nothing.
+    """
+    found: list[Run] = []
+    for reference in references:
+        several = _runs_of_task(reference, runs_dir)
+        if several:
+            found += several
+            continue
+        run, why = find_run(reference, runs_dir)
+        if reference == "latest":
+            _log.info(f"{run.folder} ({why})")
+        found.append(run)
+    return found
+
+
+def _runs_of_task(reference: str, runs_dir: Path) -> list[Run]:
+    """The runs of a task, or in a folder of runs; none where the word names one run."""
+    folder = Path(reference)
+    if (folder / RECORD).is_file() or reference == "latest":
+        return []
+    found = list_runs(runs_dir, reference.rpartition(":")[2])
+    if not found and folder.is_dir():
+        there = list_runs(folder.resolve().parent, None)
+        found = [run for run in there if run.folder.parent.samefile(folder)]
+    return found
+
+
+def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
+    """Runs under a folder, oldest first; what is not a run is passed over."""
+    runs = []
+    studies = (file.parent for file in runs_dir.glob(f"*/*/{STUDY}") if file.is_file())
+    for file in (*runs_dir.glob(f"*/*/{RECORD}"), *(file for study in studies for file in study.glob(f"*/{RECORD}"))):
+        try:
+            run = open_run(file.parent)
+        except CheckpointError:
+            continue
+        if task is None or run.record["task"].get("name") == task:
+            runs.append(run)
+    return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name))
+
+
+def find_checkpoint(
+    reference: str, runs_dir: Path, task: str | None = None, *, whole: bool = False
+) -> tuple[Run, Path, str]:
+    """A checkpoint by `RUN`, `RUN@best`, `RUN@step:N`, `latest` or its folder; and why it was chosen.
+
+    Of a run that is named without a checkpoint it is the newest good one.
+
+    Args:
+        reference: what was named.
+        runs_dir: the folder of runs.
+        task: of which it must be.
+        whole: good is what can be resumed, not only what can be played.
+
+    Raises:
+        CheckpointError: if there is none.
+    """
+    from rlcli.runs.checkpoint import steps
+
+    folder = Path(reference)
+    if os.path.isfile(folder / "manifest.json"):  # of a name too long for the system: no
+        return open_run(folder.resolve().parent.parent), folder, "as named"
+    name, _, which = (reference, "", "") if os.path.exists(folder) else reference.partition("@")
+    run, why = find_run(name, runs_dir, task)
+    have = steps(run.checkpoints)
+    if not have:
+        raise CheckpointError(f"{run.folder} has no complete checkpoint")
+    if not which:
+        return run, *_newest_good(run, have, why, whole)
+    if which == "best":
+        best = run.record.get("best")
+        if best not in have:
+            raise CheckpointError(
+                f"{run.folder} has no best checkpoint: it was not evaluated", hint="leave out @best for the newest"
+            )
+        return run, run.checkpoints / f"{best:012d}", "its best evaluation"
+    kind, _, number = which.partition(":")
+    if kind == "step" and re.fullmatch("[0-9]{1,30}", number):
+        if int(number) not in have:
+            raise CheckpointError(
+                f"{run.folder} has no checkpoint at step {number}", hint=f"steps: {listing(map(str, have))}"
+            )
+        return run, run.checkpoints / f"{int(number):012d}", "as named"
+    raise CheckpointError(
+        f"'{reference}' does not name a checkpoint", hint="RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest"
+    )
+
+
+def _newest_good(run: Run, have: list[int], why: str, whole: bool) -> tuple[Path, str]:
+    """Return the newest checkpoint that is in order, with a warning for each newer one."""
+    from rlcli.runs.checkpoint import open_checkpoint
+
+    for passed, step in enumerate(reversed(have)):
+        folder = run.checkpoints / f"{step:012d}"
+        try:
+            open_checkpoint(folder).verify(whole=whole)
+        except CheckpointError as error:
+            if passed == len(have) - 1:
+                raise
+            _log.warning(f"checkpoint {folder.name} is passed over: {error.message}")
+            continue
+        return folder, f"{why}, its newest {'good ' if passed else ''}checkpoint"
+    raise AssertionError("a run without checkpoints is refused before")
+
+
+def default_runs_dir() -> Path:
+    """RLCLI_RUNS_DIR, or what the user's settings say, or `runs` in the current folder."""
+    return Path(os.environ.get("RLCLI_RUNS_DIR") or Path(setting("runs_dir") or "runs").expanduser())
+
+
+def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, str]:
+    if reference == "latest":
+        runs = list_runs(runs_dir, task)
+        if not runs:
+            of = f" of {task}" if task else ""
+            raise CheckpointError(f"there is no run{of} in {runs_dir}", hint=f"rlcli train {task or 'TASK'} makes one")
+        return runs[-1], f"newest run of {task}" if task else f"newest run in {runs_dir}"
+    for candidate in (Path(reference), runs_dir / reference, *([runs_dir / task / reference] if task else [])):
+        if os.path.isfile(candidate / RECORD):
+            return open_run(candidate), "as named"
+        if os.path.isfile(candidate / STUDY):
+            inside = sorted(file.parent.name for file in candidate.glob(f"*/{RECORD}"))
+            raise CheckpointError(
+                f"{candidate} is a study of several runs",
+                hint=f"name one: {listing(str(candidate / n) for n in inside)}",
+            )
+    matches = [run for run in list_runs(runs_dir, None) if run.folder.name == reference]
+    if len(matches) == 1:
+        return matches[0], "as named"
+    names = [run.folder.name for run in list_runs(runs_dir, None)]
+    near = did_you_mean(reference, names)
+    raise CheckpointError(f"no run '{reference}'", hint=near or f"runs in {runs_dir}: {listing(names[-5:])}")

@@ -1,0 +1,135 @@
+"""Archives of torch and Stable-Baselines3, read without unpickling anything that is not a tensor."""
+
+from __future__ import annotations
+
+import io
+import pickletools
+import re
+import stat
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rlcli.errors import CheckpointError, one_line
+from rlcli.machine import memory
+from rlcli.runs.safe_io import read_file
+
+_MAX_BYTES = 4 * 2**30
+"""Largest size of a file, and of all members of a zip together [bytes]."""
+_MAX_RATIO = 100
+_MAX_MEMBERS = 20_000
+_PICKLE_LIMIT = 4 * 2**20
+_ALLOWED = {
+    "collections OrderedDict",
+    "torch._utils _rebuild_tensor_v2",
+    "torch._utils _rebuild_parameter",
+    *(
+        f"torch {kind}Storage"
+        for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Short", "Byte", "Bool")
+    ),
+}
+"""Names that the pickle in a .pt file may contain; no other name is ever looked up."""
+_REFUSED_OPCODES = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "PERSID"}
+VEC_NORMALIZE_HINT = (
+    "a pickle runs the code of whoever wrote it, so none is opened; in a Python that trusts it:"
+    " v = pickle.load(open('vecnormalize.pkl', 'rb')).obs_rms; safetensors.numpy.save_file("
+    "{'mean': v.mean, 'var': v.var}, 'normalizer.safetensors'), then --normalizer normalizer.safetensors"
+)
+
+
+def read_archive_file(file: Path) -> bytes:
+    """Read a whole file, up to a share of the memory."""
+    try:
+        return read_file(file.resolve(), min(_MAX_BYTES, memory() // 4))
+    except FileNotFoundError:
+        raise CheckpointError(f"there is no file {file}") from None
+
+
+def read_member(file: Path, name: str) -> bytes:
+    """Read a member of a zip, after a check of all members."""
+    data = read_archive_file(file)
+    if data[:1] == b"\x80":
+        raise CheckpointError(f"{file} is a pickle; it is not opened", hint=VEC_NORMALIZE_HINT)
+    archive = _archive(data, str(file))
+    if name not in archive.namelist():
+        raise CheckpointError(f"{file} has no {name}: it is not what Stable-Baselines3 saves")
+    return _content(archive, name, str(file))
+
+
+def _archive(data: bytes, where: str) -> zipfile.ZipFile:
+    """Open a zip; check that all members are plain files of plausible sizes."""
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(data))
+        members = archive.infolist()
+    except Exception as error:  # untrusted numbers make zipfile raise many kinds of errors
+        raise CheckpointError(f"{where} is corrupt, or no zip: {one_line(error)}") from None
+    if len(members) > _MAX_MEMBERS:
+        raise CheckpointError(f"{where} has {len(members)} members")
+    seen: set[str] = set()
+    for member in members:
+        name, shown = member.filename, repr(member.filename[:60])
+        parts = re.split(r"[/\\]", name)
+        if name != member.orig_filename or ".." in parts or name[:1] in ("/", "\\", "") or ":" in name:
+            raise CheckpointError(f"{where} has a member {shown}, which leads out of it")
+        if name.casefold() in seen:
+            raise CheckpointError(f"{where} has two members {shown}")
+        seen.add(name.casefold())
+        if stat.S_ISLNK(member.external_attr >> 16):
+            raise CheckpointError(f"{where} has a member {shown}, which is a link")
+        if member.flag_bits & 1:
+            raise CheckpointError(f"{where} has a member {shown}, which is encrypted")
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise CheckpointError(f"{where} has a member {shown}, which is packed in an uncommon way")
+        if member.file_size > _MAX_RATIO * max(member.compress_size, 1):
+            raise CheckpointError(f"{where} has a member {shown}, which grows more than {_MAX_RATIO} times unpacked")
+    total, most = sum(member.file_size for member in members), min(_MAX_BYTES, memory() // 4)
+    if total > most:
+        raise CheckpointError(f"{where} holds {total:,} bytes, at most {most:,} are read")
+    return archive
+
+
+def _content(archive: zipfile.ZipFile, name: str, where: str) -> bytes:
+    try:
+        size = archive.getinfo(name).file_size
+        with archive.open(name) as member:
+            data = member.read(size + 1)
+    except Exception as error:
+        raise CheckpointError(f"{where}: {name} is corrupt: {one_line(error)}") from None
+    if len(data) != size:
+        raise CheckpointError(f"{where}: {name} is corrupt: {len(data)} bytes of {size}")
+    return data
+
+
+def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
+    """Load nested dictionaries of tensors and numbers; the pickle inside may name nothing else."""
+    if data[:4] != b"PK\x03\x04":
+        kind = "in the form of torch before 1.6, or a plain pickle" if data[:1] == b"\x80" else "no file of torch"
+        raise CheckpointError(f"{where} is {kind}; it is not opened", hint="save it again with torch.save")
+    archive = _archive(data, where)
+    described = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
+    if len(described) != 1 or archive.getinfo(described[0]).file_size > _PICKLE_LIMIT:
+        raise CheckpointError(f"{where} is no file of torch: it does not describe its tensors, or at great length")
+    _require_tensors_only(_content(archive, described[0], where), where)
+    try:
+        saved = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise CheckpointError(f"{where} is corrupt, or holds more than tensors: {one_line(error, 300)}") from None
+    if not isinstance(saved, Mapping):
+        raise CheckpointError(f"{where} holds no named tensors")
+    return saved
+
+
+def _require_tensors_only(description: bytes, where: str) -> None:
+    """Check the instructions of a pickle without executing any."""
+    try:
+        for opcode, argument, _ in pickletools.genops(description):
+            if opcode.name in _REFUSED_OPCODES or (opcode.name == "GLOBAL" and argument not in _ALLOWED):
+                what = f"names '{str(argument)[:80]}'" if argument is not None else "makes objects"
+                raise CheckpointError(f"{where} {what}, which is no tensor; nothing of it is loaded")
+    except CheckpointError:
+        raise
+    except Exception as error:
+        raise CheckpointError(f"{where} is corrupt: {one_line(error)}") from None

@@ -1,0 +1,335 @@
+"""Cameras of a scene: images of every environment, rendered offscreen by threads with an OpenGL context each."""
+
+from __future__ import annotations
+
+import copy
+import os
+import queue
+import threading
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rlcli.config.schema import CameraSensorConfig
+from rlcli.errors import ConfigError, MachineError, Problem
+from rlcli.scene.lazy_sensor import LazySensor
+from rlcli.scene.sensor_specs import CameraSensorSpec
+from rlcli.sim.engine import Engine, ReplayableEngine
+from rlcli.sim.gl import open_context
+from rlcli.sim.selection import Selection, ids_of
+
+_CHANNELS = {"rgb": 3, "depth": 1, "distance": 1}
+_DISABLED_EFFECTS = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_HAZE", "mjRND_FOG")
+_VISIBLE_CATEGORIES = int(mujoco.mjtCatBit.mjCAT_STATIC | mujoco.mjtCatBit.mjCAT_DYNAMIC)
+_INTEGRATION_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_MAX_GEOMS = 10_000
+_JOIN_TIMEOUT = 5.0
+"""How long to wait for a thread to end [s]."""
+
+
+class CameraSensor(LazySensor):
+    """One image of every environment, rendered when it is read, at most once a step.
+
+    Args:
+        name: of the sensor.
+        spec: the camera in the model.
+        engine: whose states are rendered.
+        renderers: threads that render.
+    """
+
+    def __init__(self, name: str, spec: CameraSensorSpec, engine: ReplayableEngine, renderers: RendererPool) -> None:
+        super().__init__()
+        self.config = config = spec.config
+        self._engine, self._renderers = engine, renderers
+        self._camera = engine.model.camera(spec.camera).id
+        shape = (config.height, config.width, _CHANNELS[config.data])
+        kind = torch.uint8 if config.data == "rgb" else torch.float32
+        self.names = [name]
+        """The sensor."""
+        self._image = torch.zeros(engine.num_envs, *shape, dtype=kind)
+        self._pixels = self._image.numpy()
+
+    @property
+    def image(self) -> Tensor:
+        """The images, rows from the top. rgb: (num_envs, h, w, 3) uint8; else (num_envs, h, w, 1) float32 [m].
+
+        Nothing within `clip` is 0 m. Where a pixel is the mean of several samples, those that see nothing count as 0 m.
+        """
+        if not self._current:
+            self._current = True
+            self._render(np.arange(self._engine.num_envs))
+        return self._image
+
+    def on_moved(self, selection: Selection) -> None:
+        """Render the selected environments anew, if the image has been read in this step."""
+        if self._current:
+            self._render(ids_of(selection))
+
+    def close(self) -> None:
+        """Free the contexts, which all cameras of the scene share."""
+        self._renderers.close()
+
+    def _render(self, ids: NDArray[np.int64]) -> None:
+        engine, config, camera, pixels = self._engine, self.config, self._camera, self._pixels
+
+        def work_on(share: NDArray[np.int64]) -> Callable[[CameraRenderer], None]:
+            def work(renderer: CameraRenderer) -> None:
+                for env in share.tolist():
+                    renderer.load_state(engine, env)
+                    renderer.render(camera, config, pixels[env])
+
+            return work
+
+        self._renderers.run([work_on(share) for share in np.array_split(ids, self._renderers.count) if len(share)])
+
+
+class CameraRenderer:
+    """An OpenGL context with its buffers; one thread makes, uses and frees it.
+
+    Args:
+        model: of the scene.
+        width: of the largest image, in samples.
+        height: likewise.
+
+    Raises:
+        MachineError: if no OpenGL works on this machine.
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+        self._model = self._shared_model = model
+        self._data = mujoco.MjData(model)
+        self._context, _ = open_context(width, height, in_thread=True)
+        small = copy.copy(model)  # buffers of the viewer's size would be cleared for every picture
+        small.vis.global_.offwidth, small.vis.global_.offheight = width, height
+        small.vis.quality.offsamples, small.vis.quality.shadowsize = 0, 0
+        self._mjr = mujoco.MjrContext(small, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
+        self._mjr.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+        self._scene = mujoco.MjvScene(model, maxgeom=_MAX_GEOMS)
+        for flag in _DISABLED_EFFECTS:
+            self._scene.flags[getattr(mujoco.mjtRndFlag, flag)] = False
+        self._view = mujoco.MjvCamera()
+        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._option = mujoco.MjvOption()
+
+    def load_state(self, engine: ReplayableEngine, env: int) -> None:
+        """Load the state of a world, and its own model, as far as they are visible."""
+        if engine.expanded_fields():
+            if self._model is self._shared_model:
+                self._model = copy.copy(self._shared_model)
+            engine.write_own_model(env, self._model)
+        model, data = self._model, self._data
+        mujoco.mj_setState(model, data, engine.state_row(env), _INTEGRATION_STATE)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+        if model.nflex:
+            mujoco.mj_flex(model, data)
+        if model.ntendon:
+            mujoco.mj_tendon(model, data)
+
+    def render(self, camera: int, config: CameraSensorConfig, out: NDArray[Any]) -> None:
+        """Render the world that was loaded last. out (h, w, c)"""
+        scene, flags = self._scene, mujoco.mjtRndFlag
+        self._view.fixedcamid = camera
+        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._view, _VISIBLE_CATEGORIES, scene)
+        for view in scene.camera:
+            _set_clip_planes(view, *config.clip)
+        is_rgb = config.data == "rgb"
+        for flag in (flags.mjRND_SEGMENT, flags.mjRND_IDCOLOR):  # without light and textures, depth is exact
+            scene.flags[flag] = not is_rgb
+        rect = mujoco.MjrRect(0, 0, config.width * config.samples, config.height * config.samples)
+        mujoco.mjr_render(rect, scene, self._mjr)
+        if is_rgb:
+            pixels = np.empty((rect.height, rect.width, 3), np.uint8)
+            mujoco.mjr_readPixels(pixels, None, rect, self._mjr)
+            out[:] = np.rint(_downsample(pixels, config.samples))
+            return
+        nearness = np.empty((rect.height, rect.width), np.float32)
+        mujoco.mjr_readPixels(None, nearness, rect, self._mjr)
+        metres = _depth_in_metres(nearness, scene.camera[0], along_ray=config.data == "distance")
+        out[:] = _downsample(metres[..., None], config.samples)
+
+    def free(self) -> None:
+        """Free the context."""
+        self._mjr.free()
+        self._context.free()
+
+
+class RendererPool:
+    """Threads that render, each with a `CameraRenderer`.
+
+    Args:
+        model: of the scene.
+        width: of the largest image, in samples.
+        height: likewise.
+        threads: how many.
+
+    Raises:
+        MachineError: if no OpenGL works on this machine.
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int, threads: int) -> None:
+        self._process = os.getpid()
+        self._orders: list[_Orders] = []
+        self._threads: list[threading.Thread] = []
+        self._end = weakref.finalize(self, _end_threads, self._orders, self._threads, self._process)
+        for number in range(threads):  # one after the other: the first finds out which OpenGL works
+            orders: _Orders = queue.SimpleQueue()
+            ready: _Replies = queue.SimpleQueue()
+            thread = threading.Thread(
+                target=_render_orders,
+                args=(model, width, height, orders, ready),
+                name=f"rlcli-renderer-{number}",
+                daemon=True,
+            )
+            thread.start()
+            self._orders.append(orders)
+            self._threads.append(thread)
+            try:
+                _raise(ready.get())
+            except BaseException:
+                self.close()
+                raise
+
+    @property
+    def count(self) -> int:
+        """Number of threads."""
+        return len(self._threads)
+
+    def run(self, work: Sequence[Callable[[CameraRenderer], None]]) -> None:
+        """Do each piece of work in a thread of its own.
+
+        Raises:
+            MachineError: after `close`, or in a process that was forked from the one that opened the contexts.
+        """
+        if os.getpid() != self._process:
+            raise MachineError(
+                "cameras draw in the process that made the environment, and this is a fork of it",
+                hint="make the environment in the new process, or start that with 'spawn'",
+            )
+        if not self._end.alive:
+            raise MachineError("the environment is closed: its cameras draw no more")
+        done: _Replies = queue.SimpleQueue()
+        for piece, orders in zip(work, self._orders, strict=False):
+            orders.put((piece, done))
+        replies = [done.get() for _ in work]
+        for reply in replies:
+            _raise(reply)
+
+    def close(self) -> None:
+        """End the threads, which free their contexts."""
+        self._end()
+        if os.getpid() == self._process:
+            for thread in self._threads:
+                thread.join(_JOIN_TIMEOUT)
+
+
+def make_cameras(specs: Mapping[str, CameraSensorSpec], engine: Engine) -> dict[str, CameraSensor]:
+    """Make the cameras that the scene has put into the model.
+
+    Raises:
+        ConfigError: on an engine whose states are not on the CPU.
+        MachineError: if no OpenGL works on this machine.
+    """
+    if not specs:
+        return {}
+    if (states := engine.replayable) is None:
+        hint = "--device cpu, and no sim.engine: warp"
+        message = "cameras draw on a CPU: the GPU engine has none"
+        raise ConfigError([Problem("scene", f"scene.sensors.{name}", message, hint) for name in specs])
+    configs = [spec.config for spec in specs.values()]
+    width, height = (max(c.samples * getattr(c, edge) for c in configs) for edge in ("width", "height"))
+    renderers = RendererPool(engine.model, width, height, min(engine.threads, engine.num_envs))
+    return {name: CameraSensor(name, spec, states, renderers) for name, spec in specs.items()}
+
+
+_Replies = queue.SimpleQueue[BaseException | None]
+_Orders = queue.SimpleQueue[tuple[Callable[[CameraRenderer], None], _Replies] | None]
+
+
+def _render_orders(model: mujoco.MjModel, width: int, height: int, orders: _Orders, ready: _Replies) -> None:
+    """Render in a thread: OpenGL requires that one thread makes, uses and frees a context."""
+    try:
+        renderer = CameraRenderer(model, width, height)
+    except BaseException as error:
+        ready.put(error)
+        return
+    ready.put(None)
+    while (order := orders.get()) is not None:
+        piece, done = order
+        try:
+            piece(renderer)
+        except BaseException as error:
+            done.put(error)
+        else:
+            done.put(None)
+        del order, piece, done  # nothing of an environment is held while waiting
+    renderer.free()
+
+
+def _end_threads(orders: list[_Orders], threads: list[threading.Thread], process: int) -> None:
+    if os.getpid() != process:
+        return  # the threads stayed behind in the process that forked
+    for some in orders:
+        some.put(None)
+    if threading.current_thread() is threading.main_thread():
+        for thread in threads:
+            thread.join(_JOIN_TIMEOUT)
+
+
+def _raise(reply: BaseException | None) -> None:
+    if reply is not None:
+        raise reply
+
+
+def _set_clip_planes(view: mujoco.MjvGLCamera, near: float, far: float) -> None:
+    """Set the near and the far plane; the field of view stays."""
+    if not view.orthographic:
+        for name in ("center", "width", "bottom", "top"):  # measured on the near plane
+            value = getattr(view, f"frustum_{name}") * near / view.frustum_near
+            setattr(view, f"frustum_{name}", value)
+    view.frustum_near, view.frustum_far = near, far
+
+
+def _depth_in_metres(
+    nearness: NDArray[np.float32], view: mujoco.MjvGLCamera, *, along_ray: bool
+) -> NDArray[np.float32]:
+    """Return the depths of a buffer that is 1 at the near plane and 0 at the far one; 0 where nothing is seen. (h, w)
+
+    Along the camera's axis, or along the ray through each pixel.
+    """
+    near, far = np.float32(view.frustum_near), np.float32(view.frustum_far)
+    if view.orthographic:
+        metres = far - nearness * (far - near)
+    else:
+        metres = near * far / (near + nearness * (far - near))
+        if along_ray:
+            height, width = nearness.shape
+            metres *= _ray_lengths(height, width, view)
+    metres[nearness == 0.0] = 0.0
+    return metres
+
+
+def _ray_lengths(height: int, width: int, view: mujoco.MjvGLCamera) -> NDArray[np.float32]:
+    """Return the length of the ray through each pixel to depth 1, rows from the bottom. (h, w)"""
+    rows, columns = ((np.arange(count) + 0.5) / count for count in (height, width))
+    half = view.frustum_width or 0.5 * (view.frustum_top - view.frustum_bottom) * width / height
+    y = (view.frustum_bottom + rows * (view.frustum_top - view.frustum_bottom)) / view.frustum_near
+    x = (view.frustum_center + (2.0 * columns - 1.0) * half) / view.frustum_near
+    lengths: NDArray[np.float32] = np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2).astype(np.float32)
+    return lengths
+
+
+def _downsample(values: NDArray[Any], samples: int) -> NDArray[Any]:
+    """Return means of blocks, with rows from the top instead of the bottom. (h s, w s, c) -> (h, w, c)"""
+    if samples > 1:
+        rows = np.stack([values[k::samples] for k in range(samples)]).sum(axis=0, dtype=np.float32)
+        values = np.stack([rows[:, k::samples] for k in range(samples)]).sum(axis=0) / np.float32(samples * samples)
+    return values[::-1]

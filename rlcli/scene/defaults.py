@@ -1,0 +1,51 @@
+"""Where an entity starts: its joints and its root as the MJCF and the entity's configuration have them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rlcli.scene.names import NameProblem, match
+
+if TYPE_CHECKING:
+    from rlcli.scene.entity import Entity
+
+
+def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:
+    """Default joint positions and velocities: the MJCF's qpos0, with the entity's `init` over it. (k,), (k,)
+
+    Raises:
+        NameProblem: if `init` names a joint that the model does not have.
+    """
+    position = torch.tensor(entity.engine.model.qpos0[entity.qpos_columns.cpu().numpy()], dtype=torch.float32)
+    velocity = torch.zeros_like(position)
+    for values, target in (
+        (entity.config.init.joint_pos, position),
+        (entity.config.init.joint_vel, velocity),
+    ):
+        for pattern, value in values.items():
+            target[match(pattern, entity.joint_names, "joint")] = value
+    return position, velocity
+
+
+def default_root_state(entity: Entity) -> Tensor:
+    """Default root pose and velocity: those of the MJCF, with the entity's configuration over them. (13,)
+
+    Raises:
+        NameProblem: if `init` gives a velocity to a root that is fixed.
+    """
+    model = entity.engine.model
+    if entity.root_qpos is not None:
+        pose = model.qpos0[entity.root_qpos : entity.root_qpos + 7]
+    elif not entity.root_body:  # geoms of the world only
+        pose = np.concatenate([entity.config.pos, entity.config.quat])
+    else:
+        body = entity.root_body
+        pose = np.concatenate([model.body_pos[body], model.body_quat[body]])
+    velocity = [*entity.config.init.lin_vel, *entity.config.init.ang_vel]
+    if entity.root_qpos is None and any(velocity):
+        raise NameProblem(f"entity '{entity.name}' has no free root", "lin_vel and ang_vel are those of a free root")
+    return torch.tensor([*pose, *velocity], dtype=torch.float32)

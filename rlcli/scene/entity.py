@@ -1,0 +1,173 @@
+"""A robot or object of the scene: its elements by name, and how to set its state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rlcli.config.schema import EntityConfig
+from rlcli.errors import TaskError
+from rlcli.scene.entity_data import EntityData
+from rlcli.scene.names import match
+from rlcli.scene.scene_joints import model_actuator_kind
+from rlcli.sim.engine import Engine
+from rlcli.sim.force_sensors import sensor_columns
+from rlcli.sim.indexing import as_index, id_tensor
+from rlcli.sim.rotations import rotate, rotate_inverse
+from rlcli.sim.selection import ALL, Columns, Field, Selection
+from rlcli.sim.state_cache import SimData
+
+if TYPE_CHECKING:
+    from rlcli.scene.actuators import ActuatorModel
+
+_KINDS = {
+    "Joints": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
+    "Bodies": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
+    "Sites": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
+    "Sensors": (mujoco.mjtObj.mjOBJ_SENSOR, "nsensor"),
+    "Actuators": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
+    "Geoms": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
+    "Tendons": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
+    "Pairs": (mujoco.mjtObj.mjOBJ_PAIR, "npair"),
+}
+"""Kinds of elements: MuJoCo's type, and the model's field that counts them."""
+_SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+class Entity:
+    """One attached model. Joints are its hinges and slides in the model's order; a free joint is its root."""
+
+    def __init__(self, name: str, config: EntityConfig, engine: Engine, sim: SimData) -> None:
+        self.name = name
+        self.config = config
+        self.engine = engine
+        self.sim = sim
+        model = engine.model
+        self.ids = {alias: _ids(model, name, kind, getattr(model, count)) for alias, (kind, count) in _KINDS.items()}
+        """Ids in the model, by kind: Joints, Bodies, ..."""
+        self.ids["Joints"] = self.ids["Joints"][np.isin(model.jnt_type[self.ids["Joints"]], _SCALAR)]
+        self.joint_ids, self.body_ids, self.site_ids = self.ids["Joints"], self.ids["Bodies"], self.ids["Sites"]
+        self.actuator_ids, self.geom_ids = self.ids["Actuators"], self.ids["Geoms"]
+        self.names = {alias: _names(model, name, kind, self.ids[alias]) for alias, (kind, _) in _KINDS.items()}
+        """Names without the entity's prefix, by kind."""
+        self.joint_names = self.names["Joints"]
+        self.qpos_columns = id_tensor(model.jnt_qposadr[self.joint_ids], engine.device)
+        self.dof_columns = id_tensor(model.jnt_dofadr[self.joint_ids], engine.device)
+        self.root_body = int(self.body_ids[0]) if len(self.body_ids) else 0
+        self.root_qpos, self.root_dof = self._root(model)
+        self.mocap = int(model.body_mocapid[self.root_body])
+        """Number of the mocap body that the root is; -1: none."""
+        self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
+        self._places: dict[tuple[int, ...], tuple[Columns, Field, Columns]] = {}
+        self.data = EntityData(self, sim)
+        self.actuators: list[ActuatorModel] = []
+        """Models that drive joints between physics steps; filled once the entity stands."""
+
+    @property
+    def is_floating(self) -> bool:
+        """Whether the root is a free joint."""
+        return self.root_qpos is not None
+
+    def select(self, alias: str, patterns: str | Sequence[str]) -> tuple[Columns, list[str]]:
+        """Names or regexes of Joints, Bodies, ... -> an index into this entity's columns, and the names it stands for.
+
+        Raises:
+            NameProblem: for what the model does not have.
+        """
+        names = self.names[alias]
+        singular = {"Bodies": "body"}.get(alias, alias[:-1].lower())
+        positions = match(patterns, names, singular)
+        if alias == "Sensors":
+            columns = sensor_columns(self.engine.model, self.ids[alias][positions].tolist())
+            return self._index(columns), [names[p] for p in positions]
+        return self._index(positions), [names[p] for p in positions]
+
+    def actuators_of(self, kind: str) -> list[tuple[int, int]]:
+        """(joint column, actuator id) of every joint that a motor, position or velocity actuator drives."""
+        model = self.engine.model
+        found = []
+        for a in self.actuator_ids.tolist():
+            made = model_actuator_kind(model, a)
+            joint = int(model.actuator_trnid[a, 0])
+            if made == kind and joint in self.joint_ids:
+                found.append((self.joint_ids.tolist().index(joint), a))
+        return sorted(found)
+
+    def write_joint_positions(self, selection: Selection, values: Tensor, joints: Columns = ALL) -> None:
+        """Set joint positions of the selected environments. values (rows, k) [m or rad]"""
+        field, columns = self._place(self._qpos, self.qpos_columns, joints)
+        selection.write(field, values, columns)
+
+    def write_joint_velocities(self, selection: Selection, values: Tensor, joints: Columns = ALL) -> None:
+        """Set joint velocities of the selected environments. values (rows, k) [m/s or rad/s]"""
+        field, columns = self._place(self._qvel, self.dof_columns, joints)
+        selection.write(field, values, columns)
+
+    def write_root_pose(self, selection: Selection, position: Tensor, quat: Tensor) -> None:
+        """Set the pose of a free or mocap root in its world. position (rows, 3) [m], quat (rows, 4) w, x, y, z"""
+        if self.mocap >= 0:
+            selection.write(self.engine.field("mocap_pos")[:, self.mocap], position)
+            selection.write(self.engine.field("mocap_quat")[:, self.mocap], quat)
+            return
+        root, _ = self.floating()
+        selection.write(self._qpos, torch.cat([position, quat], dim=1), slice(root, root + 7))
+
+    def write_root_velocity(self, selection: Selection, linear_w: Tensor, angular_w: Tensor) -> None:
+        """Set the root's velocity, world frame; set the pose first. linear [m/s] and angular [rad/s], (rows, 3) each"""
+        root, dof = self.floating()
+        quat = selection.read(self._qpos, slice(root + 3, root + 7)).float()
+        local = rotate_inverse(quat, angular_w)  # a free joint's angular velocity is in the body's frame
+        selection.write(self._qvel, torch.cat([linear_w, local], dim=1), slice(dof, dof + 6))
+
+    def read_root_velocity(self, selection: Selection) -> tuple[Tensor, Tensor]:
+        """The root's velocity as it is now, also where it has just been set, world frame. (rows, 3) each"""
+        qpos, dof = self.floating()
+        velocity = selection.read(self._qvel, slice(dof, dof + 6)).float()
+        quat = selection.read(self._qpos, slice(qpos + 3, qpos + 7)).float()
+        return velocity[:, :3], rotate(quat, velocity[:, 3:])
+
+    def floating(self) -> tuple[int, int]:
+        """Where the free joint of the root lies in qpos and in qvel.
+
+        Raises:
+            TaskError: if the root is fixed to the world.
+        """
+        if self.root_qpos is None or self.root_dof is None:
+            raise TaskError(f"entity '{self.name}' is fixed to the world and cannot be moved")
+        return self.root_qpos, self.root_dof
+
+    def _index(self, positions: Sequence[int]) -> Columns:
+        return as_index(positions, self.engine.device)
+
+    def _place(self, field: Tensor, of: Tensor, joints: Columns) -> tuple[Field, Columns]:
+        """Where in a field of the engine joints lie: of consecutive columns the part that is these alone."""
+        key = (id(of), joints.start, joints.stop, joints.step) if isinstance(joints, slice) else (id(of), id(joints))
+        if key not in self._places:
+            columns = self._index(of[joints].tolist())
+            if isinstance(columns, slice):
+                field, columns = field[:, columns], ALL
+            # the joints stay referenced, so that their id is not given to another tensor
+            self._places[key] = (joints, self.engine.as_field(field), columns)
+        return self._places[key][1:]
+
+    def _root(self, model: mujoco.MjModel) -> tuple[int | None, int | None]:
+        joint = int(model.body_jntadr[self.root_body])
+        if joint < 0 or model.jnt_type[joint] != int(mujoco.mjtJoint.mjJNT_FREE):
+            return None, None
+        return int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+
+
+def _ids(model: mujoco.MjModel, entity: str, kind: mujoco.mjtObj, count: int) -> NDArray[np.int64]:
+    """Return the ids of the elements whose names have the entity's prefix."""
+    names = [mujoco.mj_id2name(model, kind, i) or "" for i in range(count)]
+    return np.array([i for i, name in enumerate(names) if name.startswith(f"{entity}/")], dtype=np.int64)
+
+
+def _names(model: mujoco.MjModel, entity: str, kind: mujoco.mjtObj, ids: NDArray[np.int64]) -> list[str]:
+    return [(mujoco.mj_id2name(model, kind, int(i)) or "").removeprefix(f"{entity}/") for i in ids]

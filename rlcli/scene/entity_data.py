@@ -1,0 +1,411 @@
+"""What terms read of an entity: joints, root, gravity, bodies and sites, in every environment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from rlcli.scene.defaults import default_joint_state, default_root_state
+from rlcli.scene.joint_efforts import JointEfforts
+from rlcli.scene.scene_joints import joint_settings
+from rlcli.sim.force_sensors import computes_body_forces
+from rlcli.sim.indexing import MAX_CACHED_VIEWS, CachedViews, as_index, id_tensor
+from rlcli.sim.rotations import atan2, axis_x, cross, length, multiply, rotate, rotate_inverse, wrap_to_pi
+from rlcli.sim.selection import ALL, Columns, Field, Selection
+from rlcli.sim.state_cache import SimData
+
+if TYPE_CHECKING:
+    from rlcli.scene.entity import Entity
+
+
+class EntityData:
+    """The state of an entity in every environment, float32, positions in the environment's frame.
+
+    Read it, do not write it: most attributes are live views. Setters are methods of `Entity`.
+    """
+
+    def __init__(self, entity: Entity, sim: SimData) -> None:
+        self._entity = entity
+        self._sim = sim
+        self._cache: dict[Hashable, tuple[int, Tensor]] = {}
+        self._pos, self._vel = CachedViews(), CachedViews()
+        self._default_pos, self._default_vel = CachedViews(), CachedViews()
+        self._limit_views = {soft: (CachedViews(), CachedViews()) for soft in (False, True)}
+        self._angles: dict[int, tuple[Columns, int, Tensor]] = {}
+        self._defaults: dict[tuple[Any, ...], tuple[Tensor, Tensor, Field, Field]] = {}
+        model, num_envs = entity.engine.model, entity.engine.num_envs
+        device = entity.engine.device
+        self._qpos_index = as_index(entity.qpos_columns.tolist(), device)
+        self._dof_index = as_index(entity.dof_columns.tolist(), device)
+        self._body_index = as_index(entity.body_ids.tolist(), device)
+        # consecutive columns: a view of the copied state, made once
+        self._joint_pos = sim.qpos[:, self._qpos_index] if isinstance(self._qpos_index, slice) else None
+        self._joint_vel = sim.qvel[:, self._dof_index] if isinstance(self._dof_index, slice) else None
+        ranges = torch.tensor(model.jnt_range[entity.joint_ids], dtype=torch.float32, device=device)
+        limited = torch.tensor(model.jnt_limited[entity.joint_ids], dtype=torch.bool, device=device)
+        infinite = torch.tensor([-torch.inf, torch.inf], device=device)
+        self.joint_pos_limits = torch.where(limited[:, None], ranges, infinite)
+        """Lower and upper limit of each joint, infinite where it has none. (k, 2) [m or rad]"""
+        soft = torch.stack(self._soft_limits(*ranges.unbind(dim=1)), dim=1)
+        self.soft_joint_pos_limits = torch.where(limited[:, None], soft, infinite)
+        """The limits, drawn in by `soft_joint_pos_limit_factor`. (k, 2) [m or rad]"""
+        self._limits = {
+            soft: tuple(end[None] for end in limits.unbind(dim=1))
+            for soft, limits in ((False, self.joint_pos_limits), (True, self.soft_joint_pos_limits))
+        }
+        self._limited = limited
+        self._joint_index = as_index(entity.joint_ids.tolist(), device)
+        self._infinite = infinite
+        position, velocity = (values.to(device) for values in default_joint_state(entity))
+        self.default_joint_pos = position.expand(num_envs, -1).clone()
+        """Default joint positions. (num_envs, k) [m or rad]"""
+        self.default_joint_vel = velocity.expand(num_envs, -1).clone()
+        """Default joint velocities. (num_envs, k) [m/s or rad/s]"""
+        self.default_root_state = default_root_state(entity).to(device).expand(num_envs, -1).clone()
+        """Default root pose and velocity: position, quat (w, x, y, z), linear, angular. (num_envs, 13)"""
+        self.joint_vel_limits = torch.tensor(
+            [joint_settings(entity.config, name).velocity_limit or math.inf for name in entity.joint_names],
+            device=device,
+        )
+        """Speed limit of each joint, `velocity_limit`, infinite where it has none. (k,) [m/s or rad/s]"""
+        self._gravity = torch.tensor(model.opt.gravity, dtype=torch.float32, device=device).expand(num_envs, -1)
+        self._down = _direction(self._gravity)
+        self._tree_root = id_tensor(model.body_rootid[entity.body_ids], device)
+        self._site_index = as_index(entity.site_ids.tolist(), device)
+        site_bodies = model.site_bodyid[entity.site_ids]
+        self._site_body = id_tensor(site_bodies, device)
+        self._site_quat = torch.tensor(model.site_quat[entity.site_ids], dtype=torch.float32, device=device)
+        self._tree_root_of_sites = id_tensor(model.body_rootid[site_bodies], device)
+        self._computes_body_forces = computes_body_forces(model)
+        self._efforts = JointEfforts(entity)
+
+    @property
+    def joint_pos(self) -> Tensor:
+        """Joint positions. (num_envs, k) [m or rad]"""
+        if self._joint_pos is not None:
+            return self._joint_pos
+        return self._once("joint_pos", lambda: self._sim.qpos[:, self._qpos_index])
+
+    @property
+    def joint_vel(self) -> Tensor:
+        """Joint velocities. (num_envs, k) [m/s or rad/s]"""
+        if self._joint_vel is not None:
+            return self._joint_vel
+        return self._once("joint_vel", lambda: self._sim.qvel[:, self._dof_index])
+
+    def joint_pos_of(self, joints: Columns) -> Tensor:
+        """`joint_pos[:, joints]`, for what is read in every step: a view is made once. (num_envs, k) [m or rad]"""
+        return self._pos.of(self.joint_pos if self._joint_pos is None else self._joint_pos, joints)
+
+    def joint_vel_of(self, joints: Columns) -> Tensor:
+        """`joint_vel[:, joints]`, likewise. (num_envs, k) [m/s or rad/s]"""
+        return self._vel.of(self.joint_vel if self._joint_vel is None else self._joint_vel, joints)
+
+    def default_joint_pos_of(self, joints: Columns) -> Tensor:
+        """`default_joint_pos[:, joints]`, likewise. (num_envs, k) [m or rad]"""
+        return self._default_pos.of(self.default_joint_pos, joints)
+
+    def default_joint_vel_of(self, joints: Columns) -> Tensor:
+        """`default_joint_vel[:, joints]`, likewise. (num_envs, k) [m/s or rad/s]"""
+        return self._default_vel.of(self.default_joint_vel, joints)
+
+    def read_default_joints(self, selection: Selection, joints: Columns = ALL) -> tuple[Tensor, Tensor]:
+        """Default positions and velocities of some joints, for a moment as `read_view`. (rows, k) each"""
+        position, velocity = self.default_joint_pos, self.default_joint_vel
+        if not isinstance(joints, slice):
+            return selection.read_view(position, joints), selection.read_view(velocity, joints)
+        key = (joints.start, joints.stop, joints.step)
+        known = self._defaults.get(key)
+        if known is None or known[0] is not position or known[1] is not velocity:
+            as_field = self._entity.engine.as_field
+            known = position, velocity, as_field(position[:, joints]), as_field(velocity[:, joints])
+            self._defaults[key] = known
+        return selection.read_view(known[2]), selection.read_view(known[3])
+
+    def joint_limits_of(self, joints: Columns, soft: bool = False) -> tuple[Tensor, Tensor]:
+        """`joint_limits` of some joints, likewise. (num_envs or 1, k) each"""
+        low, high = self.joint_limits(soft)
+        lows, highs = self._limit_views[soft]
+        return lows.of(low, joints), highs.of(high, joints)
+
+    def joint_angle_of(self, joints: Columns) -> Tensor:
+        """`joint_pos[:, joints]` wrapped to [-pi, pi], computed once a step: do not write to it. (num_envs, k) [rad]"""
+        stamp, known = self._sim.stamp, self._angles.get(id(joints))
+        if known is not None and known[0] is joints and known[1] == stamp:
+            return known[2]
+        angle = wrap_to_pi(self.joint_pos_of(joints))
+        if len(self._angles) >= MAX_CACHED_VIEWS:
+            self._angles.clear()
+        self._angles[id(joints)] = joints, stamp, angle
+        return angle
+
+    @property
+    def joint_acc(self) -> Tensor:
+        """Joint accelerations over the last substep. (num_envs, k) [m/s^2 or rad/s^2]"""
+        return self._sim.derived_field("qacc")[:, self._dof_index]
+
+    @property
+    def applied_effort(self) -> Tensor:
+        """Forces of the actuators on the joints, after their limits. (num_envs, k) [N or N m]"""
+        return self._sim.derived_field("qfrc_actuator")[:, self._dof_index]
+
+    @property
+    def root_pos_w(self) -> Tensor:
+        """Root position. (num_envs, 3) [m]"""
+        q = self._entity.root_qpos
+        if self._entity.mocap >= 0:
+            return self._sim.derived_field("mocap_pos")[:, self._entity.mocap]
+        return self._sim.qpos[:, q : q + 3] if q is not None else self.default_root_state[:, :3]
+
+    @property
+    def root_quat_w(self) -> Tensor:
+        """Root orientation (w, x, y, z). (num_envs, 4)"""
+        q = self._entity.root_qpos
+        if self._entity.mocap >= 0:
+            return self._sim.derived_field("mocap_quat")[:, self._entity.mocap]
+        return self._sim.qpos[:, q + 3 : q + 7] if q is not None else self.default_root_state[:, 3:7]
+
+    @property
+    def root_lin_vel_w(self) -> Tensor:
+        """Root linear velocity, world frame. (num_envs, 3) [m/s]"""
+        d = self._entity.root_dof
+        return self._sim.qvel[:, d : d + 3] if d is not None else self.default_root_state[:, 7:10]
+
+    @property
+    def root_ang_vel_b(self) -> Tensor:
+        """Root angular velocity, body frame. (num_envs, 3) [rad/s]"""
+        d = self._entity.root_dof
+        return self._sim.qvel[:, d + 3 : d + 6] if d is not None else self.default_root_state[:, 10:13]
+
+    @property
+    def root_lin_vel_b(self) -> Tensor:
+        """Root linear velocity, body frame. (num_envs, 3) [m/s]"""
+        return self._once("root_lin_vel_b", lambda: rotate_inverse(self.root_quat_w, self.root_lin_vel_w))
+
+    @property
+    def root_ang_vel_w(self) -> Tensor:
+        """Root angular velocity, world frame. (num_envs, 3) [rad/s]"""
+        return self._once("root_ang_vel_w", lambda: rotate(self.root_quat_w, self.root_ang_vel_b))
+
+    @property
+    def root_com_lin_vel_w(self) -> Tensor:
+        """Velocity of the root body's centre of mass, world frame. (num_envs, 3) [m/s]"""
+        return self.body_com_lin_vel_w[:, 0]
+
+    @property
+    def forward_w(self) -> Tensor:
+        """The root's x axis, world frame. (num_envs, 3)"""
+        return self._once("forward_w", lambda: axis_x(self.root_quat_w))
+
+    @property
+    def heading_w(self) -> Tensor:
+        """Direction of the root's x axis in the horizontal plane, about z from the world's x. (num_envs,) [rad]"""
+        return self._once("heading_w", lambda: atan2(self.forward_w[:, 1], self.forward_w[:, 0]))
+
+    @property
+    def gravity_w(self) -> Tensor:
+        """Gravity, the environment's own where it differs between environments. (num_envs, 3) [m/s^2]"""
+        own = self._entity.engine.expanded("opt.gravity")
+        return self._gravity if own is None else self._once("gravity_w", lambda: own.float().view(-1, 3))
+
+    @property
+    def down_w(self) -> Tensor:
+        """Direction of gravity, length 1; -z where there is none. (num_envs, 3)"""
+        if self._entity.engine.expanded("opt.gravity") is None:
+            return self._down
+        return self._once("down_w", lambda: _direction(self.gravity_w))
+
+    @property
+    def projected_gravity_b(self) -> Tensor:
+        """Direction of gravity in the root's frame, length 1. (num_envs, 3)"""
+        return self._once("projected_gravity_b", lambda: rotate_inverse(self.root_quat_w, self.down_w))
+
+    @property
+    def computed_effort(self) -> Tensor:
+        """What actuators would put on the joints without limits on forces. (num_envs, k) [N or N m]
+
+        Of actuator models, in the last substep. Of MuJoCo's actuators with a fixed gain, no or an affine bias and no
+        dynamics of their own (motor, position, velocity), by the present state and controls. Others count as 0.
+        """
+        return self._once("computed_effort", self._efforts.without_limits)
+
+    @property
+    def joint_effort_limits(self) -> Tensor:
+        """Largest effort of the actuators on each joint, infinite where nothing limits it. (1 or num_envs, k)
+
+        [N or N m] From force limits of actuators and joints, and control limits of motors.
+        """
+        return self._once("joint_effort_limits", self._efforts.limits)
+
+    @property
+    def withheld_effort(self) -> Tensor:
+        """How much less than `computed_effort` limits let through, >= 0. (num_envs, k) [N or N m]"""
+        return self._once("withheld_effort", self._efforts.removed_by_limits)
+
+    def joint_limits(self, soft: bool = False) -> tuple[Tensor, Tensor]:
+        """Lower and upper position limits as they are now, infinite where there is none. (num_envs or 1, k) each
+
+        `joint_pos_limits` are those of the configuration; these follow a randomisation.
+        """
+        ranges = self._entity.engine.expanded("jnt_range")
+        if ranges is None:
+            low, high = self._limits[soft]
+            return low, high
+        low, high = self._once(
+            "joint_ranges", lambda: ranges.view(len(ranges), -1, 2)[:, self._joint_index].float()
+        ).unbind(dim=2)
+        if soft:
+            low, high = self._soft_limits(low, high)
+        return torch.where(self._limited, low, self._infinite[0]), torch.where(self._limited, high, self._infinite[1])
+
+    @property
+    def body_pos_w(self) -> Tensor:
+        """Body positions. (num_envs, bodies, 3) [m]"""
+        return self._sim.derived_field("xpos")[:, self._body_index]
+
+    @property
+    def body_quat_w(self) -> Tensor:
+        """Body orientations (w, x, y, z). (num_envs, bodies, 4)"""
+        return self._sim.derived_field("xquat")[:, self._body_index]
+
+    @property
+    def body_com_pos_w(self) -> Tensor:
+        """Centres of mass of the bodies. (num_envs, bodies, 3) [m]"""
+        return self._sim.derived_field("xipos")[:, self._body_index]
+
+    @property
+    def body_ang_vel_w(self) -> Tensor:
+        """Angular velocities of the bodies, world frame. (num_envs, bodies, 3) [rad/s]"""
+        return self._sim.derived_field("cvel")[:, self._body_index, :3]
+
+    @property
+    def body_lin_vel_w(self) -> Tensor:
+        """Velocities of the bodies' frame origins, world frame. (num_envs, bodies, 3) [m/s]"""
+        return self._once("body_lin_vel_w", lambda: self._velocity_at(self.body_pos_w))
+
+    @property
+    def body_com_lin_vel_w(self) -> Tensor:
+        """Velocities of the bodies' centres of mass, world frame. (num_envs, bodies, 3) [m/s]"""
+        return self._once("body_com_lin_vel_w", lambda: self._velocity_at(self.body_com_pos_w))
+
+    @property
+    def body_lin_vel_b(self) -> Tensor:
+        """Velocities of the bodies' frame origins, each in its body's frame. (num_envs, bodies, 3) [m/s]"""
+        return self._once("body_lin_vel_b", lambda: rotate_inverse(self.body_quat_w, self.body_lin_vel_w))
+
+    @property
+    def body_ang_vel_b(self) -> Tensor:
+        """Angular velocities of the bodies, each in its body's frame. (num_envs, bodies, 3) [rad/s]"""
+        return self._once("body_ang_vel_b", lambda: rotate_inverse(self.body_quat_w, self.body_ang_vel_w))
+
+    @property
+    def body_ang_acc_w(self) -> Tensor:
+        """Angular accelerations over the last substep, world frame. (num_envs, bodies, 3) [rad/s^2]"""
+        return self._body_force("cacc")[:, self._body_index, :3]
+
+    @property
+    def body_lin_acc_w(self) -> Tensor:
+        """Accelerations of the bodies' frame origins over the last substep, world frame. (num_envs, bodies, 3) [m/s^2]
+
+        0 at rest, and that of gravity in free fall.
+        """
+
+        def compute() -> Tensor:
+            acceleration = self._body_force("cacc")[:, self._body_index]
+            angular, linear = acceleration[..., :3], acceleration[..., 3:]
+            at_origin = linear + cross(angular, self._from_tree_com(self.body_pos_w))
+            turning = cross(self.body_ang_vel_w, self.body_lin_vel_w)
+            return at_origin + turning + self.gravity_w[:, None]  # MuJoCo's accelerations are against gravity
+
+        return self._once("body_lin_acc_w", compute)
+
+    @property
+    def body_incoming_wrench_b(self) -> Tensor:
+        """Force and torque by which each body's parent holds it, in the body's frame. (num_envs, bodies, 6) [N, N m]
+
+        Of the last substep; the torque is about the body's frame origin.
+        """
+
+        def compute() -> Tensor:
+            wrench = self._body_force("cfrc_int")[:, self._body_index]
+            force = wrench[..., 3:]
+            torque = wrench[..., :3] - cross(self._from_tree_com(self.body_pos_w), force)
+            quat = self.body_quat_w
+            return torch.cat([rotate_inverse(quat, force), rotate_inverse(quat, torque)], dim=-1)
+
+        return self._once("body_incoming_wrench_b", compute)
+
+    @property
+    def site_pos_w(self) -> Tensor:
+        """Site positions. (num_envs, sites, 3) [m]"""
+        return self._sim.derived_field("site_xpos")[:, self._site_index]
+
+    @property
+    def site_quat_w(self) -> Tensor:
+        """Site orientations (w, x, y, z). (num_envs, sites, 4)"""
+        return self._once(
+            "site_quat_w",
+            lambda: multiply(self._sim.derived_field("xquat")[:, self._site_body], self._site_quat),
+        )
+
+    @property
+    def site_ang_vel_w(self) -> Tensor:
+        """Angular velocities of the sites, world frame. (num_envs, sites, 3) [rad/s]"""
+        return self._sim.derived_field("cvel")[:, self._site_body, :3]
+
+    @property
+    def site_lin_vel_w(self) -> Tensor:
+        """Velocities of the sites, world frame. (num_envs, sites, 3) [m/s]"""
+
+        def compute() -> Tensor:
+            roots = self._tree_root_of_sites
+            arm = self.site_pos_w - self._sim.derived_field("subtree_com")[:, roots]
+            velocity = self._sim.derived_field("cvel")[:, self._site_body]
+            return velocity[..., 3:] + cross(velocity[..., :3], arm)
+
+        return self._once("site_lin_vel_w", compute)
+
+    @property
+    def sensordata(self) -> Tensor:
+        """All sensor readings of the model, in the units of each sensor. (num_envs, nsensordata)"""
+        return self._sim.derived_field("sensordata")
+
+    def _soft_limits(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+        """Return limits drawn in by `soft_joint_pos_limit_factor`."""
+        middle, half = 0.5 * (low + high), 0.5 * self._entity.config.soft_joint_pos_limit_factor * (high - low)
+        return middle - half, middle + half
+
+    def _velocity_at(self, points: Tensor) -> Tensor:
+        """Velocity of a point of each body: MuJoCo gives that at the centre of mass of the body's tree."""
+        velocity = self._sim.derived_field("cvel")[:, self._body_index]
+        return velocity[..., 3:] + cross(velocity[..., :3], self._from_tree_com(points))
+
+    def _from_tree_com(self, points: Tensor) -> Tensor:
+        return points - self._sim.derived_field("subtree_com")[:, self._tree_root]
+
+    def _body_force(self, name: str) -> Tensor:
+        if not self._computes_body_forces:
+            raise ValueError(
+                "reads accelerations or forces of bodies, which MuJoCo computes only where a sensor needs them: mark"
+                " the term with rlcli.task.reads_body_forces, or give the MJCF an accelerometer, force or torque sensor"
+            )
+        return self._sim.derived_field(name)
+
+    def _once(self, name: Hashable, compute: Callable[[], Tensor]) -> Tensor:
+        stamp, value = self._cache.get(name, (-1, None))
+        if stamp != self._sim.stamp or value is None:
+            value = compute()
+            self._cache[name] = (self._sim.stamp, value)
+        return value
+
+
+def _direction(gravity: Tensor) -> Tensor:
+    """Where gravity points, length 1; -z where there is none. (n, 3)"""
+    size = length(gravity)[:, None]
+    down = torch.zeros_like(gravity)
+    down[:, 2].fill_(-1.0)
+    return torch.where(size > 0.0, gravity / size, down)

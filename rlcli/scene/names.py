@@ -1,0 +1,75 @@
+"""Names and regular expressions of the YAML -> positions in a list of names, in exactly the order written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import TypeVar
+
+from rlcli.errors import did_you_mean, listing
+
+Value = TypeVar("Value")
+
+
+class NameProblem(ValueError):
+    """A name or regex that does not fit the model; `hint` names those that do."""
+
+    def __init__(self, message: str, hint: str | None = None) -> None:
+        super().__init__(message)
+        self.hint = hint
+
+
+class SceneProblem(NameProblem):
+    """A part of the scene's configuration that does not fit the models; `path` is its key."""
+
+    def __init__(self, path: tuple[str, ...], message: str, hint: str | None = None) -> None:
+        super().__init__(message, hint)
+        self.path = path
+
+
+def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> list[int]:
+    """Positions of the names that the patterns match in full.
+
+    The patterns' order is kept; within one regex the order is that of `names`.
+
+    Raises:
+        NameProblem: a pattern matches nothing, is not a regex, or a name is matched twice.
+    """
+    positions: list[int] = []
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        found = [names.index(pattern)] if pattern in names else _search(pattern, names, what)
+        for position in found:
+            if position in positions:
+                raise NameProblem(f"{what} '{names[position]}' is matched twice, the second time by '{pattern}'")
+            positions.append(position)
+    return positions
+
+
+def match_values(values: Mapping[str, Value], names: Sequence[str], what: str) -> list[Value | None]:
+    """The value that a mapping from names or regexes gives each name; None for a name that it leaves out.
+
+    Raises:
+        NameProblem: as `match`.
+    """
+    found: list[Value | None] = [None] * len(names)
+    taken: dict[int, str] = {}
+    for pattern, value in values.items():
+        for position in match(pattern, names, what):
+            if position in taken:
+                raise NameProblem(f"{what} '{names[position]}' is matched by '{taken[position]}' and by '{pattern}'")
+            taken[position] = pattern
+            found[position] = value
+    return found
+
+
+def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
+    try:
+        regex = re.compile(pattern)
+    except re.error as error:
+        raise NameProblem(f"'{pattern}' is neither a {what} nor a regular expression ({error})") from None
+    found = [position for position, name in enumerate(names) if regex.fullmatch(name)]
+    if not found:
+        near = did_you_mean(pattern, names)
+        have = f"{'bodies' if what == 'body' else f'{what}s'}: {listing(names)}"
+        raise NameProblem(f"no {what} matches '{pattern}'", f"{near} {have}" if near else have)
+    return found

@@ -1,0 +1,151 @@
+"""From the scene's configuration to a compiled MuJoCo model: named entities, ground, lights, actuators."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TypeVar
+
+import mujoco
+import numpy as np
+
+from rlcli.config.schema import EntityConfig, SceneConfig, SimConfig
+from rlcli.errors import ConfigError, Problem
+from rlcli.scene.entity_model import entity_model, name_all, write_masses
+from rlcli.scene.ground_and_lights import add_ground_plane, add_lights, add_materials
+from rlcli.scene.names import SceneProblem
+from rlcli.scene.scene_joints import ActuatorNeed, SceneJoints
+from rlcli.scene.sensor_specs import CameraSensorSpec, ContactSensorSpec, RaySensorSpec, SensorBuilder
+from rlcli.scene.terrain import Ground, add_ground, make_ground, terrain_problems
+from rlcli.sim.mujoco_log import quiet_mujoco
+
+_INTEGRATORS = {
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+}
+
+_OPTIONS = (
+    "integrator", "cone", "jacobian", "solver", "tolerance", "ls_tolerance", "noslip_tolerance", "iterations",
+    "ls_iterations", "noslip_iterations", "ccd_iterations", "ccd_tolerance", "impratio", "density", "viscosity",
+    "wind", "magnetic", "disableflags", "enableflags", "disableactuator",
+)  # fmt: skip
+
+View = TypeVar("View")
+
+
+class Scene:
+    """A scene under construction; `spec` is open to a direct task's `set_up_scene` until it is compiled."""
+
+    def __init__(self, config: SceneConfig, sim: SimConfig, root: Path, *, installed: bool = False) -> None:
+        quiet_mujoco()  # attaching a model whose options differ from the scene's logs each of them
+        self.config = config.model_copy(update={"entities": dict(config.entities)})
+        self.sim = sim
+        self.root = root.resolve()
+        self.installed = installed
+        self.spec = mujoco.MjSpec()
+        self.spec.copy_during_attach = True
+        self.problems: list[SceneProblem] = []
+        self.views: list[object] = []
+        self.sensors: dict[str, ContactSensorSpec | RaySensorSpec | CameraSensorSpec] = {}
+        self.ground: Ground | None = None
+        self._joints = SceneJoints(self.spec, self.config.entities, self.problems)
+        for name, entity in config.entities.items():
+            self._attach(name, entity)
+        self._options()
+        if config.terrain is not None:
+            self._terrain()
+        elif config.ground is not None:
+            add_ground_plane(self.spec, config.ground)
+        add_lights(self.spec, config.lights)
+        self._sensors()
+
+    def add(self, view: View) -> View:
+        """Register a view; it is bound to the simulation once the model is compiled."""
+        self.views.append(view)
+        return view
+
+    def add_actuators(self, needs: Iterable[ActuatorNeed]) -> None:
+        """Add the actuators that are asked for and that the MJCF does not have."""
+        self._joints.add_actuators(needs)
+
+    def add_motors(self) -> None:
+        """Give every hinge and slide joint without an actuator a motor: a direct task may set any effort."""
+        self._joints.add_motors()
+
+    def compile(self) -> mujoco.MjModel:
+        """Compile to an MjModel.
+
+        Raises:
+            ConfigError: if MuJoCo refuses the model.
+        """
+        try:
+            with warnings.catch_warnings():
+                # attach reports options of the MJCF that the scene's own replace; sim: says which hold
+                warnings.simplefilter("ignore")
+                model = self.spec.compile()
+        except ValueError as error:
+            message = f"MuJoCo cannot compile the model: {' '.join(str(error).split())}"
+            raise ConfigError([Problem("scene", "", message)]) from None
+        return model
+
+    def _attach(self, name: str, entity: EntityConfig) -> None:
+        try:
+            child = entity_model(name, entity, self.root, installed=self.installed)
+        except SceneProblem as problem:
+            self.problems.append(problem)
+        else:
+            self.attach(name, entity, child)
+
+    def attach(self, name: str, entity: EntityConfig, child: mujoco.MjSpec) -> None:
+        """Add an entity to the scene; `child` is its model, which `entity.model` need not name."""
+        self.config.entities[name] = entity
+        name_all(child)
+        if child.compiler.settotalmass > 0:
+            write_masses(child)
+        models = [other for other, config in self.config.entities.items() if config.model is not None]
+        if name == next(iter(models), None):
+            for option in _OPTIONS:
+                if hasattr(child.option, option):
+                    setattr(self.spec.option, option, getattr(child.option, option))
+        for key in list(child.keys):
+            child.delete(key)  # keyframes of one entity have the wrong size in a scene of several
+        self.spec.memory = max(self.spec.memory, child.memory)
+        quat = np.asarray(entity.quat) / np.linalg.norm(entity.quat)
+        frame = self.spec.worldbody.add_frame(pos=entity.pos, quat=quat)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.spec.attach(child, prefix=f"{name}/", frame=frame)
+        self._joints.override(name, entity, degrees=bool(child.compiler.degree))
+        self._joints.add_models(name, entity)
+
+    def _options(self) -> None:
+        option = self.spec.option
+        option.timestep = self.sim.dt
+        option.gravity = self.sim.gravity
+        if self.sim.integrator is not None:
+            option.integrator = _INTEGRATORS[self.sim.integrator]
+        if self.sim.iterations is not None:
+            option.iterations = self.sim.iterations
+        if self.sim.ls_iterations is not None:
+            option.ls_iterations = self.sim.ls_iterations
+
+    def _terrain(self) -> None:
+        config = self.config.terrain
+        assert config is not None
+        found = list(terrain_problems(config, self.root))
+        self.problems += [SceneProblem(("scene", "terrain", *path), text, hint) for path, text, hint in found]
+        if not found:
+            add_materials(self.spec)
+            self.ground = make_ground(config, self.root)
+            add_ground(self.spec, self.ground, "ground")
+
+    def _sensors(self) -> None:
+        builder = SensorBuilder(self.spec, self.config.entities, self.ground)
+        for name, config in self.config.sensors.items():
+            try:
+                self.sensors[name] = builder.add(name, config)
+            except SceneProblem as problem:
+                self.problems.append(problem)

@@ -1,0 +1,209 @@
+"""The joints of a scene's entities: what the configuration changes of them, and the actuators that they get."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rlcli.config.schema import EntityConfig, JointConfig
+from rlcli.scene.names import NameProblem, SceneProblem, match
+
+_KNOWN_ACTUATORS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtGain.mjGAIN_FIXED))
+"""Transmission, dynamics and gain of the actuators whose kind is known."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActuatorNeed:
+    """An action term needs an actuator of a kind on some joints of an entity."""
+
+    entity: str
+    joints: str | list[str]
+    kind: str
+    path: tuple[str, ...]
+
+
+class SceneJoints:
+    """Hinges and slides of the entities that are attached so far.
+
+    Args:
+        spec: the scene.
+        entities: the configuration of each entity.
+        problems: what they do not fit is added here.
+    """
+
+    def __init__(self, spec: mujoco.MjSpec, entities: Mapping[str, EntityConfig], problems: list[SceneProblem]) -> None:
+        self._spec = spec
+        self._entities = entities
+        self._problems = problems
+
+    def add_actuators(self, needs: Iterable[ActuatorNeed]) -> None:
+        """Add the actuators that are asked for and that the MJCF does not have."""
+        for need in needs:
+            if need.entity not in self._entities:
+                continue  # the term's own binding says so
+            names = [joint.name.removeprefix(f"{need.entity}/") for joint in self._scalar_joints(need.entity)]
+            try:
+                models = self._entities[need.entity].actuators.values()
+                modelled = {names[p] for model in models for p in match(model.joints, names, "joint")}
+                for position in match(need.joints, names, "joint"):
+                    if names[position] not in modelled:
+                        self._add_actuator(need.entity, names[position], need.kind)
+            except NameProblem:
+                continue  # likewise
+
+    def add_motors(self) -> None:
+        """Give every hinge and slide joint without an actuator a motor: a direct task may set any effort."""
+        driven = {actuator.target for actuator in self._spec.actuators}
+        for entity in self._entities:
+            for joint in self._scalar_joints(entity):
+                if joint.name not in driven:
+                    self._add_actuator(entity, joint.name.removeprefix(f"{entity}/"), "motor")
+
+    def override(self, name: str, entity: EntityConfig, *, degrees: bool) -> None:
+        """Write what the entity's `joints` say into the model; `degrees`: the unit that its MJCF has angles in."""
+        joints = self._scalar_joints(name)
+        names = [joint.name.removeprefix(f"{name}/") for joint in joints]
+        for pattern, change in entity.joints.items():
+            try:
+                positions = match(pattern, names, "joint")
+            except NameProblem as problem:
+                path = ("scene", "entities", name, "joints", pattern)
+                self._problems.append(SceneProblem(path, str(problem), problem.hint))
+                continue
+            for position in positions:
+                _override(joints[position], change, degrees=degrees)
+                self._set_gains_and_limits(joints[position].name, change)
+                if change.actuator is not None:
+                    self._add_actuator(name, names[position], change.actuator)
+
+    def add_models(self, name: str, entity: EntityConfig) -> None:
+        """Give the joints of actuator models a motor each, without limits of its own, in place of what they have."""
+        names = [joint.name.removeprefix(f"{name}/") for joint in self._scalar_joints(name)]
+        owner: dict[str, str] = {}
+        for key, config in entity.actuators.items():
+            path = ("scene", "entities", name, "actuators", key)
+            try:
+                joints = [names[position] for position in match(config.joints, names, "joint")]
+            except NameProblem as problem:
+                self._problems.append(SceneProblem((*path, "joints"), str(problem), problem.hint))
+                continue
+            for joint in joints:
+                if joint in owner:
+                    message = f"joint '{joint}' is driven by '{owner[joint]}' already"
+                    self._problems.append(SceneProblem((*path, "joints"), message))
+                    continue
+                owner[joint] = key
+                target = f"{name}/{joint}"
+                for actuator in [a for a in self._spec.actuators if a.target == target]:
+                    self._spec.delete(actuator)
+                motor = self._spec.add_actuator(name=target, target=target, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+                motor.set_to_motor()
+
+    def _set_gains_and_limits(self, joint: str, change: JointConfig) -> None:
+        """Set gains and limits of the joint's actuators."""
+        for actuator in self._spec.actuators:
+            if actuator.target != joint or actuator.trntype != mujoco.mjtTrn.mjTRN_JOINT:
+                continue
+            if change.effort_limit is not None:
+                _limit_effort(actuator, change.effort_limit)
+            kind = _spec_kind(actuator)
+            if kind == "position" and change.kp is not None:
+                actuator.gainprm[0], actuator.biasprm[1] = change.kp, -change.kp
+            if kind == "velocity" and change.kv is not None:
+                actuator.gainprm[0] = change.kv
+            if kind in ("position", "velocity") and change.kv is not None:
+                actuator.biasprm[2] = -change.kv
+
+    def _add_actuator(self, entity: str, joint: str, kind: str) -> None:
+        target = f"{entity}/{joint}"
+        if any(a.target == target and _spec_kind(a) == kind for a in self._spec.actuators):
+            return
+        settings = joint_settings(self._entities[entity], joint)
+        taken = {actuator.name for actuator in self._spec.actuators}
+        name = target if target not in taken else f"{target}_{kind}"
+        actuator = self._spec.add_actuator(name=name, target=target, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        if kind == "motor":
+            actuator.set_to_motor()
+        elif kind == "position":
+            if settings.kp is None:
+                message = f"joint '{joint}' needs a position actuator and no gain is given"
+                hint = f"add joints: {{{joint}: {{kp: ..., kv: ...}}}}"
+                self._problems.append(SceneProblem(("scene", "entities", entity, "joints"), message, hint))
+                return
+            actuator.set_to_position(kp=settings.kp, kv=settings.kv or 0.0)
+        else:
+            actuator.set_to_velocity(kv=settings.kv if settings.kv is not None else 1.0)
+        if settings.effort_limit is not None:
+            _limit_effort(actuator, settings.effort_limit)
+
+    def _scalar_joints(self, entity: str) -> list[mujoco.MjsJoint]:
+        scalar = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        return [j for j in self._spec.joints if j.name.startswith(f"{entity}/") and j.type in scalar]
+
+
+def joint_settings(entity: EntityConfig, joint: str) -> JointConfig:
+    """What an entity's configuration says of a joint, later matches over earlier ones."""
+    merged: dict[str, object] = {}
+    for pattern, change in entity.joints.items():
+        try:
+            matched = bool(match(pattern, [joint], "joint"))
+        except NameProblem:
+            matched = False
+        if matched:
+            merged.update(change.model_dump(exclude_none=True))
+    return JointConfig.model_validate(merged)
+
+
+def model_actuator_kind(model: mujoco.MjModel, actuator: int) -> str:
+    """Return the kind of an actuator of a compiled model: motor, position, velocity or other."""
+    m, a = model, actuator
+    types = m.actuator_trntype[a], m.actuator_dyntype[a], m.actuator_gaintype[a], m.actuator_biastype[a]
+    return _actuator_kind(types, m.actuator_gainprm[a], m.actuator_biasprm[a])
+
+
+def _spec_kind(a: mujoco.MjsActuator) -> str:
+    types = a.trntype, a.dyntype, a.gaintype, a.biastype
+    return _actuator_kind(types, a.gainprm, a.biasprm)
+
+
+def _actuator_kind(types: tuple[int, int, int, int], gainprm: NDArray[Any], biasprm: NDArray[Any]) -> str:
+    """Return the kind of an actuator, from the types of its transmission, dynamics, gain and bias."""
+    transmission, dynamics, gain, bias = map(int, types)
+    if (transmission, dynamics, gain) != _KNOWN_ACTUATORS:
+        return "other"
+    if bias == int(mujoco.mjtBias.mjBIAS_NONE):
+        return "motor"
+    if bias == int(mujoco.mjtBias.mjBIAS_AFFINE):
+        if biasprm[1] == -gainprm[0] != 0:
+            return "position"
+        if biasprm[1] == 0 and biasprm[2] == -gainprm[0] != 0:
+            return "velocity"
+    return "other"
+
+
+def _override(joint: mujoco.MjsJoint, change: JointConfig, *, degrees: bool) -> None:
+    for key in ("damping", "stiffness", "armature", "friction_loss"):
+        value, attribute = getattr(change, key), key.replace("_", "")
+        if value is not None:
+            current = getattr(joint, attribute)
+            if isinstance(current, np.ndarray):  # MuJoCo 4 has polynomial damping and stiffness: the linear term
+                current[:] = 0.0
+                current[0] = value
+            else:
+                setattr(joint, attribute, value)
+    if change.range is not None:
+        # a spec keeps angles in the unit of the MJCF it came from
+        turn = 180.0 / np.pi if degrees and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
+        joint.range = [turn * end for end in change.range]
+        joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+
+
+def _limit_effort(actuator: mujoco.MjsActuator, effort: float) -> None:
+    force = effort / (abs(actuator.gear[0]) or 1.0)  # MuJoCo's limit is before the gear, ours is on the joint
+    actuator.forcerange = [-force, force]
+    actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE

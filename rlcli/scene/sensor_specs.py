@@ -1,0 +1,206 @@
+"""The sensors that a scene adds to its model, and their specifications for the classes that read them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rlcli.config.schema import CameraSensorConfig, ContactSensorConfig, EntityConfig, RaySensorConfig
+from rlcli.errors import did_you_mean, listing
+from rlcli.scene.names import NameProblem, SceneProblem, match
+from rlcli.scene.terrain import TERRAIN_BODY, Ground
+
+_CONTACT_DATA = mujoco.mjtConDataField
+_FOUND_AND_FORCE = (1 << int(_CONTACT_DATA.mjCONDATA_FOUND)) | (1 << int(_CONTACT_DATA.mjCONDATA_FORCE))
+_NET_FORCE = 3
+"""Of a contact sensor's reductions the one that adds all contacts up, in the world frame."""
+_DRAWN_GROUPS = (0, 1, 2)
+"""Geom groups that viewers draw."""
+
+
+@dataclass(frozen=True, slots=True)
+class ContactSensorSpec:
+    """A contact sensor in the model: its bodies, and the MJCF sensors of each, whose forces add up."""
+
+    config: ContactSensorConfig
+    bodies: list[str]
+    sensors: list[list[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class RaySensorSpec:
+    """A ray sensor in the model: the full name of its body, and the geom groups that it sees (None: all)."""
+
+    config: RaySensorConfig
+    body: str
+    groups: tuple[int, ...] | None
+    ground: Ground | None = None
+    """What heights are looked up in, instead of casting rays."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSensorSpec:
+    """A camera sensor in the model: the full name of its camera."""
+
+    config: CameraSensorConfig
+    camera: str
+
+
+class SensorBuilder:
+    """Adds sensors to the model of a scene, after its entities and its ground."""
+
+    def __init__(self, spec: mujoco.MjSpec, entities: Mapping[str, EntityConfig], ground: Ground | None) -> None:
+        self._spec = spec
+        self._entities = entities
+        self._ground = ground
+
+    def add(
+        self, name: str, config: ContactSensorConfig | RaySensorConfig | CameraSensorConfig
+    ) -> ContactSensorSpec | RaySensorSpec | CameraSensorSpec:
+        """Add a sensor.
+
+        Raises:
+            SceneProblem: if it names what the models do not have.
+        """
+        path = ("scene", "sensors", name)
+        if isinstance(config, ContactSensorConfig):
+            return self._contacts(name, config, path)
+        if isinstance(config, CameraSensorConfig):
+            return self._camera(name, config, path)
+        return self._rays(config, path)
+
+    def _contacts(self, name: str, config: ContactSensorConfig, path: tuple[str, ...]) -> ContactSensorSpec:
+        """For each body and what it may touch, a sensor of the model: net force on the body, and how many contacts.
+
+        The body is the second of the two, which makes the force the one that acts on it.
+        """
+        bodies = self._bodies(config.entity, config.bodies, path, "bodies")
+        solid = [body for body in self._bodies(config.entity, ".*", path, "bodies") if self._can_touch(body)]
+        for body in bodies:
+            if not self._can_touch(body):
+                have = listing([b.removeprefix(f"{config.entity}/") for b in solid]) if solid else "none"
+                short = body.removeprefix(f"{config.entity}/")
+                message = f"body '{short}' has no geom that can touch anything"
+                raise SceneProblem((*path, "bodies"), message, f"bodies that have: {have}")
+        made: list[list[str]] = []
+        for slot, body in enumerate(bodies):
+            made.append([])
+            for number, other in enumerate(self._contact_partners(config, path)):
+                sensor = self._spec.add_sensor(name=f"//{name}/{slot}/{number}", type=mujoco.mjtSensor.mjSENS_CONTACT)
+                if other is not None:
+                    sensor.objtype, sensor.objname = other
+                sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, body
+                sensor.intprm[:3] = [_FOUND_AND_FORCE, _NET_FORCE, 1]
+                made[-1].append(sensor.name)
+        return ContactSensorSpec(config, [body.removeprefix(f"{config.entity}/") for body in bodies], made)
+
+    def _contact_partners(
+        self, config: ContactSensorConfig, path: tuple[str, ...]
+    ) -> list[tuple[mujoco.mjtObj, str] | None]:
+        against = config.against
+        if against is None:
+            return [None]
+        if against == "ground":
+            if not self._ground_geoms():
+                raise SceneProblem((*path, "against"), "the scene has no ground", "add scene.ground or scene.terrain")
+            if self._ground is not None:
+                return [(mujoco.mjtObj.mjOBJ_BODY, TERRAIN_BODY)]
+            return [(mujoco.mjtObj.mjOBJ_GEOM, "ground")]
+        path = (*path, "against")
+        if against.bodies is not None:
+            bodies = self._bodies(against.entity, against.bodies, path, "bodies")
+            return [(mujoco.mjtObj.mjOBJ_BODY, body) for body in bodies]
+        every = self._bodies(against.entity, ".*", path, "bodies")
+        roots = [body for body in every if not self._spec.body(body).parent.name.startswith(f"{against.entity}/")]
+        return [(mujoco.mjtObj.mjOBJ_XBODY, body) for body in roots]
+
+    def _rays(self, config: RaySensorConfig, path: tuple[str, ...]) -> RaySensorSpec:
+        body = self._body(config.entity, config.body, path)
+        groups = tuple(config.sees) if isinstance(config.sees, list) else None
+        if config.sees == "ground":
+            groups = (self._group_of_ground((*path, "sees")),)
+        if not config.lookup:
+            return RaySensorSpec(config, body, groups)
+        if self._ground is None or self._ground.blocks:
+            lacks = "the scene has no terrain" if self._ground is None else "the terrain has boxes"
+            raise SceneProblem((*path, "lookup"), f"there is no table of heights to look in: {lacks}", "lookup: false")
+        return RaySensorSpec(config, body, groups, self._ground)
+
+    def _camera(self, name: str, config: CameraSensorConfig, path: tuple[str, ...]) -> CameraSensorSpec:
+        body = self._spec.worldbody
+        if config.entity is not None:
+            body = self._spec.body(self._body(config.entity, config.body, path))
+        if config.camera is None:
+            quat = _look_rotation(np.subtract(config.lookat, config.eye))
+            camera = body.add_camera(name=f"//{name}", pos=config.eye, quat=quat, fovy=config.fov)
+            return CameraSensorSpec(config, camera.name)
+        prefix = f"{config.entity}/"
+        names = [c.name.removeprefix(prefix) for c in self._spec.cameras if c.name.startswith(prefix)]
+        if config.camera not in names:
+            near = did_you_mean(config.camera, names) or f"cameras: {listing(names) if names else 'none'}"
+            raise SceneProblem((*path, "camera"), f"no camera '{config.camera}' in the MJCF of '{config.entity}'", near)
+        return CameraSensorSpec(config, prefix + config.camera)
+
+    def _body(self, entity: str, pattern: str | None, path: tuple[str, ...]) -> str:
+        """Return the full name of a body of an entity: of its first one without a pattern."""
+        bodies = self._bodies(entity, ".*" if pattern is None else pattern, path, "body")
+        if pattern is not None and len(bodies) > 1:
+            short = listing([body.removeprefix(f"{entity}/") for body in bodies])
+            raise SceneProblem((*path, "body"), f"'{pattern}' is several bodies: {short}", "name one")
+        return bodies[0]
+
+    def _bodies(self, entity: str, patterns: str | list[str], path: tuple[str, ...], key: str) -> list[str]:
+        """Full names of bodies of an entity."""
+        if entity not in self._entities:
+            near = did_you_mean(entity, self._entities) or f"entities: {listing(self._entities)}"
+            raise SceneProblem((*path, "entity"), f"no entity '{entity}' in the scene", near)
+        prefix = f"{entity}/"
+        names = [body.name.removeprefix(prefix) for body in self._spec.bodies if body.name.startswith(prefix)]
+        try:
+            return [prefix + names[position] for position in match(patterns, names, "body")]
+        except NameProblem as problem:
+            raise SceneProblem((*path, key), str(problem), problem.hint) from None
+
+    def _can_touch(self, body: str) -> bool:
+        geoms = self._spec.body(body).geoms
+        paired = {name for pair in self._spec.pairs for name in (pair.geomname1, pair.geomname2)}
+        return any(geom.contype or geom.conaffinity or (geom.name and geom.name in paired) for geom in geoms)
+
+    def _ground_geoms(self) -> list[mujoco.MjsGeom]:
+        if self._ground is not None:
+            return list(self._spec.body(TERRAIN_BODY).geoms)
+        return [geom for geom in self._spec.worldbody.geoms if geom.name == "ground"]
+
+    def _group_of_ground(self, path: tuple[str, ...]) -> int:
+        """The geom group of the ground, made its own: a group is what a ray can be told to see."""
+        ground = self._ground_geoms()
+        if not ground:
+            raise SceneProblem(path, "the scene has no ground", "add scene.ground or scene.terrain, or write sees: all")
+        names = {geom.name for geom in ground}
+        taken = {int(geom.group) for geom in self._spec.geoms if geom.name not in names}
+        free = [group for group in _DRAWN_GROUPS if group not in taken]
+        if not free:
+            message = f"geoms of the entities are in all groups that are drawn, {listing(map(str, _DRAWN_GROUPS))}"
+            raise SceneProblem(path, message, "leave one of them to the ground in the MJCF, or write sees: all")
+        for geom in ground:
+            geom.group = free[0]
+        return free[0]
+
+
+def _look_rotation(ray: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation of a camera that looks along a ray with z up, or x where it looks along z.
+
+    A camera looks along its own -z axis.
+    """
+    back = -ray / np.linalg.norm(ray)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross([1.0, 0.0, 0.0], back)
+    right /= np.linalg.norm(right)
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).flatten())
+    return quat

@@ -1,0 +1,267 @@
+"""Contact sensors, ray sensors and cameras of a scene, as terms see them: (num_envs, ...) tensors, always current."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from rlcli.config.schema import GridPatternConfig, RaySensorConfig
+from rlcli.scene.camera import CameraSensor, make_cameras
+from rlcli.scene.entity import Entity
+from rlcli.scene.lazy_sensor import LazySensor
+from rlcli.scene.sensor_specs import CameraSensorSpec, ContactSensorSpec, RaySensorSpec
+from rlcli.scene.terrain_heights import HeightTable
+from rlcli.sim.force_sensors import sensor_columns
+from rlcli.sim.indexing import as_index
+from rlcli.sim.rotations import rotate
+from rlcli.sim.selection import Selection
+from rlcli.sim.state_cache import SimData
+
+_TIMES = ("air_time", "contact_time", "last_air_time", "last_contact_time")
+_FLAGS = ("first_contact", "first_air", "found")
+_STATE_NAMES = (*_TIMES, *_FLAGS, "force_history")
+"""What a contact sensor carries from step to step."""
+
+
+class ContactSensor:
+    """Net contact forces on k bodies, and for how long each has been in contact or in the air.
+
+    Times count environment steps: the step in which contact begins counts as the last of the air time and as the first
+    of the contact time. An episode starts with all times 0, so its first contact or lift-off is none that changed.
+    """
+
+    def __init__(self, spec: ContactSensorSpec, sim: SimData) -> None:
+        self._sim = sim
+        engine = sim.engine
+        n, k, device = engine.num_envs, len(spec.bodies), engine.device
+        self.names = spec.bodies
+        """The bodies, a slot each."""
+        self._threshold = spec.config.force_threshold
+        self._others = len(spec.sensors[0])
+        sensors = [engine.model.sensor(name).id for names in spec.sensors for name in names]
+        self._columns = as_index(sensor_columns(engine.model, sensors), device)
+        engine.field("sensordata")
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(n, *shape, dtype=dtype, device=device)
+
+        self._times, self._flags = zeros(len(_TIMES), k), zeros(len(_FLAGS), k, dtype=torch.bool)
+        times, flags = self._times.unbind(1), self._flags.unbind(1)
+        self.force_history = zeros(spec.config.history, k, 3)
+        """Net contact force on each body over the last steps, newest first, world frame. (num_envs, h, k, 3) [N]"""
+        self.force = self.force_history[:, 0]
+        """Net contact force on each body in the last substep, world frame. (num_envs, k, 3) [N]"""
+        self.air_time = times[0]
+        """How long each body has been in the air; 0 in contact. (num_envs, k) [s]"""
+        self.contact_time = times[1]
+        """How long each body has been in contact; 0 in the air. (num_envs, k) [s]"""
+        self.last_air_time = times[2]
+        """How long each body was in the air before its last contact. (num_envs, k) [s]"""
+        self.last_contact_time = times[3]
+        """How long each body was in contact before it last lifted off. (num_envs, k) [s]"""
+        self.first_contact = flags[0]
+        """Whether contact began in the last step. (num_envs, k)"""
+        self.first_air = flags[1]
+        """Whether contact ended in the last step. (num_envs, k)"""
+        self.found = flags[2]
+        """Whether each body is in contact. (num_envs, k)"""
+
+    def update(self, dt: float) -> None:
+        """Take in what a step has measured."""
+        for age in range(self.force_history.shape[1] - 1, 0, -1):
+            self.force_history[:, age] = self.force_history[:, age - 1]
+        force, found = self._measure(self._sim.derived_field("sensordata"))
+        self.force.copy_(force)
+        self.found.copy_(found)
+        torch.logical_and(found, self.air_time > 0.0, out=self.first_contact)
+        torch.logical_and(~found, self.contact_time > 0.0, out=self.first_air)
+        self._times[:, :2] += dt
+        torch.where(self.first_contact, self.air_time, self.last_air_time, out=self.last_air_time)
+        torch.where(self.first_air, self.contact_time, self.last_contact_time, out=self.last_contact_time)
+        self.air_time *= ~found
+        self.contact_time *= found
+
+    def reset(self, selection: Selection) -> None:
+        """Begin new episodes: no times, no history, and the forces of the start state."""
+        for values in (self._times, self._flags, self.force_history):
+            selection.write(values, 0)
+        if self._sim.engine.forces_after_reset:
+            force, found = self._measure(selection.read_view(self._sim.derived_field("sensordata")))
+            selection.write(self.force, force)
+            selection.write(self.found, found)
+
+    def on_moved(self, selection: Selection) -> None:
+        """Forces are those of the last step, wherever an event has put the bodies since."""
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What the sensor carries from step to step."""
+        return {name: getattr(self, name).clone() for name in _STATE_NAMES}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore the state returned by `state_dict()`."""
+        for name in _STATE_NAMES:
+            getattr(self, name).copy_(state[name])
+
+    def _measure(self, sensordata: Tensor) -> tuple[Tensor, Tensor]:
+        """Return net forces (rows, k, 3), and whether they are contacts (rows, k)."""
+        values = torch.unflatten(sensordata[:, self._columns], 1, (-1, self._others, 4))
+        total = values[:, :, 0]
+        for other in range(1, self._others):
+            total = total + values[:, :, other]
+        force, found = total[..., 1:], total[..., 0] > 0.0
+        if self._threshold > 0.0:
+            x, y, z = force.unbind(-1)
+            found = found & ((x * x + y * y + z * z).sqrt() >= self._threshold)
+        return force, found
+
+
+class RaySensor(LazySensor):
+    """Distances along r rays from a body. Rays are cast when they are read, at most once a step."""
+
+    def __init__(self, spec: RaySensorSpec, sim: SimData, entity: Entity) -> None:
+        super().__init__()
+        self._sim = sim
+        self._config = config = spec.config
+        self._engine = engine = sim.engine
+        self._body = engine.model.body(spec.body).id
+        self._groups = spec.groups
+        self._table = None if spec.ground is None else HeightTable(spec.ground, engine.device)
+        self._root = entity.root_qpos if self._body == entity.root_body else None
+        starts, directions = (values.to(engine.device) for values in _pattern(config))
+        self._starts, self._directions = starts, directions
+        self._offset = torch.tensor([config.offset], device=engine.device)
+        self._unit = torch.eye(3, device=engine.device)
+        n, r = engine.num_envs, len(starts)
+        self.names = [f"ray_{i}" for i in range(r)]
+        """The rays."""
+        self._distance = torch.zeros(n, r, device=engine.device)
+        self._missed = torch.zeros(n, r, dtype=torch.bool, device=engine.device)
+        self._hits = torch.zeros(n, r, 3, device=engine.device)
+        self._position = torch.zeros(n, 3, device=engine.device)
+        self._buffers = (self._distance, self._missed, self._hits, self._position)
+
+    @property
+    def distance(self) -> Tensor:
+        """Distance along each ray to what it hits, `max_distance` where it hits nothing. (num_envs, r) [m]"""
+        self._cast()
+        return self._distance
+
+    @property
+    def missed(self) -> Tensor:
+        """Whether each ray hits nothing within `max_distance`. (num_envs, r)"""
+        self._cast()
+        return self._missed
+
+    @property
+    def hits(self) -> Tensor:
+        """Where each ray ends, world frame. (num_envs, r, 3) [m]"""
+        self._cast()
+        return self._hits
+
+    @property
+    def position(self) -> Tensor:
+        """The sensor's own position, world frame. (num_envs, 3) [m]"""
+        self._cast()
+        return self._position
+
+    def on_moved(self, selection: Selection) -> None:
+        """Cast anew for the selected environments, if rays have been cast in this step."""
+        if not self._current:
+            return
+        position, quat = self._pose()
+        found = self._rays(selection.read_view(position), selection.read_view(quat), selection)
+        for buffer, values in zip(self._buffers, found, strict=True):
+            selection.write(buffer, values)
+
+    def _cast(self) -> None:
+        if not self._current:
+            self._current = True
+            found = self._rays(*self._pose())
+            for buffer, values in zip(self._buffers, found, strict=True):
+                buffer.copy_(values)
+
+    def _rays(self, position: Tensor, quat: Tensor, selection: Selection | None = None) -> tuple[Tensor, ...]:
+        self._sim.forward_moved()
+        axes = self._axes(quat)
+        position = position + _rotated(axes, self._offset)[:, 0]
+        points = position[:, None] + _rotated(axes, self._starts)
+        directions = _rotated(axes, self._directions)
+        if self._table is not None:
+            found = self._table.distance(points)
+        else:
+            found = self._engine.rays(points, directions, groups=self._groups, exclude=self._body, selection=selection)
+        reach = self._config.max_distance
+        missed = (found < 0.0) | (found > reach)
+        distance = found.masked_fill_(missed, reach)
+        return distance, missed, points + directions * distance[..., None], position
+
+    def _pose(self) -> tuple[Tensor, Tensor]:
+        if self._root is not None:
+            qpos = self._sim.qpos
+            return qpos[:, self._root : self._root + 3], qpos[:, self._root + 3 : self._root + 7]
+        return self._sim.derived_field("xpos")[:, self._body], self._sim.derived_field("xquat")[:, self._body]
+
+    def _axes(self, quat: Tensor) -> Tensor | None:
+        """The axes of the sensor's frame in the world, one below the other; None: the world's. (rows, 3, 3)"""
+        if self._config.alignment == "world":
+            return None
+        x, y, z = (rotate(quat, axis.expand(len(quat), 3)) for axis in self._unit)
+        if self._config.alignment == "base":
+            return torch.stack([x, y, z], dim=1)
+        ahead, left = x[:, 0] + 1e-12, x[:, 1]  # a body that points straight up heads along x
+        norm = (ahead * ahead + left * left).sqrt()
+        cos, sin, zero = ahead / norm, left / norm, torch.zeros_like(norm)
+        rows = [cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1.0]
+        return torch.unflatten(torch.stack(rows, dim=1), 1, (3, 3))
+
+
+Sensor = ContactSensor | RaySensor | CameraSensor
+"""What `scene.sensors` has."""
+
+
+def make_sensors(
+    specs: Mapping[str, ContactSensorSpec | RaySensorSpec | CameraSensorSpec],
+    sim: SimData,
+    entities: Mapping[str, Entity],
+) -> dict[str, Sensor]:
+    """Make the sensors that the scene has put into the model, in the order of `specs`."""
+    cameras = {name: spec for name, spec in specs.items() if isinstance(spec, CameraSensorSpec)}
+    made: dict[str, Sensor] = dict(make_cameras(cameras, sim.engine))
+    for name, spec in specs.items():
+        if isinstance(spec, ContactSensorSpec):
+            made[name] = ContactSensor(spec, sim)
+        elif isinstance(spec, RaySensorSpec):
+            made[name] = RaySensor(spec, sim, entities[spec.config.entity])
+    return {name: made[name] for name in specs}
+
+
+def _pattern(config: RaySensorConfig) -> tuple[Tensor, Tensor]:
+    """Starts relative to the sensor, and unit directions. (r, 3) each"""
+    if not isinstance(config.pattern, GridPatternConfig):
+        directions = torch.tensor(config.pattern)
+        return torch.zeros_like(directions), torch.nn.functional.normalize(directions, dim=1)
+    x, y = (_line(size, config.pattern.resolution) for size in config.pattern.size)
+    y, x = torch.meshgrid(y, x, indexing="ij")
+    starts = torch.stack([x, y, torch.zeros_like(x)], dim=-1).view(-1, 3)
+    direction = torch.nn.functional.normalize(torch.tensor(config.pattern.direction), dim=0)
+    return starts, direction.expand(len(starts), 3).contiguous()
+
+
+def _line(size: float, resolution: float) -> Tensor:
+    """Points at the resolution's distance, centred, that fit in the size."""
+    count = math.floor(size / resolution + 1e-6) + 1
+    return (torch.arange(count) - (count - 1) / 2) * resolution
+
+
+def _rotated(axes: Tensor | None, vectors: Tensor) -> Tensor:
+    """Vectors of the sensor's frame in the world. (r, 3) -> (rows, r, 3), one row where the frame is the world's"""
+    if axes is None:
+        return vectors[None]
+    x, y, z = axes[:, None].unbind(2)
+    return vectors[:, 0:1] * x + vectors[:, 1:2] * y + vectors[:, 2:3] * z

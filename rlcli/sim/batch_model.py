@@ -1,0 +1,135 @@
+"""The model of the CPU engine's worlds, and the model fields that differ between them."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import MODEL_FIELDS, SimulationError
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rlcli import machine
+from rlcli.errors import DeviceError, DivergedError, did_you_mean
+from rlcli.sim.divergence import MORE_MEMORY
+from rlcli.sim.mujoco_log import quiet_mujoco
+from rlcli.sim.mujoco_private import expand_disable_flags, expanded_fields, make_batch, without_profiler
+from rlcli.sim.selection import Selection, ids_of
+from rlcli.sim.skippable_work import skippable_flags
+
+INTEGRATION_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_FLAGS = frozenset(
+    [
+        *("geom_contype", "geom_conaffinity", "geom_priority", "geom_group", "jnt_limited", "jnt_actgravcomp"),
+        *("jnt_actfrclimited", "tendon_limited", "tendon_actfrclimited", "actuator_ctrllimited", "actuator_actlimited"),
+        *("actuator_forcelimited", "eq_active0", "opt.disableactuator"),
+    ]
+)
+"""Integers of a model that are neither an address nor a count nor a type: no value of them is out of range."""
+_MIN_STATES_PER_ENV = 3
+"""Least memory of an environment, in integration states; the built-in tasks take 3.3 to 16."""
+
+
+class BatchModel:
+    """Worlds on CPU threads, and the model fields that differ between them.
+
+    Raises:
+        DeviceError: for more worlds than the machine's memory holds.
+    """
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int, threads: int, *, persistent: bool) -> None:
+        quiet_mujoco()
+        _require_memory(model, num_envs)
+        self.model = model
+        self.num_envs = num_envs
+        self.threads = threads
+        self._disable_flags = model.opt.disableflags
+        self._batch = make_batch(model, num_envs, threads, skipped_flags=skippable_flags(model), persistent=persistent)
+        self._skips = True
+        """Whether steps skip what changes no state."""
+        self._expanded = expanded_fields(self._batch)
+        self.own_constants = False
+        """Whether `set_constants` has been called."""
+
+    def can_expand(self, name: str) -> bool:
+        """Return whether a model field may differ between worlds."""
+        return name in MODEL_FIELDS
+
+    def expand(self, name: str) -> Tensor:
+        """Return a model field with a value for every world."""
+        if name not in MODEL_FIELDS:
+            raise ValueError(f"'{name}' cannot differ between worlds; {did_you_mean(name, MODEL_FIELDS) or ''}")
+        values = torch.from_numpy(self._batch.expand(name))
+        if not values.is_floating_point():
+            self._skip_nothing()
+        return values
+
+    def expanded(self, name: str) -> Tensor | None:
+        """Return a model field that has been expanded; None if all worlds share the model's value."""
+        return self.expand(name) if name in self._expanded else None
+
+    def expanded_fields(self) -> list[str]:
+        """Return the names of the model fields that have been expanded."""
+        return list(self._expanded)
+
+    def set_constants(self, selection: Selection | None = None) -> None:
+        """Recompute the constants that MuJoCo derives from model fields."""
+        try:
+            with without_profiler:
+                self._batch.set_const(None if selection is None else ids_of(selection).astype(np.int32))
+        except SimulationError as error:
+            raise engine_error(error) from None
+        self.own_constants = True
+
+    def own_model_fields(self, env: int) -> dict[str, NDArray[Any]]:
+        """Return copies of the model fields of one world."""
+        return {name: np.array(values[env]) for name, values in self._expanded.items()}
+
+    def load_model_field(self, name: str, values: Tensor) -> None:
+        """Expand a model field and set its values, which were read from a file.
+
+        Raises:
+            ValueError: for values that do not fit, or that could make MuJoCo read outside of its arrays.
+        """
+        target = self.expand(name)
+        if target.shape != values.shape or target.dtype != values.dtype:
+            raise ValueError(f"model field '{name}' is {tuple(values.shape)}, not {tuple(target.shape)}")
+        if not target.dtype.is_floating_point and name not in _FLAGS and not torch.equal(target, values):
+            raise ValueError(f"model field '{name}' is part of the model's structure, and not the model's")
+        target.copy_(values)
+
+    def write_own_model(self, env: int, model: mujoco.MjModel) -> None:
+        """Write the model of one world into a copy of the model. Who steps the copy skips nothing."""
+        self._batch.get_model(env, model)
+        if "opt.disableflags" not in self._expanded:
+            model.opt.disableflags = self._disable_flags
+
+    def _skip_nothing(self) -> None:
+        """Have MuJoCo compute from now on all that the model's own flags say."""
+        if self._skips:
+            self._skips = False
+            expand_disable_flags(self._batch)[:] = self._disable_flags
+
+
+def engine_error(error: SimulationError) -> DivergedError:
+    """Return what to raise for an error of `mujoco.batch`."""
+    return DivergedError(f"the physics engine stopped: {' '.join(str(error).split())}", hint=MORE_MEMORY)
+
+
+def _require_memory(model: mujoco.MjModel, num_envs: int) -> None:
+    """Refuse worlds that do not fit into memory: a kernel that overcommits would kill the process later.
+
+    Raises:
+        DeviceError: if they do not fit.
+    """
+    each = _MIN_STATES_PER_ENV * 8 * mujoco.mj_stateSize(model, INTEGRATION_STATE)
+    free = min(machine.memory(), machine.memory_limit() or sys.maxsize)
+    if each * num_envs > free:
+        raise DeviceError(
+            f"{num_envs} environments need {each * num_envs / 2**30:.1f} GiB at the least,"
+            f" {free / 2**30:.1f} GiB are free on this machine",
+            hint="fewer environments: --num-envs",
+        )

@@ -1,0 +1,45 @@
+"""Fields and sensors that MuJoCo computes in the acceleration stage of a step."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+ACCELERATION_FIELDS = frozenset(
+    [
+        *("qacc", "qacc_smooth", "actuator_force", "qfrc_actuator", "qfrc_smooth", "qfrc_constraint", "qfrc_inverse"),
+        *("act_dot", "cacc", "cfrc_int", "cfrc_ext"),
+    ]
+)
+"""Fields of MjData that the acceleration stage writes. They are read as the last substep left them."""
+_BODY_FORCE_SENSORS = [
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}"))
+    for kind in ("ACCELEROMETER", "FORCE", "TORQUE", "FRAMELINACC", "FRAMEANGACC")
+]
+
+
+def computes_body_forces(model: mujoco.MjModel) -> bool:
+    """Return whether a step computes `cacc`, `cfrc_int` and `cfrc_ext`: only for sensors that need them."""
+    return bool(np.isin(model.sensor_type, _BODY_FORCE_SENSORS).any())
+
+
+def add_body_forces(spec: mujoco.MjSpec) -> None:
+    """Add a dummy sensor to the model, for which MuJoCo computes `cacc`, `cfrc_int` and `cfrc_ext`."""
+    spec.add_sensor(
+        name="body_forces",
+        type=mujoco.mjtSensor.mjSENS_FRAMEANGACC,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        objname="world",
+    )
+
+
+def force_sensors(model: mujoco.MjModel) -> list[int]:
+    """Return the columns of `sensordata` that the acceleration stage computes."""
+    acceleration = int(mujoco.mjtStage.mjSTAGE_ACC)
+    return sensor_columns(model, np.flatnonzero(model.sensor_needstage == acceleration).tolist())
+
+
+def sensor_columns(model: mujoco.MjModel, sensors: list[int]) -> list[int]:
+    """Return the columns of some sensors in `sensordata`."""
+    starts, sizes = model.sensor_adr, model.sensor_dim
+    return [column for s in sensors for column in range(int(starts[s]), int(starts[s] + sizes[s]))]

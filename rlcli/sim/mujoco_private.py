@@ -1,0 +1,135 @@
+"""Private names of MuJoCo: those of `mujoco.batch`, and the clock variable of MuJoCo's C library.
+
+A new version of MuJoCo may rename any of them, so they are used in this module alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import ctypes
+import functools
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import mujoco
+import mujoco.batch
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from rlcli.errors import DependencyError
+
+_VERSION = "4.0"
+"""Version of MuJoCo that has all names of this module."""
+
+
+def _private(owner: object, name: str) -> Any:
+    """Return a private attribute of MuJoCo.
+
+    Raises:
+        DependencyError: if the installed version does not have it.
+    """
+    try:
+        return getattr(owner, name)
+    except AttributeError:
+        raise DependencyError(
+            f"MuJoCo {mujoco.__version__} has no '{name}', which rlcli uses; MuJoCo {_VERSION} has it",
+            hint=f'pip install "mujoco=={_VERSION}.*"',
+        ) from None
+
+
+STATE_FIELDS: dict[str, mujoco.mjtState] = _private(mujoco.batch, "_STATE_FIELDS")
+"""Fields of MjData that belong to the integration state -> their component of it."""
+
+
+def make_batch(
+    model: mujoco.MjModel, num_envs: int, threads: int, *, skipped_flags: int = 0, persistent: bool = False
+) -> Batch:
+    """Make a batch of worlds.
+
+    Args:
+        model: stays as it is: other threads may step it.
+        num_envs: worlds.
+        threads: that step them.
+        skipped_flags: disable flags (mjtDisableBit) that are set in the batch in addition to the model's.
+        persistent: keep one MjData for each world.
+
+    Raises:
+        DependencyError: if the installed version of MuJoCo lacks a private name that is used here.
+    """
+    own = copy.copy(model)
+    own.opt.disableflags |= skipped_flags
+    batch = Batch(own, num_envs, threads, persistent=persistent)
+    for name in ("_b", "_check", "_component", "_expanded"):
+        _private(batch, name)
+    return batch
+
+
+def state_columns(batch: Batch) -> dict[str, tuple[int, int]]:
+    """Return the first column and the size of each field in the integration state."""
+    return {name: batch._component(kind) for name, kind in STATE_FIELDS.items()}
+
+
+def expanded_fields(batch: Batch) -> dict[str, NDArray[Any]]:
+    """Return the model fields that differ between worlds, name -> (num_envs, ...); the dictionary is live."""
+    fields: dict[str, NDArray[Any]] = batch._expanded
+    return fields
+
+
+def expand_disable_flags(batch: Batch) -> NDArray[np.int32]:
+    """Return disable flags of each world, live, without listing them among the expanded fields."""
+    flags: NDArray[np.int32] = batch._b.expand("opt.disableflags").view(np.int32)
+    return flags
+
+
+def forward_of(batch: Batch) -> Callable[[NDArray[np.int64], int], None]:
+    """Return `batch.forward` without its checks of the ids, which take longer than the computation for few worlds."""
+    compute, check = batch._b.forward, batch._check
+
+    def forward(ids: NDArray[np.int64], stage: int) -> None:
+        worlds = ids.astype(np.int32)
+        check(worlds, compute(worlds, stage))
+
+    return forward
+
+
+class _WithoutProfiler:
+    """Context in which MuJoCo does not read the clock. Timers of threads that step elsewhere meanwhile are wrong.
+
+    `mjcb_time` is a variable of MuJoCo's C library. Python's `set_mjcb_time(None)` puts the bindings' own clock there.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._inside = 0
+        self._clock: int | None = None
+
+    @functools.cached_property
+    def _callback(self) -> ctypes.c_void_p:
+        for name in ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll"):
+            for path in Path(mujoco.__file__).parent.glob(name):
+                with contextlib.suppress(OSError, ValueError):
+                    return ctypes.c_void_p.in_dll(ctypes.CDLL(str(path)), "mjcb_time")
+        return ctypes.c_void_p()  # a build of MuJoCo with another layout: its profiler stays on
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._clock = self._callback.value
+                self._callback.value = None
+            self._inside += 1
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside and self._callback.value is None:  # no other callback was set meanwhile
+                self._callback.value = self._clock
+
+
+without_profiler = _WithoutProfiler()

@@ -1,0 +1,130 @@
+"""The joint state of all worlds in float32, copied once a step; derived fields are cast when they are read."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from rlcli.sim.engine import Engine
+from rlcli.sim.selection import Selection, ids_of
+
+
+def is_finite(values: Tensor) -> bool:
+    """Whether every value is finite, in one pass where they are: a finite sum has finite summands only."""
+    return math.isfinite(values.sum().item()) or bool(values.isfinite().all())
+
+
+class SimData:
+    """The engine's joint state as float32, copied once a step, and derived fields cast when read.
+
+    `qpos` (num_envs, nq) and `qvel` (num_envs, nv) keep their storage for ever, so views of them stay valid. Where the
+    engine keeps the two side by side they are one copy; where its own are float32, they are the engine's own.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        qpos, qvel = engine.field("qpos"), engine.field("qvel")
+        joined = _joined(qpos, qvel)
+        self._sources = [qpos, qvel] if joined is None else [joined]
+        self._copies = [source.to(torch.float32).contiguous() for source in self._sources]
+        self._flat = [copy.view(-1) for copy in self._copies]
+        own = self._copies[0] is self._sources[0]
+        # an engine in float64 is on the CPU, where small copies cost numpy half of torch's
+        pairs = [] if own else zip(self._copies, self._sources, strict=True)
+        self._stale = [(copy.numpy(), source.numpy()) for copy, source in pairs]
+        self._saved = [copy.copy() for copy, _ in self._stale]
+        self.qpos = self._copies[0][:, : qpos.shape[1]]
+        self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
+        self.stamp = 0
+        self._saved_at, self._summed = -1, (-1, 0.0)
+        self._moved: Selection | None = None
+        self._derived: dict[str, tuple[int, Tensor]] = {}
+
+    def on_moved(self, selection: Selection) -> None:
+        """Update the selected worlds, whose state has been written.
+
+        An engine that computes all worlds at once does so when it is next read: once, however often worlds move.
+        """
+        if not self.engine.asynchronous:
+            self.engine.forward(selection)
+        else:
+            self._moved = selection if self._moved is None else self._moved.union(selection)
+        self.refresh_rows(selection)
+
+    def forward_moved(self) -> None:
+        """Compute the derived fields of worlds that have moved, where that has been put off."""
+        if self._moved is not None:
+            selection, self._moved = self._moved, None
+            self.engine.forward(selection)
+
+    def refresh(self) -> None:
+        """Copy the state of every world."""
+        for copy, source in self._stale:
+            copy[...] = source
+        self.stamp += 1
+
+    def refresh_rows(self, selection: Selection) -> None:
+        """Copy the state of the selected worlds, and drop what was computed from it."""
+        for copy, source in self._stale:
+            rows = ids_of(selection)
+            copy[rows] = source[rows]
+        self.stamp += 1
+
+    def save_good_state(self) -> None:
+        """Save the state of every world; `restore_rows` writes it back."""
+        if self._saved_at == self.stamp:
+            return
+        self._saved_at = self.stamp
+        for saved, (copy, _) in zip(self._saved, self._stale, strict=True):
+            saved[...] = copy
+
+    def restore_rows(self, selection: Selection) -> None:
+        """Write the last saved state of the selected worlds back to the engine."""
+        for saved, (_, source) in zip(self._saved, self._stale, strict=True):
+            rows = ids_of(selection)
+            source[rows] = saved[rows]
+
+    def is_finite(self) -> bool:
+        """Whether every position and velocity is a finite number, as the last `refresh` found them."""
+        return math.isfinite(self._squares()) or all(bool(flat.isfinite().all()) for flat in self._flat)
+
+    def out_of_bounds(self, limit: float) -> Tensor | None:
+        """Worlds with a position or a velocity that is not finite or beyond `limit`; None for none. (num_envs,) bool"""
+        # the sum of all squares bounds each of them, is not finite where one is not, and rounds by far less than half
+        if self._squares() <= 0.5 * limit * limit:
+            return None
+        bad = [~(copy.abs() <= limit).all(dim=1) for copy in self._copies]
+        return torch.stack(bad).any(dim=0)
+
+    def _squares(self) -> float:
+        at, total = self._summed
+        if at != self.stamp:
+            total = 0.0
+            for flat in self._flat:
+                total += torch.dot(flat, flat).item()
+            self._summed = self.stamp, total
+        return total
+
+    def derived_field(self, name: str) -> Tensor:
+        """A derived field as float32, cast once a step. (num_envs, ...)"""
+        self.forward_moved()
+        stamp, value = self._derived.get(name, (-1, None))
+        if stamp != self.stamp or value is None:
+            value = self.engine.field(name).float()
+            self._derived[name] = (self.stamp, value)
+        return value
+
+
+def _joined(left: Tensor, right: Tensor) -> Tensor | None:
+    """Two 2-d views as one, where they are neighbouring columns of the same storage; else None."""
+    neighbours = (
+        left.dtype == right.dtype
+        and left.stride() == right.stride()
+        and left.untyped_storage().data_ptr() == right.untyped_storage().data_ptr()
+        and right.data_ptr() == left.data_ptr() + left.shape[1] * left.element_size()
+    )
+    if not neighbours:
+        return None
+    return left.as_strided((left.shape[0], left.shape[1] + right.shape[1]), left.stride())

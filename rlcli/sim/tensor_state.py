@@ -1,0 +1,60 @@
+"""Checks of saved tensors before they are copied into their places."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+
+class TensorState:
+    """Base class of an object whose state is a few tensors, which are restored in place."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors themselves, by their keys in `state_dict`."""
+        raise NotImplementedError
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return copies of the tensors."""
+        return {name: tensor.clone() for name, tensor in self.tensors().items()}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore the state returned by `state_dict()`."""
+        for name, tensor in self.tensors().items():
+            tensor.copy_(state[name])
+
+
+def substate(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Return the part of a state whose keys begin with a prefix, without the prefix."""
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+
+
+def require_matching_tensors(saved: Mapping[str, Tensor], own: Mapping[str, Tensor], what: str) -> None:
+    """Check that saved tensors have the shapes and types of their targets: `copy_` would broadcast or round them.
+
+    Args:
+        saved: what was read.
+        own: where it goes; names that only one of both has are passed over.
+        what: the part that was read, for the message.
+
+    Raises:
+        ValueError: naming the first tensor that differs.
+    """
+    for name, value in own.items():
+        found = saved.get(name)
+        if found is not None and (found.shape != value.shape or found.dtype != value.dtype):
+            raise ValueError(f"{what}: '{name}' is {_text(found)}, expected {_text(value)}")
+
+
+def require_in_range(value: Tensor, low: int, high: int, what: str) -> None:
+    """Check that indices are within their range.
+
+    Raises:
+        ValueError: naming them.
+    """
+    if value.numel() and not bool(((value >= low) & (value <= high)).all()):
+        raise ValueError(f"'{what}' is {int(value.min())} to {int(value.max())}, allowed is {low} to {high}")
+
+
+def _text(value: Tensor) -> str:
+    return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"

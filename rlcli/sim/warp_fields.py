@@ -1,0 +1,61 @@
+"""Fields of the GPU engine's worlds: which are state, and which stage of a step computes the others."""
+
+from __future__ import annotations
+
+import mujoco
+
+from rlcli.sim.force_sensors import ACCELERATION_FIELDS, force_sensors
+
+STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
+"""What every world carries from step to step, and every reset restores."""
+INPUTS = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
+"""Further state, with the model's values until a term binds it."""
+_KINEMATIC_FIELDS = frozenset(
+    [
+        *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos"),
+        *("site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir", "subtree_com", "ten_length", "cinert"),
+    ]
+)
+"""Derived fields of the position stage that kinematics alone give."""
+_MOTION_FIELDS = frozenset(["cvel", "cdof", "cdof_dot"])
+"""Fields of the velocity stage that the motion of bodies alone gives: no inertias, no contacts, no constraints."""
+_MOTION_SENSORS = frozenset(
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
+    for name in (
+        *("MAGNETOMETER", "CAMPROJECTION", "RANGEFINDER", "JOINTPOS", "TENDONPOS", "BALLQUAT", "FRAMEPOS", "FRAMEQUAT"),
+        *("FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS", "SUBTREECOM", "CLOCK", "INSIDESITE", "VELOCIMETER", "GYRO"),
+        *("JOINTVEL", "BALLANGVEL", "FRAMELINVEL", "FRAMEANGVEL", "SUBTREELINVEL", "SUBTREEANGMOM"),
+    )
+)
+"""Sensors before the acceleration stage that read nothing else."""
+KINEMATICS, VELOCITY, FORCE = range(3)
+"""Groups of derived fields."""
+
+
+class FieldStages:
+    """The stages that compute the fields of a model's worlds."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        force_columns = force_sensors(model)
+        self._sensor_stages = {FORCE} if force_columns else set()
+        if len(force_columns) < model.nsensordata:
+            self._sensor_stages.add(VELOCITY)
+        self._sensors_need_only_motion = _MOTION_SENSORS.issuperset(
+            int(kind)
+            for kind, stage in zip(model.sensor_type, model.sensor_needstage, strict=True)
+            if int(stage) < int(mujoco.mjtStage.mjSTAGE_ACC)
+        )
+
+    def stages_of(self, name: str) -> set[int]:
+        """Return the groups of derived fields that a field belongs to."""
+        if name in (*STATE, *INPUTS):
+            return set()
+        if name == "sensordata":
+            return self._sensor_stages
+        return {KINEMATICS if name in _KINEMATIC_FIELDS else FORCE if name in ACCELERATION_FIELDS else VELOCITY}
+
+    def needs_only_motion(self, name: str) -> bool:
+        """Return whether a field can be derived from the state without contacts, constraints and inertias."""
+        if name == "sensordata":
+            return self._sensors_need_only_motion
+        return VELOCITY not in self.stages_of(name) or name in _MOTION_FIELDS

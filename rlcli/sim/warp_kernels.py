@@ -1,0 +1,191 @@
+"""Warp kernels of the GPU engine: counter-based random numbers, the check for divergence, resets by mask.
+
+Each does in one launch what would take torch ten: inside a captured step the launches are what costs.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+wp.config.log_level = wp.LOG_ERROR  # standard output belongs to data
+wp.init()
+# nothing here is differentiated: half the code to compile
+wp.set_module_options({"enable_backward": False})
+
+_GOLDEN = wp.constant(wp.uint64(0x9E3779B97F4A7C15))
+_MIX1 = wp.constant(wp.uint64(0xBF58476D1CE4E5B9))
+_MIX2 = wp.constant(wp.uint64(0x94D049BB133111EB))
+_TO_UNIT = wp.constant(wp.float32(2.0**-24))
+_TOO_LARGE = wp.constant(wp.float32(1e10))
+CAUSES = ("qpos not finite", "qpos out of bounds", "qvel not finite", "qvel out of bounds")
+"""Causes of a divergence, by number."""
+
+
+@wp.func
+def mix(x: wp.uint64) -> wp.uint64:
+    """SplitMix64's finaliser, as `rlcli.random.mix`."""
+    x = x ^ (x >> wp.uint64(30))
+    x = x * _MIX1
+    x = x ^ (x >> wp.uint64(27))
+    x = x * _MIX2
+    return x ^ (x >> wp.uint64(31))
+
+
+@wp.func
+def unit(start: wp.uint64, counter: wp.int64, stream: wp.uint64, env: int, index: int) -> float:
+    """The `index`th number of a stream in an environment, in [0, 1): the bits of `rlcli.random.uniform`."""
+    key = mix(mix(wp.uint64(env) * _GOLDEN + start) + wp.uint64(counter) * _GOLDEN)
+    word = mix(key + wp.uint64(index + 1) * _GOLDEN + stream)
+    return wp.float32(word >> wp.uint64(40)) * _TO_UNIT
+
+
+@wp.kernel
+def draw_uniform(
+    start: wp.uint64,
+    counters: wp.array(dtype=wp.int64),
+    stream: wp.uint64,
+    index: int,
+    num_streams: int,
+    low: float,
+    span: float,
+    out: wp.array2d(dtype=float),
+):
+    """Uniform in [low, low + span). out (num_envs, count)"""
+    env, column = wp.tid()
+    out[env, column] = unit(start, counters[env], stream, env % num_streams, index + column) * span + low
+
+
+@wp.kernel
+def draw_normal(
+    start: wp.uint64,
+    counters: wp.array(dtype=wp.int64),
+    stream: wp.uint64,
+    index: int,
+    num_streams: int,
+    out: wp.array2d(dtype=float),
+):
+    """Standard normal, by Box and Muller. out (num_envs, count)"""
+    env, column = wp.tid()
+    count = out.shape[1]
+    u = unit(start, counters[env], stream, env % num_streams, index + column)
+    v = unit(start, counters[env], stream, env % num_streams, index + count + column)
+    out[env, column] = wp.sqrt(-2.0 * wp.log(1.0 - u)) * wp.cos(2.0 * wp.pi * v)
+
+
+@wp.kernel
+def check_bounds(
+    qpos: wp.array2d(dtype=float),
+    qvel: wp.array2d(dtype=float),
+    warmstart: wp.array2d(dtype=float),
+    ctrl: wp.array2d(dtype=float),
+    act: wp.array2d(dtype=float),
+    overflow: wp.array(dtype=wp.int32),
+    max_velocity: wp.float32,
+    last_qpos: wp.array2d(dtype=float),
+    last_qvel: wp.array2d(dtype=float),
+    diverged: wp.array(dtype=wp.bool),
+    counts: wp.array(dtype=wp.int64),
+    first: wp.array(dtype=wp.int32),
+    overflowed: wp.array(dtype=wp.int32),
+):
+    """Find worlds whose state is not finite, beyond MuJoCo's limit or too fast; restore their last good state.
+
+    `counts` has a number for each of `CAUSES`; `first` holds the number of the first such world ever, counted from 1,
+    with its cause and the column. Overflows of capacities are added to `overflowed`, except for diverged worlds.
+    """
+    world = wp.tid()
+    bad = wp.int32(0)  # a plain number would be a constant
+    column = wp.int32(0)
+    for i in range(qvel.shape[1]):
+        x = qvel[world, i]
+        if not wp.isfinite(x):
+            bad = wp.int32(3)
+            column = i
+        elif wp.abs(x) > max_velocity:
+            bad = wp.int32(4)
+            column = i
+    for i in range(qpos.shape[1]):
+        x = qpos[world, i]
+        if bad != 1 and not wp.isfinite(x):
+            bad = wp.int32(1)
+            column = i
+        elif bad != 1 and wp.abs(x) > _TOO_LARGE:
+            bad = wp.int32(2)
+            column = i
+    diverged[world] = bad != 0
+    if bad != 0:
+        wp.atomic_add(counts, bad - 1, wp.int64(1))
+        if wp.atomic_cas(first, 0, wp.int32(0), world + 1) == 0:
+            first[1] = bad - 1
+            first[2] = column
+        overflow[world] = 0
+        for i in range(qpos.shape[1]):
+            qpos[world, i] = last_qpos[world, i]
+        for i in range(qvel.shape[1]):
+            qvel[world, i] = last_qvel[world, i]
+            warmstart[world, i] = 0.0
+        for i in range(ctrl.shape[1]):
+            ctrl[world, i] = 0.0
+        for i in range(act.shape[1]):
+            act[world, i] = 0.0
+    else:
+        if overflow[world] != 0:
+            overflowed[world] = overflowed[world] | overflow[world]
+            overflow[world] = 0
+        for i in range(qpos.shape[1]):
+            last_qpos[world, i] = qpos[world, i]
+        for i in range(qvel.shape[1]):
+            last_qvel[world, i] = qvel[world, i]
+
+
+@wp.kernel
+def restore_diverged(diverged: wp.array(dtype=wp.bool), now: wp.array2d(dtype=float), last: wp.array2d(dtype=float)):
+    """Restore the rows of diverged worlds from their last values; save the rows of the others."""
+    world, column = wp.tid()
+    if diverged[world]:
+        now[world, column] = last[world, column]
+    else:
+        last[world, column] = now[world, column]
+
+
+@wp.kernel
+def save_rows(mask: wp.array(dtype=wp.bool), now: wp.array2d(dtype=float), last: wp.array2d(dtype=float)):
+    """Save the masked rows as the last ones."""
+    world, column = wp.tid()
+    if mask[world]:
+        last[world, column] = now[world, column]
+
+
+@wp.kernel
+def reset_worlds(
+    mask: wp.array(dtype=wp.bool),
+    default_qpos: wp.array(dtype=float),
+    default_qvel: wp.array(dtype=float),
+    qpos: wp.array2d(dtype=float),
+    qvel: wp.array2d(dtype=float),
+    warmstart: wp.array2d(dtype=float),
+    ctrl: wp.array2d(dtype=float),
+    act: wp.array2d(dtype=float),
+    time: wp.array(dtype=float),
+):
+    """Put the masked worlds into the default state."""
+    world = wp.tid()
+    if mask[world]:
+        time[world] = 0.0
+        for i in range(qpos.shape[1]):
+            qpos[world, i] = default_qpos[i]
+        for i in range(qvel.shape[1]):
+            qvel[world, i] = default_qvel[i]
+            warmstart[world, i] = 0.0
+        for i in range(ctrl.shape[1]):
+            ctrl[world, i] = 0.0
+        for i in range(act.shape[1]):
+            act[world, i] = 0.0
+
+
+@wp.kernel
+def flag_nonfinite(values: wp.array2d(dtype=float), flag: wp.array(dtype=wp.int32), index: int):
+    """Raise a flag if a value is not finite."""
+    row, column = wp.tid()
+    if not wp.isfinite(values[row, column]):
+        flag[index] = 1

@@ -1,0 +1,93 @@
+"""Memory of the GPU engine: for a model and its worlds, and for their contacts and constraints."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import mujoco
+import mujoco_warp as mjw
+import torch
+import warp as wp
+
+from rlcli.errors import ConfigError, DeviceError, DivergedError, Problem
+from rlcli.sim.capacity import Capacity
+from rlcli.sim.skippable_work import skippable_flags
+
+OVERFLOW_SETTINGS = {
+    mjw.OverflowType.NEFC: "constraints_per_env",
+    mjw.OverflowType.NJMAX_NNZ: "constraints_per_env",
+    mjw.OverflowType.BROADPHASE: "contacts_per_env",
+    mjw.OverflowType.NARROWPHASE: "contacts_per_env",
+    mjw.OverflowType.CCD: "contacts_per_env",
+    mjw.OverflowType.HFIELD: "contacts_per_env",
+    mjw.OverflowType.EPA_HORIZON: "contacts_per_env",
+}
+"""Capacities that a step may exceed -> the setting that raises them. Solver iterations are no capacity."""
+
+
+def put_on_device(
+    model: mujoco.MjModel, num_envs: int, device: torch.device, capacity: Capacity
+) -> tuple[mjw.Model, mjw.Data]:
+    """Put a model and its worlds on a device; called where Warp launches there.
+
+    Raises:
+        ConfigError: for a model that MuJoCo Warp cannot run.
+        DeviceError: for more worlds than the device's memory holds.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            on_device = mjw.put_model(model)
+        if not on_device.nsensorcollision:  # the same pass measures distances
+            on_device.opt.disableflags |= skippable_flags(model) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        on_device.opt.warn_overflow = 0  # printing stops the device; `report_nonfinite` raises
+        if device.type == "cpu":
+            on_device.opt.graph_conditional = False
+    except (NotImplementedError, ValueError) as error:
+        message = f"the GPU engine (MuJoCo Warp) cannot run this model: {' '.join(str(error).split())}"
+        hint = "--device cpu runs it; or change the option in the MJCF"
+        raise ConfigError([Problem("scene", "", message, hint)]) from None
+    try:
+        return on_device, _make_data(model, num_envs, capacity)
+    except RuntimeError as error:
+        if "alloc" not in str(error) and "memory" not in str(error):
+            raise
+        raise _memory_error(model, num_envs, device, capacity) from None
+
+
+def overflow_error(found: int, capacity: Capacity) -> DivergedError:
+    """Return what to raise for exceeded capacities; `found` has the bit of each."""
+    settings = {setting for bit, setting in OVERFLOW_SETTINGS.items() if found & int(bit)}
+    kinds = " and ".join(bit.name.lower() for bit in OVERFLOW_SETTINGS if found & int(bit) and bit.name)
+    now = {"contacts_per_env": capacity.contacts, "constraints_per_env": capacity.constraints}
+    advice = " ".join(f"sim.{setting}={2 * now[setting]}" for setting in sorted(settings))
+    return DivergedError(
+        f"the GPU engine ran out of room ({kinds}): {capacity.contacts} contacts and {capacity.constraints} constraints"
+        " an environment were set aside, and the results since are wrong",
+        hint=f"give it more: {advice}",
+    )
+
+
+def _make_data(model: mujoco.MjModel, num_envs: int, capacity: Capacity) -> mjw.Data:
+    return mjw.make_data(model, nworld=num_envs, nconmax=capacity.contacts, njmax=capacity.constraints)
+
+
+def _memory_error(model: mujoco.MjModel, num_envs: int, device: torch.device, capacity: Capacity) -> DeviceError:
+    some = 64
+    sample = sum(_byte_count(value) for value in vars(_make_data(model, some, capacity)).values())
+    free = wp.device_from_torch(device).free_memory if device.type == "cuda" else 0
+    fits = int(0.8 * free / (sample / some))
+    return DeviceError(
+        f"{num_envs} environments need {sample / some * num_envs / 2**30:.1f} GiB,"
+        f" {free / 2**30:.1f} GiB are free on {device}",
+        hint=f"--num-envs {max(1, fits)} would fit",
+    )
+
+
+def _byte_count(value: object) -> int:
+    if isinstance(value, wp.array):
+        return int(value.capacity)
+    if dataclasses.is_dataclass(value):
+        return sum(_byte_count(getattr(value, f.name)) for f in dataclasses.fields(value))
+    return 0

@@ -1,0 +1,37 @@
+"""Detection of host syncs: operations whose result the host must read before it goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+SYNC_OPS = {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "item", "unique", "_unique2"}
+"""Operations whose result the host must have before it goes on."""
+COPY_OPS = {"lift_fresh", "lift", "from_file"}
+"""Operations that make a tensor of what the host has; none of them can be recorded."""
+_MASKED = ("index", "index_put", "index_put_")
+
+
+class HostSyncError(AssertionError):
+    """Raised when a step reads a value back to the host."""
+
+
+class HostSyncGuard(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch has no type here
+    """Dispatch mode that raises `HostSyncError` at operations that force a host sync, on any device."""
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        """Let everything else through."""
+        name = func.overloadpacket.__name__
+        if name in SYNC_OPS:
+            raise HostSyncError(f"'{name}' waits for the device")
+        if name in COPY_OPS:
+            raise HostSyncError(f"'{name}' makes a tensor of numbers of the host, which waits for the device")
+        if name in _MASKED and any(isinstance(i, Tensor) and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
+            raise HostSyncError(f"'{name}' with a mask is a search, which waits for the device")
+        return func(*args, **(kwargs or {}))

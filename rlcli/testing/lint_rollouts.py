@@ -1,0 +1,244 @@
+"""Scripted agents (zero, random, bang-bang, sine), and the recorded rollouts that the linter checks."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rlcli.envs.managed import ManagedEnv
+from rlcli.envs.observers import StepObserver
+from rlcli.envs.vec_env import VecEnv
+from rlcli.testing.task_under_test import TaskUnderTest
+
+NUM_ENVS = 16
+MAX_STEPS = 1000
+"""Longest rollout [steps], where no other time is given."""
+ScriptedAgent = Callable[[int], Tensor]
+"""Step -> action (num_envs, a)."""
+
+SWITCH_S = 0.25
+"""How long a bang-bang agent holds a sign, on average [s]."""
+SINE_HZ = (0.25, 2.0)
+"""Frequencies of the sine agent [Hz]."""
+
+
+def zero(env: VecEnv, bound: float) -> ScriptedAgent:
+    """Return an agent that always sends a zero action."""
+    return lambda step: torch.zeros(env.num_envs, env.layout.action_size)
+
+
+def uniform(env: VecEnv, bound: float) -> ScriptedAgent:
+    """Return an agent that draws each action uniformly within the bound."""
+    generator = torch.Generator().manual_seed(0)
+    shape = (env.num_envs, env.layout.action_size)
+    return lambda step: (torch.rand(shape, generator=generator) * 2.0 - 1.0) * bound
+
+
+def bang_bang(env: VecEnv, bound: float) -> ScriptedAgent:
+    """Return an agent whose columns are at the bound and change sign at random times."""
+    generator = torch.Generator().manual_seed(1)
+    shape = (env.num_envs, env.layout.action_size)
+    sign = torch.where(torch.rand(shape, generator=generator) < 0.5, -1.0, 1.0)
+    switches = min(0.5, env.step_dt / SWITCH_S)
+
+    def act(step: int) -> Tensor:
+        sign.mul_(torch.where(torch.rand(shape, generator=generator) < switches, -1.0, 1.0))
+        return sign * bound
+
+    return act
+
+
+def sine(env: VecEnv, bound: float) -> ScriptedAgent:
+    """Return an agent of sines as high as the bound, each column with its own frequency and phase."""
+    generator = torch.Generator().manual_seed(2)
+    frequency, phase = torch.rand(2, env.num_envs, env.layout.action_size, generator=generator).unbind(0)
+    low, high = SINE_HZ
+    turn = 2.0 * math.pi * env.step_dt * (low + (high - low) * frequency)
+    return lambda step: bound * torch.sin(2.0 * math.pi * phase + turn * step)
+
+
+SCRIPTED_AGENTS: dict[str, Callable[[VecEnv, float], ScriptedAgent]] = {
+    "zero": zero,
+    "random": uniform,
+    "bang-bang": bang_bang,
+    "sine": sine,
+}
+"""Name -> factory of the agent, in the order in which they run."""
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """An episode, possibly cut off by the end of the rollout."""
+
+    steps: int
+    total: float
+    """Undiscounted sum of rewards."""
+    terminated: bool
+    ended: bool
+    causes: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class Rollout:
+    """Rollout of one agent in a task. Tensors are (steps, num_envs, ...)."""
+
+    agent: str
+    env: VecEnv
+    reward: Tensor
+    over: Tensor
+    """Whether the episode ended with this step. bool"""
+    terminated: Tensor
+    terms: dict[str, Tensor]
+    """Reward term -> what it paid, weight included; empty for a direct task."""
+    obs: dict[str, Tensor]
+    """Group -> observations, start states first, divergent ones left out."""
+    episodes: list[Episode]
+    limited: dict[str, float]
+    """Name of a limited quantity -> share of the steps in which it was at its limit, under random actions only."""
+    speed: Tensor
+    """Root mean square of each velocity. (nv,)"""
+    diverged: int
+    error: Exception | None = None
+
+
+def record_rollout(env: VecEnv, agent: str, bound: float, steps: int) -> Rollout:
+    """Run a scripted agent from `reset(seed=0)` for some steps, or until an error is raised, and record the rollout."""
+    act, limits = SCRIPTED_AGENTS[agent](env, bound), agent == "random"
+    steps_of: defaultdict[str, list[Tensor]] = defaultdict(list)
+    terms: defaultdict[str, list[Tensor]] = defaultdict(list)
+    obs: defaultdict[str, list[Tensor]] = defaultdict(list)
+    episodes, error, totals = [], None, torch.zeros(env.num_envs)
+    physics = _PhysicsObserver(env, limits=limits)
+    with env.observers.added(physics):
+        try:
+            _append(obs, env.reset(seed=0))
+            for step in range(steps):
+                action = act(step)
+                result = env.step(action)
+                over = result.terminated | result.truncated
+                _append(steps_of, {"reward": result.reward, "over": over, "terminated": result.terminated})
+                if isinstance(env, ManagedEnv):
+                    _append(terms, env.reward_manager.values())
+                if limits:
+                    physics.add_clipped_columns(action)
+                _append(obs, result.obs)
+                totals += result.reward
+                if result.episodes is not None:
+                    ended = result.episodes.ended()
+                    for row, number in enumerate(ended.ids.tolist()):
+                        causes = tuple(name for name, mask in ended.causes.items() if bool(mask[row]))
+                        length, out = int(ended.lengths[row]), bool(result.terminated[number])
+                        episodes.append(Episode(length, float(totals[number]), out, True, causes))
+                        totals[number] = 0.0
+        except Exception as stopped:
+            error = stopped
+    running = zip(env.episode_length_buf.tolist(), totals.tolist(), strict=True)
+    episodes += [Episode(length, total, False, False) for length, total in running if length]
+    count = max(1, physics.steps)
+    return Rollout(
+        agent,
+        env,
+        reward=_stack(steps_of["reward"], env),
+        over=_stack(steps_of["over"], env),
+        terminated=_stack(steps_of["terminated"], env),
+        terms={name: torch.stack(values) for name, values in terms.items()},
+        obs={group: torch.stack(values) for group, values in obs.items()},
+        episodes=episodes,
+        limited={name: total / count for name, total in physics.shares.items()},
+        speed=torch.zeros(0) if physics.squares is None else (physics.squares / count).sqrt(),
+        diverged=env.divergences,
+        error=error,
+    )
+
+
+def _stack(steps: list[Tensor], env: VecEnv) -> Tensor:
+    return torch.stack(steps) if steps else torch.zeros(0, env.num_envs)
+
+
+def _append(lists: defaultdict[str, list[Tensor]], values: dict[str, Tensor]) -> None:
+    for name, value in values.items():
+        lists[name].append(value.clone())
+
+
+class _PhysicsObserver(StepObserver):
+    """Observer that records velocities and saturated efforts and controls, before any environment is reset."""
+
+    def __init__(self, env: VecEnv, *, limits: bool) -> None:
+        self._env, self._limits = env, limits
+        self.steps = 0
+        self.squares: Tensor | None = None
+        """Sum over the steps of each squared velocity, averaged over the environments. (nv,)"""
+        self.shares: defaultdict[str, float] = defaultdict(float)
+        """Name of a limited quantity -> sum over the steps of the share of environments at its limit."""
+
+    def after_physics(self) -> None:
+        env, model = self._env, self._env.engine.model
+        self.steps += 1
+        squares = env.engine.field("qvel").double().square().mean(dim=0)
+        self.squares = squares if self.squares is None else self.squares + squares
+        if not self._limits:
+            return
+        for entity in env.entities.values():
+            if not entity.joint_names:
+                continue
+            effort, limit = entity.data.computed_effort.abs(), entity.data.joint_effort_limits
+            shares = (effort >= limit * (1.0 - 1e-6)).float().mean(dim=0)
+            for joint, share in zip(entity.joint_names, shares.tolist(), strict=True):
+                self.shares[f"the effort of joint '{joint}'"] += share
+        for number in model.actuator_ctrllimited.nonzero()[0].tolist():
+            low, high = model.actuator_ctrlrange[number].tolist()
+            slack = 1e-6 * (high - low)
+            name = f"the control of actuator '{model.actuator(number).name or number}'"
+            control = env.engine.field("ctrl")[:, number]
+            self.shares[name] += float(((control <= low + slack) | (control >= high - slack)).float().mean())
+
+    def add_clipped_columns(self, action: Tensor) -> None:
+        """Record which columns of the action are clipped before they become commands."""
+        column = 0
+        for term in self._env.layout.actions:
+            for place in range(term.size):
+                clip = None if term.clip is None else term.clip[place]
+                if isinstance(clip, tuple):
+                    scale = 1.0 if term.scale is None else term.scale[place]
+                    offset = 0.0 if term.offset is None else term.offset[place]
+                    command = action[:, column + place] * scale + offset
+                    name = term.elements[place] if len(term.elements) == term.size else str(place)
+                    share = float(((command < clip[0]) | (command > clip[1])).float().mean())
+                    self.shares[f"column {column + place} of the action ({name})"] += share
+            column += term.size
+
+
+class RolloutEvidence:
+    """Rollouts of the scripted agents, recorded on first use, and environments for further measurements."""
+
+    def __init__(self, subject: TaskUnderTest, seconds: float | None) -> None:
+        self.subject = subject
+        task = subject.resolved.task
+        wanted = min(task.max_episode_length, MAX_STEPS) if seconds is None else seconds / task.step_dt
+        self.steps = max(1, math.ceil(wanted - 1e-6))
+        self._rollouts: list[Rollout] | None = None
+
+    @property
+    def rollouts(self) -> list[Rollout]:
+        """One rollout of each agent."""
+        if self._rollouts is None:
+            bound = self.subject.bound
+            self._rollouts = [record_rollout(self.env(), name, bound, self.steps) for name in SCRIPTED_AGENTS]
+        return self._rollouts
+
+    @property
+    def stopped(self) -> bool:
+        """Whether a recorded rollout ended in an error."""
+        return any(rollout.error is not None for rollout in self._rollouts or ())
+
+    def env(self, num_envs: int = NUM_ENVS, **settings: Any) -> VecEnv:
+        """Return a new environment with further settings."""
+        flags = {key.replace("__", "."): value for key, value in settings.items()}
+        # all cores: what a world does is the same at any number of threads
+        return self.subject.env(flags={"scene.num_envs": num_envs, "sim.engine_threads": None, **flags})

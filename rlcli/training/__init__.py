@@ -1,0 +1,1 @@
+"""Training: from a configuration or a saved run to finished checkpoints."""

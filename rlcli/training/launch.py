@@ -1,0 +1,359 @@
+"""Start of a training: make a new run or resume one on rank 0, and broadcast the job to all ranks."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlcli.config.dump import given, to_data, to_yaml
+from rlcli.config.load import Resolved, resolve
+from rlcli.errors import CheckpointError, DeviceError, UsageError
+from rlcli.machine import choose_device
+from rlcli.rl import distributed
+from rlcli.runs.provenance import environment_record, file_digest
+from rlcli.runs.run import RECORD, WAITING, Run, begin_run, create_run, open_run, require_own
+from rlcli.settings import setting
+from rlcli.training.job import Job, TrainingResult, threads
+from rlcli.training.loggers import check_loggers
+
+if TYPE_CHECKING:
+    from rlcli.envs.vec_env import VecEnv
+    from rlcli.registry import TaskSource
+    from rlcli.rl.trainer import Trainer
+    from rlcli.training.signals import StopRequest
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class TrainingRequest:
+    """What the command line asks for: a task and all changes to it, or a run to resume."""
+
+    runs: Path
+    """Folder of runs."""
+    source: TaskSource | None = None
+    """The task; of a run that is resumed it may be left out."""
+    resume: str | None = None
+    """Reference of the run to resume."""
+    agent: str | None = None
+    device: str = "auto"
+    gpus: int | None = None
+    """Processes to start on this machine, a GPU each."""
+    config: Path | None = None
+    overrides: list[str] = field(default_factory=list)
+    flags: dict[str, Any] = field(default_factory=dict)
+    """Dotted key -> value of further settings."""
+    budget: dict[str, Any] = field(default_factory=dict)
+    """Dotted key -> value of the budget; empty: the agent's own."""
+    seed: int = 42
+    loggers: list[str] | None = None
+    init_from: str | None = None
+    """Reference of the checkpoint whose weights a new run begins with."""
+    video_every: int | None = None
+    """Iterations between videos; 0: none."""
+    name: str | None = None
+    """Part of a new run's folder name."""
+
+    def resolve(self, changes: Sequence[str] = ()) -> tuple[Resolved, str]:
+        """Return the configuration of a new run and its device.
+
+        Args:
+            changes: overrides besides those of the request.
+
+        Raises:
+            ConfigError: if the configuration is wrong.
+            DeviceError: if the device is not there.
+            UsageError: if the trainer does not work on the device, or not in several processes.
+        """
+        assert self.source is not None
+        device = process_device(self.device, self.gpus)
+        resolved = resolve(
+            self.source,
+            agent=self.agent,
+            device=device,
+            config_file=self.config,
+            overrides=[*self.overrides, *changes],
+            flags={**self.flags, **self.budget},
+        )
+        _require_parallel(resolved, self.gpus or 1)
+        return resolved, _trainer_device(resolved, device, self.device)
+
+
+def broadcast_job(request: TrainingRequest, resolved: Resolved | None, device: str) -> Job | TrainingResult | None:
+    """Make or resume the run on rank 0 and broadcast the job to the other ranks.
+
+    Args:
+        request: what to train.
+        resolved: the configuration of a new run; None resumes a run.
+        device: the device of this process.
+
+    Returns:
+        The job; without one the result of a run that is finished already, or None on the other ranks.
+    """
+    if not distributed.is_rank_zero():
+        message = distributed.join(device).broadcast_object()
+        return None if message is None else _job_of_other_rank(message, request, resolved)
+    try:
+        job = resume_run(request) if resolved is None else new_run(request, resolved, device)
+    except Exception:
+        distributed.join(device).broadcast_object(None)  # the other ranks block until they receive a message
+        raise
+    if not isinstance(job, Job):
+        distributed.join(device).broadcast_object(None)
+        return job
+    try:
+        ranks = distributed.join(device)
+        if ranks.world_size > 1 and job.created:
+            job.run.update(processes=ranks.world_size)
+        ranks.broadcast_object(job.message())
+    except BaseException:
+        if job.created:
+            job.run.discard()
+        raise
+    return job
+
+
+def new_run(request: TrainingRequest, resolved: Resolved, device: str) -> Job:
+    """Create a run: its folder is written before anything heavy is imported."""
+    record = run_record(request, resolved, device)
+    config = to_yaml(to_data(resolved))
+    run = create_run(request.runs, resolved.source.name, request.name, config, record)
+    _log.info("run %s", run.folder)
+    init_from = record["init_from"] and Path(record["init_from"])
+    return Job(run, resolved, record["loggers"], init_from=init_from, video_every=record["video_every"])
+
+
+def prepare_run(folder: Path, request: TrainingRequest, changes: Sequence[str] = ()) -> str:
+    """Create a run that waits for its training in a given folder, unless it exists; return its device.
+
+    Raises:
+        UsageError: if the folder holds a run with other settings.
+    """
+    resolved, device = request.resolve(changes)
+    if (folder / RECORD).is_file():
+        known = open_run(folder).record.get("given")
+        if known is not None and _overrides_in(known) != _overrides_in(given(resolved)):
+            raise UsageError(
+                f"{folder} is the run of other settings: its sweep was another", hint="another --name begins anew"
+            )
+        return device
+    for file in ("config.yaml", "checkpoints"):  # left by a process that was killed while it created the run
+        path = folder / file
+        shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+    record = run_record(request, resolved, device)
+    begin_run(folder, to_yaml(to_data(resolved)), {**record, "state": WAITING}).unlock()
+    return device
+
+
+def run_record(request: TrainingRequest, resolved: Resolved, device: str) -> dict[str, Any]:
+    """Return the content of a new run's run.json.
+
+    Raises:
+        CheckpointError: if there is no checkpoint to take weights from.
+        DependencyError: if a logger or the video encoder is not installed.
+    """
+    loggers = check_loggers(request.loggers or setting("loggers"))
+    _require_video(request.video_every)
+    initial = None
+    if request.init_from is not None:
+        from rlcli.runs.policy_ref import choose
+
+        choice = choose(request.init_from, request.runs, resolved.source, any_task=True)
+        initial = choice.folder
+        _log.info("weights of %s (%s)", initial, choice.why)
+    return {
+        "seed": request.seed,
+        "device": device,
+        "task": resolved.source.record() | {"file": resolved.source.config.name},
+        "agent": resolved.agent_name,
+        "loggers": loggers,
+        "video_every": request.video_every or 0,
+        "init_from": str(initial) if initial else None,
+        "init_from_sha256": file_digest(initial / "policy.safetensors") if initial else None,
+        "given": given(resolved),
+        **environment_record(resolved, *threads(resolved)),
+    }
+
+
+def resume_run(request: TrainingRequest) -> Job | TrainingResult:
+    """Open and lock a run to train on; return its result if it is finished and has no new budget."""
+    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.restore import resolve_run
+
+    run, folder, why = _find_checkpoint(request)
+    if run.record.get("state") == "finished" and not request.budget and folder is not None:
+        _log.info("%s (%s) is finished; --max-iterations N trains on", run.folder, why)
+        return TrainingResult(run.folder, folder, open_checkpoint(folder).step)
+    resolved = resolve_run(run, play=False, flags=request.budget, named=request.source)
+    _require_parallel(resolved)
+    loggers = check_loggers(request.loggers or run.record.get("loggers") or ["none"])
+    video_every = run.record.get("video_every", 0) if request.video_every is None else request.video_every
+    _require_video(video_every)
+    require_own(run, ".")
+    run.lock()
+    try:
+        from rlcli.training.checkpoint_writer import remove_temporary_files
+
+        remove_temporary_files(run.checkpoints)
+        saved = None if folder is None else open_checkpoint(folder)
+    except BaseException:
+        run.unlock()
+        raise
+    if run.record.get("state") == WAITING:
+        _log.info("run %s", run.folder)
+    elif folder is None:
+        _log.info("%s (%s) ended before its first checkpoint: it begins again", run.folder, why)
+    else:
+        _log.info("resuming %s (%s)", folder, why)
+    initial = run.record.get("init_from") if folder is None else None
+    return Job(
+        run,
+        resolved,
+        loggers,
+        resume_from=saved,
+        created=False,
+        init_from=Path(initial) if initial else None,
+        config=to_yaml(to_data(resolved)) if request.budget else None,
+        video_every=video_every,
+    )
+
+
+def setup_job(
+    job: Job, device: str, stop: StopRequest, check_model: Callable[[VecEnv], None] = lambda _: None
+) -> tuple[Trainer, VecEnv]:
+    """Import everything heavy and build the trainer and its environment; remove a new run if that fails.
+
+    Args:
+        job: what to train.
+        device: where to train.
+        stop: a signal ends the setup.
+        check_model: receives the environment, and raises if training must not begin.
+    """
+    try:
+        with stop.before_training(interruptible=not distributed.launched()):
+            from rlcli.training.setup import build_trainer
+
+            trainer, env = build_trainer(job, device)
+            check_model(env)
+    except BaseException:
+        if job.created and job.writes:
+            job.run.discard()
+        job.run.unlock()
+        raise
+    return trainer, env
+
+
+def _job_of_other_rank(message: dict[str, Any], request: TrainingRequest, resolved: Resolved | None) -> Job:
+    """Return the job that rank 0 broadcast; other ranks write nothing into the run."""
+    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.restore import resolve_run
+
+    folder, initial = Path(message["run"]), message["init_from"]
+    if resolved is not None:
+        return Job(Run(folder, message["record"]), resolved, [], init_from=initial, writes=False)
+    run = open_run(folder)
+    resolved = resolve_run(run, play=False, flags=request.budget, named=request.source)
+    saved = None if message["resume_from"] is None else open_checkpoint(Path(message["resume_from"]))
+    return Job(run, resolved, [], resume_from=saved, created=message["created"], init_from=initial, writes=False)
+
+
+def process_device(wanted: str, gpus: int | None) -> str:
+    """Return the device of this process.
+
+    Raises:
+        DeviceError: if there are fewer GPUs than processes.
+        UsageError: if --gpus and --device contradict each other.
+    """
+    if gpus is not None and wanted == "auto":
+        wanted = "cuda"
+    if gpus is not None and wanted != "cuda":
+        raise UsageError(f"--gpus {gpus} and --device {wanted} contradict each other", hint="--gpus alone")
+    device = choose_device(wanted)
+    one_process = gpus is None and not distributed.launched()
+    if one_process or device == "cpu" or ":" in wanted:
+        return device
+    import torch
+
+    local_rank, local_size = distributed.local_rank_and_size()
+    need, have = max(gpus or 1, local_size), torch.cuda.device_count()
+    if have < need:
+        raise DeviceError(f"{need} processes need a GPU each, and torch sees {have}", hint=f"--gpus {have}")
+    return f"cuda:{local_rank}"
+
+
+def _trainer_device(resolved: Resolved, device: str, wanted: str) -> str:
+    """Return the device, or the CPU if the trainer cannot use the GPU and the user did not name a device."""
+    assert resolved.agent is not None
+    assert resolved.trainer is not None
+    if device == "cpu" or resolved.trainer.gpu:
+        return device
+    if wanted == "auto":
+        return "cpu"
+    raise UsageError(
+        f"agent '{resolved.agent_name}' (trainer {resolved.agent.trainer}) trains on the CPU only, not on '{device}'",
+        hint="--device cpu, or an agent whose trainer uses the GPU (trainer: ppo)",
+    )
+
+
+def _require_parallel(resolved: Resolved, gpus: int = 1) -> None:
+    """Check that the trainer works in several processes if there are several.
+
+    Raises:
+        UsageError: if it does not.
+    """
+    resolved.require_agent()
+    assert resolved.agent is not None
+    assert resolved.trainer is not None
+    if (gpus > 1 or distributed.launched()) and not resolved.trainer.parallel:
+        raise UsageError(
+            f"trainer '{resolved.agent.trainer}' of agent '{resolved.agent_name}' trains in one process",
+            hint="name an agent of trainer ppo with --agent",
+        )
+
+
+def _require_video(video_every: int | None) -> None:
+    """Check before training that videos can be drawn and encoded.
+
+    Raises:
+        DependencyError: if imageio is not installed.
+        MachineError: if nothing on this machine can draw.
+    """
+    if not video_every:
+        return
+    from rlcli.sim.gl import open_context
+    from rlcli.viewer.video_writer import check_video
+
+    check_video(Path("clip.mp4"))
+    context, _ = open_context(64, 64)
+    context.free()
+
+
+def _find_checkpoint(request: TrainingRequest) -> tuple[Run, Path | None, str]:
+    """Return the run, the checkpoint to resume from and the reason; no checkpoint if the run ended before its first."""
+    from rlcli.runs.checkpoint import steps
+    from rlcli.runs.run_ref import find_checkpoint, find_run
+
+    assert request.resume is not None
+    task = None if request.source is None else request.source.name
+    try:
+        return find_checkpoint(request.resume, request.runs, task, whole=True)
+    except CheckpointError:
+        try:
+            run, why = find_run(request.resume, request.runs, task)
+        except (CheckpointError, UsageError):
+            run = None
+        # a run that has a step in its record had checkpoints and has lost them: it is damaged
+        if run is None or not run.checkpoints.is_dir() or steps(run.checkpoints) or "step" in run.record:
+            raise
+        return run, None, why
+
+
+def _overrides_in(given: object) -> Any:
+    """Return the entries of a run's `given` that came from overrides."""
+    if not isinstance(given, dict):
+        return given
+    return {key: origin for key, origin in given.items() if str(origin).startswith("override")}

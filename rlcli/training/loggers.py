@@ -1,0 +1,210 @@
+"""Loggers of metrics: always `metrics.jsonl`, TensorBoard if it is installed, and the trackers that the user names."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from rlcli.errors import DependencyError, require_known
+from rlcli.registry import load_object
+from rlcli.runs.atomic_io import disk_error, write_atomic
+from rlcli.runs.run import Run
+
+
+@dataclass(frozen=True, slots=True)
+class LoggerKind:
+    """Logger that `--logger` can name."""
+
+    needs: str
+    """The module that must be installed; its extra has the logger's name."""
+    factory: str
+    """`module:name` of its class."""
+    title: str
+
+
+LOGGERS = {
+    "tensorboard": LoggerKind("tensorboard", "rlcli.training.loggers:TensorBoard", "TensorBoard"),
+    "wandb": LoggerKind("wandb", "rlcli.training.trackers:Wandb", "Weights & Biases"),
+    "mlflow": LoggerKind("mlflow", "rlcli.training.trackers:MLflow", "MLflow"),
+    "trackio": LoggerKind("trackio", "rlcli.training.trackers:Trackio", "trackio"),
+}
+"""Name for `--logger` -> logger; `none` means no logger."""
+_LONGEST_LINE = 1024**2
+"""Bytes of one iteration's metrics."""
+
+
+class Logger(Protocol):
+    """Logger of the metrics of every iteration."""
+
+    def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
+        """Record one iteration."""
+        ...
+
+    def close(self, state: str = "finished") -> None:
+        """Flush and close, with the state of the run: finished, stopped, diverged or failed."""
+        ...
+
+
+class JsonLines:
+    """Logger that writes one JSON object an iteration into `metrics.jsonl`, at once."""
+
+    def __init__(self, file: Path, *, resume_after: int | None = None) -> None:
+        self._path = file
+        if resume_after is not None:
+            _cut(file, resume_after)
+        try:
+            self._file = file.open("a", encoding="utf-8", buffering=1)
+        except OSError as error:
+            raise disk_error(file, error) from error
+
+    def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
+        """Append one line."""
+        try:
+            finite = {name: value for name, value in metrics.items() if math.isfinite(value)}
+            self._file.write(json.dumps({"iteration": iteration, "step": step, **finite}) + "\n")
+        except OSError as error:
+            raise disk_error(self._path, error) from error
+
+    def close(self, state: str = "finished") -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class TensorBoard:
+    """Logger that writes event files of TensorBoard."""
+
+    def __init__(self, folder: Path, *, resume_after_step: int | None = None) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        try:
+            if resume_after_step is not None:
+                for file in sorted(folder.glob("events.out.tfevents.*")):
+                    _cut_events(file, resume_after_step)
+            self._writer: Any = SummaryWriter(str(folder))
+        except OSError as error:
+            raise disk_error(folder, error) from error
+
+    def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
+        """Add scalars at the environment step."""
+        for name, value in metrics.items():
+            self._writer.add_scalar(name, value, step)
+
+    def close(self, state: str = "finished") -> None:
+        """Flush and close."""
+        self._writer.close()
+
+
+def check_loggers(names: Sequence[str] | None) -> list[str]:
+    """Return the loggers to use; by default TensorBoard if it is installed.
+
+    Raises:
+        UsageError: for a name that is no logger.
+        DependencyError: for one that is not installed.
+    """
+    if not names:
+        return ["tensorboard"] if _installed("tensorboard") else []
+    known = [*LOGGERS, "none"]
+    wanted = [name for name in dict.fromkeys(names) if name != "none"]
+    for name in wanted:
+        require_known(name, known, "logger", "loggers")
+    for name in wanted:
+        if not _installed(name):
+            raise DependencyError(f"{LOGGERS[name].title} is not installed", hint=f'pip install "rlcli[{name}]"')
+    return wanted
+
+
+def open_loggers(
+    run: Run,
+    names: Sequence[str],
+    *,
+    resume: tuple[int, int] | None = None,
+    config: Mapping[str, Any] | None = None,
+) -> list[Logger]:
+    """Open the loggers of a run.
+
+    Args:
+        run: the run.
+        names: the loggers besides `metrics.jsonl`.
+        resume: iteration and step after which the run is resumed.
+        config: the resolved configuration, which trackers store.
+
+    Raises:
+        MachineError: if one cannot be opened.
+    """
+    from rlcli.training.trackers import FailSafeLogger, open_tracker  # heavy; `check_loggers` does not need it
+
+    iteration, step = resume if resume is not None else (None, None)
+    reached = None if resume is None else max(resume, _end(run.metrics))
+    loggers: list[Logger] = [JsonLines(run.metrics, resume_after=iteration)]
+    try:
+        for name in names:
+            make = load_object(LOGGERS[name].factory)
+            if name == "tensorboard":
+                board = make(run.folder / "tb", resume_after_step=step)
+                loggers.append(FailSafeLogger(name, board, 0))
+            else:
+                loggers.append(open_tracker(name, make, run, config or {}, reached))
+    except BaseException:
+        for logger in loggers:
+            logger.close("failed")
+        raise
+    return loggers
+
+
+def read_metrics(file: Path) -> list[dict[str, Any]]:
+    """Return the rows of a metrics file up to the first damaged one; a kill leaves an incomplete last line."""
+    rows = []
+    with file.open("rb") as lines:
+        for line in iter(lambda: lines.readline(_LONGEST_LINE), b""):
+            try:
+                row = json.loads(line)
+            except (ValueError, RecursionError):
+                break
+            if not isinstance(row, dict) or not all(type(row.get(key)) is int for key in ("iteration", "step")):
+                break
+            rows.append(row)
+    return rows
+
+
+def _installed(name: str) -> bool:
+    return importlib.util.find_spec(LOGGERS[name].needs) is not None
+
+
+def _end(file: Path) -> tuple[int, int]:
+    """Return the last iteration and step in a file."""
+    try:
+        last = read_metrics(file)[-1]
+    except (OSError, IndexError):
+        return 0, 0
+    return last["iteration"], last["step"]
+
+
+def _cut(file: Path, iteration: int) -> None:
+    """Remove the rows after the checkpoint from which the run is resumed."""
+    if not file.exists():
+        return
+    try:
+        rows = [row for row in read_metrics(file) if row["iteration"] <= iteration]
+        write_atomic(file, "".join(json.dumps(row) + "\n" for row in rows))
+    except OSError as error:
+        raise disk_error(file, error) from error
+
+
+def _cut_events(file: Path, step: int) -> None:
+    """Remove the events after the checkpoint; the last event of a killed run may be incomplete."""
+    from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
+    from tensorboard.compat.proto.event_pb2 import Event
+    from tensorboard.summary.writer.record_writer import RecordWriter
+
+    kept = io.BytesIO()
+    writer = RecordWriter(kept)
+    for data in RawEventFileLoader(str(file)).Load():
+        if Event.FromString(data).step <= step:
+            writer.write(data)
+    write_atomic(file, kept.getvalue())

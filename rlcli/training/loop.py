@@ -1,0 +1,220 @@
+"""Training loop: iterate, log, evaluate and save until the budget is spent or a signal arrives."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import shlex
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rlcli.errors import DivergedError, Stopped
+from rlcli.rl import distributed
+from rlcli.rl.budget import Budget
+from rlcli.rl.trainer import Report, Trainer
+from rlcli.runs import checkpoint
+from rlcli.runs.run import Run
+from rlcli.training.checkpoint_writer import CheckpointWriter
+from rlcli.training.loggers import Logger
+from rlcli.training.periodic_eval import PeriodicEval
+from rlcli.training.progress import Progress
+from rlcli.training.signals import Interrupted, StopRequest
+
+if TYPE_CHECKING:
+    from rlcli.viewer.training_videos import TrainingVideos
+
+_log = logging.getLogger(__name__)
+
+SAVE_EVERY_S = 60.0
+LONG_S = 0.1
+"""An iteration that takes longer can be interrupted: the state before it is copied [s]."""
+DIVERGED_SHARE = 0.01
+"""Share of an iteration's environment steps that may diverge before the run stops."""
+
+
+@dataclass(slots=True)
+class TrainLoop:
+    """Training loop of one run: iterate, log, evaluate and save until the budget is spent or a signal arrives.
+
+    A checkpoint is always taken at a boundary between iterations. All ranks pass each boundary together; rank 0 writes
+    the checkpoints.
+    """
+
+    trainer: Trainer
+    run: Run
+    writer: CheckpointWriter
+    loggers: Sequence[Logger] = ()
+    save_interval: int | None = None
+    """Iterations between checkpoints; None: `SAVE_EVERY_S` seconds."""
+    periodic_eval: PeriodicEval | None = None
+    videos: TrainingVideos | None = None
+    show: Callable[[Progress], None] = lambda _: None
+    """Called after each iteration."""
+    count_divergences: Callable[[], int] = lambda: 0
+    """Returns how many environment steps have diverged since the environment was built."""
+    stop: StopRequest = field(default_factory=StopRequest)
+    _ranks: distributed.ProcessGroup = field(init=False, default_factory=distributed.current)
+    _boundary: tuple[int, int] = field(init=False, default=(0, 0))
+    """Iteration and environment steps before the iteration that runs."""
+    _iteration_s: float = field(init=False, default=0.0)
+    """Duration of the last iteration."""
+    _saved_at: float = field(init=False, default_factory=time.monotonic)
+
+    def train(self, budget: Budget) -> None:
+        """Train until the budget is spent.
+
+        Raises:
+            Stopped: on a signal, after the checkpoint of the last boundary was written; at once on the second.
+            DivergedError: if the learner or too much of the simulation diverges; the last good checkpoint is kept.
+            MachineError: if the disk refuses.
+        """
+        self._boundary = self.trainer.iteration, self.trainer.env_steps
+        try:
+            self._train(budget)
+        except Interrupted:
+            number = self._boundary[0] + 1
+            raise self._stopped(f"stopped in iteration {number}; resumed, it begins again") from None
+        except KeyboardInterrupt:
+            raise self._stopped("stopped at once; what came after the last checkpoint is lost") from None
+        except Stopped:
+            raise
+        except BaseException as error:
+            with contextlib.suppress(Exception):  # the first error is the one to report
+                self.writer.wait()  # a good checkpoint may still be in the background thread
+                if isinstance(error, DivergedError):
+                    iteration, step = self._boundary
+                    self.writer.save_cases(iteration + 1, step + self.trainer.steps_per_iteration)
+            raise
+
+    def _train(self, budget: Budget) -> None:
+        trainer, writer = self.trainer, self.writer
+        if writer.newest is None:
+            self._save()
+            writer.wait()
+        begin, first_step = time.monotonic(), trainer.env_steps
+        while not (stopped := self._signal_on_any_rank()) and not budget.spent(trainer):
+            report, evaluation, is_best, must_save = self._iterate()
+            metrics = {**_with_rates(report, trainer.steps_per_iteration), **evaluation}
+            for logger in self.loggers:
+                logger.write(trainer.iteration, trainer.env_steps, metrics)
+            self.show(_progress(trainer, budget, report, metrics, time.monotonic() - begin, first_step))
+            if must_save or writer.is_due(trainer.iteration, self.save_interval):
+                self._save()
+            if is_best:
+                writer.wait()
+                writer.best = trainer.env_steps
+                self.run.update(best=writer.best)
+            writer.check()
+            if self.videos is not None and self.videos.due(trainer.iteration):
+                self.videos.record(trainer.policy, trainer.env_steps)
+        self._save()
+        writer.wait()
+        if stopped and not budget.spent(trainer):
+            raise self._stopped(f"stopped at iteration {trainer.iteration}, checkpoint written")
+
+    def _iterate(self) -> tuple[Report, dict[str, float], bool, bool]:
+        """Do one iteration and, if it is due, one evaluation.
+
+        Returns:
+            The trainer's report, the metrics of the evaluation, whether that was the best one (on the rank that
+            evaluates), and whether all ranks must take a checkpoint.
+
+        Raises:
+            DivergedError: if too many environment steps diverged.
+        """
+        trainer, cases, evaluator = self.trainer, self.writer.cases, self.periodic_eval
+        diverged_before = self.count_divergences()
+        evaluates = evaluator is not None and evaluator.due(trainer.iteration + 1)
+        with self._interruptible(is_long=evaluates):
+            report = trainer.iterate()
+            if cases is not None:
+                cases.commit(trainer.iteration, trainer.env_steps)
+            evaluation = evaluator.run(trainer.policy) if evaluator is not None and evaluates else {}
+            is_best = evaluator is not None and evaluator.improves(evaluation)
+            is_overdue = self.save_interval is None and self._ranks.is_rank_zero and self._unsaved_s() > SAVE_EVERY_S
+            new_divergences = self.count_divergences() - diverged_before
+            diverged, *must_save = self._ranks.sum(new_divergences, is_overdue, is_best)
+            _require_stable(diverged, trainer)
+        return report, evaluation, is_best, any(must_save)
+
+    @contextlib.contextmanager
+    def _interruptible(self, is_long: bool) -> Iterator[None]:
+        """Surround an iteration: a signal or a divergence ends a long one and saves the boundary before it.
+
+        A short iteration is cheaper to finish than to copy the trainer's state before it. On a GPU and with several
+        ranks every iteration is finished.
+        """
+        self._boundary = self.trainer.iteration, self.trainer.env_steps
+        interruptible = self.stop.can_interrupt and self._ranks.world_size == 1
+        is_saved = self.writer.newest == self._boundary
+        copies = interruptible and not is_saved and (is_long or self._iteration_s > LONG_S)
+        state = self.trainer.state() if copies else None
+        begin = time.monotonic()
+        try:
+            with self.stop.interruptible(interruptible and (is_saved or copies)):
+                yield
+        except (Interrupted, DivergedError):
+            if state is not None:
+                self.writer.save(state, *self._boundary)
+            self.writer.wait()
+            raise
+        self._iteration_s = time.monotonic() - begin
+
+    def _save(self) -> None:
+        """Take a checkpoint of this boundary, unless there is one."""
+        boundary = self.trainer.iteration, self.trainer.env_steps
+        if self.writer.newest != boundary:
+            state = self.trainer.state()  # every rank takes part
+            if self._ranks.is_rank_zero:
+                self.writer.save(state, *boundary)
+            else:
+                self.writer.newest = boundary
+        self._saved_at = time.monotonic()
+
+    def _unsaved_s(self) -> float:
+        return time.monotonic() - self._saved_at
+
+    def _signal_on_any_rank(self) -> bool:
+        return any(self._ranks.sum(self.stop.signal is not None))
+
+    def _stopped(self, message: str) -> Stopped:
+        hint = f"rlcli train --resume {shlex.quote(str(self.run.folder))}"
+        have_checkpoint = checkpoint.steps(self.run.checkpoints)
+        return Stopped(message, exit_code=self.stop.exit_code, hint=hint if have_checkpoint else None)
+
+
+def _with_rates(report: Report, steps: int) -> dict[str, float]:
+    seconds = report.seconds
+    total = max(sum(seconds.values()), 1e-9)
+    rates = {
+        "Perf/total_fps": steps / total,
+        "Perf/collection_time": total - seconds.get("update", 0.0),
+        "Perf/learning_time": seconds.get("update", 0.0),
+        **{f"Perf/{name}_share": value / total for name, value in seconds.items()},
+    }
+    return {**report.metrics, **rates}
+
+
+def _progress(
+    trainer: Trainer,
+    budget: Budget,
+    report: Report,
+    metrics: dict[str, float],
+    elapsed: float,
+    first_step: int,
+) -> Progress:
+    iterations = budget.iterations(trainer)
+    rate = (trainer.env_steps - first_step) / max(elapsed, 1e-9)
+    remaining = (iterations - trainer.iteration) * trainer.steps_per_iteration / max(rate, 1e-9)
+    return Progress(trainer.iteration, iterations, trainer.env_steps, elapsed, remaining, rate, report.seconds, metrics)
+
+
+def _require_stable(diverged: float, trainer: Trainer) -> None:
+    share = diverged / trainer.steps_per_iteration
+    if share > DIVERGED_SHARE:
+        raise DivergedError(
+            f"the simulation diverged in {share:.1%} of the environment steps of iteration {trainer.iteration}",
+            hint="lower sim.dt, limit actuator efforts, add joint damping or armature",
+        )

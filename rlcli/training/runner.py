@@ -1,0 +1,235 @@
+"""Run of a training: open the run for writing, drive the loop, and record in the run how it ended."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rlcli.config.dump import to_data
+from rlcli.deploy.env_description import describe
+from rlcli.envs.make import make_env
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import DivergedError, RlcliError, Stopped
+from rlcli.random import derive
+from rlcli.replay.crash_dump import CrashDumper
+from rlcli.replay.failure_recorder import open_failure_recorder
+from rlcli.rl.budget import Budget
+from rlcli.runs.checkpoint import steps
+from rlcli.runs.provenance import built_record, differences, environment_record
+from rlcli.runs.restore import resolve_run
+from rlcli.training.checkpoint_writer import CheckpointWriter, Keep
+from rlcli.training.job import Job, TrainingResult
+from rlcli.training.loggers import Logger, open_loggers, read_metrics
+from rlcli.training.loop import TrainLoop
+from rlcli.training.periodic_eval import PeriodicEval
+from rlcli.training.progress import Progress
+from rlcli.training.signals import StopRequest
+
+if TYPE_CHECKING:
+    from rlcli.rl.trainer import Trainer
+    from rlcli.viewer.training_videos import TrainingVideos
+
+_log = logging.getLogger(__name__)
+
+
+class ProgressView(Protocol):
+    """Context that shows the progress of a training."""
+
+    def show(self, progress: Progress) -> None:
+        """Show one iteration."""
+        ...
+
+    def __enter__(self) -> Any: ...
+
+    def __exit__(self, *_: Any) -> None: ...
+
+
+def run_training(
+    job: Job, trainer: Trainer, env: VecEnv, stop: StopRequest, view: ProgressView
+) -> TrainingResult | None:
+    """Train a job until its budget is spent; an error of the loop is recorded in the run and raised.
+
+    Args:
+        job: what to train; its run is unlocked at the end.
+        trainer: its trainer, at the boundary where training begins.
+        env: the trainer's environment, which is closed at the end.
+        stop: the request to stop by a signal.
+        view: shows each iteration.
+
+    Returns:
+        The result; None on ranks that do not write the run.
+    """
+    run, resolved = job.run, job.resolved
+    _log.debug("built in %.1f s", time.monotonic() - job.begin)
+    size, actions = env.layout.size(), env.layout.action_size
+    _log.info(
+        f"{resolved.source.name}: {env.num_envs} environments, {size} observations, {actions} actions,"
+        f" {env.engine.threads} engine threads, agent {resolved.agent_name}, seed {run.record['seed']}"
+    )
+    if job.writes:
+        CrashDumper(env, run.folder / "dumps")
+    try:
+        _train(job, trainer, env, stop, view)
+    finally:
+        run.unlock()
+        env.close()
+    _warn_of_physics(env)
+    if not job.writes:
+        return None
+    newest = run.checkpoints / f"{steps(run.checkpoints)[-1]:012d}"
+    elapsed = time.monotonic() - job.begin
+    return TrainingResult(run.folder, newest, trainer.env_steps, trainer.iteration, elapsed, run.record["seed"])
+
+
+def _train(job: Job, trainer: Trainer, env: VecEnv, stop: StopRequest, view: ProgressView) -> None:
+    """Open the run for writing, drive the loop, and record in the run how it ended."""
+    run, agent = job.run, job.resolved.agent
+    assert agent is not None
+    budgets = [Budget(end, None) for end in job.stages] or [Budget(agent.max_iterations, agent.max_steps)]
+    writer = _open_writer(job, env)
+    loggers: list[Logger] = []
+    trained_before = run.record.get("trained_s", 0.0)
+
+    def close(state: str, reason: str | None = None) -> None:
+        with contextlib.ExitStack() as stack:
+            if job.writes and writer.written is not None:
+                iteration, step = writer.written
+                trained_s = trained_before + time.monotonic() - job.begin
+                end = {"state": state, "reason": reason, "trained_s": trained_s, "iteration": iteration, "step": step}
+                stack.callback(lambda: run.update(**end))
+            for logger in loggers:
+                stack.callback(logger.close, state)
+
+    try:
+        if job.writes:
+            _record_begin(job, trainer, env, budgets[-1])
+            resume = None if job.created else (trainer.iteration, trainer.env_steps)
+            loggers += open_loggers(run, job.loggers, resume=resume, config=to_data(job.resolved))
+        loop = TrainLoop(
+            trainer,
+            run,
+            writer,
+            loggers,
+            save_interval=agent.save_interval,
+            periodic_eval=_periodic_eval(job, writer, stop),
+            videos=_training_videos(job, stop),
+            show=view.show,
+            count_divergences=lambda: env.divergences,
+            stop=stop,
+        )
+        env.observers.add(stop)
+        stop.can_interrupt = not env.engine.asynchronous
+        with view:
+            for budget in budgets:
+                loop.train(budget)
+    except BaseException as error:
+        with contextlib.suppress(OSError, RlcliError):  # the first error is the one to report
+            close(*_end_state(error))
+        raise
+    close("finished")
+
+
+def _open_writer(job: Job, env: VecEnv) -> CheckpointWriter:
+    """Open the writer of checkpoints, with what every manifest holds and the recorder of failed episodes."""
+    run, agent = job.run, job.resolved.agent
+    assert agent is not None
+    manifest = {
+        **{key: run.record[key] for key in ("task", "agent", "seed")},
+        "trainer": agent.trainer,
+        "layout": env.layout.record(),
+        "deployment": describe(env),
+        "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
+    }
+    keep = Keep() if job.stages else Keep.of(agent.keep_last, agent.keep_every, agent.save_interval)
+    cases = None
+    if job.writes and not job.stages:
+        step = None if job.resume_from is None else job.resume_from.step
+        cases = open_failure_recorder(env, agent.autopsy, run.folder, step)
+    return CheckpointWriter(run.checkpoints, keep, manifest, resumed=job.resume_from, cases=cases)
+
+
+def _record_begin(job: Job, trainer: Trainer, env: VecEnv, budget: Budget) -> None:
+    """Write the state of the run, and whether it resumes exactly, into run.json."""
+    unsaved = env.unsaved_state()
+    if unsaved:
+        _log.warning("a resumed run may differ: no checkpoint can hold %s", ", ".join(unsaved))
+    exact = not unsaved and env.device.type == "cpu"
+    job.run.update(state="running", since=datetime.now(UTC).isoformat(), iterations=budget.iterations(trainer))
+    job.run.update(resumes_exactly=exact, **_provenance(job, trainer, env))
+
+
+def _provenance(job: Job, trainer: Trainer, env: VecEnv) -> dict[str, Any]:
+    """Return run.json's entries on the built model and the machine; of a resumed run those that have changed."""
+    record, device = job.run.record, str(env.device)
+    built = built_record(env.engine.model, device)
+    if job.resume_from is None:
+        return built
+    now = environment_record(job.resolved, env.engine.threads, record.get("torch_threads") or 0) | built
+    now["engine_threads"] = record.get("engine_threads")  # the number of threads changes no bit
+    same = env.device.type == str(record.get("device", "cpu")).partition(":")[0]
+    now["device"] = record.get("device") if same else device
+    changed = {name: after for name, _, after in differences(record, now)}
+    if not changed:
+        return {}
+    _log.warning("resumed in another environment, the bits may differ: %s", ", ".join(changed))
+    return {"resumed": [*record.get("resumed", []), {"step": trainer.env_steps, "changed": changed}]}
+
+
+def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest) -> PeriodicEval | None:
+    """Return the evaluation between iterations, if the agent wants one; only the rank that writes evaluates."""
+    run, agent = job.run, job.resolved.agent
+    assert agent is not None
+    if agent.eval_interval is None or not job.writes:
+        return None
+
+    def make() -> VecEnv:
+        num_envs = min(agent.eval_episodes, job.resolved.task.scene.num_envs)
+        resolved = resolve_run(run, play=True, flags={"scene.num_envs": num_envs}, named=job.resolved.source)
+        env = make_env(resolved, seed=derive(run.record["seed"], "evaluation"))
+        env.observers.add(stop)
+        return env
+
+    evaluator = PeriodicEval(make, agent.eval_episodes, agent.eval_interval, read_metrics(run.metrics))
+    writer.best = evaluator.best if evaluator.best in steps(run.checkpoints) else None
+    if run.record.get("best") != writer.best:  # the run was killed in between, or is resumed from before its best
+        run.update(best=writer.best)
+    return evaluator
+
+
+def _training_videos(job: Job, stop: StopRequest) -> TrainingVideos | None:
+    """Return the recorder of videos between iterations, if the user wants them; only the rank that writes records."""
+    run, interval = job.run, job.video_every
+    if not interval or not job.writes:
+        return None
+    from rlcli.viewer.training_videos import (
+        TrainingVideos,  # imports OpenGL and video modules, which most trainings do not need
+    )
+
+    def make() -> VecEnv:
+        single = {"scene.num_envs": 1, "sim.engine_threads": 1}
+        resolved = resolve_run(run, play=True, flags=single, named=job.resolved.source)
+        return make_env(resolved, seed=derive(run.record["seed"], "video"))
+
+    return TrainingVideos(make, run.folder / "videos", interval, lambda: stop.signal is not None)
+
+
+def _end_state(error: BaseException) -> tuple[str, str | None]:
+    """Return the state in which an error leaves the run, and the reason."""
+    if isinstance(error, Stopped | KeyboardInterrupt):
+        return "stopped", None
+    message = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"
+    return "diverged" if isinstance(error, DivergedError) else "failed", " ".join(message.split())[:500]
+
+
+def _warn_of_physics(env: VecEnv) -> None:
+    advice = {
+        "contact_full": "contacts were dropped; enlarge <size memory=...> in the MJCF",
+        "constraint_full": "constraints were dropped; enlarge <size memory=...> in the MJCF",
+        "inertia": "a body's inertia is nearly singular; check masses and sizes in the MJCF",
+    }
+    for name, count in env.engine.warnings.items():
+        if count:
+            _log.warning("%s times: %s", count, advice[name])

@@ -1,0 +1,96 @@
+"""Setup of a training: build the environment and the trainer of a job, at the boundary where training begins."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from rlcli.envs.make import make_env
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import CheckpointError, RlcliError, one_line
+from rlcli.random import derive
+from rlcli.registry import load_object
+from rlcli.rl import distributed
+from rlcli.rl.rng import seed_generators
+from rlcli.runs.atomic_io import write_atomic
+from rlcli.runs.checkpoint import Checkpoint, open_checkpoint
+from rlcli.runs.restore import require_fit, require_same_policy, require_trainer
+from rlcli.training.checkpoint_writer import drop_after
+from rlcli.training.job import Job, threads
+
+if TYPE_CHECKING:
+    from rlcli.config.load import Resolved
+    from rlcli.rl.trainer import Trainer, TrainerState
+
+_log = logging.getLogger(__name__)
+
+
+def build_trainer(job: Job, device: str) -> tuple[Trainer, VecEnv]:
+    """Build the trainer and its environment; start it, or load the checkpoint to resume from.
+
+    The run's configuration is written last: only then it is certain that training goes on.
+
+    Raises:
+        CheckpointError: if a checkpoint does not fit.
+    """
+    resolved, record, saved = job.resolved, job.run.record, job.resume_from
+    assert resolved.agent is not None
+    state = None
+    if saved is not None:  # read the untrusted files before anything is built
+        require_trainer(saved, resolved.agent.trainer)
+        state = saved.state()
+    torch_threads = int(record.get("torch_threads") or threads(resolved)[1])
+    trainer, env = make_trainer(resolved, record["seed"], device, torch_threads)
+    if saved is not None and state is not None:
+        _resume(job, saved, state, trainer, env)
+        return trainer, env
+    if job.init_from is not None:
+        initial = open_checkpoint(job.init_from)
+        require_fit(initial, env.layout)
+        require_same_policy(initial, trainer.policy(), resolved.agent.trainer)
+        _load(initial, lambda: trainer.load_weights(initial.tensors("policy")), "its weights do not fit the agent")
+    if job.config is not None:
+        write_atomic(job.run.config, job.config)
+    trainer.start()
+    return trainer, env
+
+
+def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int) -> tuple[Trainer, VecEnv]:
+    """Make the environment and the trainer of a configuration; every rank has environments with seeds of its own."""
+    assert resolved.trainer is not None
+    ranks = distributed.current()
+    seed_generators(ranks.seed(derive(seed, "task"), "task"))  # some tasks draw from them while they are built
+    env = make_env(resolved, seed=ranks.seed(seed, "environments"), device=device)
+    try:
+        make: Callable[..., Trainer] = load_object(resolved.trainer.trainer)
+        return make(env, resolved.agent, seed=seed, device=device, torch_threads=torch_threads), env
+    except BaseException:
+        env.close()
+        raise
+
+
+def _resume(job: Job, saved: Checkpoint, state: TrainerState, trainer: Trainer, env: VecEnv) -> None:
+    """Load the state of a checkpoint and remove the checkpoints after it."""
+    require_fit(saved, env.layout)
+    _load(saved, lambda: trainer.load(state), "it cannot be resumed")
+    if (trainer.iteration, trainer.env_steps) != (saved.iteration, saved.step):
+        raise CheckpointError(f"{saved.folder} cannot be resumed: its manifest and its state name different steps")
+    processes, size = state.values.get("processes", 1), distributed.current().world_size
+    if processes != size:
+        _log.info("saved by %s processes, going on in %s: every environment begins a new episode", processes, size)
+    if job.config is not None:
+        write_atomic(job.run.config, job.config)
+    dropped = drop_after(job.run.checkpoints, saved.step) if job.writes else []
+    if dropped:
+        _log.info("removed %s later checkpoints: they are not what comes next", len(dropped))
+
+
+def _load(saved: Checkpoint, load: Callable[[], Any], failure: str) -> None:
+    """Call a loader; what untrusted numbers make it raise becomes a CheckpointError."""
+    try:
+        load()
+    except RlcliError:
+        raise
+    except Exception as error:
+        raise CheckpointError(f"{saved.folder}: {failure}: {one_line(error)}") from error

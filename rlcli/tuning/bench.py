@@ -1,0 +1,397 @@
+"""How fast a task steps and trains on this machine, and which sizes and threads get an iteration done soonest.
+
+What is compared learns alike: as many samples an iteration, as many gradient steps of as many samples. Then the time of
+an iteration is what the time to a solution hangs on; more steps a second that are learned from less are no gain.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from rlcli.envs.make import make_env
+from rlcli.errors import ConfigError
+from rlcli.machine import available_cores, memory, resident
+from rlcli.training.job import threads
+from rlcli.training.setup import make_trainer
+
+if TYPE_CHECKING:
+    from rlcli.config.load import Resolved
+    from rlcli.envs.vec_env import VecEnv
+    from rlcli.rl.trainer import Trainer
+
+SIZES = (16, 64, 256, 1_024, 4_096, 16_384)
+"""Numbers of environments that are stepped."""
+HORIZONS = ("num_steps", "n_steps", "num_steps_per_env", "train_freq")
+"""What trainers call the steps of an environment in an iteration."""
+UNSTEADY = 0.15
+"""Spread of a measurement that is repeated; of one that stays so, other work on the machine is a part."""
+WORTH = 0.97
+"""Share of the present time below which another setting is recommended."""
+_ACTIONS = 8
+_ENV_BYTES = 256 * 2**10
+"""Memory that an environment is taken to need until one has been built."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How long is measured."""
+
+    block_s: float = 0.4
+    """A block of calls takes at least so long."""
+    blocks: int = 5
+    rounds: int = 3
+    """Times that blocks are measured while they differ."""
+    longest_s: float = 4.0
+    """A step that would take longer is left out."""
+
+
+QUICK = Pace(block_s=0.05, blocks=3, rounds=1, longest_s=1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Stepped:
+    """Environments under random actions."""
+
+    num_envs: int
+    engine_threads: int
+    steps_per_s: float | None = None
+    physics: float | None = None
+    """Share of the time."""
+    spread: float | None = None
+    """Difference of the quartiles of its blocks, as a share of their median."""
+    resident: int | None = None
+    """Of the process [bytes]."""
+    left_out: str | None = None
+    """Why it was not measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Sizes and threads of a training."""
+
+    num_envs: int
+    horizon: int | None
+    minibatches: int | None
+    engine_threads: int
+    torch_threads: int
+
+
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """Iterations of a training."""
+
+    setting: Setting
+    alike: bool
+    """Whether it learns as the present setting does."""
+    samples: int = 0
+    """An iteration."""
+    seconds: float | None = None
+    """An iteration, the median."""
+    shares: Mapping[str, float] = field(default_factory=dict)
+    """Of physics, task, policy and update."""
+    spread: float | None = None
+    resident: int | None = None
+    left_out: str | None = None
+
+    @property
+    def steps_per_s(self) -> float | None:
+        """Environment steps, rollout and update taken together."""
+        return None if self.seconds is None else self.samples / self.seconds
+
+    @property
+    def milliseconds(self) -> float | None:
+        """Duration of an iteration [ms]."""
+        return None if self.seconds is None else 1e3 * self.seconds
+
+
+@dataclass(slots=True)
+class Findings:
+    """What has been measured so far."""
+
+    stepped: list[Stepped] = field(default_factory=list)
+    trained: list[Trained] = field(default_factory=list)
+    present: Trained | None = None
+    """The setting as it is, measured in turn with the recommended one."""
+    recommended: Trained | None = None
+
+    @property
+    def unsteady(self) -> bool:
+        """Whether other work on the machine shows in what was measured."""
+        rows: list[Stepped | Trained] = [*self.stepped, *self.trained]
+        known = [row.spread for row in rows if row.spread is not None]
+        return bool(known) and statistics.median(known) > UNSTEADY
+
+    def record(self) -> dict[str, Any]:
+        """As plain data."""
+        rows = []
+        for one in self.trained:
+            entries = asdict(one)
+            rows.append({**entries.pop("setting"), **entries, "steps_per_s": one.steps_per_s})
+        return {"environment": [asdict(one) for one in self.stepped], "training": rows, "unsteady": self.unsteady}
+
+
+class Bench:
+    """Measures one task and agent.
+
+    Args:
+        resolve: the configuration with some keys changed: dotted key -> value.
+        pace: how long is measured.
+        announce: called with what is measured next.
+        show: called after each measurement.
+    """
+
+    def __init__(
+        self,
+        resolve: Callable[[Mapping[str, Any]], Resolved],
+        pace: Pace,
+        announce: Callable[[str], None] = lambda _: None,
+        show: Callable[[Findings], None] = lambda _: None,
+    ) -> None:
+        self.findings = Findings()
+        self._resolve, self._pace, self._announce, self._show = resolve, pace, announce, show
+        self._present = resolve({})
+        agent = self._present.agent
+        assert agent is not None
+        self.horizon_key = next((key for key in HORIZONS if isinstance(getattr(agent, key, None), int)), None)
+        engine, update = threads(self._present)
+        horizon = None if self.horizon_key is None else int(getattr(agent, self.horizon_key))
+        minibatches = getattr(agent, "num_minibatches", None)
+        if getattr(agent, "minibatch_size", None) is not None:
+            minibatches = None
+        self.present = Setting(self._present.task.scene.num_envs, horizon, minibatches, engine, update)
+
+    def run(self) -> Findings:
+        """Measure everything; what is found stands in `findings` all the while."""
+        self._step_all()
+        self._train_all()
+        return self.findings
+
+    def changes(self, setting: Setting) -> dict[str, Any]:
+        """A setting as keys of the configuration."""
+        changed: dict[str, Any] = {
+            "scene.num_envs": setting.num_envs,
+            "sim.engine_threads": setting.engine_threads,
+            "agent.torch_threads": setting.torch_threads,
+        }
+        if self.horizon_key is not None:
+            changed[f"agent.{self.horizon_key}"] = setting.horizon
+        if setting.minibatches is not None:
+            changed["agent.num_minibatches"] = setting.minibatches
+        return changed
+
+    # --- the environment alone ---
+
+    def _step_all(self) -> None:
+        most = self.present.engine_threads
+        sizes = [(num_envs, most) for num_envs in SIZES]
+        sizes += [(self.present.num_envs, count) for count in _powers(available_cores()) if count != most]
+        for num_envs, engine_threads in sizes:
+            self.findings.stepped.append(self._step(num_envs, engine_threads))
+            self._show(self.findings)
+
+    def _step(self, num_envs: int, engine_threads: int) -> Stepped:
+        self._announce(f"{num_envs:,} environments, {engine_threads} engine threads")
+        reason = self._too_large(num_envs)
+        if reason is not None:
+            return Stepped(num_envs, engine_threads, left_out=reason)
+        torch.set_num_threads(1)  # as in a rollout
+        env = make_env(
+            self._resolve({"scene.num_envs": num_envs, "sim.engine_threads": engine_threads}), seed=42, device="cpu"
+        )
+        try:
+            generator = torch.Generator().manual_seed(42)
+            shape = (_ACTIONS, num_envs, env.layout.action_size)
+            actions = torch.rand(shape, generator=generator) * 2.0 - 1.0
+            env.reset(seed=42)
+            taken = 0
+
+            def step() -> None:
+                nonlocal taken
+                env.step(actions[taken % _ACTIONS])
+                taken += 1
+
+            with torch.inference_mode():
+                for _ in range(3):
+                    step()
+                before = dict(env.seconds)
+                blocks = list(_blocks(step, self._pace))
+            physics = (env.seconds["physics"] - before["physics"]) / (env.seconds["step"] - before["step"])
+            middle = statistics.median(blocks)
+            return Stepped(num_envs, engine_threads, num_envs / middle, physics, _spread(blocks), resident())
+        finally:
+            env.close()
+
+    def _too_large(self, num_envs: int) -> str | None:
+        """Why so many environments are not built."""
+        smaller = [row for row in self.findings.stepped if row.left_out is None and row.num_envs < num_envs]
+        known = sorted(smaller, key=lambda row: row.num_envs)
+        last = known[-1] if known else None
+        each = _ENV_BYTES
+        if last is not None and last.resident is not None and known[0].resident is not None and last is not known[0]:
+            each = max(4096, (last.resident - known[0].resident) // (last.num_envs - known[0].num_envs))
+        if each * num_envs > memory() // 2:
+            return f"it would take about {each * num_envs / 2**30:.1f} GiB"
+        if last is not None and last.steps_per_s and num_envs / last.steps_per_s > self._pace.longest_s:
+            return f"a step would take about {num_envs / last.steps_per_s:.0f} s"
+        return None
+
+    # --- training ---
+
+    def _train_all(self) -> None:
+        best = self._add_trained(self.present)
+        for key, most in (("torch_threads", min(16, available_cores())), ("engine_threads", available_cores())):
+            others = [count for count in _powers(most) if count != getattr(best.setting, key)]
+            best = _soonest([best, *(self._add_trained(replace(best.setting, **{key: count})) for count in others)])
+        best = _soonest([best, *(self._add_trained(setting) for setting in self._sizes(best.setting))])
+        if best.setting.minibatches is not None:
+            for count in (best.setting.minibatches // 2, best.setting.minibatches * 2):
+                if count:
+                    self._add_trained(replace(best.setting, minibatches=count))
+        self._compare(best)
+
+    def _sizes(self, setting: Setting) -> Iterator[Setting]:
+        """As many samples an iteration from half and from twice the environments."""
+        if setting.horizon is None:
+            return
+        samples = setting.num_envs * setting.horizon
+        for num_envs in (setting.num_envs // 2, setting.num_envs * 2):
+            if num_envs and samples % num_envs == 0 and samples // num_envs > 1:
+                yield replace(setting, num_envs=num_envs, horizon=samples // num_envs)
+
+    def _add_trained(self, setting: Setting) -> Trained:
+        row = self._train(setting)
+        self.findings.trained.append(row)
+        self._show(self.findings)
+        return row
+
+    def _train(self, setting: Setting) -> Trained:
+        self._announce(f"training: {_describe(setting)}")
+        alike = setting.minibatches == self.present.minibatches
+        reason = None if setting == self.present else self._too_large(setting.num_envs)
+        if reason is not None:
+            return Trained(setting, alike, left_out=reason)
+        try:
+            env, trainer = self._build(setting)
+        except ConfigError as error:
+            if setting == self.present:
+                raise
+            return Trained(setting, alike, left_out=error.problems[0].message)
+        try:
+            parts: list[Mapping[str, float]] = []
+            iterate = _iteration(trainer, parts)
+            iterate()
+            parts.clear()
+            blocks = list(_blocks(iterate, self._pace))
+            return self._trained(setting, alike, trainer, blocks, parts)
+        finally:
+            env.close()
+
+    def _trained(
+        self, setting: Setting, alike: bool, trainer: Trainer, blocks: list[float], parts: list[Mapping[str, float]]
+    ) -> Trained:
+        total = sum(sum(each.values()) for each in parts)
+        names = dict.fromkeys(name for each in parts for name in each)
+        shares = {name: sum(each.get(name, 0.0) for each in parts) / total for name in names}
+        middle, spread = statistics.median(blocks), _spread(blocks)
+        return Trained(setting, alike, trainer.steps_per_iteration, middle, shares, spread, resident())
+
+    def _build(self, setting: Setting) -> tuple[VecEnv, Trainer]:
+        resolved = self._resolve(self.changes(setting))
+        trainer, env = make_trainer(resolved, 42, "cpu", setting.torch_threads)
+        try:
+            trainer.start()
+        except BaseException:
+            env.close()
+            raise
+        return env, trainer
+
+    def _compare(self, best: Trained) -> None:
+        """Measure the best and the present setting once more, in turn, so that both meet the same machine."""
+        present = self.findings.trained[0]
+        if best.setting == present.setting:
+            self.findings.present = self.findings.recommended = present
+            return
+        self._announce(f"in turn: {_describe(present.setting)} and {_describe(best.setting)}")
+        with contextlib.ExitStack() as stack:
+            built: list[tuple[Trained, Trainer, list[float], list[Mapping[str, float]]]] = []
+            for row in (present, best):
+                env, trainer = self._build(row.setting)
+                stack.callback(env.close)
+                built.append((row, trainer, [], []))
+            for _ in range(1 + max(3, self._pace.blocks)):
+                for _, trainer, blocks, parts in built:
+                    blocks.append(_block(_iteration(trainer, parts), self._pace.block_s))
+            now = [self._trained(row.setting, True, t, blocks[1:], parts) for row, t, blocks, parts in built]
+        present, best = now
+        assert present.seconds is not None
+        assert best.seconds is not None
+        noise = max(present.spread or 0.0, best.spread or 0.0)
+        better = best.seconds < present.seconds * min(WORTH, 1.0 - noise)
+        self.findings.present, self.findings.recommended = present, best if better else present
+
+
+def load() -> float | None:
+    """Processes that want to run, the mean of the last minute; None where the system does not say."""
+    try:
+        return os.getloadavg()[0]
+    except (AttributeError, OSError):
+        return None
+
+
+def _iteration(trainer: Trainer, parts: list[Mapping[str, float]]) -> Callable[[], None]:
+    """An iteration that notes the seconds of its parts."""
+    return lambda: parts.append(trainer.iterate().seconds)
+
+
+def _blocks(call: Callable[[], None], pace: Pace) -> Iterator[float]:
+    """Seconds of a call, a number for each block; blocks that differ are measured again."""
+    blocks: list[float] = []
+    for _ in range(pace.rounds):
+        blocks += [_block(call, pace.block_s) for _ in range(pace.blocks)]
+        if _spread(blocks) <= UNSTEADY:
+            break
+    yield from blocks
+
+
+def _block(call: Callable[[], None], least_s: float) -> float:
+    begin, calls = time.perf_counter(), 0
+    while True:
+        call()
+        calls += 1
+        took = time.perf_counter() - begin
+        if took >= least_s:
+            return took / calls
+
+
+def _spread(blocks: list[float]) -> float:
+    low, middle, high = statistics.quantiles(blocks, n=4, method="inclusive")
+    return (high - low) / middle
+
+
+def _powers(most: int) -> list[int]:
+    """1, 2, 4, ... and the number itself."""
+    return sorted({*(2**n for n in range(int(math.log2(most)) + 1)), most})
+
+
+def _soonest(rows: list[Trained]) -> Trained:
+    """Of those that learn alike."""
+    measured = [row for row in rows if row.alike and row.seconds is not None]
+    return min(measured, key=lambda row: row.seconds or math.inf)
+
+
+def _describe(setting: Setting) -> str:
+    parts = [f"{setting.num_envs:,} environments"]
+    if setting.horizon is not None:
+        parts.append(f"{setting.horizon} steps")
+    if setting.minibatches is not None:
+        parts.append(f"{setting.minibatches} minibatches")
+    return ", ".join([*parts, f"threads {setting.engine_threads} and {setting.torch_threads}"])

@@ -1,0 +1,63 @@
+"""Recommendation of a benchmark, as a `--config` file with the measurements in comments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+from rlcli.config.dump import to_yaml
+from rlcli.config.load import Resolved
+from rlcli.tuning.bench import Findings, Trained
+from rlcli.tuning.preset import preset_of, put
+
+
+def bench_preset(
+    resolved: Resolved, changes: Mapping[str, Any], findings: Findings, machine: Mapping[str, Any], agent_named: bool
+) -> str:
+    """Return YAML: the user's changes, the recommended settings, and comments with the measurements.
+
+    Args:
+        resolved: the configuration of the command line.
+        changes: the recommended settings: dotted key -> value.
+        findings: the measurements.
+        machine: the machine that was measured.
+        agent_named: whether the command line names the agent, which becomes the default.
+    """
+    data = preset_of(resolved, agent_named)
+    for key, value in changes.items():
+        put(data, tuple(key.split(".")), value)
+    title = f"{resolved.source.name}, agent {resolved.agent_name}: measured by `rlcli bench`"
+    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    lines = [
+        f"{title} on {datetime.now(UTC).date().isoformat()}",
+        f"{machine['cpu']}, {machine['cores']} cores; {versions}",
+        *explanation(findings),
+    ]
+    return "".join(f"# {' '.join(line.split())}\n" for line in lines) + to_yaml(data)
+
+
+def explanation(findings: Findings) -> list[str]:
+    """Return the recommendation and its reason, in sentences."""
+    present, best = findings.present, findings.recommended
+    if present is None or best is None:
+        return []
+    if best is present:
+        reason = "nothing that learns alike is faster than the present sizes and threads:"
+        lines = [f"{reason} {_describe(present)}"]
+    else:
+        lines = [f"{_describe(best)},", f"instead of {_describe(present)}, measured in turn"]
+    lines.append("compared at as many samples and gradient steps an iteration, so that it learns alike")
+    if findings.unsteady:
+        lines.append("the machine was busy: the figures are not steady")
+    return lines
+
+
+def _describe(row: Trained) -> str:
+    assert row.seconds is not None
+    assert row.steps_per_s is not None
+    shares = ", ".join(f"{name} {share:.0%}" for name, share in row.shares.items())
+    return (
+        f"{1e3 * row.seconds:.3g} ms an iteration of {row.samples:,} samples ({row.steps_per_s:,.0f} steps/s;"
+        f" {shares}; spread {row.spread or 0.0:.0%})"
+    )

@@ -1,0 +1,196 @@
+"""Optuna's storage of a sweep: a journal in its folder, or a database that several machines share."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import sys
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from filelock import FileLock
+
+from rlcli.errors import CheckpointError, DependencyError, MachineError, UsageError
+from rlcli.runs.atomic_io import disk_error
+
+if TYPE_CHECKING:
+    import optuna
+
+JOURNAL = "journal.log"
+_TRIES = 5
+
+
+def check_optuna() -> None:
+    """Check that Optuna is installed.
+
+    Raises:
+        DependencyError: with the line that installs it.
+    """
+    if importlib.util.find_spec("optuna") is None:
+        raise DependencyError("a sweep needs Optuna", hint='pip install "rlcli[sweep]"')
+
+
+def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *, create: bool) -> optuna.Study:
+    """Open Optuna's study of a sweep.
+
+    Args:
+        folder: of the sweep, in which a journal is kept.
+        settings: of the sweep: `task`, `name`, `direction` and `pruner` (median or none).
+        storage: URL of a database; None is the journal.
+        create: make it if it is not there.
+
+    Raises:
+        CheckpointError: if it is not there, or its journal is damaged.
+        MachineError: if the storage cannot be reached, or the folder not written.
+        UsageError: if `storage` is no address.
+    """
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+    name = f"rlcli/{settings['task']}/{settings['name']}"
+    median = optuna.pruners.MedianPruner(n_startup_trials=4, n_warmup_steps=30)
+    pruner = median if settings["pruner"] == "median" else optuna.pruners.NopPruner()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            place = _journal(folder, create) if storage is None else _database(storage)
+        if not create:
+            return optuna.load_study(study_name=name, storage=place, pruner=pruner)
+        return optuna.create_study(
+            storage=place,
+            study_name=name,
+            load_if_exists=True,
+            direction=settings["direction"],
+            pruner=pruner,
+        )
+    except KeyError:
+        raise CheckpointError(
+            f"there is no sweep '{name}' in {without_password(storage) if storage else folder}"
+        ) from None
+    except OSError as error:
+        raise disk_error(folder / JOURNAL, error) from error
+
+
+@contextlib.contextmanager
+def storage_errors(storage: str | None) -> Iterator[None]:
+    """Context that turns the errors of a lost database into a MachineError.
+
+    Raises:
+        MachineError: if it cannot be reached any more.
+    """
+    try:
+        yield
+    except Exception as error:
+        if storage is None or not _is_of_a_database(error):
+            raise
+        raise MachineError(
+            f"--storage {without_password(storage)} cannot be reached: {_first_line(error)}",
+            hint="the same command again goes on, once it is there",
+        ) from None
+
+
+def without_password(url: str) -> str:
+    """Return an address without its password."""
+    before, at, after = url.rpartition("@")
+    if not at:
+        return url
+    scheme, _, user = before.partition("://")
+    return f"{scheme}://{user.partition(':')[0]}@{after}"
+
+
+def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
+
+    file = folder / JOURNAL
+    if file.is_symlink():
+        raise CheckpointError(f"{file} is a link; it was not made by rlcli")
+    if not create and not file.is_file():
+        raise CheckpointError(f"{folder} has lost its trials: there is no {JOURNAL} in it")
+
+    lock: Any = FileLock(folder / f".{JOURNAL}")  # released by the system when its process is killed
+
+    class Backend(JournalFileBackend):
+        """Optuna's backend, with checks for lines cut short by a full disk and for damage."""
+
+        def append_logs(self, logs: list[dict[str, Any]]) -> None:
+            with lock:
+                try:
+                    _cut(file)
+                    super().append_logs(logs)
+                except OSError as error:
+                    with contextlib.suppress(OSError):
+                        _cut(file)
+                    raise disk_error(file, error) from error
+
+        def read_logs(self, log_number_from: int) -> Iterator[dict[str, Any]]:  # type: ignore[override]
+            try:
+                for entry in super().read_logs(log_number_from):
+                    if not isinstance(entry, dict) or not {"op_code", "worker_id"} <= entry.keys():
+                        raise ValueError("a line is no entry")
+                    yield entry
+            except ValueError as error:
+                raise CheckpointError(
+                    f"{file} is corrupt: {error}", hint="another --name begins anew; the runs of its trials are whole"
+                ) from None
+            except OSError as error:
+                raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
+
+    return JournalStorage(Backend(str(file), lock_obj=lock))
+
+
+def _cut(file: Path) -> None:
+    """Remove the incomplete last line of a killed writer; the caller holds the lock."""
+    with file.open("r+b") as journal:
+        size = begin = journal.seek(0, 2)
+        tail = b""
+        while begin > 0 and b"\n" not in tail:
+            begin, end = max(0, begin - 4096), begin
+            journal.seek(begin)
+            tail = journal.read(end - begin) + tail
+        whole = begin + tail.rfind(b"\n") + 1
+        if whole < size:
+            journal.truncate(whole)
+
+
+def _database(url: str) -> optuna.storages.BaseStorage:
+    try:
+        import sqlalchemy
+        from optuna.storages import RDBStorage
+    except ImportError:
+        raise DependencyError("a shared storage needs SQLAlchemy", hint='pip install "rlcli[sweep]"') from None
+    try:
+        closed_after_use = {"poolclass": sqlalchemy.pool.NullPool}  # a trial lasts longer than a connection
+        for _ in range(_TRIES):
+            with contextlib.suppress(sqlalchemy.exc.IntegrityError, sqlalchemy.exc.ProgrammingError):
+                return RDBStorage(url, engine_kwargs=closed_after_use)
+            time.sleep(1.0)  # another machine makes the same tables at this moment
+        return RDBStorage(url, engine_kwargs=closed_after_use)
+    except ModuleNotFoundError as error:
+        raise DependencyError(f"--storage needs the driver {error.name}", hint=f"pip install {error.name}") from None
+    except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError) as error:
+        raise UsageError(
+            f"--storage '{without_password(url)}' is no address of a database: {_first_line(error)}",
+            hint="as in postgresql+psycopg://user@host/name",
+        ) from None
+    except (sqlalchemy.exc.SQLAlchemyError, OSError) as error:
+        raise MachineError(f"--storage {without_password(url)} cannot be reached: {_first_line(error)}") from None
+
+
+def _is_of_a_database(error: BaseException) -> bool:
+    from optuna.exceptions import StorageInternalError
+
+    sqlalchemy: Any = sys.modules.get("sqlalchemy")
+    return isinstance(error, StorageInternalError) or (
+        sqlalchemy is not None and isinstance(error, sqlalchemy.exc.SQLAlchemyError)
+    )
+
+
+def _first_line(error: BaseException) -> str:
+    cause = error.__cause__ or error
+    cause = getattr(cause, "orig", None) or cause
+    return (str(cause).strip().splitlines() or [type(cause).__name__])[0][:300]

@@ -1,0 +1,185 @@
+"""Search space and objective of a sweep, as the command line writes them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from rlcli.config import strict_yaml
+from rlcli.config.dump import to_yaml
+from rlcli.config.layers import parse_address, parse_override
+from rlcli.config.strict_yaml import YamlError
+from rlcli.errors import ConfigError, UsageError, listing
+
+if TYPE_CHECKING:
+    import optuna
+
+_RANGE = re.compile(r"(log:)?([^:,\[\]]+):([^:,\[\]]+)")
+_OBJECTIVE = re.compile(
+    r"((?:success|return|length)|(?:reward_terms|terminations)\.[^@\s]+)(?:@([0-9.e+]+)(s|steps)?)?"
+)
+_LARGEST = {int: 2**53, float: 1e300}
+"""Bounds of a range: floats hold every integer up to there, and the width of the range is finite."""
+HINT = "KEY=LOW:HIGH, KEY=log:LOW:HIGH or KEY=A,B,C"
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """Key of the configuration with the range or the choices of its values."""
+
+    key: str
+    low: float | int | None = None
+    high: float | int | None = None
+    log: bool = False
+    choices: tuple[Any, ...] = ()
+
+    @property
+    def bounds(self) -> tuple[Any, ...]:
+        """Values that the configuration is checked with: the ends of the range, or each choice."""
+        return self.choices or (self.low, self.high)
+
+    def override(self, value: object) -> str:
+        """Return a value as an override on the command line."""
+        return f"{self.key}={_written(value)}"
+
+    def suggest(self, trial: optuna.Trial) -> Any:
+        """Return a value that Optuna suggests."""
+        if self.choices:  # Optuna stores scalars; other values are stored as text
+            return self.value(trial.suggest_categorical(self.key, [_written(choice) for choice in self.choices]))
+        suggest = trial.suggest_int if isinstance(self.low, int) else trial.suggest_float
+        return suggest(self.key, *self.bounds, log=self.log)
+
+    def value(self, stored: Any) -> Any:
+        """Return the value that Optuna stores for a trial."""
+        if not self.choices:
+            return stored
+        return self.choices[[_written(choice) for choice in self.choices].index(stored)]
+
+
+@dataclass(frozen=True, slots=True)
+class Objective:
+    """Number by which trials are compared, and how long a trial trains."""
+
+    key: str
+    """Entry in the document of `rlcli eval`: success, return, length, reward_terms.NAME or terminations.NAME."""
+    seconds: float | None = None
+    """Time after which training is stopped [s]."""
+    steps: int | None = None
+    """Environment steps after which training ends."""
+
+    def read(self, document: Mapping[str, Any]) -> float:
+        """Return the value in the document of an evaluation; NaN if it was not finite.
+
+        Raises:
+            UsageError: if it is not in there.
+        """
+        first, _, name = self.key.partition(".")
+        found = document.get(first)
+        entry = found.get(name) if name and isinstance(found, dict) else found
+        if not isinstance(entry, dict):
+            known = listing(f"{first}.{key}" for key in found) if name and isinstance(found, dict) else ""
+            raise UsageError(
+                f"--objective {self.key}: the evaluation does not tell it",
+                hint=f"there are: {known}" if known else "return, success or length",
+            )
+        value = entry["rate"] if "rate" in entry else entry["mean"]
+        return math.nan if value is None else float(value)
+
+    @property
+    def training_metric(self) -> str | None:
+        """The metric of training that is compared by the pruner meanwhile."""
+        return self.key if self.key in ("return", "success") else None
+
+
+def read_parameters(texts: Sequence[str]) -> list[Parameter]:
+    """Parse the repeated option `--param`.
+
+    Raises:
+        UsageError: for what is none, an empty range, or a key twice.
+    """
+    found = [_read(text) for text in texts]
+    keys = [parse_address(parameter.key) for parameter in found]
+    twice = next((key for key in keys if keys.count(key) > 1), None)
+    if twice is not None:
+        raise UsageError(f"--param names {'.'.join(twice)} twice")
+    return found
+
+
+def read_objective(text: str) -> Objective:
+    """Parse `success@30s`, `return@2e6steps` or `return`.
+
+    Raises:
+        UsageError: for anything else.
+    """
+    found = _OBJECTIVE.fullmatch(text)
+    try:
+        if found is None:
+            raise ValueError
+        if found[2] is None:
+            return Objective(found[1])
+        number = float(found[2])
+        if not 0.0 < number < 1e12:
+            raise ValueError
+        return Objective(found[1], seconds=number) if found[3] == "s" else Objective(found[1], steps=int(number))
+    except ValueError:
+        raise UsageError(
+            f"--objective '{text}' is not one",
+            hint="return, success, length, reward_terms.NAME or terminations.NAME; @30s after 30 s of training, @2e6"
+            " after so many steps",
+        ) from None
+
+
+def _read(text: str) -> Parameter:
+    key, equals, ranges = text.partition("=")
+    key = key.strip()
+    if not equals or not key or not ranges.strip():
+        raise UsageError(f"--param '{text}' says no range", hint=HINT)
+    try:
+        parse_override(f"{key}=0")
+    except ConfigError as error:
+        raise UsageError(f"--param '{text}': {error.problems[0].message}", hint=HINT) from None
+    span = _RANGE.fullmatch(ranges.strip())
+    if span is None:
+        return _choices(text, key, ranges)
+    low, high = (_load(text, part.strip()) for part in span.groups()[1:])
+    log = span[1] is not None
+    if any(type(end) not in (int, float) or not abs(end) < _LARGEST[type(end)] for end in (low, high)):
+        raise UsageError(f"--param '{text}': the ends of a range are numbers, not beyond all bounds", hint=HINT)
+    if not low < high:
+        raise UsageError(f"--param '{text}' is empty: {low} is not below {high}", hint=HINT)
+    if log and low <= 0:
+        raise UsageError(f"--param '{text}': a logarithmic range begins above 0", hint=HINT)
+    if float in (type(low), type(high)):
+        low, high = float(low), float(high)
+    return Parameter(key, low, high, log)
+
+
+def _choices(text: str, key: str, words: str) -> Parameter:
+    choices = _load(text, f"[{words}]")
+    if not isinstance(choices, list) or len(choices) < 2:
+        raise UsageError(f"--param '{text}' leaves nothing to choose", hint=HINT)
+    written = [_written(choice) for choice in choices]
+    if len(set(written)) < len(written):
+        raise UsageError(f"--param '{text}' names a choice twice")
+    return Parameter(key, choices=tuple(choices))
+
+
+def _load(text: str, value: str) -> Any:
+    """Read a value of `--param` as YAML."""
+    try:
+        return strict_yaml.load_value(value)
+    except YamlError as error:
+        raise UsageError(f"--param '{text}': {error.message}", hint=HINT) from None
+
+
+def _written(value: object) -> str:
+    """Return a value in YAML, on one line."""
+    text = to_yaml({"v": value})
+    if isinstance(value, list | dict) or "\n" in text.strip():
+        import json
+
+        return json.dumps(value)  # JSON is YAML
+    return text.strip().removeprefix("v:").strip()

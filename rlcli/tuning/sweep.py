@@ -1,0 +1,349 @@
+"""Sweep: trials in Optuna's storage, shared by any number of processes; each trial is a run in the sweep's folder."""
+
+from __future__ import annotations
+
+import contextlib
+import platform
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from filelock import FileLock, Timeout
+
+from rlcli.config.dump import to_yaml
+from rlcli.errors import CheckpointError, MachineError, UsageError, listing
+from rlcli.random import derive
+from rlcli.reporting.figures import check_drawing, scatter
+from rlcli.runs.atomic_io import disk_error, to_json, write_atomic
+from rlcli.runs.multi_seed import read_study, write_summary
+from rlcli.runs.run import STUDY
+from rlcli.tuning.optuna_storage import open_study, without_password
+from rlcli.tuning.search_space import Parameter, read_parameters
+
+if TYPE_CHECKING:
+    import optuna
+    from optuna.trial import FrozenTrial
+
+PRESET = "best.yaml"
+PICTURE = "sweep.svg"
+_SWEEP_LOCK, _TRIAL_LOCK = ".sweep", ".worker"
+_SETTINGS = "rlcli"
+"""Attribute of an Optuna study with the settings that are the same in all of its processes."""
+_PLACE = "place"
+"""Attribute of a trial with the machine and the folder of its run: only there it can be resumed."""
+_SURPLUS = "surplus"
+"""Attribute of a trial that was begun at the same moment as the last one; it does not count."""
+_KINDS: dict[str, type] = {
+    **dict.fromkeys(("task", "name", "agent", "objective", "direction", "pruner"), str),
+    **dict.fromkeys(("trials", "episodes", "seed"), int),
+    **dict.fromkeys(("params", "overrides"), list),
+    **dict.fromkeys(("source", "flags"), dict),
+}
+"""Types of the entries of a sweep's `study.json`."""
+_ENDED = ("COMPLETE", "PRUNED", "FAIL")
+
+
+@dataclass(slots=True)
+class Trial:
+    """Trial that this process runs."""
+
+    number: int
+    folder: Path
+    trial: optuna.Trial
+    """Optuna's trial."""
+    values: dict[str, Any]
+    """Key -> value of its parameters."""
+    _lock: FileLock | None = None
+
+    def release(self) -> None:
+        """Let another process claim the trial."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+
+@dataclass(slots=True)
+class Sweep:
+    """Sweep with its folder, its settings and Optuna's study."""
+
+    folder: Path
+    settings: dict[str, Any]
+    parameters: list[Parameter]
+    study: optuna.Study
+    _claimed: dict[int, Trial] = field(default_factory=dict)
+
+    def trials(self) -> list[FrozenTrial]:
+        """Return Optuna's trials in order, without those that were begun beyond the wanted number."""
+        return [trial for trial in self.study.get_trials(deepcopy=False) if _SURPLUS not in trial.user_attrs]
+
+    def ended(self) -> list[FrozenTrial]:
+        """Return the trials that have ended."""
+        return [trial for trial in self.trials() if trial.state.name in _ENDED]
+
+    def best(self) -> FrozenTrial | None:
+        """Return the best finished trial, if there is one."""
+        done = [trial for trial in self.trials() if trial.state.name == "COMPLETE"]
+        if not done:
+            return None
+        better = max if self.settings["direction"] == "maximize" else min
+        return better(done, key=lambda trial: (trial.value, -trial.number if better is max else trial.number))
+
+    def values(self, trial: FrozenTrial | optuna.Trial) -> dict[str, Any]:
+        """Return the values of a trial's parameters."""
+        return {p.key: p.value(trial.params[p.key]) for p in self.parameters if p.key in trial.params}
+
+    def overrides(self, values: Mapping[str, Any]) -> list[str]:
+        """Return the values of a trial as overrides."""
+        return [p.override(values[p.key]) for p in self.parameters if p.key in values]
+
+    def trial_folder(self, number: int) -> Path:
+        """Return the folder of a trial, which is a run."""
+        return self.folder / f"trial-{number:04d}"
+
+    def document(self, trial: FrozenTrial) -> dict[str, Any]:
+        """Return a trial as plain data."""
+        folder = self.trial_folder(trial.number)
+        return {
+            "trial": trial.number,
+            "state": trial.state.name.lower(),
+            "value": trial.value if trial.state.name == "COMPLETE" else None,
+            "params": self.values(trial),
+            "run": str(folder) if folder.is_dir() else None,
+            "seconds": trial.user_attrs.get("seconds"),
+            "step": trial.user_attrs.get("step"),
+            "why": trial.user_attrs.get("why"),
+        }
+
+    def claim(self) -> Trial | None:
+        """Return a trial whose process is gone, or a new one; None if none is left.
+
+        One process claims at a time, so no trial is begun twice and none too many.
+        """
+        with _locked(self.folder / _SWEEP_LOCK):
+            for trial in self.trials():
+                if trial.state.name != "RUNNING" or trial.number in self._claimed or not self._is_here(trial):
+                    continue
+                taken = self._lock_trial(trial.number)
+                if taken is None:
+                    continue
+                if any(other.number == trial.number for other in self.ended()):  # another process has just ended it
+                    taken.release()
+                    continue
+                return self._claim(taken, self._with_own_sampler(trial))
+            if len(self.trials()) >= self.settings["trials"]:
+                return None
+            asked = self.study.ask()
+            asked.set_user_attr(_PLACE, self._here)
+            if sum(trial.number < asked.number for trial in self.trials()) >= self.settings["trials"]:
+                asked.set_user_attr(_SURPLUS, True)  # another machine has begun the last trial
+                self.study.tell(asked, state=_state("FAIL"))
+                return None
+            held = self._lock_trial(asked.number)
+            if held is None:
+                raise MachineError(f"{self.trial_folder(asked.number)} is being written to by another process")
+            return self._claim(held, self._with_own_sampler(asked))
+
+    def tell(self, trial: Trial, value: float | None = None, *, state: str | None = None, **notes: Any) -> None:
+        """Tell Optuna the value or the state of a trial that has ended; `notes` are stored with it."""
+        for key, note in notes.items():
+            trial.trial.set_user_attr(key, note)
+        self.study.tell(trial.trial, value, state=_state(state))
+        self._claimed.pop(trial.number, None)
+        trial.release()
+
+    def write_preset(self, data: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> Path | None:
+        """Write the best trial as a `--config` file, with a comment that says where it is from.
+
+        Args:
+            data: returns the content of the file for the values of a trial.
+
+        Raises:
+            MachineError: if it cannot be written.
+        """
+        with _locked(self.folder / _SWEEP_LOCK):  # another process may have told a better trial since
+            best = self.best()
+            if best is None:
+                return None
+            score = f"{self.settings['objective']} = {best.value:.6g}"
+            title = f"# {self.settings['task']}: trial {best.number} of {self.folder.name}, {score}\n"
+            write_atomic(self.folder / PRESET, title + to_yaml(dict(data(self.values(best)))))
+        return self.folder / PRESET
+
+    def release(self) -> None:
+        """Let other processes resume the unfinished trials."""
+        for trial in self._claimed.values():
+            trial.release()
+        self._claimed.clear()
+
+    @property
+    def _here(self) -> str:
+        return f"{platform.node()}:{self.folder.resolve()}"
+
+    def _is_here(self, trial: FrozenTrial) -> bool:
+        """Return whether a trial was begun in this folder, on this machine or one that shares the folder."""
+        return self.settings["storage"] is None or trial.user_attrs.get(_PLACE) == self._here
+
+    def _lock_trial(self, number: int) -> FileLock | None:
+        place = self.trial_folder(number)
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise disk_error(place, error) from error
+        lock = FileLock(place / _TRIAL_LOCK)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            return None
+        return lock
+
+    def _with_own_sampler(self, trial: FrozenTrial | optuna.Trial) -> optuna.Trial:
+        """Return a trial whose sampler depends on its number, not on the process; values drawn before stay."""
+        import optuna
+
+        self.study.sampler = _sampler(derive(self.settings["seed"], f"trial {trial.number}"))
+        return optuna.trial.Trial(self.study, trial._trial_id)
+
+    def _claim(self, lock: FileLock, trial: optuna.Trial) -> Trial:
+        for parameter in self.parameters:
+            parameter.suggest(trial)
+        taken = Trial(trial.number, self.trial_folder(trial.number), trial, self.values(trial), lock)
+        self._claimed[taken.number] = taken
+        return taken
+
+
+def open_sweep(
+    folder: Path,
+    settings: dict[str, Any],
+    source: Mapping[str, Any],
+    parameters: list[Parameter],
+    storage: str | None,
+) -> Sweep:
+    """Begin a sweep in a folder, or join the one that is there.
+
+    Args:
+        folder: of the sweep; made if it is not there.
+        settings: equal in all processes of the sweep, but for `trials`, which may grow.
+        source: where the task is from; equal in all processes that share the folder.
+        parameters: the parameters of a trial.
+        storage: URL of a database; None keeps a journal in the folder.
+
+    Raises:
+        UsageError: if the folder or the storage holds another sweep.
+        CheckpointError: if what the folder holds is damaged.
+        MachineError: if the storage cannot be reached, or the folder not written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(folder, error) from error
+    about = {"kind": "sweep", **settings, "source": dict(source)}
+    with _locked(folder / _SWEEP_LOCK):
+        exists = (folder / STUDY).is_file()
+        if exists:
+            _require_same(folder, read_study(folder, "sweep"), about)
+        study = open_study(folder, settings, storage, create=storage is not None or not exists)
+        known = study.user_attrs.get(_SETTINGS)
+        if known is not None:
+            _require_same(storage or folder, known, settings)
+        study.set_user_attr(_SETTINGS, settings)
+        write_atomic(folder / STUDY, to_json(about))
+    return Sweep(folder, settings, parameters, study)
+
+
+def read_sweep(folder: Path, storage: str | None = None) -> Sweep:
+    """Open a sweep to read it.
+
+    Raises:
+        CheckpointError: if there is none, or it is damaged.
+        MachineError: if its storage cannot be reached.
+    """
+    settings = read_study(folder, "sweep")
+    if any(not isinstance(settings.get(key), kind) for key, kind in _KINDS.items()):
+        raise CheckpointError(f"{folder / STUDY} is corrupt: it lacks what a sweep is told")
+    if settings.get("storage") and storage is None:
+        raise UsageError(f"{folder} keeps its trials in a database", hint="--storage URL, as it was begun")
+    study = open_study(folder, settings, storage, create=False)
+    return Sweep(folder, settings, read_parameters(settings["params"]), study)
+
+
+def find_sweep(words: Sequence[str], runs: Path, storage: str | None) -> Sweep:
+    """Find a sweep by its folder or its name; without one return the newest.
+
+    Raises:
+        CheckpointError: if there is none.
+        UsageError: if several are named, or several have that name.
+    """
+    if len(words) > 1:
+        raise UsageError("one sweep at a time", hint="its folder or its name")
+    known = sorted(file.parent for file in runs.glob(f"*/sweep-*/{STUDY}"))
+    if not words:
+        found = sorted(known, key=lambda folder: (folder / STUDY).stat().st_mtime)[-1:]
+    elif (Path(words[0]) / STUDY).is_file():
+        found = [Path(words[0])]
+    else:
+        found = [folder for folder in known if folder.name in (words[0], f"sweep-{words[0]}")]
+    if len(found) > 1:
+        raise UsageError(f"several tasks have a sweep '{words[0]}'", hint=f"name one: {listing(map(str, found))}")
+    if not found:
+        have = f"sweeps: {listing(map(str, known))}" if known else "rlcli sweep TASK --param ... makes one"
+        raise CheckpointError(f"no sweep{f' {words[0]!r}' if words else ''} in {runs}", hint=have)
+    return read_sweep(found[0], storage)
+
+
+def draw_sweep(sweep: Sweep) -> Path:
+    """Draw the values of the trials over each parameter into the sweep's folder.
+
+    Raises:
+        UsageError: if no trial has ended yet.
+        DependencyError: without matplotlib.
+    """
+    check_drawing()
+    done = [trial for trial in sweep.trials() if trial.state.name == "COMPLETE"]
+    if not done:
+        raise UsageError("there is nothing to draw: no trial has ended yet")
+    panels = [("trial", [trial.number for trial in done], False)]
+    panels += [(p.key, [sweep.values(trial)[p.key] for trial in done], p.log) for p in sweep.parameters]
+    values = [trial.value for trial in done if trial.value is not None]  # a finished trial has a value
+    picture = scatter(panels, values, sweep.settings["objective"], title=sweep.folder.name)
+    return write_summary(sweep.folder, PICTURE, picture)
+
+
+def _require_same(place: object, known: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    """Check that a sweep has the same settings as this process.
+
+    Raises:
+        UsageError: naming what differs.
+    """
+    differing = [key for key in settings if key != "trials" and known.get(key) != settings[key]]
+    if differing:
+        said = "; ".join(f"{key}: {known.get(key)!r} there, {settings[key]!r} here" for key in differing[:3])
+        where = without_password(str(place))
+        raise UsageError(f"{where} is another sweep ({said})", hint="another --name, or the same command again")
+
+
+def _sampler(seed: int) -> optuna.samplers.BaseSampler:
+    import optuna
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True, n_startup_trials=8)
+
+
+def _state(name: str | None) -> optuna.trial.TrialState | None:
+    import optuna
+
+    return None if name is None else optuna.trial.TrialState[name]
+
+
+@contextlib.contextmanager
+def _locked(file: Path) -> Iterator[None]:
+    try:
+        lock = FileLock(file).acquire(timeout=120)
+    except Timeout:
+        raise MachineError(f"{file} is held by another process") from None
+    except OSError as error:
+        raise disk_error(file, error) from error
+    with lock:
+        yield

@@ -1,0 +1,229 @@
+"""Comparison of the best trial's settings with the task's own: which learn faster, with several seeds."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlcli.config.dump import to_data, to_yaml
+from rlcli.errors import CheckpointError, DivergedError, RlcliError, UsageError
+from rlcli.evaluation.limits import require_success
+from rlcli.runs.index import newest_rows, overview
+from rlcli.runs.run import CONFIG, Run
+from rlcli.training.launch import TrainingRequest, prepare_run
+from rlcli.training.loggers import read_metrics
+from rlcli.training.subprocesses import POLL_S, start_training
+from rlcli.tuning.time_to_threshold import Reached, Threshold, median, read_threshold, time_to_threshold
+
+if TYPE_CHECKING:
+    from rlcli.training.signals import StopRequest
+    from rlcli.tuning.sweep import Sweep
+
+_log = logging.getLogger(__name__)
+
+ARMS = ("default", "best")
+"""The task's own settings, and those of the best trial."""
+
+
+@dataclass(slots=True)
+class Training:
+    """One of the trainings that are compared."""
+
+    arm: str
+    seed: int
+    folder: Path
+    reached: Reached | None = None
+    error: RlcliError | None = None
+
+    @property
+    def state(self) -> str:
+        """reached, not reached, or failed."""
+        return "failed" if self.error else "reached" if self.reached else "not reached"
+
+    def time(self) -> dict[str, float | None]:
+        """Return seconds and steps until the threshold; None if it was not reached."""
+        if self.reached is None:
+            return {"seconds": None, "steps": None}
+        return {"seconds": self.reached.seconds, "steps": self.reached.step}
+
+
+@dataclass(slots=True)
+class Comparison:
+    """Trainings with both settings, and how long they took to reach the threshold."""
+
+    sweep: Path
+    task: str
+    threshold: Threshold
+    trial: int
+    """Number of the best trial."""
+    seeds: Sequence[int]
+    trainings: list[Training] = field(default_factory=list)
+    stop_code: int | None = None
+    """The exit code of a signal that stopped the comparison before its end."""
+
+    @property
+    def exit_code(self) -> int:
+        """The exit code of the first training that failed."""
+        return next((one.error.exit_code for one in self.trainings if one.error is not None), 0)
+
+    def training(self, seed: int, arm: str) -> Training | None:
+        """Return a training, if it was made."""
+        return next((one for one in self.trainings if (one.seed, one.arm) == (seed, arm)), None)
+
+    def medians(self) -> dict[str, dict[str, float | None]]:
+        """Return arm -> the medians of seconds and steps, for arms that were trained with every seed."""
+        medians = {}
+        for arm in ARMS:
+            times = [one.time() for one in self.trainings if one.arm == arm]
+            if len(times) == len(self.seeds):
+                medians[arm] = {key: median([time[key] for time in times]) for key in ("seconds", "steps")}
+        return medians
+
+    def ratios(self) -> dict[str, float | None]:
+        """Return the medians of the best trial's settings divided by those of the task's own."""
+        medians = self.medians()
+        if len(medians) < len(ARMS):
+            return {}
+        ratios: dict[str, float | None] = {}
+        for key in ("seconds", "steps"):
+            default, best = (medians[arm][key] for arm in ARMS)
+            ratios[key] = None if default is None or best is None else best / default
+        return ratios
+
+    def document(self) -> dict[str, Any]:
+        """Return the comparison as plain data."""
+        return {
+            "sweep": str(self.sweep),
+            "task": self.task,
+            "until": {self.threshold.key: self.threshold.value},
+            "trial": self.trial,
+            "compared": [
+                {"policy": one.arm, "seed": one.seed, "run": str(one.folder), "state": one.state, **one.time()}
+                for one in self.trainings
+            ],
+            "medians": self.medians(),
+            "ratios": self.ratios(),
+        }
+
+
+def compare(
+    sweep: Sweep, request: TrainingRequest, seeds: Sequence[int], until: str | None, episodes: int, stop: StopRequest
+) -> Comparison:
+    """Train with both settings, one training after the other, until an evaluation reaches the threshold.
+
+    The runs are kept in the sweep's folder, so that the same command continues after an interruption.
+
+    Args:
+        sweep: the sweep.
+        request: the device, the budget and the overrides of all trainings.
+        seeds: the seeds of the trainings.
+        until: the threshold, such as `success=0.99`.
+        episodes: number of episodes of an evaluation.
+        stop: the request to stop by a signal.
+
+    Raises:
+        CheckpointError: if no trial has finished.
+        UsageError: if the task has no success to be measured by.
+    """
+    best = sweep.best()
+    if best is None:
+        raise CheckpointError(f"{sweep.folder} has no finished trial yet", hint="rlcli sweep show")
+    threshold = read_threshold(until or "success=0.99")
+    comparison = Comparison(sweep.folder, sweep.settings["task"], threshold, best.number, seeds)
+    with _request_of_sweep(sweep, request) as base:
+        resolved, _ = base.resolve()
+        if resolved.task.success is None and until is None:
+            raise UsageError("this task defines no success: until what?", hint="--until return=X")
+        require_success(resolved, [threshold.key])
+        if resolved.agent is not None and not resolved.agent.eval_interval:
+            base.overrides.append("agent.eval_interval=1")
+        base.overrides.append(f"agent.eval_episodes={episodes}")
+        changes: dict[str, list[str]] = {"default": [], "best": sweep.overrides(sweep.values(best))}
+        with stop:
+            for turn, seed in enumerate(seeds):
+                for arm in ARMS if turn % 2 == 0 else ARMS[::-1]:  # a machine that slows down slows both arms
+                    if stop.signal is not None:
+                        break
+                    training = _train(comparison, replace(base, seed=seed), arm, changes[arm], stop)
+                    if training.reached or training.error or stop.signal is None:  # else a signal stopped it
+                        comparison.trainings.append(training)
+    if stop.signal is not None and len(comparison.trainings) < len(ARMS) * len(seeds):
+        comparison.stop_code = stop.exit_code
+    return comparison
+
+
+@contextmanager
+def _request_of_sweep(sweep: Sweep, request: TrainingRequest) -> Iterator[TrainingRequest]:
+    """Complete a request by what the trials of a sweep have in common, except for their budget."""
+    from rlcli.runs.restore import recorded_task
+
+    settings = sweep.settings
+    source = recorded_task(settings["source"], f"the task of {sweep.folder}")
+    with tempfile.TemporaryDirectory() as folder:
+        config = None
+        if settings.get("config") is not None:
+            config = Path(folder) / "config.yaml"
+            config.write_text(settings["config"], encoding="utf-8")
+        yield replace(
+            request,
+            source=source,
+            agent=settings["agent"],
+            config=config,
+            overrides=[*settings["overrides"], *request.overrides],
+            flags=dict(settings["flags"]),
+        )
+
+
+def _train(
+    comparison: Comparison, request: TrainingRequest, arm: str, changes: Sequence[str], stop: StopRequest
+) -> Training:
+    """Train with one of the settings until the threshold is reached, the budget is spent, or a signal arrives."""
+    seed, threshold = request.seed, comparison.threshold
+    name = "compare-default" if arm == "default" else f"compare-trial-{comparison.trial:04d}"
+    training = Training(arm, seed, _run_folder(comparison.sweep, f"{name}-seed-{seed}", request, changes))
+    device = prepare_run(training.folder, request, changes)
+    run = overview(training.folder)
+
+    def time_of_run() -> Reached | None:
+        metrics = training.folder / "metrics.jsonl"
+        return time_to_threshold(read_metrics(metrics), threshold) if metrics.is_file() else None
+
+    training.reached = time_of_run()
+    if training.reached is None and run.state == "diverged":
+        training.error = DivergedError(f"{training.folder}: {run.reason}")
+    elif training.reached is None and run.state != "finished":
+        _log.info("%s, seed %s: %s", arm, seed, training.folder)
+        process = start_training(training.folder, device)
+        try:
+            while not process.has_ended():
+                if stop.signal is not None or any(map(threshold.reached_by, newest_rows(Run(training.folder)))):
+                    process.stop()
+                time.sleep(POLL_S)
+        finally:
+            process.process.kill()
+        training.reached = time_of_run()
+        if process.has_failed and stop.signal is None:
+            training.error = process.error()
+            _log.warning("%s, seed %s: %s", arm, seed, training.error.message)
+    reached = training.reached
+    time_taken = "" if reached is None else f" after {reached.seconds:.1f} s, {reached.step:,} steps"
+    _log.info("%s, seed %s: %s%s", arm, seed, training.state, time_taken)
+    return training
+
+
+def _run_folder(sweep: Path, name: str, request: TrainingRequest, changes: Sequence[str]) -> Path:
+    """Return the folder of a training; if the name is that of a run with other settings, append a number."""
+    config = to_yaml(to_data(request.resolve(changes)[0]))
+    number = 1
+    while True:
+        folder = sweep / (name if number == 1 else f"{name}-{number}")
+        if not (folder / CONFIG).is_file() or (folder / CONFIG).read_text(encoding="utf-8") == config:
+            folder.mkdir(exist_ok=True)
+            return folder
+        number += 1

@@ -1,0 +1,222 @@
+"""Trials of a sweep: each is trained and then evaluated in a subprocess, and pruned if it learns worse than most."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from rlcli.errors import DivergedError, RlcliError, UsageError, did_you_mean, listing
+from rlcli.evaluation.limits import require_success
+from rlcli.runs.index import newest_rows, overview
+from rlcli.runs.run import Run, open_run
+from rlcli.training.launch import TrainingRequest, prepare_run
+from rlcli.training.subprocesses import POLL_S, STOPPED, TrainingProcess, start_command, start_training
+from rlcli.tuning.preset import preset_of
+from rlcli.tuning.search_space import Objective, Parameter
+from rlcli.tuning.time_to_threshold import training_s
+
+if TYPE_CHECKING:
+    from rlcli.config.load import Resolved
+    from rlcli.training.signals import StopRequest
+    from rlcli.tuning.sweep import Sweep, Trial
+
+_log = logging.getLogger(__name__)
+
+_REPORT_EVERY_S = 1.0
+"""Time between two reports of a trial's progress to the pruner."""
+_PRUNER_STEPS = 100
+"""Trials are compared by the pruner at each percent of their budget."""
+_MAX_FAILURES = 3
+"""Number of failed trials before the first success after which the sweep itself is wrong."""
+_NOT_OF_THE_TRIAL = (7, 8, 10, STOPPED, 130)
+"""Exit codes that another setting would not change: a missing package or device, the machine, a signal."""
+
+
+def check_parameters(request: TrainingRequest, parameters: Sequence[Parameter], objective: Objective) -> Resolved:
+    """Check before anything is written that trials can be trained and evaluated; return a configuration.
+
+    Raises:
+        ConfigError: for an unknown key, or a bound of a range that its key cannot have.
+        UsageError: for an objective that evaluations of this task do not have.
+    """
+    for index in range(max(len(parameter.bounds) for parameter in parameters)):
+        bounds = [p.override(p.bounds[min(index, len(p.bounds) - 1)]) for p in parameters]
+        resolved, _ = request.resolve(bounds)
+    require_success(resolved, [objective.key])
+    group, _, name = objective.key.partition(".")
+    task = resolved.task
+    groups: dict[str, Mapping[str, Any]] = {"reward_terms": task.rewards, "terminations": task.terminations}
+    names = [key for key, term in groups.get(group, {}).items() if term is not None]
+    if names and name not in names:
+        hint = did_you_mean(name, names) or f"there are: {listing(names)}"
+        raise UsageError(f"--objective {objective.key}: the task has none of that name", hint=hint)
+    return resolved
+
+
+def write_preset(sweep: Sweep, request: TrainingRequest) -> None:
+    """Write the settings of the best trial into the sweep's folder, as a `--config` file."""
+
+    def preset(values: Mapping[str, Any]) -> dict[str, Any]:
+        resolved, _ = replace(request, budget={}).resolve(sweep.overrides(values))
+        return preset_of(resolved, names_agent=True)
+
+    sweep.write_preset(preset)
+
+
+class TrialRunner:
+    """Runner of trials: it claims trials, trains and evaluates each in subprocesses, and tells the storage."""
+
+    def __init__(
+        self, sweep: Sweep, request: TrainingRequest, objective: Objective, jobs: int, stop: StopRequest
+    ) -> None:
+        self._sweep, self._request, self._objective, self._jobs, self._stop = sweep, request, objective, jobs, stop
+        self._active: list[_Stage] = []
+        self._failures: list[RlcliError] = []
+
+    def run(self) -> None:
+        """Run trials until there is none left, or a signal arrives.
+
+        Raises:
+            RlcliError: if the first trials all fail, or for an error that every trial would have.
+        """
+        try:
+            while True:
+                stopping = self._stop.signal is not None
+                while not stopping and len(self._active) < self._jobs:
+                    trial = self._sweep.claim()
+                    if trial is None:
+                        break
+                    self._active.append(self._begin(trial))
+                if not self._active:
+                    break
+                for stage in list(self._active):
+                    if stopping:
+                        stage.process.stop()
+                    if stage.process.has_ended():
+                        self._active.remove(stage)
+                        self._end(stage, stopping)
+                    elif not stopping:
+                        self._watch(stage)
+                time.sleep(POLL_S)
+        finally:
+            for stage in self._active:
+                stage.process.process.kill()
+        if self._failures and not stopping and self._sweep.best() is None:
+            raise self._all_failed()
+
+    def _begin(self, trial: Trial) -> _Stage:
+        """Start or resume the training of a trial, or evaluate a trial that is trained already."""
+        changes = self._sweep.overrides(trial.values)
+        _log.info("trial %s: %s", trial.number, ", ".join(changes))
+        device = prepare_run(trial.folder, self._request, changes)
+        run = overview(trial.folder)
+        limit_s = self._objective.seconds
+        if run.state == "finished" or (limit_s is not None and (run.duration_s or 0.0) >= limit_s):
+            return self._evaluate(trial)
+        return _Stage(trial, start_training(trial.folder, device))
+
+    def _evaluate(self, trial: Trial) -> _Stage:
+        episodes, seed = self._sweep.settings["episodes"], self._sweep.settings["seed"]
+        words = ["eval", "--checkpoint", str(trial.folder), "--episodes", str(episodes), "--seed", str(seed)]
+        return _Stage(trial, start_command(trial.folder, words), evaluates=True)
+
+    def _watch(self, stage: _Stage) -> None:
+        """Stop a training whose time is over, or that learns worse than most."""
+        if stage.evaluates or stage.process.stop_requested:
+            return
+        now, limit_s, metric = time.monotonic(), self._objective.seconds, self._objective.training_metric
+        if limit_s is None and now < stage.next_report:
+            return
+        stage.next_report = now + _REPORT_EVERY_S
+        rows = newest_rows(Run(stage.trial.folder))
+        if not rows:
+            return
+        run = overview(stage.trial.folder)
+        share = 0.0
+        if limit_s is not None:
+            share = stage.add_trained_time(rows) / limit_s
+            if share >= 1.0:
+                stage.process.stop()
+                return
+        elif run.iterations:
+            share = (run.iteration or 0) / run.iterations
+        step = int(_PRUNER_STEPS * share)
+        if metric is None or metric not in run.last or step <= stage.reported:
+            return
+        stage.reported = step
+        stage.trial.trial.report(run.last[metric], step)
+        if stage.trial.trial.should_prune():
+            stage.pruned = True
+            stage.process.stop()
+
+    def _end(self, stage: _Stage, stopping: bool) -> None:
+        """Evaluate a trial that is trained, tell the storage of one that is evaluated, pruned or failed."""
+        trial, process = stage.trial, stage.process
+        if stage.evaluates and process.exit_code == 0:
+            self._tell_value(trial, self._objective.read(process.document))
+        elif stage.pruned:
+            self._sweep.tell(trial, state="PRUNED")
+            _log.info("trial %s: pruned", trial.number)
+        elif stopping:
+            return  # the trial stays in the storage, to be resumed
+        elif not stage.evaluates and not process.has_failed:
+            self._active.append(self._evaluate(trial))
+        elif process.exit_code in _NOT_OF_THE_TRIAL:
+            error = process.error()
+            error.message = f"trial {trial.number}: {error.message}"
+            error.hint = "the same command again goes on with this trial"
+            raise error
+        else:
+            self._fail(trial, process.error())
+
+    def _tell_value(self, trial: Trial, value: float) -> None:
+        if not math.isfinite(value):
+            self._fail(trial, DivergedError(f"{self._objective.key} of its evaluation is not finite"))
+            return
+        run = overview(trial.folder)
+        self._sweep.tell(trial, value, seconds=run.duration_s, step=run.step)
+        state = open_run(trial.folder).record["state"]
+        _log.info("trial %s: %s = %.6g (%s)", trial.number, self._sweep.settings["objective"], value, state)
+        write_preset(self._sweep, self._request)
+
+    def _fail(self, trial: Trial, error: RlcliError) -> None:
+        self._failures.append(error)
+        self._sweep.tell(trial, state="FAIL", why=error.message)
+        _log.warning("trial %s: %s", trial.number, error.message)
+        if len(self._failures) >= _MAX_FAILURES and self._sweep.best() is None:
+            raise self._all_failed()
+
+    def _all_failed(self) -> RlcliError:
+        error, count = self._failures[-1], len(self._failures)
+        error.message = f"the first {f'{count} trials' if count > 1 else 'trial'} failed: {error.message}"
+        return error
+
+
+@dataclass(slots=True)
+class _Stage:
+    """Training or evaluation of a trial."""
+
+    trial: Trial
+    process: TrainingProcess
+    evaluates: bool = False
+    pruned: bool = False
+    reported: int = 0
+    """Newest step of the pruner that was reported."""
+    next_report: float = 0.0
+    trained_s: float = 0.0
+    counted: int = 0
+    """Iterations that `trained_s` includes."""
+
+    def add_trained_time(self, rows: Sequence[Mapping[str, Any]]) -> float:
+        """Add the rollouts and updates of new rows of the metrics; return the time of all [s]."""
+        fresh = [row for row in rows if row["iteration"] > self.counted]
+        if fresh and fresh[0]["iteration"] > self.counted + 1:  # rows were missed, or the run was resumed
+            self.trained_s = max(self.trained_s, overview(self.trial.folder).duration_s or 0.0)
+        self.trained_s += sum(map(training_s, fresh))
+        if fresh:
+            self.counted = fresh[-1]["iteration"]
+        return self.trained_s

@@ -1,0 +1,76 @@
+"""Time that a training takes until an evaluation between its iterations reaches a threshold."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rlcli.errors import UsageError
+
+_METRICS = {"success": "Eval/success_rate", "return": "Eval/mean_reward", "length": "Eval/mean_episode_length"}
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """Value that an evaluation must reach."""
+
+    key: str
+    """success, return or length."""
+    value: float
+
+    def reached_by(self, row: Mapping[str, Any]) -> bool:
+        """Return whether the evaluation in a row of the metrics reached the threshold."""
+        return bool(row.get(_METRICS[self.key], -math.inf) >= self.value)
+
+
+@dataclass(frozen=True, slots=True)
+class Reached:
+    """Time at which a training reached its threshold."""
+
+    seconds: float
+    """Sum of all rollouts and updates until then, without evaluations [s]."""
+    step: int
+    """Environment steps."""
+    iteration: int
+
+
+def read_threshold(text: str) -> Threshold:
+    """Parse `success=0.99`, `return=200` or `length=250`.
+
+    Raises:
+        UsageError: for anything else.
+    """
+    key, _, number = text.partition("=")
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if key not in _METRICS or not math.isfinite(value):
+        raise UsageError(f"--until '{text}' is no bar", hint="as in --until success=0.99, return=200 or length=250")
+    if key == "success" and not 0.0 < value <= 1.0:
+        raise UsageError(f"--until '{text}': a success rate is above 0 and at most 1")
+    return Threshold(key, value)
+
+
+def training_s(row: Mapping[str, Any]) -> float:
+    """Return the time of the rollout and the update of an iteration [s]."""
+    return float(row.get("Perf/collection_time", 0.0) + row.get("Perf/learning_time", 0.0))
+
+
+def time_to_threshold(rows: Iterable[Mapping[str, Any]], threshold: Threshold) -> Reached | None:
+    """Return when a training first reached a threshold, by all rows of its metrics; None if it has not."""
+    seconds = 0.0
+    for row in rows:
+        seconds += training_s(row)
+        if threshold.reached_by(row):
+            return Reached(seconds, row["step"], row["iteration"])
+    return None
+
+
+def median(values: Sequence[float | None]) -> float | None:
+    """Return the median over seeds; None stands for a seed that never reached the threshold, also as the result."""
+    found = statistics.median([math.inf if value is None else value for value in values])
+    return found if math.isfinite(found) else None

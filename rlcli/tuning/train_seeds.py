@@ -1,0 +1,171 @@
+"""Training of one configuration with several seeds, and the curves of all seeds together."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rlcli.config.dump import to_data, to_yaml
+from rlcli.errors import CheckpointError, DependencyError
+from rlcli.reporting.curves import AXES, Curve, Line, gather
+from rlcli.reporting.figures import check_drawing, picture
+from rlcli.reporting.panels import choose
+from rlcli.runs.index import overview
+from rlcli.runs.multi_seed import create_study, read_study, runs_of, write_summary
+from rlcli.runs.run import open_run
+from rlcli.training.launch import TrainingRequest, run_record
+from rlcli.training.subprocesses import train_all
+
+if TYPE_CHECKING:
+    from rlcli.config.load import Resolved
+    from rlcli.training.signals import StopRequest
+
+_log = logging.getLogger(__name__)
+
+CURVES = "curves.csv"
+PICTURE = "curves.svg"
+METRICS = {"return": "Train/mean_reward", "success": "Train/success_rate"}
+"""Name in tables and documents -> metric."""
+
+
+class StudyView(Protocol):
+    """Context that shows the progress of the runs of a study."""
+
+    def poll(self) -> None:
+        """Update the view if it is time to."""
+        ...
+
+    def __enter__(self) -> Any: ...
+
+    def __exit__(self, *_: Any) -> None: ...
+
+
+@dataclass(slots=True)
+class StudyResult:
+    """State of a study at the end of `train_seeds`."""
+
+    folder: Path
+    task: str
+    runs: list[dict[str, Any]]
+    """The seed, the state and the last metrics of each run."""
+    together: dict[str, Any] | None = None
+    """Name -> interquartile mean over the seeds and its interval; None if no run has metrics."""
+    curves: Path | None = None
+    picture: Path | None = None
+    exit_code: int = 0
+    """The exit code of the first training that failed."""
+    stop_code: int | None = None
+    """The exit code of a signal that stopped the study before its end."""
+
+
+def new_study(request: TrainingRequest, resolved: Resolved, device: str, seeds: Sequence[int]) -> Path:
+    """Create the folder of a study, with a run for each seed that waits for its training."""
+    record, config = run_record(request, resolved, device), to_yaml(to_data(resolved))
+    folder = create_study(request.runs, resolved.source.name, request.name, config, record, seeds)
+    _log.info("study %s: seeds %s", folder, ", ".join(map(str, seeds)))
+    return folder
+
+
+def resume_options(request: TrainingRequest) -> list[str]:
+    """Return the options of a request that each run of a resumed study is resumed with."""
+    values = {
+        "--max-iterations": request.budget.get("agent.max_iterations"),
+        "--max-steps": request.budget.get("agent.max_steps"),
+        "--video-every": request.video_every,
+    }
+    options = [word for option, value in values.items() if value is not None for word in (option, str(value))]
+    return options + [word for name in request.loggers or [] for word in ("--logger", name)]
+
+
+def train_seeds(
+    folder: Path,
+    device: str | None,
+    jobs: int,
+    stop: StopRequest,
+    make_view: Callable[[str, Sequence[Path]], StudyView],
+    finished_too: bool = False,
+    options: Sequence[str] = (),
+) -> StudyResult:
+    """Train the runs of a study that are not finished, and write the curves of all seeds together.
+
+    Args:
+        folder: the study.
+        device: where to train; None is the device that the study began on.
+        jobs: number of trainings at a time.
+        stop: the request to stop by a signal.
+        make_view: makes the view from a title and the folders of the runs.
+        finished_too: whether runs that are finished have a new budget.
+        options: further options of each `rlcli train --resume`.
+    """
+    study = read_study(folder)
+    runs = runs_of(folder, study)
+    with stop:
+        left = [run for run in runs if finished_too or overview(run).state != "finished"]
+        with make_view(f"rlcli train {study['task']}", runs) as view:
+            ended = train_all(left, device or str(study.get("device", "cpu")), jobs, options, stop, view.poll)
+    result = _summary(folder, study["task"], runs)
+    result.exit_code = next((one.exit_code for one in ended if one.exit_code and not one.stop_requested), 0)
+    if stop.signal is not None and any(overview(run).state != "finished" for run in runs):
+        result.stop_code = stop.exit_code
+    return result
+
+
+def _summary(folder: Path, task: str, runs: Sequence[Path]) -> StudyResult:
+    """Write the curves of all seeds together, and return them with the last metrics of each seed."""
+    rows: list[dict[str, Any]] = []
+    for run in map(overview, runs):
+        row = {"seed": run.seed, "run": str(run.folder), "state": run.state, "step": run.step}
+        rows.append({**row, "trained_s": run.duration_s, **run.last})
+    result = StudyResult(folder, task, rows)
+    try:
+        curves, notes = gather([open_run(run) for run in runs])
+    except CheckpointError as error:
+        _log.warning("%s", error.message)
+        return result
+    for note in notes:
+        _log.warning("%s", note)
+    lines = {name: curves[0].line(metric) for name, metric in METRICS.items() if metric in curves[0].names()}
+    found = {name: line for name, line in lines.items() if line is not None}
+    result.together = {}
+    for name, line in found.items():
+        low, high = (None if end is None else float(end[-1]) for end in (line.low, line.high))
+        result.together[name] = {"iqm": float(line.middle[-1]), "low": low, "high": high, "step": int(line.x[-1])}
+    if found:
+        result.curves = write_summary(folder, CURVES, _csv(found))
+        result.picture = _picture(folder, curves)
+    return result
+
+
+def _csv(lines: dict[str, Line]) -> str:
+    """Return a table of steps and, of each metric, the interquartile mean with its interval.
+
+    The first metric gives the steps; the others are interpolated.
+    """
+    import numpy as np
+
+    text = [",".join(["steps", *(f"{name}{end}" for name in lines for end in ("", "_low", "_high"))])]
+    axis = next(iter(lines.values())).x
+    columns = [
+        np.full(len(axis), np.nan) if values is None else np.interp(axis, line.x, values)
+        for line in lines.values()
+        for values in (line.middle, line.low, line.high)
+    ]
+    for steps, *row in zip(axis, *columns, strict=True):
+        text.append(",".join([f"{int(steps)}", *("" if np.isnan(value) else f"{value:.6g}" for value in row)]))
+    return "\n".join(text) + "\n"
+
+
+def _picture(folder: Path, curves: list[Curve]) -> Path | None:
+    """Draw the curves, if matplotlib is installed."""
+    try:
+        check_drawing()
+    except DependencyError:
+        return None
+    panels = choose(curves, list(METRICS), "steps")
+    if not panels:
+        return None
+    drawn = picture(panels, AXES["steps"], ".svg", title=curves[0].label, note="")
+    return write_summary(folder, PICTURE, drawn)

@@ -1,0 +1,72 @@
+"""Origin and Host checks of the web viewer: only its own page, opened on this machine, may connect.
+
+Every page that the user's browser has open can reach a server on the loopback interface. But a page cannot forge the
+headers that the browser adds: `Host` (the name it connects to), `Origin` (the page that sends the request) and
+`Sec-Fetch-*`. A request is answered only if these headers name our own page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+SOCKETS = ("/ui", "/state")
+"""Paths that a WebSocket may be opened to; models are not taken from browsers (`/drop`)."""
+
+HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:;"
+        " worker-src 'self' blob:; connect-src 'self' {sockets} blob: data:; img-src 'self' blob: data:;"
+        " style-src 'self' 'unsafe-inline'; object-src 'none'; base-uri 'none'; form-action 'none';"
+        " frame-ancestors 'none'"
+    ),
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+}
+"""Headers of every response: nothing is loaded from elsewhere, and no other page may embed or read this one."""
+
+
+def response_headers(port: int) -> dict[str, str]:
+    """The response_headers of every answer of the server at `port`."""
+    sockets = " ".join(f"ws://{host}" for host in allowed_hosts(port))
+    return {name: value.replace("{sockets}", sockets) for name, value in HEADERS.items()}
+
+
+def allowed_hosts(port: int) -> tuple[str, ...]:
+    """Return the `Host` values of a browser on this machine or at the other end of a tunnel."""
+    names = ("localhost", "127.0.0.1")
+    return (*(f"{name}:{port}" for name in names), *(names if port == 80 else ()))
+
+
+def refusal_reason(port: int, path: str, request_headers: Mapping[str, Sequence[str]]) -> str | None:
+    """Return why a request is refused, or None if it is answered.
+
+    Args:
+        port: the port of the server.
+        path: the path of the request, with its query.
+        request_headers: header name in lower case -> its values.
+    """
+    host = [value.lower() for value in request_headers.get("host", ())]
+    if len(host) != 1 or host[0] not in allowed_hosts(port):
+        return "not a name of this machine"
+    place = path.partition("?")[0]
+    if not path.startswith("/") or ".." in place or "\\" in place or "%" in place:
+        return "no such path"
+    opens = (
+        any("upgrade" in value.lower() for value in request_headers.get("connection", ()))
+        or "upgrade" in request_headers
+    )
+    if opens and place not in SOCKETS:
+        return "no such socket"
+    origin = [value.lower() for value in request_headers.get("origin", ())]
+    own = f"http://{host[0]}"
+    if (opens and not origin) or any(value != own for value in origin) or len(origin) > 1:
+        return "another page"
+    site, mode, target = (
+        (*request_headers.get(f"sec-fetch-{name}", ()), "")[0].lower() for name in ("site", "mode", "dest")
+    )
+    followed = mode == "navigate" and target == "document" and place in ("/", "/index.html") and not opens
+    if site not in ("", "same-origin", "none") and not followed:
+        return "another page"
+    return None

@@ -1,0 +1,313 @@
+"""Playback of a policy in an environment in real time, with the controls of a viewer.
+
+All viewers share this object. The viewer's thread submits requests (`submit`) and reads the state (`view`). The thread
+of the simulation executes the requests between two steps (`advance`), so that nothing changes within a step.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import CheckpointError, UsageError
+from rlcli.managers.command import CommandManager
+from rlcli.rl.acting import Act
+from rlcli.viewer.protocol import CheckpointSource, View
+
+_log = logging.getLogger(__name__)
+SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+"""Multiples of real time."""
+_LAG = 0.25
+"""How far the simulation may fall behind before it stops to catch up [s]."""
+_FRAME_S = 1.0 / 60.0
+_REFRESH_S = 1.0
+"""Time between two reads of the list of checkpoints [s]."""
+
+
+@dataclass(slots=True)
+class Playback:
+    """See the module.
+
+    Args:
+        env: the environment; its episodes begin when the playback is made, unless they have `initial_obs`.
+        act: the policy.
+        checkpoint_source: other policies, if there are.
+        checkpoint: the step of the first policy.
+    """
+
+    env: VecEnv
+    act: Act
+    checkpoint_source: CheckpointSource | None = None
+    checkpoint: int | None = None
+    shown: int = 0
+    speed: float = 1.0
+    follow: bool = False
+    """Play each new checkpoint as it appears."""
+    patience: float = 0.1
+    """How long steps may go on before a viewer is asked again what it wants [s]."""
+    initial_obs: Tensor | None = None
+    """Observations of an environment that goes on from where it stands; None: its episodes begin now."""
+    steps: int = 0
+    message: str = ""
+    _knob: int = 0
+    _requests: queue.SimpleQueue[Callable[[], None]] = field(default_factory=queue.SimpleQueue)
+    _obs: Tensor = field(init=False)
+    _due: float = 0.0
+    _single: int = 0
+    _push: np.ndarray | None = None
+    _reward: Tensor = field(init=False)
+    _checkpoints: tuple[int, ...] = ()
+    ended: Tensor = field(init=False)
+    """Episodes that have ended. (num_envs,)"""
+    _view: View = field(init=False)
+    _commands: CommandManager | None = None
+
+    def __post_init__(self) -> None:
+        self._commands = _commands(self.env)
+        self._obs = self.env.reset(seed=self.env.seed)["policy"] if self.initial_obs is None else self.initial_obs
+        self._reward = torch.zeros(self.env.num_envs)
+        self.ended = torch.zeros(self.env.num_envs, dtype=torch.int64)
+        self.refresh_checkpoints()
+        self._publish()
+
+    # --- from any thread ---
+
+    @property
+    def view(self) -> View:
+        """What is to be shown now."""
+        return self._view
+
+    def submit(self, request: Callable[[], None]) -> None:
+        """Have one of the methods below called between two steps."""
+        self._requests.put(request)
+
+    def requests(self) -> dict[str, Callable[[], None]]:
+        """Return the requests that every viewer has a key for, by their names."""
+        view = self._view
+        return {
+            "pause": partial(self.pause, not view.paused),
+            "step": self.single_step,
+            "reset": self.reset,
+            "slower": partial(self.change_speed, -1),
+            "faster": partial(self.change_speed, 1),
+            "next environment": partial(self.show, view.shown + 1),
+            "previous environment": partial(self.show, view.shown - 1),
+            "newer checkpoint": partial(self.switch_relative, 1),
+            "older checkpoint": partial(self.switch_relative, -1),
+            "previous command": partial(self.select_command, -1),
+            "next command": partial(self.select_command, 1),
+            "raise command": partial(self.adjust_command, 1),
+            "lower command": partial(self.adjust_command, -1),
+        }
+
+    # --- in the simulation's thread ---
+
+    def advance(self, elapsed: float) -> int:
+        """Do what was asked, then as many steps as are due after `elapsed` seconds; how many those were.
+
+        A machine that is too slow falls behind real time; it does not try to catch up.
+        """
+        while True:
+            try:
+                request = self._requests.get_nowait()
+            except queue.Empty:
+                break
+            request()
+        count, self._single = self._single, 0
+        if not count and self.env.is_playing():
+            self._due += min(elapsed, _LAG) * self.speed / self.env.step_dt
+            count = int(self._due)
+            self._due -= count
+        end = time.perf_counter() + self.patience
+        done = 0
+        while done < count and (done == 0 or time.perf_counter() < end):
+            self._step()
+            done += 1
+        self._publish()
+        return done
+
+    def pause(self, paused: bool = True) -> None:
+        """Pause: no step runs, and the environment says so. Or go on."""
+        self.env.pause(paused)
+        self._due = 0.0
+
+    def single_step(self) -> None:
+        """Pause, and make one step of the environment."""
+        self.pause()
+        self._single += 1
+
+    def set_speed(self, speed: float) -> None:
+        """The nearest of `SPEEDS`."""
+        self.speed = min(SPEEDS, key=lambda known: abs(np.log(known / max(speed, 1e-9))))
+
+    def change_speed(self, places: int = 1) -> None:
+        """Up or down in `SPEEDS`."""
+        position = SPEEDS.index(self.speed) + places
+        self.speed = SPEEDS[max(0, min(position, len(SPEEDS) - 1))]
+
+    def reset(self) -> None:
+        """A new episode in every environment."""
+        self._obs = self.env.reset()["policy"]
+        self._reward = torch.zeros(self.env.num_envs)
+        self._due = 0.0
+
+    def show(self, shown: int) -> None:
+        """Show another environment; numbers wrap around."""
+        self.shown = shown % self.env.num_envs
+        self._push = None
+
+    def hold(self, name: str, value: float | None) -> None:
+        """Ask this of the policy, whatever the task would ask; None: what the task asks."""
+        hold_command(self.env, name, value)
+
+    def select_command(self, places: int) -> None:
+        """Which command `adjust_command` changes: the next one, or the one before."""
+        if self._commands is not None and (knobs := self._commands.knobs()):
+            self._knob = (self._knob + places) % len(knobs)
+
+    def adjust_command(self, places: int) -> None:
+        """Hold the chosen command, some tenths of its range higher or lower; beyond the range it is let go."""
+        if self._commands is None or not (knobs := self._commands.knobs()):
+            return
+        knob = knobs[self._knob]
+        start = min(max(0.0, knob.low), knob.high)
+        value = self._commands.held.get(knob.name, start) + places * (knob.high - knob.low) / 10.0
+        inside = knob.low - 1e-6 <= value <= knob.high + 1e-6
+        self.hold(knob.name, round(value, 6) if inside else None)
+
+    def refresh_checkpoints(self) -> None:
+        """Read the list of checkpoints again; with `follow`, play the newest."""
+        if self.checkpoint_source is None:
+            return
+        before, self._checkpoints = self._checkpoints, tuple(self.checkpoint_source.steps())
+        if self.follow and self._checkpoints != before:
+            self._switch_to_newest()
+
+    def set_follow(self, follow: bool) -> None:
+        """Whether each new checkpoint is played as it appears; the newest at once."""
+        self.follow = follow
+        self.refresh_checkpoints()
+        if follow:
+            self._switch_to_newest()
+
+    def _switch_to_newest(self) -> None:
+        if self._checkpoints and self._checkpoints[-1] != self.checkpoint:
+            self.switch(self._checkpoints[-1])
+
+    def switch(self, step: int) -> None:
+        """Play another checkpoint in the running episodes; if it cannot be played, say so and change nothing."""
+        assert self.checkpoint_source is not None
+        try:
+            self.act = self.checkpoint_source.load(step)
+        except CheckpointError as error:
+            self._report(f"step {step} cannot be played, step {self.checkpoint} goes on: {error.message}")
+            self._checkpoints = tuple(self.checkpoint_source.steps())
+            return
+        self.checkpoint = step
+        self._report(f"now playing step {step}")
+
+    def switch_relative(self, places: int) -> None:
+        """Play the next newer or older checkpoint."""
+        self.refresh_checkpoints()
+        if not self._checkpoints:
+            return
+        newer = [step for step in self._checkpoints if step > (self.checkpoint or 0)]
+        older = [step for step in self._checkpoints if step < (self.checkpoint or 0)]
+        chosen = newer[:1] if places > 0 else older[-1:]
+        if chosen:
+            self.switch(chosen[0])
+
+    def push(self, forces: np.ndarray | None) -> None:
+        """Forces and torques on the bodies of the environment shown, until the next call. (nbody, 6) [N, N m]"""
+        usable = forces is not None and forces.shape == (self.env.engine.model.nbody, 6) and np.isfinite(forces).all()
+        self._push = forces.copy() if forces is not None and usable and forces.any() else None
+
+    def _step(self) -> None:
+        playing = self.env.is_playing()
+        self.env.pause(False)
+        try:
+            with torch.no_grad():
+                action = self.act(self._obs)
+                if self._push is None:
+                    result = self.env.step(action)
+                else:
+                    result = self._pushed(action, self._push)
+        finally:
+            self.env.pause(not playing)
+        self._obs, self._reward = result.obs["policy"], result.reward
+        self.ended += result.terminated | result.truncated
+        self.steps += 1
+
+    def _pushed(self, action: Tensor, push: np.ndarray) -> Any:
+        """A step under a force; where the step itself wrote another one, as a reset does, that stays."""
+        row = self.env.engine.field("xfrc_applied")[self.shown]
+        before = row.clone()
+        under = before + torch.from_numpy(push).to(row)
+        row.copy_(under)
+        result = self.env.step(action)
+        row.copy_(torch.where(row == under, before, row))
+        return result
+
+    def _report(self, message: str) -> None:
+        self.message = " ".join(message.split())
+        _log.info(message)
+
+    def _publish(self) -> None:
+        shown = self.shown
+        self._view = View(
+            paused=not self.env.is_playing(),
+            speed=self.speed,
+            shown=shown,
+            num_envs=self.env.num_envs,
+            episode_s=float(self.env.episode_length_buf[shown]) * self.env.step_dt,
+            reward=float(self._reward[shown]),
+            episodes=int(self.ended[shown]),
+            checkpoint=self.checkpoint,
+            checkpoints=self._checkpoints,
+            follow=self.follow,
+            knobs=() if self._commands is None else tuple(self._commands.knobs()),
+            held={} if self._commands is None else dict(self._commands.held),
+            knob=self._knob,
+            message=self.message,
+        )
+
+
+def run_in_real_time(playback: Playback, is_open: Callable[[], bool], draw: Callable[[], None]) -> None:
+    """Advance and draw, 60 times a second, until the viewer is closed."""
+    before, refreshed = time.perf_counter(), 0.0
+    while is_open():
+        now = time.perf_counter()
+        if now - refreshed > _REFRESH_S:
+            playback.refresh_checkpoints()
+            refreshed = now
+        playback.advance(now - before)
+        before = now
+        draw()
+        time.sleep(max(0.0, _FRAME_S - (time.perf_counter() - now)))
+
+
+def hold_command(env: VecEnv, name: str, value: float | None) -> None:
+    """Ask a value of the policy; see `CommandManager.hold`.
+
+    Raises:
+        UsageError: for a name that there is not.
+    """
+    manager = _commands(env)
+    if manager is None:
+        raise UsageError(f"no command '{name}'", hint="the task has no commands")
+    manager.hold(name, value)
+
+
+def _commands(env: VecEnv) -> CommandManager | None:
+    """Only manager-based tasks have command terms."""
+    return getattr(env, "command_manager", None)

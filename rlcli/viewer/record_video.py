@@ -1,0 +1,50 @@
+"""One episode of an environment as a video file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from rlcli.envs.vec_env import VecEnv
+from rlcli.rl.acting import PATIENCE
+from rlcli.viewer.offscreen import Renderer
+from rlcli.viewer.video_writer import VideoWriter
+
+
+def record_episode(
+    env: VecEnv, act: Callable[[Tensor], Tensor], file: Path, *, longest_s: float | None = None
+) -> tuple[int, float, str]:
+    """Film environment 0 from a reset to its episode's end, a picture of each state that the policy acts in.
+
+    Args:
+        env: the environments.
+        act: what acts in them.
+        file: an .mp4 or .gif; it appears when it is whole.
+        longest_s: after so much simulated time it ends anyway; None: after as many episode lengths as an evaluation
+            waits for.
+
+    Returns:
+        The pictures, how many a second, and what drew them.
+
+    Raises:
+        UsageError: for another kind of file.
+        DependencyError: if imageio is not installed.
+        MachineError: if nothing on this machine can draw, or the disk refuses.
+    """
+    stride = max(1, env.config.sim.render_interval // env.config.decimation)
+    steps = PATIENCE * env.max_episode_length if longest_s is None else max(1, round(longest_s / env.step_dt))
+    with Renderer(env.engine.model, env.config.viewer) as renderer, VideoWriter(file, stride * env.step_dt) as writer:
+        obs = env.reset(seed=env.seed)["policy"]
+        for number in range(steps):
+            if number % stride == 0:
+                writer.add(renderer.picture(env))
+            with torch.no_grad():
+                step = env.step(act(obs))
+            obs = step.obs["policy"]
+            if bool(step.terminated[0] | step.truncated[0]):
+                break
+        env.check()
+    return writer.frames, writer.fps, renderer.backend

@@ -1,0 +1,411 @@
+"""`rlcli runs` and `rlcli watch`: what became of trainings, told from their files, whoever wrote these."""
+
+import json
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from rlcli.cli.commands.runs import age, size
+from rlcli.runs.eval_store import keep_evaluation
+from rlcli.runs.index import overviews
+from rlcli.runs.run import create_run, is_locked, open_run
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+RECORD = {"task": {"name": "arm", "distribution": "arms"}, "agent": "ppo", "seed": 7, "iterations": 40}
+SMALL = ("cartpole", "scene.num_envs=8", "sim.engine_threads=1", "agent.torch_threads=1", "--logger", "none", "-q")
+
+
+def row(iteration, **metrics):
+    shares = {"physics": 0.5, "task": 0.125, "policy": 0.125, "update": 0.25}
+    split = {"Perf/collection_time": 0.75, "Perf/learning_time": 0.25}
+    split |= {f"Perf/{part}_share": share for part, share in shares.items()}
+    return {"iteration": iteration, "step": 64 * iteration, **split, **metrics}
+
+
+def write_rows(run, *rows):
+    with run.metrics.open("a") as file:
+        file.write("".join(json.dumps(one) + "\n" for one in rows))
+
+
+@pytest.fixture
+def made():
+    """Make a run: its rows, how it ended (None: it still runs), and entries of run.json."""
+    locked = []
+
+    def make(name="a", rows=(), state=None, task="arm", checkpoint=True, started="2026-01-01T10:00:00+00:00", **record):
+        record = {**RECORD, "task": {**RECORD["task"], "name": task}, **record}
+        run = create_run(Path("runs"), task, name, "decimation: 1\n", record)
+        write_rows(run, *rows)
+        if checkpoint:
+            (run.checkpoints / f"{64:012d}").mkdir()
+            (run.checkpoints / f"{64:012d}" / "manifest.json").write_text("{}")
+        if state is None:
+            locked.append(run)
+        else:
+            run.update(state=state, step=64, iteration=1, started=started)
+            run.unlock()
+        return run
+
+    yield make
+    for run in locked:
+        run.unlock()
+
+
+def listed(cli, *words):
+    done = cli("runs", *words, "--json")
+    assert done.code == 0
+    return done.json["runs"]
+
+
+def test_a_run_is_a_row_with_its_progress_and_score(cli, made):
+    write = {"Train/mean_reward": 3.25, "Train/success_rate": 0.5}
+    made("first", [row(1, **write), row(2)], **{"device": "cuda"})
+    (found,) = listed(cli)
+    wanted = {
+        "task": "arm", "state": "running", "iteration": 2, "iterations": 40, "step": 128, "agent": "ppo", "seed": 7,
+        "last": {"return": 3.25, "success": 0.5}, "best": {}, "resumable": False, "reason": None,
+    }  # fmt: skip
+    assert {key: found[key] for key in wanted} == wanted
+    assert found["tags"]["device"] == "cuda"
+    assert found["run"].endswith("-first")
+    assert found["age_s"] < 60
+    files = [file for file in Path(found["run"]).rglob("*") if file.is_file()]
+    assert found["size_bytes"] == sum(file.stat().st_size for file in files) > 0
+    out = cli("runs").out
+    for word in ("STATE", "arm/", "running", "2/40", "3.25", "50.0%", "ppo", "7", "cuda"):
+        assert word in out, word
+
+
+@pytest.mark.parametrize("state", ["finished", "stopped", "diverged", "failed"])
+def test_a_run_that_ended_says_how(cli, made, state):
+    made("a", [row(1)], state, reason="the disk is full")
+    (found,) = listed(cli)
+    assert found["state"] == state
+    assert found["reason"] == ("the disk is full" if state in ("diverged", "failed") else None)
+    assert found["resumable"]
+    assert (": resumable" in cli("runs").out) == (state != "finished")
+
+
+@pytest.mark.parametrize(("checkpoint", "step", "resumable"), [(True, 64, True), (False, None, True)])
+def test_a_run_that_says_it_runs_and_is_not_locked_was_interrupted(cli, made, checkpoint, step, resumable):
+    run = made("a", [row(1)], "running", checkpoint=checkpoint)
+    if step is None:
+        record = {key: value for key, value in run.record.items() if key not in ("step", "iteration")}
+        (run.folder / "run.json").write_text(json.dumps(record))
+    (found,) = listed(cli)
+    assert (found["state"], found["resumable"]) == ("interrupted", resumable)
+
+
+def test_a_run_that_has_lost_its_checkpoints_is_not_resumable(cli, made):
+    made("a", [row(1)], "running", checkpoint=False)
+    assert not listed(cli)[0]["resumable"]
+
+
+def test_the_best_is_that_of_the_evaluations(cli, made):
+    rows = [row(n, **{"Eval/mean_reward": float(n), "Eval/success_rate": n / 10}) for n in (1, 2, 3)]
+    made("a", rows, "finished", best=128)
+    assert listed(cli)[0]["best"] == {"step": 128, "return": 2.0, "success": 0.2}
+    assert "20.0%" in cli("runs").out
+
+
+def test_what_eval_found_is_shown(cli, made):
+    run = made("a", [row(1)], "finished")
+    mean, none = {"mean": 4.5, "std": 0.1, "low": 4.4, "high": 4.6}, {"rate": 0.875, "low": 0.5, "high": 1.0}
+    document = {"command": "eval", "episodes": 8, "seed": 1, "return": mean, "length": mean, "success": none}
+    document |= {"reward_terms": {}, "terminations": {}, "diverged": 0, "diverged_by": {}}
+    keep_evaluation(run, f"{64:012d}", document)
+    (run.folder / "evaluations" / "000000000128.json").write_text("{")
+    assert listed(cli)[0]["evaluation"] == {"step": 64, "episodes": 8, "return": 4.5, "success": 0.875}
+    assert "87.5%" in cli("runs").out
+
+
+def test_newest_first_of_one_task_and_no_more_than_asked_for(cli, made):
+    days = {"old": 1, "new": 3, "middle": 2}
+    for name, day in days.items():
+        made(name, [], "finished", started=f"2026-01-0{day}T10:00:00+00:00")
+    made("other", [], "finished", task="leg")
+    assert [found["run"].rpartition("-")[2] for found in listed(cli, "arm")] == ["new", "middle", "old"]
+    done = cli("runs", "arm", "--limit", 2)
+    assert "-old" not in done.out
+    assert "1 older" in done.err
+    assert cli("runs", "./arm").out == cli("runs", "arms:arm").out == cli("runs", "arm").out
+
+
+def test_no_run_is_said(cli, made):
+    done = cli("runs")
+    assert (done.code, done.out) == (0, "")
+    assert "no run in runs" in done.err
+    made("a", [], "finished")
+    assert "did you mean 'arm'" in cli("runs", "arn").err
+    assert listed(cli, "leg") == []
+
+
+def test_trained_time_does_not_count_pauses(cli, made):
+    day = (datetime.now(UTC) - timedelta(days=1)).isoformat()
+    made("a", [row(1)], "finished", trained_s=90.0, started=day)
+    made("b", [row(1)], trained_s=90.0, since=(datetime.now(UTC) - timedelta(seconds=10)).isoformat())
+    ended, running = sorted(listed(cli), key=lambda found: found["run"])
+    assert ended["duration_s"] == 90.0
+    assert 99.0 < running["duration_s"] < 160.0
+    assert 86400 <= ended["age_s"] < 86500
+    assert "1 d" in cli("runs").out
+
+
+BROKEN = {
+    "no run.json": (lambda run: (run / "run.json").unlink(), "has no run.json"),
+    "no JSON": (lambda run: (run / "run.json").write_text("{"), "not JSON"),
+    "a list": (lambda run: (run / "run.json").write_text("[]"), "not a JSON object"),
+    "no task": (lambda run: (run / "run.json").write_text("{}"), "missing key 'task'"),
+    "a link out": (lambda run: (run / "config.yaml").replace(run.parent / "c") and (run / "config.yaml").symlink_to(
+        run.parent / "c"), "is a link"),
+    "a pipe": (lambda run: ((run / "run.json").unlink(), os.mkfifo(run / "run.json")), "no plain file"),
+    "metrics that are a pipe": (lambda run: ((run / "metrics.jsonl").unlink(), os.mkfifo(run / "metrics.jsonl")),
+                                "no plain file"),
+    "no config": (lambda run: (run / "config.yaml").unlink(), "no config.yaml"),
+    "a state of its own": (lambda run: _edit(run, state="\x1b[31mfine"), "fine"),
+}  # fmt: skip
+
+
+def _edit(run, **entries):
+    record = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps(record | entries))
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_a_broken_run_is_a_row_with_its_reason(cli, made, kind):
+    spoil, reason = BROKEN[kind]
+    run = made("broken", [row(1)], "finished")
+    made("good", [row(1)], "finished")
+    spoil(run.folder)
+    found = {found["run"].rpartition("-")[2]: found for found in listed(cli)}
+    assert found["good"]["state"] == "finished"
+    assert found["broken"]["state"] == "broken"
+    assert reason in found["broken"]["reason"]
+    done = cli("runs")
+    assert "broken" in done.out
+    assert "\x1b" not in done.out
+
+
+STRANGE = {
+    "half a line": b'{"iteration": 9, "st',
+    "a number too large": b'{"iteration": 1e999, "step": 3}\n',
+    "an integer larger than any float": b'{"iteration": 4, "step": 256, "Train/mean_reward": 1' + b"0" * 400 + b"}\n",
+    "a list": b"[1, 2]\n",
+    "deep": b"[" * 100_000 + b"\n",
+    "binary": bytes(range(256)) * 300 + b"\n",
+    "one long line": b'{"iteration": 8, "step": 512, "a": "' + b"x" * 3_000_000 + b'"}\n',
+}
+
+
+@pytest.mark.parametrize("kind", STRANGE)
+def test_strange_metrics_are_passed_over(cli, made, kind):
+    run = made("a", [row(3, **{"Train/mean_reward": 1.5})], "finished")
+    with run.metrics.open("ab") as file:
+        file.write(STRANGE[kind])
+    assert listed(cli)[0]["state"] == "finished"
+    assert cli("watch").code == 0
+
+
+def test_a_training_without_end_in_sight_is_shown(cli, made):
+    made("a", [row(1) | {"Perf/collection_time": 9e299}], "stopped", iterations=10**18, trained_s=1e300)
+    done = cli("watch")
+    assert (done.code, "? left" in done.err) == (0, True)
+    (line,) = [line for line in cli("runs").out.splitlines() if line.startswith("arm/")]
+    assert len(line) < 200
+
+
+def test_what_metrics_hold_cannot_steer_the_terminal(made):
+    made("a", [row(1, **{"Train/\x1b]0;owned\x07[red]x": 1.0})], "finished")
+    shown, code = on_a_terminal("watch")
+    assert code == 0
+    assert "\x1b]0;" not in shown
+    assert "[red]x" in shown
+
+
+def test_looking_at_runs_imports_nothing_heavy_and_writes_nothing(made, environment):
+    made("a", [row(1)], "finished")
+    before = {path: path.stat().st_mtime_ns for path in Path("runs").rglob("*")}
+    for words in (["runs"], ["watch", "latest"], ["watch", "latest", "--json"]):
+        program = (
+            f"import sys; from rlcli.cli.app import main; code = main({words!r});"
+            "print(code, sorted({'torch', 'mujoco', 'numpy'} & set(sys.modules)))"
+        )
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+        assert done.stdout.splitlines()[-1] == "0 []", done.stderr
+    assert {path: path.stat().st_mtime_ns for path in Path("runs").rglob("*")} == before
+
+
+def test_looking_whether_a_run_is_locked_keeps_nobody_out(made):
+    run = open_run(made("a", [], "finished").folder)
+    over = threading.Event()
+
+    def look():
+        while not over.is_set():
+            is_locked(run.folder)
+
+    watchers = [threading.Thread(target=look) for _ in range(2)]
+    for watcher in watchers:
+        watcher.start()
+    try:
+        for _ in range(100):
+            run.lock()
+            run.unlock()
+    finally:
+        over.set()
+        for watcher in watchers:
+            watcher.join()
+
+
+def test_a_run_that_ended_is_shown_as_it_ended(cli, made):
+    made("a", [row(n, **{"Train/mean_reward": 2.5, "Train/mean_episode_length": 9}) for n in (1, 2)], "stopped")
+    done = cli("watch", "latest")
+    assert done.code == 0
+    assert re.search(r"^iteration 2/40  128 steps  64 steps/s  return 2.500  length 9", done.err, re.MULTILINE)
+    assert "stopped, iteration 2 of 40" in done.out
+    assert "rlcli train --resume runs/arm/" in done.err
+
+
+def test_json_is_one_document_of_the_state_now(cli, made):
+    made("a", [row(n, **{"Loss/value": 0.5}) for n in (1, 2)])
+    found = cli("watch", "--json").json
+    assert (found["state"], found["iteration"], found["iterations"]) == ("running", 2, 40)
+    assert found["steps_per_s"] == pytest.approx(64)
+    assert found["remaining_s"] == pytest.approx(38)
+    assert found["metrics"]["Loss/value"] == 0.5
+
+
+@pytest.mark.parametrize("words", [("watch",), ("watch", "nothing"), ("watch", "--json")])
+def test_a_run_that_is_not_there_cannot_be_watched(cli, words):
+    assert cli(*words).code == 5
+
+
+def until(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_a_run_is_followed_to_its_end(start, made):
+    run = made("a", [row(1)])
+    with Path("err").open("w") as err:
+        process = start("watch", run.folder, stderr=err)
+        until(lambda: "iteration 1/40" in Path("err").read_text())
+        write_rows(run, row(2), row(3, **{"Train/success_rate": 0.75}))
+        time.sleep(1.0)  # the lines of a watcher are seconds apart
+        assert process.poll() is None
+        run.update(state="diverged", reason="the learner's loss is not finite", iteration=3, step=192)
+        run.unlock()
+        out, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert "diverged, iteration 3 of 40" in out
+    assert "iteration 3/40  192 steps" in Path("err").read_text()
+    assert "success 75.0%" in Path("err").read_text()
+    assert "the learner's loss is not finite" in Path("err").read_text()
+
+
+def test_ctrl_c_ends_the_watcher_and_leaves_the_run_alone(start, made):
+    run = made("a", [row(1)])
+    with Path("err").open("w") as err:
+        process = start("watch", "latest", stderr=err)
+        until(lambda: "iteration 1/40" in Path("err").read_text())
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "the run is left alone" in Path("err").read_text()
+    assert is_locked(run.folder)
+    assert json.loads((run.folder / "run.json").read_text())["state"] == "running"
+
+
+def on_a_terminal(*words):
+    """What a command writes to a terminal, and its exit code."""
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.environ.update(TERM="xterm-256color", COLUMNS="160", LINES="50")
+        os.execv(sys.executable, [sys.executable, "-m", "rlcli", *map(str, words)])
+    shown = b""
+    while select.select([terminal], [], [], 60)[0]:
+        try:
+            chunk = os.read(terminal, 65536)
+        except OSError:
+            break
+        if not chunk:
+            break
+        shown += chunk
+    os.close(terminal)
+    return shown.decode(errors="replace"), os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def test_a_terminal_shows_the_table_of_the_training(made):
+    metrics = {"Train/mean_reward": 2.5, "Episode_Reward/alive": 1.0, "Episode_Termination/fell": 0.25, "Loss/value": 3}
+    made("a", [row(2, **metrics)], "finished")
+    shown, code = on_a_terminal("watch", "latest")
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown)
+    assert code == 0
+    for word in ("iteration 2/40", "128 steps", "physics  50%", "reward terms", "alive", "fell", "25.0%", "learner"):
+        assert word in text, word
+    assert shown.count("\x1b[?25l") <= shown.count("\x1b[?25h")  # the cursor is back
+
+
+@pytest.mark.parametrize(
+    ("value", "words"), [(0.4, "0 s"), (59, "59 s"), (60, "1 min"), (7200, "2 h"), (86400 * 3, "3 d")]
+)
+def test_ages_in_their_largest_unit(value, words):
+    assert age(value) == words
+
+
+@pytest.mark.parametrize(("value", "words"), [(0, "0 B"), (999, "999 B"), (1500, "1.5 kB"), (2.5e12, "2500.0 GB")])
+def test_sizes_in_a_fitting_unit(value, words):
+    assert size(value) == words
+
+
+@pytest.mark.slow
+def test_a_training_is_seen_by_others_from_its_first_moment_to_its_end(cli, start):
+    words = ("train", *SMALL, "agent.save_interval=1")
+    training = start(*words, "--max-iterations", 100_000)
+    until(lambda: len(overviews(Path("runs"))) == 1)
+    (found,) = overviews(Path("runs"))
+    assert found.state == "running"
+    watcher = start("watch", found.folder)
+    until(lambda: (overviews(Path("runs"))[0].iteration or 0) > 3)
+    assert overviews(Path("runs"))[0].iterations == 100_000
+    training.kill()
+    out, err = watcher.communicate(timeout=60)
+    assert watcher.returncode == 0
+    assert "interrupted, iteration" in out
+    assert "rlcli train --resume" in err
+    (found,) = listed(cli)
+    assert (found["state"], found["resumable"]) == ("interrupted", True)
+    done = cli("train", "--resume", "latest", "--max-iterations", found["iteration"] + 2, "-q")
+    assert done.code == 0
+    (after,) = listed(cli)
+    assert (after["state"], after["iteration"], after["iterations"]) == ("finished", *[found["iteration"] + 2] * 2)
+    assert after["duration_s"] > 0
+
+
+@pytest.mark.slow
+def test_a_training_that_diverges_says_so_afterwards(cli):
+    assert cli("train", *SMALL, "agent.learning_rate=1e30").code == 6
+    (found,) = listed(cli)
+    assert found["state"] == "diverged"
+    assert "not finite" in found["reason"]
+
+
+def test_a_run_that_is_being_created_is_not_called_broken(cli):
+    folder = Path("runs/arm/2026-01-01_10-00-00")
+    (folder / "checkpoints").mkdir(parents=True)
+    assert listed(cli)[0]["state"] == "running"
+    assert "0/?" in cli("runs").out
+    os.utime(folder, (0, 0))
+    assert listed(cli)[0]["state"] == "broken"

@@ -1,0 +1,114 @@
+"""Tables on a terminal fit its width: nothing is cut, and a row that is too wide becomes a block of lines."""
+
+import io
+import re
+import sys
+
+import pytest
+
+from rlcli.cli.ui.console import console
+from rlcli.cli.ui.progress_view import TrainingView
+from rlcli.cli.ui.tables import flow
+from rlcli.evaluation.stress_params import read_sweeps
+from rlcli.reporting.heat_map import heat_map
+from rlcli.training.progress import progress_of
+
+COLUMNS = ["RUN", "STATE", "PROGRESS", "RETURN", "SUCCESS", "AGE", "REMARK"]
+ROWS = [
+    ["cartpole/2026-11-21_17-35-25", "finished", "240/240", "4.934", "100.0%", "1 min", "-"],
+    ["cartpole/2026-11-21_17-32-47", "interrupted: resumable", "12/240", "-1.2", "-", "4 min", ""],
+]
+
+
+@pytest.fixture
+def terminal(monkeypatch, capsys):
+    """Of a given width; what was printed on it, as lines."""
+
+    def shown(width, draw):
+        monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+        monkeypatch.setattr(console, "json", False)
+        monkeypatch.setenv("COLUMNS", str(width))
+        draw()
+        return [line.rstrip() for line in re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out).splitlines()]
+
+    return shown
+
+
+def test_a_table_that_fits_has_a_line_for_each_row(terminal):
+    lines = terminal(120, lambda: console.table(COLUMNS, ROWS))
+    assert len(lines) == 3
+    assert lines[0].split() == COLUMNS
+    assert lines[2].split() == " ".join(ROWS[1]).split()
+
+
+@pytest.mark.parametrize("width", [80, 40])
+def test_a_table_that_does_not_fit_loses_no_letter(terminal, width):
+    lines = terminal(width, lambda: console.table(COLUMNS, ROWS))
+    assert max(map(len, lines)) <= width
+    said = "\n".join(lines)
+    assert "…" not in said
+    assert "RUN cartpole/2026-11-21_17-35-25" in lines
+    assert "RUN cartpole/2026-11-21_17-32-47" in lines
+    for name, cell in zip(COLUMNS[1:6], ROWS[0][1:6], strict=True):
+        assert f"{name} {cell}" in said
+    assert "STATE interrupted: resumable" in said
+
+
+def test_what_is_not_known_is_left_out_of_a_block(terminal):
+    lines = terminal(40, lambda: console.table(COLUMNS, ROWS))
+    assert sum("SUCCESS" in line for line in lines) == 1
+    assert not any("REMARK" in line for line in lines)
+
+
+def test_a_sentence_is_broken_at_its_words_and_a_short_cell_is_not(terminal):
+    found = "of four environments that began alike two parted in the third step"
+    lines = terminal(60, lambda: console.table(["CHECK", "RESULT"], [["same seed, same life", found]]))
+    assert lines[0].split() == ["CHECK", "RESULT"]
+    assert len(lines) == 3
+    assert lines[1].startswith("same seed, same life  of four")
+    assert " ".join(" ".join(lines[1:]).split()) == f"same seed, same life {found}"
+
+
+@pytest.mark.parametrize(("width", "headers"), [(80, 1), (24, 2)])
+def test_a_map_too_wide_goes_on_below(terminal, width, headers):
+    sweeps = read_sweeps(["body_mass.pole=0.5,2", "action_delay=0:4"], 5)
+    values = {(y, x): 0.11 * x + y / 100 for y in sweeps[0].values for x in sweeps[1].values}
+    drawn = heat_map("success", sweeps, values, (0.0, 1.0))
+    lines = terminal(width, lambda: console.heat_map("success, trained", "body_mass.pole / action_delay", drawn))
+    assert max(map(len, lines)) <= width
+    rows = [line.split() for line in lines if line.startswith(("0.5", "2 "))]
+    assert len(rows) == 2 * headers
+    light = [cell for row in rows if row[0] == "0.5" for cell in row[1:]]
+    assert light == [f"{0.11 * x + 0.005:.2f}" for x in range(5)]
+
+
+def test_parts_stay_whole_and_in_order():
+    assert flow(["iteration 80/240", "655,360 steps", "0:23 left"], 32) == [
+        "iteration 80/240  655,360 steps",
+        "0:23 left",
+    ]
+    assert flow(["a" * 9, "b"], 5, indent=2) == ["  " + "a" * 9, "  b"]
+    assert flow([], 5) == []
+
+
+@pytest.mark.parametrize("width", [80, 40])
+def test_the_live_table_breaks_no_number_from_its_unit(width):
+    from rich.console import Console
+    from rich.live import Live
+
+    row = {"iteration": 80, "step": 655360, "Perf/collection_time": 0.1, "Perf/learning_time": 0.05}
+    view = TrainingView("rlcli train cartpole")
+    screen = Console(file=io.StringIO(), width=width)
+    view._live = Live(console=screen)
+    screen.print(view._table(progress_of([row], 240, 12.0)))
+    said = screen.file.getvalue()
+    for whole in ("rlcli train cartpole", "iteration 80/240", "655,360 steps", "54,613 steps/s", "0:24 left"):
+        assert whole in said
+
+
+def test_what_is_left_counts_what_lies_between_iterations():
+    """Clips, evaluations and checkpoints take time that no iteration tells."""
+    row = {"iteration": 50, "step": 5000, "Perf/collection_time": 0.1, "Perf/learning_time": 0.1}
+    assert progress_of([row], 100, 10.0).remaining_s == pytest.approx(10.0)
+    assert progress_of([row], 100, 30.0).remaining_s == pytest.approx(30.0)
+    assert progress_of([row], 100, 0.0).remaining_s == pytest.approx(10.0)  # how long it trained is not known

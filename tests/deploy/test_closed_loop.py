@@ -1,0 +1,361 @@
+"""`rlcli export --verify`: an exported file drives plain MuJoCo, and what is wrong with it shows."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from rlcli.cli.app import main
+from rlcli.deploy import onboard_program
+from rlcli.runs.run_ref import find_checkpoint
+
+PUSHED = """
+summary: A cart that is pushed, under a randomised mass, asked for a velocity, seen through a history and a delay.
+decimation: 2
+episode_length_s: 0.5
+sim: {dt: 0.01}
+scene: {num_envs: 6, entities: {robot: {model: cart.xml, joints: {slide: {kp: 30.0, kv: 2.0}}}}}
+commands:
+  wanted: {func: wanted, resampling_time_s: [0.1, 0.2]}
+actions:
+  slide: {func: relative_joint_position, joints: [slide], scale: 0.2}
+observations:
+  policy:
+    pos: {func: joint_pos, history: 3, scale: 2.0, noise: {kind: uniform, low: -0.1, high: 0.1}}
+    vel: {func: joint_vel, modifiers: [{kind: integrator}], delay: {steps: [1, 2]}}
+    own: {func: doubled}
+    before: {func: last_action}
+    asked: {func: generated_commands, command: wanted}
+events:
+  reset: {func: reset_joints_by_offset, mode: reset, position: [-0.2, 0.2], velocity: [-1.0, 1.0]}
+  mass: {func: randomize_body_mass, mode: reset, operation: scale, range: [0.5, 2.0]}
+  kick: {func: kick, mode: interval, interval_range_s: [0.06, 0.1]}
+rewards:
+  near: {func: joint_pos_target_l2, weight: -1.0, joints: [slide], target: 0.3}
+  alive: {func: is_alive, weight: 0.1}
+curriculum:
+  dearer: {func: dearer, address: rewards.near.weight}
+terminations:
+  time_out: {func: time_out, time_out: true}
+  far: {func: joint_pos_out_of_manual_limit, joints: [slide], bounds: [-0.9, 0.9]}
+agents:
+  ppo: {trainer: ppo, algorithm: ppo, max_iterations: 1, num_steps: 4, num_minibatches: 1, rnn: {hidden: 6},
+        torch_threads: 1, actor: {hidden: [8]}, critic: {hidden: [8]}, compile: false}
+"""
+TERMS = '''
+"""Terms that no formula stands for."""
+import torch
+
+from rlcli.task import Address, Entity, Joints
+
+
+def doubled(env, *, entity: Entity = "robot", joints: Joints = ".*"):
+    """Twice the velocity. (num_envs, k)"""
+    return 2.0 * entity.data.joint_vel[:, joints]
+
+
+def kick(env, selection, *, entity: Entity = "robot"):
+    """A push."""
+    selection.add(env.engine.field("qvel"), selection.uniform(-2.0, 2.0, (1,)))
+
+
+def dearer(env, selection, *, address: Address):
+    """What an episode costs grows with the episodes before it."""
+    address.sub_(0.1)
+
+
+class wanted:
+    """What is asked."""
+
+    def __init__(self, env):
+        self.command = torch.zeros(env.num_envs, 2)
+
+    def resample(self, selection):
+        selection.write(self.command, selection.uniform(-1.0, 1.0, (2,)))
+
+    def update(self):
+        pass
+'''
+CART = """
+<mujoco><worldbody>
+  <body name="cart"><joint name="slide" type="slide" axis="1 0 0" damping="0.5"/><geom size="0.1" mass="1"/></body>
+</worldbody></mujoco>
+"""
+
+
+def checks(document):
+    return {row["check"].partition(":")[0]: row["passed"] for row in document["verified"]["checks"]}
+
+
+def verify(capfd, run, output, *more, code=0):
+    asked = ["export", "--checkpoint", str(run), "--output", str(output), "--verify", "--json", "-q", *more]
+    assert main(asked) == code, capfd.readouterr().err
+    return json.loads(capfd.readouterr().out)
+
+
+@pytest.mark.parametrize("label", ["cartpole", "cartpole sac", "cartpole-direct"])
+def test_a_file_drives_plain_mujoco_through_the_episodes_of_the_evaluation(newest, tmp_path, capfd, label):
+    run = newest(label).parent.parent
+    more = ("--format", "numpy", "--episodes", "8")
+    document = verify(capfd, run, tmp_path / "policy.py", *more)
+    verified = document["verified"]
+    assert verified["passed"]
+    assert verified["episodes"] == 8
+    assert verified["closed_by_task"] == []
+    assert len(verified["closed_by_metadata"]) == (5 if label == "cartpole-direct" else 3)
+    assert verified["return"] == pytest.approx(verified["evaluation_return"], rel=1e-4)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["model.xml", "policy.py", "run_policy.py"]
+    assert main(["eval", "--checkpoint", str(run), "--episodes", "8", "--json", "-q"]) == 0
+    assert json.loads(capfd.readouterr().out)["return"]["mean"] == pytest.approx(verified["evaluation_return"])
+
+
+@pytest.fixture(scope="module")
+def pushed(tmp_path_factory):
+    """A run of a task with all that a controller must keep, and a term that only the task knows."""
+    folder = tmp_path_factory.mktemp("pushed")
+    task = folder / "pushed"
+    task.mkdir()
+    for name, text in {"task.yaml": PUSHED, "terms.py": TERMS, "cart.xml": CART}.items():
+        (task / name).write_text(text)
+    assert main(["train", str(task), "--runs-dir", str(folder / "runs"), "--logger", "none", "-q"]) == 0
+    return next((folder / "runs" / "pushed").iterdir())
+
+
+@pytest.mark.slow
+def test_histories_memories_pushes_masses_and_commands_are_lived_through(pushed, tmp_path, capfd):
+    verified = verify(capfd, pushed, tmp_path / "p.py", "--format", "numpy", "--episodes", "24")["verified"]
+    assert verified["passed"]
+    assert verified["closed_by_task"] == ["observation own"]
+    closed = ["observation pos", "observation vel", "observation before", "observation asked", "control slide"]
+    assert verified["closed_by_metadata"] == closed
+    assert verified["return"] == pytest.approx(verified["evaluation_return"], abs=1e-4)
+
+
+@pytest.fixture
+def copied(newest, tmp_path):
+    """A run of the cartpole to be tampered with."""
+    return Path(shutil.copytree(newest("cartpole").parent.parent, tmp_path / "copied"))
+
+
+def tamper(run, change):
+    file = find_checkpoint(str(run), run.parent)[1] / "manifest.json"
+    manifest = json.loads(file.read_text())
+    change(manifest)
+    file.write_text(json.dumps(manifest))
+
+
+def swap(manifest):
+    manifest["deployment"]["observations"]["policy"][0]["value"]["of"][0]["at"] = [1, 0]
+
+
+def shift(manifest):
+    manifest["deployment"]["observations"]["policy"][1]["value"]["of"][1] = [0.0, 0.3]
+
+
+def weaken(manifest):
+    manifest["deployment"]["controls"][0]["value"] = {"op": "mul", "of": [{"given": "command", "at": [0]}, [0.2]]}
+
+
+@pytest.mark.parametrize(
+    ("change", "fails"),
+    [(swap, "observation"), (shift, "observation"), (weaken, "control")],
+    ids=["swapped columns", "shifted value", "weakened control"],
+)
+def test_metadata_that_says_something_else_than_the_task_does_is_found_out(copied, tmp_path, capfd, change, fails):
+    tamper(copied, change)
+    document = verify(capfd, copied, tmp_path / "policy.py", "--format", "numpy", "--episodes", "16", code=9)
+    assert not document["verified"]["passed"]
+    held = checks(document)
+    assert not held[fails]
+    assert held["action"]
+
+
+def test_timing_that_is_not_the_runs_shows_in_the_return(copied, tmp_path, capfd):
+    tamper(copied, lambda manifest: manifest["layout"].update(decimation=8))
+    document = verify(capfd, copied, tmp_path / "policy.py", "--format", "numpy", "--episodes", "16", code=9)
+    found = checks(document)
+    assert found == {"description": False, "action": True, "observation": True, "control": True, "return": False}
+
+
+ELSEWHERE = {
+    "layout.dt": lambda m: m["layout"].update(dt=0.5),
+    "layout.actions.0.limits.0.1": lambda m: m["layout"]["actions"][0]["limits"][0].__setitem__(1, 500.0),
+    "deployment.joints.0.default": lambda m: m["deployment"]["joints"][0].update(default=0.1),
+    "deployment.joints.1.name": lambda m: m["deployment"]["joints"][1].update(name="pole"),
+    "deployment.start.qpos.0": lambda m: m["deployment"]["start"]["qpos"].__setitem__(0, 0.5),
+    "deployment.controls.0.closed": lambda m: m["deployment"]["controls"][0].update(closed=False),
+    "deployment.actuators.0.name": lambda m: m["deployment"]["actuators"][0].update(name="motor"),
+}
+
+
+@pytest.mark.parametrize("place", ELSEWHERE)
+def test_a_robot_that_is_described_otherwise_than_by_its_task_is_found_out(copied, tmp_path, capfd, place):
+    """None of it need show in the episodes that are lived."""
+    tamper(copied, ELSEWHERE[place])
+    document = verify(capfd, copied, tmp_path / "policy.py", "--format", "numpy", "--episodes", "2", code=9)
+    assert not checks(document)["description"]
+    assert document["verified"]["unlike"] == [place]
+
+
+SENSELESS = {
+    "a control that is not there": lambda d: d["controls"][0].update(ctrl=[7]),
+    "a command that is not there": lambda d: d["controls"][0]["value"].update(at=[7]),
+    "a formula that nobody computes": lambda d: d["observations"]["policy"][0].update(closed=False),
+    "a control without a formula": lambda d: d["controls"][0].update(value=None),
+}
+
+
+@pytest.mark.parametrize("kind", SENSELESS)
+def test_a_description_that_contradicts_itself_is_refused(copied, tmp_path, capfd, kind):
+    tamper(copied, lambda manifest: SENSELESS[kind](manifest["deployment"]))
+    asked = ["export", "--checkpoint", str(copied), "--format", "numpy", "--output", str(tmp_path / "p.py"), "--verify"]
+    assert main([*asked, "--episodes", "1"]) == 5
+
+
+def test_a_table_says_what_failed(copied, tmp_path, capfd):
+    tamper(copied, swap)
+    asked = ["export", "--checkpoint", str(copied), "--output", str(tmp_path / "p.py"), "--format", "numpy"]
+    assert main([*asked, "--verify", "--episodes", "4"]) == 9
+    out, _ = capfd.readouterr()
+    assert "observation: formulas against the task" in out
+    assert "FAILS" in out
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["text", [], {"joints": []}, {"field": "__class__"}, None],
+    ids=["text", "list", "half", "class", "null"],
+)
+def test_a_description_that_makes_no_sense_is_refused(copied, tmp_path, capfd, value):
+    def change(manifest):
+        if isinstance(value, dict) and "field" in value:
+            manifest["deployment"]["observations"]["policy"][0]["value"] = {"field": "__class__", "at": [0]}
+        else:
+            manifest["deployment"] = value
+
+    tamper(copied, change)
+    output = tmp_path / "policy.py"
+    asked = ["export", "--checkpoint", str(copied), "--format", "numpy", "--output", str(output)]
+    if value is None:  # as of a checkpoint of an older version: the file is written, and says less
+        assert main(asked) == 0
+        return
+    assert main(asked) == 5
+    assert "deployment" in capfd.readouterr().err
+    assert not output.exists()
+
+
+def test_a_checkpoint_that_says_nothing_of_its_robot_is_verified_by_what_the_task_says(copied, tmp_path, capfd):
+    tamper(copied, lambda manifest: manifest.pop("deployment"))
+    more = ("--format", "numpy", "--episodes", "4")
+    assert verify(capfd, copied, tmp_path / "policy.py", *more)["verified"]["passed"]
+
+
+def test_formulas_that_reach_beyond_the_model_are_refused(copied, tmp_path, capfd):
+    def change(manifest):
+        manifest["deployment"]["observations"]["policy"][0]["value"]["of"][0]["at"] = [0, 5000]
+
+    tamper(copied, change)
+    asked = ["export", "--checkpoint", str(copied), "--format", "numpy", "--output", str(tmp_path / "p.py"), "--verify"]
+    assert main(asked) == 5
+    assert "does not fit the model" in capfd.readouterr().err
+
+
+def test_verify_outside_of_a_run_is_a_usage_error(newest, tmp_path, capfd):
+    folder = shutil.copytree(newest("cartpole"), tmp_path / "alone")
+    assert main(["export", "--checkpoint", str(folder), "--output", str(tmp_path / "p.onnx"), "--verify"]) == 2
+    assert "--verify" in capfd.readouterr().err
+
+
+def test_a_program_that_somebody_has_changed_stays(newest, tmp_path, capfd):
+    own = tmp_path / "run_policy.py"
+    own.write_text("raise SystemExit('mine')\n")
+    run = newest("cartpole").parent.parent
+    asked = ["export", "--checkpoint", str(run), "--output", str(tmp_path / "policy.py"), "--format", "numpy"]
+    assert main([*asked, "--verify", "--episodes", "4"]) == 0
+    assert own.read_text() == "raise SystemExit('mine')\n"
+    assert "stays as it is" in capfd.readouterr().err
+
+
+def test_nothing_takes_the_place_of_somebodys_own_file(newest, tmp_path, capfd):
+    run = newest("cartpole").parent.parent
+    asked = ["export", "--checkpoint", str(run), "--format", "numpy", "--verify", "--episodes", "1", "--output"]
+    assert main([*asked, str(tmp_path / "run_policy.py")]) == 2
+    assert list(tmp_path.iterdir()) == []
+    for _ in range(2):  # its own may be replaced
+        assert main([*asked, str(tmp_path / "policy.py")]) == 0
+    (tmp_path / "model.xml").write_text("<mujoco/>")
+    capfd.readouterr()
+    assert main([*asked, str(tmp_path / "policy.py")]) == 2
+    assert "model.xml" in capfd.readouterr().err
+    assert (tmp_path / "model.xml").read_text() == "<mujoco/>"
+
+
+PROGRAM = """
+import sys
+sys.modules.update(dict.fromkeys({blocked!r}))
+import runpy
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize("format_", [pytest.param("onnx", marks=pytest.mark.slow), "numpy"])
+def test_the_program_is_80_lines_and_runs_without_rlcli(newest, tmp_path, capfd, format_):
+    run, suffix = newest("cartpole").parent.parent, {"onnx": ".onnx", "numpy": ".py"}[format_]
+    verify(capfd, run, tmp_path / f"policy{suffix}", "--format", format_, "--episodes", "2")
+    file = tmp_path / "run_policy.py"
+    assert len(file.read_text().splitlines()) <= 80
+    assert max(map(len, file.read_text().splitlines())) <= 120
+    blocked = ["rlcli", "rlcli_tasks", "torch", "pydantic", *(["onnxruntime"] if format_ == "numpy" else [])]
+    command = [sys.executable, "-B", "-c", PROGRAM.format(blocked=blocked), str(file), "60"]
+    result = subprocess.run(command, cwd="/", capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith("60 steps, 1.00 s; qpos ")
+
+
+def test_the_model_that_is_written_is_the_one_that_was_trained_on(newest, tmp_path, capfd):
+    run = newest("arm").parent.parent
+    verify(capfd, run, tmp_path / "policy.py", "--format", "numpy", "--episodes", "2")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    assert [model.actuator(i).name for i in range(model.nu)] == ["robot/m", "robot/p", "robot/w"]
+    np.testing.assert_allclose(model.actuator_gainprm[1, 0], 5.0)
+
+
+def test_a_model_with_meshes_from_files_is_written_compiled_and_whole(tmp_path):
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "part.obj").write_text(corners)
+    text = """<mujoco><asset><mesh name="part" file="part.obj"/></asset><worldbody>
+      <body><joint name="turn"/><geom type="mesh" mesh="part"/></body></worldbody></mujoco>"""
+    (tmp_path / "source.xml").write_text(text)
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "source.xml"))
+    folder = tmp_path / "written"
+    folder.mkdir()
+    model = spec.compile()
+    file = onboard_program.write_model(spec, model, folder)
+    assert list(folder.iterdir()) == [file]
+    assert file.name == "model.mjb"
+    again = onboard_program.open_model(file)
+    assert again.joint(0).name == "turn"
+    np.testing.assert_array_equal(again.mesh_vert, model.mesh_vert)
+
+
+@pytest.mark.slow
+def test_the_program_runs_where_there_are_only_numpy_onnxruntime_and_mujoco(newest, tmp_path, capfd):
+    verify(capfd, newest("cartpole").parent.parent, tmp_path / "policy.onnx", "--episodes", "2")
+    venv.create(tmp_path / "bare", with_pip=True)
+    python = next(path for name in ("bin/python", "Scripts/python.exe") if (path := tmp_path / "bare" / name).exists())
+    constraints = Path(__file__).parents[2] / "constraints.txt"
+    install = [python, "-m", "pip", "install", "-q", "-c", constraints, "numpy", "onnxruntime", "mujoco"]
+    subprocess.run(install, check=True, timeout=600)
+    bare = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    asked = [python, tmp_path / "run_policy.py"]
+    result = subprocess.run(asked, cwd=tmp_path, env=bare, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith("300 steps, 5.00 s; qpos ")

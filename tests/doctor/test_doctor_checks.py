@@ -1,0 +1,315 @@
+"""What `rlcli doctor` says of each planted fault: what was found, and the line that mends it."""
+
+import json
+import os
+
+import pytest
+
+from rlcli.doctor import isolated_checks
+from rlcli.doctor.installation import installation_checks, unmet
+from rlcli.doctor.isolated_checks import compute_checks, gpu_checks, graphics_check, run_isolated, shared_memory_check
+from rlcli.doctor.machine import machine_checks, memory_check
+from rlcli.doctor.settings import harmful_variables, settings_checks
+from rlcli.machine import memory_limit
+from rlcli.settings import settings_file
+
+
+def named(checks):
+    return {check.name: check for check in checks}
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """package(name, version) plants the metadata of an installed distribution before all others."""
+    site = tmp_path / "planted"
+    site.mkdir()
+    monkeypatch.syspath_prepend(str(site))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])]))
+
+    def plant(name, version, *requirements):
+        info = site / f"{name.replace('-', '_')}-{version}.dist-info"
+        info.mkdir()
+        lines = [f"Requires-Dist: {requirement}" for requirement in requirements]
+        (info / "METADATA").write_text(
+            "\n".join(["Metadata-Version: 2.1", f"Name: {name}", f"Version: {version}", *lines, ""])
+        )
+        return site
+
+    return plant
+
+
+def test_packages_of_mujoco_that_agree_are_fine():
+    check = named(installation_checks())["mujoco packages"]
+    assert (check.state, check.hint) == ("ok", None)
+    assert set(check.details) == {"mujoco", "mujoco-core", "mujoco-studio"}
+
+
+def test_a_mujoco_core_of_another_version_is_named_with_both_versions_and_the_mending_line(package):
+    mine = named(installation_checks())["mujoco packages"].details["mujoco"]
+    package("mujoco-core", "3.13.0")
+    check = named(installation_checks())["mujoco packages"]
+    assert check.state == "broken"
+    assert f"mujoco {mine} needs mujoco-core {mine}, but mujoco-core 3.13.0 is installed" in check.found
+    assert "mujoco-core is there 2 times" in check.found
+    assert check.hint == f'pip uninstall -y mujoco mujoco-core mujoco-studio && pip install "mujoco=={mine}"'
+
+
+def test_a_mujoco_from_before_it_was_split_is_found_beside_the_new_one(package):
+    package("mujoco", "3.3.0", "numpy")
+    check = named(installation_checks())["mujoco packages"]
+    assert check.state == "broken"
+    assert "mujoco is there 2 times: 3.3.0 in" in check.found
+    assert "mujoco 3.3.0 does not fit" in named(installation_checks())["packages"].found
+
+
+def test_a_package_too_old_and_one_that_is_missing_are_named(package, monkeypatch):
+    package("torch", "1.13.0")
+    package("rlcli", "0.1.0", "torch>=2.10", "numpy>=2.0", "no-such-package>=1", 'onnx>=99; extra == "export"')
+    check = named(installation_checks())["packages"]
+    assert check.state == "broken"
+    assert "torch 1.13.0 does not fit, >=2.10 is needed" in check.found
+    assert "no-such-package is missing" in check.found
+    assert "onnx" in check.found
+    assert "numpy" not in check.found
+
+
+def test_an_extra_is_there_absent_or_half_installed(package):
+    package(
+        "rlcli", "0.1.0", 'numpy>=2; extra == "one"', 'no-such-package; extra == "two"', 'numpy; extra == "three"',
+        'no-such-package; extra == "three"', 'rlcli[one]; extra == "all"', 'no-such-package; extra == "dev"',
+    )  # fmt: skip
+    found = named(installation_checks())
+    assert {name for name in found if name.startswith("extra ")} == {"extra one", "extra two", "extra three"}
+    assert (found["extra one"].state, found["extra one"].hint) == ("ok", None)
+    assert (found["extra two"].state, found["extra two"].hint) == ("absent", 'pip install "rlcli[two]"')
+    assert (found["extra three"].state, found["extra three"].hint) == ("warning", 'pip install "rlcli[three]"')
+    assert "missing: no-such-package" in found["extra three"].found
+
+
+@pytest.mark.parametrize(
+    ("wanted", "found", "bad"),
+    [
+        (">=2.10", "2.9.2", True),
+        (">=2.10", "2.13.0+cpu", False),
+        ("==4.0.0", "4.0", False),
+        ("==4.0.*", "4.0.7", False),
+        ("==4.0.*", "4.1", True),
+        (">=1.0,<2", "2.0", True),
+        ("!=1.5", "1.5", True),
+        ("", "1", False),
+        ("~=1.0", "7", False),
+    ],
+)
+def test_bounds_of_versions(wanted, found, bad):
+    assert unmet(wanted, found) == bad
+
+
+def test_a_library_of_another_version_than_its_package_is_told():
+    answer = {"torch": "2", "cuda": None, "threads": 2, "mujoco": "3.3.0", "mujoco_package": "4.0.0", "cores": [8, 8]}
+    check = named(compute_checks(answer, ""))["mujoco"]
+    assert (check.state, check.hint) == ("broken", isolated_checks.REINSTALL)
+    assert "4.0.0" in check.found
+    assert "3.3.0" in check.found
+
+
+@pytest.mark.parametrize(
+    ("reason", "hint"),
+    [
+        ("ModuleNotFoundError: No module named 'mujoco._structs'", isolated_checks.REINSTALL),
+        ("OSError: libtorch_cpu.so: no such file", "pip install --upgrade --force-reinstall torch"),
+        ("no answer within 30 s", isolated_checks.BUSY),
+    ],
+)
+def test_what_does_not_answer_is_mended_by_what_it_said(reason, hint):
+    (check,) = compute_checks(None, reason)
+    assert (check.state, check.hint) == ("broken", hint)
+
+
+@pytest.mark.slow
+def test_openmp_that_pins_the_process_is_found_by_trying(monkeypatch):
+    cores = len(os.sched_getaffinity(0))
+    if cores < 2:
+        pytest.skip("on one core there is nothing to be pinned to")
+    monkeypatch.setenv("OMP_PROC_BIND", "true")
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    check = named(compute_checks(*run_isolated("compute", 120.0)))["pinning"]
+    assert (check.state, check.hint) == ("warning", "unset OMP_PROC_BIND")
+    assert f"1 of {cores} cores" in check.found
+
+
+@pytest.mark.slow
+def test_a_graphics_library_that_crashes_ends_its_own_process_alone(tmp_path, monkeypatch):
+    (tmp_path / "OpenGL").mkdir()
+    (tmp_path / "OpenGL" / "__init__.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    assert run_isolated("egl", 120.0) == (None, "crashed (SIGSEGV)")
+
+
+def test_a_library_that_hangs_is_given_up(tmp_path, monkeypatch):
+    (tmp_path / "mujoco").mkdir()
+    (tmp_path / "mujoco" / "__init__.py").write_text("import time\ntime.sleep(600)\n")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    assert run_isolated("egl", 2.0) == (None, "no answer within 2 s")
+
+
+@pytest.mark.parametrize(
+    ("chosen", "works", "state", "used"),
+    [
+        (None, ("egl", "osmesa"), "ok", "egl"),
+        (None, ("osmesa",), "ok", "osmesa"),
+        (None, (), "warning", None),
+        ("osmesa", ("egl", "osmesa"), "ok", "osmesa"),
+        ("osmesa", ("egl",), "broken", None),
+        ("nonsense", ("egl",), "broken", None),
+        ("disable", ("egl",), "ok", None),
+    ],
+)
+def test_graphics_are_judged_by_what_draws_and_what_is_chosen(monkeypatch, chosen, works, state, used):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+    if chosen is not None:
+        monkeypatch.setenv("MUJOCO_GL", chosen)
+    check = graphics_check({name: ({}, "") if name in works else (None, "why") for name in ("egl", "osmesa", "glfw")})
+    assert (check.state, check.details["used"]) == (state, used)
+    assert check.details["drawn"] == {name: name in works for name in ("egl", "osmesa", "glfw")}
+    if state == "broken":
+        assert (check.hint, f"MUJOCO_GL={chosen}" in check.found) == ("unset MUJOCO_GL", True)
+
+
+GPU = {"torch_cuda": "12.8", "torch_error": "", "devices": ["H200"], "driver_cuda": "12.9"}
+WARP = {"version": "1.19.0", "devices": ["H200"], "error": ""}
+
+
+@pytest.mark.parametrize(
+    ("change", "state", "said", "hint"),
+    [
+        ({}, "ok", "H200; driver CUDA 12.9, torch CUDA 12.8", None),
+        ({"torch_cuda": None, "devices": []}, "warning", "torch is built for the CPU", "https://pytorch.org"),
+        (
+            {"torch_cuda": "13.0"},
+            "warning",
+            "torch is built for CUDA 13.0, the driver offers CUDA 12.9",
+            "update the driver",
+        ),
+        ({"devices": []}, "warning", "torch sees no device", "nvidia-smi"),
+        (
+            {"torch_error": ": no kernel image"},
+            "warning",
+            "cannot compute there: no kernel image",
+            "built for this GPU",
+        ),
+        ({"warp": None}, "warning", "without", 'pip install "rlcli[gpu]"'),
+        ({"warp": {**WARP, "devices": []}}, "warning", "Warp 1.19.0 sees no GPU", "warp-lang"),
+        ({"warp": {**WARP, "error": "E: x"}}, "warning", "sees no GPU: E: x", "warp-lang"),
+    ],
+)
+def test_driver_torch_and_warp_are_compared(monkeypatch, change, state, said, hint):
+    monkeypatch.setattr(isolated_checks, "version", lambda _: "4.0.0")
+    check = gpu_checks(({**GPU, "warp": WARP, **change}, ""))[0]
+    assert (check.state, said in check.found) == (state, True), check.found
+    assert hint is None or hint in check.hint
+
+
+def test_without_a_driver_nothing_is_wrong_and_with_one_that_crashes_it_is_said():
+    assert gpu_checks(None)[0].state == "ok"
+    check = gpu_checks((None, "crashed (SIGSEGV)"))[0]
+    assert (check.state, "SIGSEGV" in check.found) == ("warning", True)
+
+
+def test_little_memory_and_little_shared_memory_are_warnings():
+    assert memory_check(8 << 30, None).state == "ok"
+    assert memory_check(8 << 30, 16 << 30).state == "ok"
+    limited = memory_check(8 << 30, 512 << 20)
+    assert (limited.state, "container" in limited.hint) == ("warning", True)
+    assert memory_check(300 << 20, None).state == "warning"
+    assert shared_memory_check(64 << 20).hint == "docker run --shm-size=8g"
+    assert shared_memory_check(8 << 30).state == "ok"
+
+
+@pytest.mark.parametrize(
+    ("own", "files", "limit"),
+    [
+        ("0::/a/b\n", {"a/memory.max": "2000\n", "a/b/memory.max": "max\n"}, 2000),
+        ("4:memory:/x\n3:cpu:/x\n", {"memory/x/memory.limit_in_bytes": "3000\n"}, 3000),
+        ("4:memory:/\n", {"memory/memory.limit_in_bytes": "9223372036854771712\n"}, None),
+        ("nonsense", {}, None),
+    ],
+)
+def test_the_memory_of_a_container_is_the_smallest_on_the_way_up(tmp_path, own, files, limit):
+    (tmp_path / "own").write_text(own)
+    for name, text in files.items():
+        file = tmp_path / "groups" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    assert memory_limit(tmp_path / "groups", tmp_path / "own") == limit
+
+
+@pytest.mark.parametrize(
+    ("given", "bad"),
+    [
+        ({"OMP_NUM_THREADS": "64"}, {"OMP_NUM_THREADS"}),
+        ({"OMP_NUM_THREADS": "4", "MKL_NUM_THREADS": "many"}, set()),
+        ({"OMP_THREAD_LIMIT": "1"}, {"OMP_THREAD_LIMIT"}),
+        ({"OMP_WAIT_POLICY": "ACTIVE", "KMP_BLOCKTIME": "infinite"}, {"OMP_WAIT_POLICY", "KMP_BLOCKTIME"}),
+        ({"LOCAL_WORLD_SIZE": "8"}, {"LOCAL_WORLD_SIZE"}),
+        ({"LOCAL_WORLD_SIZE": "1", "DISPLAY": ":0"}, set()),
+    ],
+)
+def test_variables_that_slow_training_down_are_named(given, bad):
+    assert set(harmful_variables(given, 4)) == bad
+
+
+def test_the_settings_file_is_shown_and_a_broken_one_is_named(monkeypatch, tmp_path):
+    file = tmp_path / "settings.yaml"
+    monkeypatch.setenv("RLCLI_SETTINGS", str(file))
+    file.write_text("viewer: web\n")
+    check = named(settings_checks())["settings"]
+    assert (check.state, check.found) == ("ok", f"{file}: viewer: web")
+    file.write_text("viewer: wbe\n")
+    check = named(settings_checks())["settings"]
+    assert check.state == "broken"
+    assert f"{file}:1:1: viewer: expected" in check.found
+    assert f"edit {settings_file()}" in check.hint
+    monkeypatch.setenv("RLCLI_SETTINGS", "none")
+    assert named(settings_checks())["settings"].state == "ok"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
+    assert named(settings_checks())["variables"].hint == "unset OMP_WAIT_POLICY"
+
+
+def test_a_runs_folder_that_is_no_folder_is_broken_and_names_what_to_set(tmp_path):
+    (tmp_path / "file").write_text("")
+    check = named(machine_checks(tmp_path / "file" / "runs"))["runs folder"]
+    assert check.state == "broken"
+    assert "RLCLI_RUNS_DIR" in check.hint
+    assert named(machine_checks(tmp_path / "new" / "runs"))["runs folder"].state == "ok"
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.slow
+def test_many_faults_at_once_are_each_named_with_their_mending_line_and_end_it_with_9(package, cli, tmp_path):
+    site = package("mujoco-core", "3.13.0")
+    (site / "OpenGL").mkdir()
+    (site / "OpenGL" / "__init__.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n")
+    (tmp_path / "file").write_text("")
+    (tmp_path / "mine.yaml").write_text("viewer: wbe\n")
+    faults = {
+        "RLCLI_RUNS_DIR": str(tmp_path / "file" / "runs"),
+        "RLCLI_SETTINGS": str(tmp_path / "mine.yaml"),
+        "MUJOCO_GL": "nonsense",
+        "OMP_WAIT_POLICY": "active",
+    }
+    done = cli("doctor", "--json", "--probe-timeout", "100", **faults)
+    assert done.returncode == 9, done.stderr
+    assert "Traceback" not in done.stderr
+    document = json.loads(done.stdout)
+    assert (document["schema"], document["healthy"], document["all_good"]) == (1, False, False)
+    found = {check["name"]: check for check in document["checks"]}
+    assert {n for n, c in found.items() if c["state"] == "broken"} == {
+        "mujoco packages", "runs folder", "settings", "graphics", "task cartpole-camera",
+    }  # fmt: skip
+    assert found["variables"]["state"] == "warning"
+    assert "mujoco-core 3.13.0" in found["mujoco packages"]["found"]
+    assert "egl cannot (crashed (SIGSEGV))" in found["graphics"]["found"]
+    assert found["graphics"]["hint"] == "unset MUJOCO_GL"
+    assert found["mujoco"]["state"] == "ok"
+    assert all(check["hint"] for check in found.values() if check["state"] != "ok")

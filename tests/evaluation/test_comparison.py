@@ -1,0 +1,141 @@
+"""`rlcli eval --compare`: policies in the same episodes."""
+
+import json
+
+import pytest
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+SMALL = ("scene.num_envs=8", "sim.engine_threads=1", "agent.torch_threads=1", "--logger", "none", "-q")
+
+
+TRAINED = {
+    "cartpole": ("cartpole",),
+    "changed": ("cartpole", "rewards.alive.weight=3.0", "episode_length_s=2.0"),
+    "other": ("cartpole", "--num-envs", 4, "viewer.width=64"),
+    "direct": ("cartpole-direct",),
+}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """trained(name) -> the folder of a run, trained once."""
+    from rlcli.cli.app import main
+
+    folder, runs = tmp_path_factory.mktemp("compared"), {}
+
+    def find(name):
+        if name not in runs:
+            words = [*TRAINED[name], *SMALL, "--max-iterations", 1, "--runs-dir", folder / name]
+            assert main(["train", *map(str, words)]) == 0
+            (runs[name],) = (folder / name).glob("*/*")
+        return runs[name]
+
+    return find
+
+
+def test_a_policy_against_itself_is_no_better_and_no_different(cli, trained):
+    run = trained("cartpole")
+    done = cli("eval", "--compare", run, run, "--episodes", 20, "--json").json
+    one, same = done["policies"]
+    assert {**one, "name": ""} == {**same, "name": ""}
+    (compared,) = done["comparisons"]
+    for metric in ("success", "return", "length"):
+        assert compared[metric]["difference"] == {"mean": 0.0, "low": 0.0, "high": 0.0}
+        assert compared[metric]["improvement"] == {"probability": 0.5, "low": 0.5, "high": 0.5}
+
+
+def test_each_policy_has_the_numbers_of_its_own_evaluation(cli, trained):
+    run = trained("cartpole")
+    done = cli("eval", "--compare", run, f"{run}@step:0", "lqr", "--episodes", 10, "--json").json
+    assert [policy["policy"] for policy in done["policies"]] == ["trained", "trained", "lqr"]
+    keys = ("episodes", "success", "return", "length", "reward_terms", "terminations")
+    alone = [
+        cli("eval", "--checkpoint", run, "--episodes", 10, "--num-envs", 10, "--json").json,
+        cli("eval", "--checkpoint", f"{run}@step:0", "--episodes", 10, "--num-envs", 10, "--json").json,
+        cli("eval", "cartpole", "--policy", "lqr", "--episodes", 10, "--num-envs", 10, "--json").json,
+    ]
+    for policy, said in zip(done["policies"], alone, strict=True):
+        assert {key: policy[key] for key in keys} == {key: said[key] for key in keys}
+    versus_lqr = done["comparisons"][1]
+    assert (versus_lqr["left"], versus_lqr["right"]) == (str(run), "lqr")
+    assert versus_lqr["return"]["improvement"]["probability"] < 0.2
+    gap = versus_lqr["return"]["difference"]
+    assert gap["low"] < gap["mean"] < gap["high"] < 0
+    means = [policy["return"]["mean"] for policy in done["policies"]]
+    assert gap["mean"] == pytest.approx(means[0] - means[2])
+
+
+def test_where_chance_alone_decides_two_policies_share_it(cli, coin, only_run):
+    cli("train", coin, *SMALL, "--max-iterations", 1)
+    run = only_run()
+    done = cli("eval", "--compare", run, "zero", "--episodes", 100, "--json").json
+    assert 0.35 < done["policies"][0]["success"]["rate"] < 0.65
+    assert done["comparisons"][0]["return"]["difference"]["mean"] == 0.0
+    assert done["comparisons"][0]["success"]["improvement"]["probability"] == 0.5
+
+
+def test_what_is_shown(cli, trained):
+    run = trained("cartpole")
+    done = cli("eval", "--compare", run, "zero", "--episodes", 4, "episode_length_s=0.5")
+    assert done.code == 0, done.err
+    first, *_ = done.out.splitlines()
+    assert (
+        first
+        == "cartpole: 4 episodes each, seed 42, the same ones; 30 steps of 0.0166667 s at most, episode_length_s=0.5"
+    )
+    assert "P(IMPROVEMENT)" in done.out
+    assert f"return: {run.name} - zero" in done.out
+
+
+def test_runs_whose_tasks_differ_are_refused_with_what_differs(cli, trained):
+    one, other = trained("cartpole"), trained("changed")
+    done = cli("eval", "--compare", one, other)
+    assert done.code == 3
+    assert "episode_length_s: 2.0, and in" in done.err
+    assert "rewards.alive.weight: 3.0" in done.err
+    assert done.err.count("error: ") == 2
+    problems = json.loads(cli("eval", "--compare", one, other, "--json").out)["error"]["problems"]
+    assert [problem["path"] for problem in problems] == ["episode_length_s", "rewards.alive.weight"]
+    alike = ("rewards.alive.weight=1.0", "episode_length_s=1.0")
+    assert cli("eval", "--compare", one, other, *alike, "--episodes", 2).code == 0
+
+
+def test_how_many_environments_a_run_was_trained_in_makes_no_difference(cli, trained):
+    one, other = trained("cartpole"), trained("other")
+    assert cli("eval", "--compare", one, other, "--episodes", 2).code == 0
+
+
+def test_runs_of_other_tasks_are_refused(cli, trained):
+    one, other = trained("cartpole"), trained("direct")
+    done = cli("eval", "--compare", one, other)
+    assert done.code == 2
+    assert "of the task cartpole, and" in done.err
+    assert "of cartpole-direct" in done.err
+
+
+def test_the_first_policy_is_the_one_that_must_not_fall_short(cli, trained):
+    run = trained("cartpole")
+    words = ("eval", "--compare", run, "lqr", "--episodes", 6, "--json")
+    done = cli(*words, "--fail-under", "success=0.9")
+    assert done.code == 9
+    assert done.json["failures"]
+    assert cli("eval", "--compare", "lqr", run, "--episodes", 6, "--fail-under", "success=0.9").code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ((), 2, "--compare: with what?"),
+        (("nowhere",), 2, "--compare nowhere: with what?"),
+        (("lqr", "zero"), 2, "none of these is a run"),
+        (("nowhere", "zero"), 5, "no run 'nowhere'"),
+        (("a", "b", "--checkpoint", "c"), 2, "as words"),
+        (("a", "b", "--policy", "zero"), 2, "as words"),
+        (("a", "b", "--record", "x.safetensors"), 2, "as words"),
+    ],
+)
+def test_mistakes_are_one_message_and_a_code(cli, words, code, said):
+    done = cli("eval", "--compare", *words)
+    assert done.code == code, done.err
+    assert said in done.err

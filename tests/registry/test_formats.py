@@ -1,0 +1,206 @@
+"""Formats of other frameworks: installed, not installed, broken, and their modules' former names."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+HIDDEN = ("rlcli-oige", "rlcli-isaaclab")
+CORE = f"""
+import importlib.metadata, sys
+every = importlib.metadata.distributions
+importlib.metadata.distributions = lambda **given: (d for d in every(**given) if d.metadata["Name"] not in {HIDDEN!r})
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {tuple(name.replace("-", "_") for name in HIDDEN)!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Absent())
+from rlcli.cli.app import main
+sys.exit(main(sys.argv[1:]))
+"""
+"""A program that is `rlcli` where neither plugin is installed."""
+
+OIGE = "name: Arm\nphysics_engine: physx\nenv: {numEnvs: 4}\nsim: {dt: 0.01}\nmjcf: {Arm: arm.xml}\n"
+IMPORTED = """
+sim: {dt: 0.01}
+decimation: 2
+episode_length_s: 1.0
+scene: {entities: {}}
+oige: {name: Arm, env: {maxEffort: 2.0}}
+"""
+ISAACLAB = """
+from rlcli.isaaclab import ManagerBasedRLEnvCfg
+
+class ArmEnvCfg(ManagerBasedRLEnvCfg):
+    pass
+"""
+
+
+@pytest.fixture
+def core(tmp_path):
+    """core(words...) -> the finished process of `rlcli` without the plugins."""
+
+    def run(*words):
+        command = [sys.executable, "-c", CORE, *map(str, words)]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+
+    return run
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Tasks of each known format, in every way in which they lie in folders."""
+    files = {
+        "own/Arm.yaml": OIGE,
+        "package/cfg/task/Arm.yaml": OIGE,
+        "imported/task.yaml": IMPORTED,
+        "lab/arm_env_cfg.py": ISAACLAB,
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("target", "plugin"),
+    [
+        ("./own", "rlcli-oige"),
+        ("./own/Arm.yaml", "rlcli-oige"),
+        ("./package", "rlcli-oige"),
+        ("./imported", "rlcli-oige"),
+        ("./lab", "rlcli-isaaclab"),
+        ("./lab/arm_env_cfg.py:ArmEnvCfg", "rlcli-isaaclab"),
+    ],
+)
+@pytest.mark.parametrize("command", ["validate", "train"])
+def test_a_task_of_a_format_that_is_not_installed_is_answered_with_the_pip_line(core, folders, target, plugin, command):
+    done = core(command, target, "--json")
+    assert done.returncode == 7, done.stderr
+    error = json.loads(done.stdout)["error"]
+    assert "is not installed" in error["message"]
+    assert error["hint"] == f"pip install {plugin}"
+
+
+def test_an_importer_that_is_not_installed_is_answered_with_the_pip_line(core):
+    done = core("import", "isaaclab", "env.yaml", "--model", "robot=robot.xml")
+    assert done.returncode == 7, done.stderr
+    assert "pip install rlcli-isaaclab" in done.stderr
+    assert "isaaclab" not in core("import", "--help").stdout
+
+
+def test_without_the_plugins_the_other_tasks_are_as_they_were(core, tmp_path):
+    assert core("validate", "cartpole").returncode == 0
+    assert "format" not in core("show", "cartpole").stdout
+    wrong = tmp_path / "wrong"
+    wrong.mkdir()
+    assert core("validate", "./wrong").returncode == 4
+    # runs of every task that were saved before have the key, empty
+    (wrong / "task.yaml").write_text(core("show", "cartpole").stdout + "\noige: {}\n")
+    assert core("validate", "./wrong").returncode == 0
+
+
+def test_plugins_left_out_by_the_user_are_not_asked(folders):
+    command = [sys.executable, "-m", "rlcli", "validate", "./own"]
+    env = {**os.environ, "RLCLI_PLUGINS": "none"}
+    done = subprocess.run(command, cwd=folders, env=env, capture_output=True, text=True)
+    assert done.returncode == 7, done.stderr
+
+
+FORMAT = """
+from pathlib import Path
+from rlcli.formats import FormatSpec, Note, Translation
+
+SPEC = FormatSpec(summary="tasks of Elsewhere", read="elsewhere:read", key="elsewhere", check="elsewhere:check",
+                  aliases={{"another_world": "elsewhere"}}{more})
+HANDS = 2
+
+
+def read(document, source):
+    if "seconds" not in document.data:
+        return None
+    from rlcli.config.layers import marked
+    data = {{"episode_length_s": document.data["seconds"], "elsewhere": {{"hands": HANDS}}}}
+    data |= {{key: value for key, value in document.data.items() if key != "seconds"}}
+    return Translation(data, marked(document, source.label, "task"), [Note("", "seconds", "mapped")])
+
+
+def check(block):
+    if block.get("hands") != HANDS:
+        yield ("hands",), "a robot here has two", None
+"""
+TASK = """
+seconds: 1.0
+sim: {dt: 0.01}
+decimation: 2
+scene: {num_envs: 2, entities: {robot: {model: "cartpole:cartpole.xml"}}}
+"""
+CODE = """
+from another_world import HANDS
+from rlcli.envs.direct import DirectTask
+
+
+class Task(DirectTask):
+    num_observations, num_actions = 1, 1
+"""
+POINTS = "[rlcli.formats]\nelsewhere = elsewhere:SPEC\n"
+
+
+@pytest.fixture
+def task(tmp_path):
+    folder = tmp_path / "task"
+    folder.mkdir()
+    (folder / "task.yaml").write_text(TASK)
+    (folder / "task.py").write_text(textwrap.dedent(CODE))
+    return folder
+
+
+def test_a_format_of_an_installed_plugin_is_read_checked_and_shown(plugins, cli, task):
+    plugins("elsewhere", FORMAT.format(more=""), entry_points=POINTS)
+    done = cli("validate", str(task))
+    assert done.returncode == 0, done.stderr
+    assert "mapped: seconds" in done.stderr
+    shown = cli("show", str(task), "--json")
+    assert json.loads(shown.stdout)["config"]["elsewhere"] == {"hands": 2}
+    assert "foreign" not in json.loads(shown.stdout)["config"]
+    wrong = cli("validate", str(task), "elsewhere.hands=3")
+    assert wrong.returncode == 3, wrong.stderr
+    assert "elsewhere.hands: a robot here has two" in wrong.stderr
+
+
+def test_an_alias_resolves_while_a_tasks_file_is_imported_and_not_otherwise(plugins, cli, task):
+    plugins("elsewhere", FORMAT.format(more=""), entry_points=POINTS)
+    program = f"""
+        from rlcli.registry import load_object
+        try:
+            import another_world
+        except ModuleNotFoundError as error:
+            print(error)
+        task = load_object({str(task / "task.py")!r} + ":Task")
+        import elsewhere, sys
+        print(sys.modules["another_world"] is elsewhere, elsewhere.__spec__.name)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True)
+    assert done.stdout.splitlines() == ["No module named 'another_world'", "True elsewhere"], done.stderr
+
+
+def test_a_format_for_a_newer_rlcli_is_refused_with_both_numbers(plugins, cli, task):
+    plugins("elsewhere", FORMAT.format(more=", api=99"), entry_points=POINTS)
+    done = cli("validate", str(task))
+    assert done.returncode == 4, done.stderr
+    assert "needs plugin API 99; this rlcli has 1" in done.stderr
+
+
+def test_a_broken_format_stops_no_task_of_rlclis_own(plugins, cli, task):
+    plugins("elsewhere", "raise RuntimeError('torn')", entry_points=POINTS)
+    shown = cli("show", "cartpole")
+    assert shown.returncode == 0, shown.stderr
+    (task / "task.yaml").write_text(shown.stdout)
+    (task / "task.py").unlink()
+    done = cli("validate", str(task))
+    assert done.returncode == 0, done.stderr
+    assert "warning: plugin elsewhere 1.0 is broken" in done.stderr
+    assert cli("import", "--help").returncode == 0

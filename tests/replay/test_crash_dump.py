@@ -1,0 +1,187 @@
+"""The dump of a run's first divergence, and `rlcli replay` of it, by whomever it was written."""
+
+import json
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+from safetensors import safe_open
+
+from rlcli.errors import CheckpointError
+from rlcli.replay.resimulate import replay_calls
+from rlcli.replay.trajectory import content_digest, read_trajectory
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+BREAKS = '''
+import torch
+from rlcli.envs.direct import DirectTask
+
+
+class Task(DirectTask):
+    """In environment 5 something goes wrong in the fourth and in the sixth step of its first episode."""
+
+    num_observations = 1
+    num_actions = 1
+
+    def pre_physics_step(self, actions):
+        for step, value in ((3, float("nan")), (5, 1e30)):
+            if int(self.env.episode_index[5]) == 0 and int(self.progress_buf[5]) == step:
+                self.env.engine.field("qvel")[5, 0] = value
+        if int(self.env.episode_index[5]) == 1 and int(self.progress_buf[5]) == 5:
+            self.env.engine.field("qvel")[5, 0] = 1e30
+
+    def get_observations(self):
+        self.obs_buf[:, 0] = self.progress_buf
+
+    def calculate_metrics(self):
+        self.rew_buf[:] = 1.0
+
+    def is_done(self):
+        self.reset_buf.zero_()
+'''
+
+
+@pytest.fixture
+def breaks(coin):
+    task = Path(coin) / "task.yaml"
+    lines = task.read_text().splitlines()
+    task.write_text("\n".join(line for line in lines if not line.startswith(("params", "success"))))
+    (Path(coin) / "task.py").write_text(BREAKS)
+    return coin
+
+
+@pytest.fixture
+def dump(breaks, cli):
+    assert cli("eval", breaks, "--policy", "zero", "--episodes", "32", "--quiet").code == 0
+    (file,) = Path("runs/dumps").iterdir()
+    return file
+
+
+def rewritten(file, **changes):
+    """A dump as an attacker may write it: with a digest that is right."""
+    with safe_open(file, "pt") as opened:
+        document = json.loads(opened.metadata()["rlcli"])
+        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    document.pop("sha256")
+    tensors.update(changes.pop("tensors", {}))
+    document["worlds"][0].update(changes.pop("world", {}))
+    document.update(changes)
+    document["sha256"] = content_digest(tensors, document)
+    safetensors.torch.save_file(tensors, file, metadata={"rlcli": json.dumps(document)})
+
+
+@pytest.mark.slow
+def test_a_run_that_diverges_says_so_once_and_replay_shows_where(breaks, cli, only_run):
+    trained = cli("train", breaks, "--max-iterations", "3", "--logger", "none")
+    assert trained.code == 0, trained.err
+    (line,) = [line for line in trained.err.splitlines() if "diverged for the first time" in line]
+    (file,) = (only_run() / "dumps").iterdir()
+    assert "environment 5: BADQVEL" in line
+    assert f"rlcli replay {file}" in line
+    rows = [json.loads(row) for row in (only_run() / "metrics.jsonl").read_text().splitlines()]
+    assert [row.get("Sim/diverged/BADQVEL") for row in rows] == [1.0, 1.0, None], "counted in its iteration"
+    shown = cli("replay", file)
+    assert shown.code == 0
+    assert "in physics step 0 of call 3, t = 0.03 s: joint 'robot/slide'" in shown.out
+    assert "qvel nan" in shown.out
+    assert "4 engine calls stepped again, 3 states compared: equal bit by bit" in shown.out
+    document = cli("replay", file, "--json").json
+    assert document["equal"] is True
+    (found,) = document["environments"]
+    assert (found["env"], found["cause"], found["where"]["call"]) == (5, "BADQVEL", 3)
+
+
+def test_an_evaluation_outside_of_a_run_counts_by_cause_and_dumps_into_the_runs_folder(breaks, cli):
+    said = cli("eval", breaks, "--policy", "zero", "--episodes", "32", "--json")
+    assert said.code == 0
+    assert said.json["diverged_by"] == {"BADQVEL": said.json["diverged"]}
+    (file,) = Path("runs/dumps").iterdir()
+    assert str(file) in said.err
+    assert cli("replay", file).code == 0
+
+
+def test_a_dump_that_differs_from_what_the_task_gives_now_is_a_negative_verdict(dump, cli):
+    model = Path("coin/model.xml")
+    model.write_text(model.read_text().replace('type="slide"', 'type="slide" stiffness="10" springref="1"'))
+    shown = cli("replay", dump, "--json")
+    assert shown.code == 9
+    assert (shown.json["equal"], shown.json["same_model"]) == (False, False)
+    assert (shown.json["difference"]["env"], shown.json["difference"]["call"]) == (5, 0)
+    assert "the task's model is not what it was dumped with" in shown.err
+
+
+def test_a_dump_of_another_model_does_not_fit(dump, cli):
+    model = Path("coin/model.xml")
+    model.write_text(model.read_text().replace("</body>", '<joint name="more" type="slide" axis="1 0 0"/></body>'))
+    shown = cli("replay", dump)
+    assert shown.code == 5
+    assert "does not fit the installed task" in shown.err
+
+
+def test_a_folder_that_cannot_be_written_does_not_stop_the_evaluation(breaks, cli):
+    Path("runs").mkdir()
+    Path("runs/dumps").write_text("in the way")
+    said = cli("eval", breaks, "--policy", "zero", "--episodes", "32")
+    assert said.code == 0
+    assert "there is no dump" in said.err
+
+
+def test_options_of_recordings_are_refused_for_dumps(dump, cli):
+    assert cli("replay", dump, "--episode", "0").code == 2
+
+
+ATTACKS = {
+    "an endless call": {"world": {"nstep": [10**9] * 4}},
+    "calls that are not there": {"world": {"nstep": [1] * 5}},
+    "no environment": {"worlds": []},
+    "another format": {"format": 1},
+    "a key of its own": {"extra": "import os"},
+    "a number for a text": {"config": 7},
+    "states of another size": {"tensors": {"world.0.states": torch.zeros(4, 3, dtype=torch.float64),
+                                           "world.0.final": torch.zeros(3, dtype=torch.float64)}},
+    "states of whole numbers": {"tensors": {"world.0.states": torch.zeros(4, 12, dtype=torch.int64)}},
+    "an address in the model": {"tensors": {"world.0.model.jnt_qposadr": torch.tensor([2**30], dtype=torch.int32)}},
+    "a kind in the model": {"tensors": {"world.0.model.geom_type": torch.tensor([99, 99], dtype=torch.int32)}},
+    "no field of the model": {"tensors": {"world.0.model.__class__": torch.zeros(1)}},
+}  # fmt: skip
+
+
+@pytest.mark.timeout(60)  # a call of 1e9 steps takes many minutes
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_a_strangers_dump_is_refused_with_the_file_and_the_reason(dump, cli, attack):
+    changes = ATTACKS[attack]
+    if "worlds" in changes:
+        with safe_open(dump, "pt") as opened:
+            document = json.loads(opened.metadata()["rlcli"])
+        document["worlds"] = []
+        safetensors.torch.save_file({}, dump, metadata={"rlcli": json.dumps(document)})
+    else:
+        rewritten(dump, **{key: dict(value) if isinstance(value, dict) else value for key, value in changes.items()})
+    shown = cli("replay", dump)
+    assert shown.code == 5
+    assert str(dump) in shown.err
+
+
+def test_a_truncated_or_changed_dump_is_refused(dump):
+    whole = dump.read_bytes()
+    for end in range(0, len(whole), max(1, len(whole) // 25)):
+        dump.write_bytes(whole[:end])
+        with pytest.raises(CheckpointError):
+            read_trajectory(dump)
+    for place in range(0, len(whole), max(1, len(whole) // 40)):
+        changed = bytearray(whole)
+        changed[place] ^= 0x10
+        dump.write_bytes(changed)
+        with pytest.raises(CheckpointError):
+            read_trajectory(dump)
+    dump.write_bytes(whole)
+    assert replay_calls(read_trajectory(dump)).difference is None
+
+
+def test_a_header_that_is_nested_a_million_deep_is_refused(tmp_path):
+    file = tmp_path / "deep.safetensors"
+    safetensors.torch.save_file({"x": torch.zeros(1)}, file, metadata={"rlcli": "[" * 1_000_000})
+    with pytest.raises(CheckpointError, match="corrupt, or no recording or dump"):
+        read_trajectory(file)

@@ -1,0 +1,204 @@
+"""`rlcli play --env E --episode K` is, bit for bit, that episode of `rlcli eval`, or says what it depends on."""
+
+import json
+
+import pytest
+import torch
+from support.worlds import CRITTER_TASK, build, critter, edited
+
+from rlcli.evaluation.evaluate import evaluate
+from rlcli.replay.episode_recorder import EpisodeRecorder
+from rlcli.replay.rerun_episode import run_episode, start_episode
+from rlcli.replay.trajectory import read_trajectory
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+ENVS, WHO, EPISODE, SEED = 5, 3, 4, 11
+COMMANDS = {"walk": {"func": "uniform_velocity", "resampling_time_s": [0.1, 0.3], "lin_vel_x": [-1.0, 1.0]}}
+EVENTS = {
+    "push": None,
+    "shove": None,
+    "mass": {"func": "randomize_body_mass", "mode": "reset", "range": [0.5, 1.5]},
+    "friction": {"func": "randomize_geom_friction", "mode": "startup", "range": [0.5, 1.5]},
+    "spin": {"func": "reset_joints_by_offset", "mode": "reset", "joints": ["hip_.."], "position": [-0.2, 0.2],
+             "velocity": [-1.0, 1.0]},
+}  # fmt: skip
+INTERVALS = {
+    "push": {"func": "push_by_setting_velocity", "mode": "interval", "interval_range_s": [0.1, 0.3],
+             "linear_velocity": [[-1.0, 1.0], [-1.0, 1.0], [0.0, 0.0]]},
+    "gravity": {"func": "randomize_gravity", "mode": "interval", "range": [-1, 1], "interval_range_s": [0.1, 0.3],
+                "global_time": True},
+}  # fmt: skip
+SOMETIMES = {"mass": {**EVENTS["mass"], "min_steps_between": 70}}
+ASKED = {"policy": {"asked": {"func": "generated_commands", "command": "walk"}}}
+OWN = {"func": "noise", "weight": 1.0}
+NOISE = {"policy": {"asked": {"func": "joint_vel_rel", "noise": {"kind": "gaussian", "std": 0.1}}}}
+CONNECTED = {
+    "commands": ({"events": EVENTS, "commands": COMMANDS, "observations": ASKED}, "commands.walk"),
+    "intervals": ({"events": {**EVENTS, **INTERVALS}}, "events.gravity"),
+    "throttled resets": ({"events": {**EVENTS, **SOMETIMES}}, "events.mass"),
+    "noise": ({"events": EVENTS, "observations": NOISE}, "observations.policy.asked"),
+}
+"""Change of the critter -> what connects its episodes."""
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+def policy(env):
+    """Something that depends on every observation, and on nothing else."""
+    generator = torch.Generator().manual_seed(3)
+    weights = torch.randn(env.layout.size(), env.layout.action_size, generator=generator)
+    return lambda obs: (obs @ weights).tanh()
+
+
+def made(task):
+    torch.manual_seed(SEED)
+    return build(task, ENVS, "episode_length_s=0.3", seed=SEED)
+
+
+def recorded(task, tmp_path):
+    """The states, actions and rewards of the episode in the whole evaluation, and those of the one alone."""
+    env = made(task)
+    whole, count = tmp_path / "whole.safetensors", ENVS * (EPISODE + 1)
+    with EpisodeRecorder(env, count) as recorder:
+        evaluate(env, policy(env), count)
+    recorder.save(whole)
+    env = made(task)
+    start = start_episode(env, policy(env), WHO, EPISODE)
+    with EpisodeRecorder(env, 1, only=WHO) as recorder:
+        run_episode(env, policy(env), start.obs, WHO)
+    recorder.save(tmp_path / "one.safetensors")
+    recording = read_trajectory(whole)
+    number = [n for n, e in enumerate(recording.header.episodes) if e.env == WHO][EPISODE]
+    return parts(recording, number), parts(read_trajectory(tmp_path / "one.safetensors"), 0), start
+
+
+def parts(recording, number):
+    prefix = f"episode.{number}."
+    return {n.removeprefix(prefix): v for n, v in recording.tensors.items() if n.startswith(prefix)}
+
+
+def assert_same(left, right):
+    assert left.keys() == right.keys()
+    for name, value in left.items():
+        assert value.numpy().tobytes() == right[name].numpy().tobytes(), name
+
+
+@pytest.mark.parametrize("task", ["critter", "cartpole"])
+def test_an_episode_that_nothing_connects_to_those_before_it_is_begun_at_once(task, tmp_path):
+    place = critter(tmp_path, edited(CRITTER_TASK, events=EVENTS)) if task == "critter" else task
+    whole, one, start = recorded(place, tmp_path)
+    assert (start.episodes_before, start.reasons, start.shared_draws()) == (0, [], False)
+    assert_same(whole, one)
+
+
+@pytest.mark.parametrize("what", CONNECTED)
+def test_what_connects_episodes_is_named_and_those_before_it_are_lived(what, tmp_path):
+    change, named = CONNECTED[what]
+    task = critter(tmp_path, edited(CRITTER_TASK, **change))
+    whole, one, start = recorded(task, tmp_path)
+    assert start.episodes_before == EPISODE
+    assert named in start.reasons
+    assert not [other for _, other in CONNECTED.values() if other != named and other in start.reasons]
+    assert_same(whole, one)
+    env = made(task)  # the name is not said for nothing: begun at once it is another episode
+    with EpisodeRecorder(env, 1, only=WHO) as recorder:
+        run_episode(env, policy(env), env.reset(seed=SEED, episode=EPISODE)["policy"], WHO)
+    recorder.save(tmp_path / "other.safetensors")
+    other = parts(read_trajectory(tmp_path / "other.safetensors"), 0)
+    assert whole["qpos"].shape != other["qpos"].shape or not torch.equal(whole["qpos"], other["qpos"])
+
+
+def test_a_direct_task_lives_the_episodes_before(tmp_path):
+    whole, one, start = recorded("cartpole-direct", tmp_path)
+    assert start.episodes_before == EPISODE
+    assert start.reasons == ["the class CartpoleTask"]
+    assert_same(whole, one)
+
+
+@pytest.fixture
+def sampled(coin):
+    """The coin, thrown with torch's own generator, as ported tasks do."""
+    file = coin_file(coin)
+    text = file.read_text().replace("self.draws(env_ids).uniform(0.0, 1.0, (1,))[:, 0]", "torch.rand(len(env_ids))")
+    file.write_text(text)
+    return coin
+
+
+def coin_file(coin):
+    from pathlib import Path
+
+    return Path(coin) / "task.py"
+
+
+def test_a_task_that_draws_from_torchs_generator_says_that_other_numbers_of_environments_live_otherwise(sampled, cli):
+    arguments = ("--policy", "zero", "--env", "3", "--episode", "6", "--num-envs", "5")
+    said = cli("play", sampled, *arguments, "--json")
+    assert said.code == 0
+    assert said.json["shared_draws"] is True
+    assert "with another --num-envs than 5 the episode is another" in said.err
+    whole = cli("eval", sampled, "--policy", "zero", "--num-envs", "5", "--episodes", "35", "--record", "all.st")
+    assert whole.code == 0
+    mine = [e for e in read_trajectory(coin_file("").parent / "all.st").header.episodes if e.env == 3][6]
+    assert (said.json["length"], said.json["ended_by"]) == (mine.length, mine.causes)
+
+
+def test_a_reward_of_ones_own_that_draws_from_torchs_generator_is_found_and_the_episodes_are_lived(tmp_path):
+    task = critter(tmp_path, edited(CRITTER_TASK, events=EVENTS, rewards={"noise": OWN}))
+    (task / "terms.py").write_text(
+        'import torch\n\n\ndef noise(env):\n    """Noise. (num_envs,)"""\n    return torch.rand(env.num_envs)\n'
+    )
+    whole, one, start = recorded(task, tmp_path)
+    assert start.episodes_before == EPISODE
+    assert start.shared_draws()
+    assert_same(whole, one)
+
+
+def test_numbers_and_a_recording_are_those_of_the_evaluation(coin, cli):
+    said = cli("play", coin, "--policy", "zero", "--env", "40", "--episode", "2", "--record", "one.st", "--json")
+    assert said.code == 0
+    document = said.json
+    assert (document["num_envs"], document["env"], document["episode"], document["lived_before"]) == (41, 40, 2, 2)
+    assert cli("replay", "one.st").code == 0
+    assert (
+        cli("eval", coin, "--policy", "zero", "--num-envs", "41", "--episodes", "123", "--record", "all.st").code == 0
+    )
+    mine = [e for e in read_trajectory(coin_file("").parent / "all.st").header.episodes if e.env == 40][2]
+    assert (document["length"], document["return"], document["ended_by"]) == (
+        mine.length,
+        mine.total_reward,
+        mine.causes,
+    )
+    assert json.dumps(document)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--env", "3"], "--env needs --episode"),
+        (["--episode", "3"], "--episode needs --env"),
+        (["--env", "3", "--episode", "0", "--num-envs", "3"], "there is no environment 3 of 3"),
+        (["--env", "3", "--episode", "0", "--record-mode", "failed"], "--record-mode"),
+    ],
+)
+def test_what_names_no_episode_is_refused(coin, cli, arguments, said):
+    done = cli("play", coin, "--policy", "zero", *arguments)
+    assert done.code == 2
+    assert said in done.err
+
+
+@pytest.mark.slow
+def test_the_episode_is_drawn_and_its_frames_are_its_own(cli):
+    imageio = pytest.importorskip("imageio.v2")
+    arguments = ("--policy", "zero", "--env", "2", "--episode", "3")
+    shown = cli("play", "cartpole", *arguments, "--video", "one.gif", "--json")
+    assert shown.code == 0, shown.err
+    assert shown.json["length"] == cli("play", "cartpole", *arguments, "--json").json["length"]
+    frames = imageio.mimread("one.gif")
+    assert len(frames) == shown.json["frames"]
+    assert shown.json["frames"] > 1
+    assert frames[0].std() > 0
+    assert (frames[0] != frames[-1]).any()

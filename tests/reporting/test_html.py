@@ -1,0 +1,53 @@
+"""The card of a task as HTML, from the same data as its Markdown."""
+
+from html.parser import HTMLParser
+
+from rlcli.config.load import resolve
+from rlcli.registry import find_task
+from rlcli.reporting.html import card_html
+from rlcli.reporting.task_card import Card, Column, Table, task_card
+
+
+class Cells(HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.rows, self.inside = [], False
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "tr":
+            self.rows.append([])
+        elif tag in ("td", "th"):
+            self.rows[-1].append("")
+            self.inside = True
+
+    def handle_endtag(self, tag):
+        self.inside &= tag not in ("td", "th")
+
+    def handle_data(self, data):
+        if self.inside:
+            self.rows[-1][-1] += data
+
+
+def test_a_card_as_html_has_every_cell_of_its_tables():
+    content = task_card(resolve(find_task("cartpole")))
+    rows = [row for row in Cells(card_html(content)).rows if row]
+    wanted = []
+    for table in content.tables:
+        wanted.append([column.title for column in table.columns])
+        wanted += [[cell.replace("`", "") for cell in row] for row in table.rows]
+    assert rows == wanted
+
+
+def test_headings_begin_at_the_level_that_is_asked_for():
+    assert "<h5>Rewards</h5>" in card_html(task_card(resolve(find_task("cartpole"))), level=4)
+
+
+def test_text_of_a_card_is_escaped_and_only_names_are_code():
+    odd = "<script>alert(1)</script> `a<b` \u202e"
+    table = Table(odd, odd, (Column(odd, "code"), Column("B")), ((odd, "one ` alone"),))
+    text = card_html(Card(odd, odd, ((odd, odd),), (table,)))
+    assert "<script" not in text
+    assert "<code>a&lt;b</code>" in text
+    assert "one ` alone" in text
+    assert "\u202e" not in text

@@ -1,0 +1,193 @@
+"""The card of a task: what its MDP is, from configuration and docstrings, as data and as Markdown."""
+
+import json
+
+import pytest
+
+from rlcli.config.load import resolve
+from rlcli.config.schema import TaskConfig
+from rlcli.config.terms import Vocabulary
+from rlcli.registry import find_task
+from rlcli.reporting.task_card import Card, Column, Table, card, markdown, task_card
+
+NOISY = [
+    "observations.policy.joint_pos_rel.noise={kind: uniform, low: -0.01, high: 0.02}",
+    "observations.policy.joint_pos_rel.clip=[-5, 5]",
+    "observations.policy.joint_vel_rel.scale=0.25",
+    "observations.policy.joint_vel_rel.history=3",
+    "observations.policy.joint_vel_rel.delay={steps: [0, 2]}",
+    "observations.policy.joint_vel_rel.bias={kind: gaussian, std: 0.1}",
+    "observations.policy.joint_vel_rel.modifiers=[{kind: scale, factor: 2.0}]",
+]
+
+
+def built(task, *overrides, layout=None, **settings):
+    source = find_task(str(task))
+    compiled = json.loads((source.root / layout).read_text()) if layout else None
+    return task_card(resolve(source, overrides=overrides, **settings), compiled)
+
+
+def rows(content, title):
+    """A table's rows, by column; no table, no rows."""
+    table = next((table for table in content.tables if table.title == title), None)
+    titles = [column.title for column in table.columns] if table else []
+    return {row[0]: dict(zip(titles, row, strict=True)) for row in table.rows} if table else {}
+
+
+def test_observations_have_meaning_unit_size_and_elements():
+    terms = rows(built("cartpole", layout="task.layout.json"), "Observations: policy")
+    assert terms["joint_vel_rel"] == {
+        "Term": "joint_vel_rel",
+        "What": "Joint velocities less their defaults [m/s or rad/s].",
+        "Unit": "m/s or rad/s",
+        "Size": "2",
+        "Of": "slider_to_cart, cart_to_pole",
+    }
+
+
+def test_what_is_done_to_an_observation_is_on_the_card():
+    terms = rows(built("cartpole", *NOISY), "Observations: policy")
+    assert terms["joint_pos_rel"]["Noise"] == "+ uniform [-0.01, 0.02]"
+    assert terms["joint_pos_rel"]["Clip"] == "[-5, 5]"
+    velocity = terms["joint_vel_rel"]
+    assert velocity["Scale"] == "x 0.25"
+    assert velocity["History"] == "3 steps"
+    assert velocity["Delay"] == "[0, 2] steps"
+    assert velocity["Bias"] == "+ normal, mean 0, std 0.1"
+    assert velocity["Modifiers"] == "scale factor: 2"
+
+
+def test_noise_that_is_switched_off_is_not_on_the_card():
+    content = built("cartpole", *NOISY, "observations.policy.enable_corruption=false")
+    terms = rows(content, "Observations: policy")
+    assert not {"Noise", "Bias", "Delay"} & set(terms["joint_vel_rel"])
+    assert "Without noise" in next(t for t in content.tables if t.title == "Observations: policy").note
+
+
+def test_rewards_have_weight_formula_and_parameters():
+    content = built("cartpole", "rewards.pole_pos.weight=-2.5", "rewards.pole_pos.target=0.125")
+    term = rows(content, "Rewards")["pole_pos"]
+    assert term["Weight"] == "-2.5"
+    assert term["Value"] == "Squared joint deviation from `target` [rad^2], positions wrapped to [-pi, pi]."
+    assert term["Parameters"] == "`joints` = [cart_to_pole], `target` = 0.125"
+    note = next(table for table in content.tables if table.title == "Rewards").note
+    assert "0.0166667 s" in note
+    unscaled = next(t for t in built("cartpole", "reward_dt_scaling=false").tables if t.title == "Rewards").note
+    assert "0.0166667" not in unscaled
+
+
+def test_a_term_that_was_removed_is_not_on_the_card():
+    assert "pole_vel" not in rows(built("cartpole", "rewards.pole_vel=null"), "Rewards")
+
+
+def test_terminations_tell_truncation_from_termination():
+    terms = rows(built("cartpole"), "Terminations")
+    assert terms["time_out"]["What it does"] == "truncates"
+    assert terms["cart_out_of_bounds"]["What it does"] == "terminates"
+    assert "`bounds` = [-3, 3]" in terms["cart_out_of_bounds"]["Parameters"]
+
+
+def test_events_have_their_time_and_ranges():
+    content = built(
+        "cartpole",
+        "events.push={func: push_by_setting_velocity, mode: interval, interval_range_s: [2, 4]}",
+        "events.mass={func: randomize_body_mass, mode: startup, bodies: pole, range: [0.8, 1.2]}",
+    )
+    terms = rows(content, "Events and randomisation")
+    assert terms["reset_cart"]["When"] == "at every reset"
+    assert "`position` = [-1, 1]" in terms["reset_cart"]["Ranges and parameters"]
+    assert terms["push"]["When"] == "every 2 to 4 s"
+    assert terms["mass"]["When"] == "once, at the start"
+    assert "`range` = [0.8, 1.2]" in terms["mass"]["Ranges and parameters"]
+
+
+def test_models_of_actuators_are_on_the_card():
+    drive = "{joints: slider_to_cart, kind: pd, stiffness: 5, damping: 1, effort_limit: 9, delay: [1, 3]}"
+    terms = rows(built("cartpole", f"scene.entities.robot.actuators={{drive: {drive}}}"), "Actuators")
+    assert terms["drive"]["Kind"] == "pd"
+    assert "stiffness: 5, damping: 1, effort_limit: 9" in terms["drive"]["Settings"]
+    assert "delay: [1, 3]" in terms["drive"]["Settings"]
+
+
+def test_tables_and_columns_without_content_are_left_out():
+    content = built("cartpole")
+    titles = [table.title for table in content.tables]
+    assert not {"Commands", "Curriculum", "Sensors", "Parameters"} & set(titles)
+    assert all(any(row[i] for row in table.rows) for table in content.tables for i in range(len(table.columns)))
+
+
+def test_a_direct_task_has_its_parameters_and_the_words_of_its_hooks():
+    content = built("cartpole-direct", "params.max_effort=250", layout="direct.layout.json")
+    assert rows(content, "Parameters")["max_effort"] == {
+        "Parameter": "max_effort", "Value": "250", "What": "Force at action 1 [N].", "Default": "400",
+    }  # fmt: skip
+    words = rows(content, "In the task's words")
+    assert words["Reward"]["What"] == "Upright and calm is good, out of bounds costs 2."
+    assert words["Start of an episode"]["Hook"] == "reset_idx"
+    assert rows(content, "Observations: policy")["pole_vel"]["Unit"] == "rad/s"
+    assert dict(content.facts)["Observations are clipped to"] == "±5"
+
+
+def test_hooks_that_a_direct_task_inherits_have_their_words_too(tmp_path):
+    source = find_task("cartpole-direct")
+    for name in ("direct.yaml", "cartpole.xml"):
+        (tmp_path / name.replace("direct", "task")).write_text((source.root / name).read_text())
+    (tmp_path / "base.py").write_text(
+        'raise SystemExit("run")\nfrom rlcli.envs.direct import DirectTask\n\n'
+        'class Other(DirectTask):\n    """Not said."""\n    def reset(self, selection):\n        """From below."""\n'
+        '    def is_done(self):\n        """Replaced."""\n'
+    )
+    (tmp_path / "task.py").write_text(
+        'from .base import Other as Base\n\nclass Task(Base):\n    """Balance."""\n'
+        '    def is_done(self):\n        """Never."""\n\n    class Params:\n'
+        "        reset_dist: float = 1.0\n        max_effort: float = 1.0\n        pole_vel_weight: float = 1.0\n"
+    )
+    words = rows(built(tmp_path), "In the task's words")
+    assert {row["Hook"]: row["What"] for row in words.values()} == {
+        "Task": "Balance.", "reset": "From below.", "is_done": "Never."}  # fmt: skip
+
+
+def test_nothing_of_a_tasks_code_runs_for_its_card(tmp_path):
+    source = find_task("cartpole")
+    (tmp_path / "task.yaml").write_text(source.config.read_text().replace("func: is_alive", "func: mine"))
+    (tmp_path / "cartpole.xml").write_text((source.root / "cartpole.xml").read_text())
+    (tmp_path / "terms.py").write_text(
+        'raise SystemExit("run")\ndef mine(env):\n    """How well\n    it goes [1]. (num_envs,)\n\n    More.\n    """\n'
+    )
+    assert rows(built(tmp_path), "Rewards")["alive"]["Value"] == "How well it goes [1]."
+
+
+def test_a_configuration_alone_has_a_card_with_the_names_of_unknown_terms():
+    task = TaskConfig.model_validate_json(
+        json.dumps(
+            {
+                "sim": {"dt": 0.01}, "decimation": 1, "episode_length_s": 1.0,
+                "scene": {"entities": {"robot": {"model": "x.xml"}}},
+                "rewards": {"mine": {"func": "of_its_own", "weight": 2.0, "gain": 3.0}},
+            }
+        )
+    )  # fmt: skip
+    term = rows(card(task, Vocabulary(), name="x"), "Rewards")["mine"]
+    assert (term["Value"], term["Parameters"]) == ("`of_its_own`", "`gain` = 3")
+
+
+@pytest.mark.parametrize("task", ["cartpole", "cartpole-direct", "ant-direct"])
+def test_every_built_in_task_has_a_card_whose_markdown_keeps_its_tables(task):
+    content = built(task)
+    lines = markdown(content, level=2).splitlines()
+    assert lines[0] == f"## {task}"
+    for table in content.tables:
+        start = lines.index(f"### {table.title}".replace("_", r"\_"))
+        first = next(i for i in range(start, len(lines)) if lines[i].startswith("| "))
+        widths = {line.replace("\\|", "").count("|") for line in lines[first : first + 2 + len(table.rows)]}
+        assert widths == {len(table.columns) + 1}
+
+
+def test_markdown_shows_text_as_it_is():
+    odd = "<script>alert(1)</script> a|b *c* _d_ [e](f) `g|h` # i\nj"
+    table = Table("T", "", (Column("A", "code"), Column("B")), ((odd, odd), ("a`b", "`")))
+    text = markdown(Card("n", odd, (("key", odd),), (table,)))
+    assert "<script" not in text.replace("`<script>", "")
+    assert "&lt;script&gt;" in text
+    assert r"a\|b \*c\* \_d\_ \[e\](f) `g\|h`" in text
+    assert text.count("\n| ") == len([line for line in text.splitlines() if line.startswith("|")])

@@ -1,0 +1,6 @@
+"""Fixtures of the tests in this folder."""
+
+from support.command_line import cli, coin, empty_folder, only_run
+from support.exported_runs import newest, runs
+from support.scheduled_task import make, scheduled
+from support.torch_threads import _one_torch_thread

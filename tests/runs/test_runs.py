@@ -1,0 +1,194 @@
+"""Run folders and how a command line names them."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from support.saved_states import state_of
+
+from rlcli.errors import CheckpointError, MachineError, UsageError
+from rlcli.runs.run import create_run, open_run
+from rlcli.runs.run_ref import find_checkpoint, find_run, list_runs
+from rlcli.training import checkpoint_writer
+
+RECORD = {"task": {"name": "cartpole", "distribution": "rlcli"}, "seed": 1}
+
+
+def make_run(runs, task="cartpole", name=None, steps=(), **entries):
+    record = {**RECORD, "task": {"name": task, "distribution": "rlcli"}, **entries}
+    run = create_run(runs, task, name, "a: 1\n", record)
+    run.unlock()
+    for step in steps:
+        checkpoint_writer.write_checkpoint(run.checkpoints, step, state_of(), {})
+    return run
+
+
+def test_a_run_has_its_configuration_and_record_at_once(tmp_path):
+    run = make_run(tmp_path / "runs", name="test")
+    assert run.folder.parent == tmp_path / "runs" / "cartpole"
+    assert run.folder.name.endswith("-test")
+    assert ":" not in run.folder.name
+    assert run.config.read_text() == "a: 1\n"
+    assert json.loads((run.folder / "run.json").read_text())["state"] == "running"
+    assert not [p for p in run.folder.iterdir() if ".tmp" in p.name]
+
+
+FIVE = """
+import json, sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from rlcli.runs.run import create_run
+def create(_):
+    return str(create_run(Path(sys.argv[1]), "cartpole", None, "a: 1", json.loads(sys.argv[2])).folder)
+print(json.dumps(list(ThreadPoolExecutor(5).map(create, range(5)))))
+"""
+
+
+def test_twenty_at_once_make_twenty_folders(tmp_path):
+    command = [sys.executable, "-c", FIVE, str(tmp_path), json.dumps(RECORD)]
+    children = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(4)]
+    folders = [folder for child in children for folder in json.loads(child.communicate()[0])]
+    assert len(set(folders)) == 20
+    assert len(list_runs(tmp_path, "cartpole")) == 20
+
+
+@pytest.mark.parametrize("name", ["a/b", "..", "a:b", "", "é", "a b", "-x"])
+def test_a_name_that_cannot_be_part_of_a_folder_is_refused(tmp_path, name):
+    with pytest.raises(UsageError, match="folder's name"):
+        make_run(tmp_path, name=name)
+
+
+def test_a_second_writer_is_refused(tmp_path):
+    run = make_run(tmp_path)
+    holder = subprocess.Popen(
+        [sys.executable, "-c",
+         "import sys; from pathlib import Path; from rlcli.runs.run import open_run;"
+         "r = open_run(Path(sys.argv[1])); r.lock(); print('held', flush=True); sys.stdin.read()", str(run.folder)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert holder.stdout.readline() == "held\n"
+    with pytest.raises(MachineError, match="written to by another process"):
+        open_run(run.folder).lock()
+    holder.communicate()
+    run.lock()
+    run.unlock()
+
+
+def test_a_killed_writer_locks_nobody_out(tmp_path):
+    run = make_run(tmp_path)
+    subprocess.run(
+        [sys.executable, "-c",
+         "import os, sys; from pathlib import Path; from rlcli.runs.run import open_run;"
+         "r = open_run(Path(sys.argv[1])); r.lock(); os.kill(os.getpid(), 9)", str(run.folder)],
+    )  # fmt: skip
+    run.lock()
+    run.unlock()
+
+
+def test_latest_is_the_newest_started_of_the_task_given(tmp_path):
+    old, new = make_run(tmp_path), make_run(tmp_path, name="aaa")
+    other = make_run(tmp_path, task="ant")
+    assert find_run("latest", tmp_path)[0].folder == other.folder
+    run, why = find_run("latest", tmp_path, "cartpole")
+    assert run.folder == new.folder != old.folder
+    assert "newest run of cartpole" in why
+
+
+def test_a_run_is_found_by_name_and_by_folder(tmp_path):
+    run = make_run(tmp_path, name="one")
+    for reference in (run.folder.name, str(run.folder), f"cartpole/{run.folder.name}"):
+        assert find_run(reference, tmp_path)[0].folder.resolve() == run.folder.resolve()
+
+
+def test_a_near_miss_is_suggested(tmp_path):
+    run = make_run(tmp_path, name="one")
+    with pytest.raises(CheckpointError) as caught:
+        find_run(run.folder.name[:-1], tmp_path)
+    assert run.folder.name in caught.value.hint
+
+
+def test_a_name_too_long_for_the_system_is_no_run(tmp_path):
+    with pytest.raises(CheckpointError, match="no run 'aaaa"):
+        find_checkpoint("a" * 5000, tmp_path)
+
+
+def test_no_run_at_all_says_how_to_make_one(tmp_path):
+    with pytest.raises(CheckpointError, match="no run of cartpole") as caught:
+        find_run("latest", tmp_path / "nowhere", "cartpole")
+    assert "rlcli train cartpole" in caught.value.hint
+
+
+def test_a_run_of_another_task_is_refused(tmp_path):
+    run = make_run(tmp_path, task="ant")
+    with pytest.raises(UsageError, match="run of ant, not of cartpole"):
+        find_run(str(run.folder), tmp_path, "cartpole")
+
+
+def test_checkpoints_by_run_best_step_and_folder(tmp_path):
+    run = make_run(tmp_path, steps=(0, 9, 10), best=9)
+    name = run.folder.name
+    for reference, step in ((name, 10), (f"{name}@best", 9), (f"{name}@step:0", 0), ("latest", 10), ("latest@best", 9)):
+        assert int(find_checkpoint(reference, tmp_path)[1].name) == step, reference
+    direct = find_checkpoint(str(run.checkpoints / "000000000009"), tmp_path)
+    assert direct[0].folder == run.folder.resolve()
+    assert direct[1] == run.checkpoints / "000000000009"
+
+
+@pytest.mark.parametrize(
+    ("which", "message", "hint"),
+    [
+        ("@step:7", "no checkpoint at step 7", "steps: 0, 9, 10"),
+        ("@best", "no best checkpoint", "leave out @best"),
+        ("@newest", "does not name a checkpoint", "RUN@step:N"),
+        ("@step:x", "does not name a checkpoint", "RUN@step:N"),
+        ("@step:²", "does not name a checkpoint", "RUN@step:N"),
+        ("@step:" + "9" * 5000, "does not name a checkpoint", "RUN@step:N"),
+    ],
+)
+def test_a_checkpoint_that_is_not_there_says_what_is(tmp_path, which, message, hint):
+    run = make_run(tmp_path, steps=(0, 9, 10))
+    with pytest.raises(CheckpointError, match=message) as caught:
+        find_checkpoint(run.folder.name + which, tmp_path)
+    assert hint in caught.value.hint
+
+
+def test_a_folder_with_an_at_sign_is_a_folder(tmp_path):
+    run = make_run(tmp_path / "user@host", steps=(3,))
+    assert find_checkpoint(str(run.folder), tmp_path)[1].name == "000000000003"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"", b"{", b"[]", b"\xff", b"{}", b'{"task": 1}', b'{"task": {}}', b'{"task": {"name": 1}}',
+        b'{"task": {"name": "x"}, "seed": 1}', b'{"task": {"name": "x", "distribution": "d"}}',
+    ],
+)  # fmt: skip
+def test_a_damaged_record_is_a_checkpoint_error_and_does_not_hide_other_runs(tmp_path, content):
+    good, bad = make_run(tmp_path, steps=(1,)), make_run(tmp_path)
+    (bad.folder / "run.json").write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"run\.json is corrupt"):
+        find_run(str(bad.folder), tmp_path)
+    assert find_run("latest", tmp_path)[0].folder == good.folder
+
+
+def test_a_runs_folder_that_is_a_file_is_a_machine_error(tmp_path):
+    (tmp_path / "runs").touch()
+    with pytest.raises(MachineError, match="cannot write"):
+        make_run(tmp_path / "runs")
+    with pytest.raises(CheckpointError, match="no run"):
+        find_run("latest", tmp_path / "runs")
+
+
+def test_a_disk_that_fills_while_a_run_is_made_leaves_no_folder(tmp_path, monkeypatch):
+    import os
+
+    def full(handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(MachineError, match="No space left") as caught:
+        make_run(tmp_path)
+    assert "free some space" in caught.value.hint
+    assert list((tmp_path / "cartpole").iterdir()) == []

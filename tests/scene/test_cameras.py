@@ -1,0 +1,367 @@
+"""Cameras of a scene, on boxes whose places, sizes and colours are known."""
+
+import math
+import os
+import subprocess
+import sys
+import threading
+
+import pytest
+import torch
+from support.worlds import build, dump, edited, write
+
+from rlcli.errors import ConfigError, MachineError
+
+torch.set_num_threads(1)
+
+BOXES = """
+<mujoco>
+  <default><geom contype="0" conaffinity="0" density="1000"/></default>
+  <worldbody>
+    <body name="slab" pos="2.05 0 1"><geom name="slab" type="box" size="0.05 0.4 0.2" rgba="1 0 0 1"/></body>
+    <body name="up" pos="4 0 3"><geom type="box" size="0.1 0.1 0.1" rgba="0 1 0 1"/></body>
+    <body name="left" pos="4 2 1"><geom type="box" size="0.1 0.1 0.1" rgba="0 0 1 1"/></body>
+    <body name="cart" pos="0 0 5"><joint name="slide" type="slide" axis="0 1 0"/>
+      <geom name="cart" type="sphere" size="0.2" rgba="1 1 1 1"/>
+      <camera name="ahead" xyaxes="0 -1 0 0 0 1" fovy="60"/></body>
+  </worldbody>
+</mujoco>
+"""
+TASK = {
+    "decimation": 2,
+    "episode_length_s": 0.06,
+    "sim": {"dt": 0.01, "gravity": [0.0, 0.0, 0.0]},
+    "scene": {"num_envs": 3, "ground": None, "entities": {"robot": {"model": "boxes.xml"}}},
+    "actions": {"push": {"func": "joint_effort"}},
+    "observations": {"policy": {"pos": {"func": "joint_pos"}}},
+    "events": {
+        "start": {"func": "reset_joints_by_offset", "mode": "reset", "position": [-0.5, 0.5], "velocity": [0.5, 2.0]}
+    },
+    "rewards": {"alive": {"func": "is_alive", "weight": 1.0}},
+    "terminations": {"time_out": {"func": "time_out", "time_out": True}},
+}
+FRONT = {
+    "kind": "camera",
+    "data": "depth",
+    "width": 41,
+    "height": 31,
+    "eye": [0, 0, 1],
+    "lookat": [1, 0, 1],
+    "fov": 60.0,
+}
+CART = {"kind": "camera", "data": "depth", "width": 64, "height": 24, "eye": [-3, 0, 5], "lookat": [0, 0, 5]}
+
+
+@pytest.fixture
+def boxes(tmp_path):
+    """Environments with cameras; they are closed behind a test."""
+    made = []
+
+    def make(sensors, *overrides, num_envs=3, **changes):
+        folder = tmp_path / f"boxes{len(made)}"
+        task = edited(dump(TASK), scene={"sensors": sensors}, **changes)
+        env = build(write(folder, task, boxes_xml=BOXES), num_envs, *overrides)
+        made.append(env)
+        env.reset(seed=1)
+        return env
+
+    yield make
+    for env in made:
+        env.close()
+
+
+def picture(env, name="camera"):
+    return env.sensors[name].image
+
+
+def step(env, count=1):
+    for _ in range(count):
+        result = env.step(torch.zeros(env.num_envs, 1))
+    return result
+
+
+# --- what is seen ---
+
+
+def test_depth_is_metres_along_the_axis_and_nothing_is_0(boxes):
+    depth = picture(boxes({"camera": FRONT}))[0, :, :, 0]
+    assert depth.shape == (31, 41)
+    assert depth[15, 20].item() == pytest.approx(2.0, abs=1e-4)  # the face of the slab
+    assert depth[0, 0].item() == 0.0
+    # 15.5 pixels from the middle are tan(30 degrees): the slab of 0.8 x 0.4 m at 2 m is 10.7 pixels wide and 5.4 high
+    slab = (depth - 2.0).abs() < 1e-3
+    assert slab.any(dim=0).sum() == 11
+    assert slab.any(dim=1).sum() == 5
+
+
+def test_distance_is_that_from_the_camera(boxes):
+    env = boxes({"depth": FRONT, "distance": {**FRONT, "data": "distance"}})
+    depth, distance = picture(env, "depth")[0, :, :, 0], picture(env, "distance")[0, :, :, 0]
+    pixel = math.tan(math.radians(30.0)) / 15.5
+    rows, columns = torch.meshgrid(torch.arange(31) - 15, torch.arange(41) - 20, indexing="ij")
+    along = torch.sqrt(1.0 + (pixel * rows) ** 2 + (pixel * columns) ** 2)
+    torch.testing.assert_close(distance, depth * along, rtol=1e-5, atol=0.0)
+    assert distance.max() > depth.max() > 0.0
+
+
+def test_pictures_agree_with_rays(boxes):
+    """Where neighbours are alike, and so no edge runs through the pixel."""
+    env = boxes({"camera": {**FRONT, "data": "distance"}})
+    seen = picture(env)[:, :, :, 0]
+    pixel = math.tan(math.radians(30.0)) / 15.5
+    rows, columns = torch.meshgrid(torch.arange(31) - 15, torch.arange(41) - 20, indexing="ij")
+    ways = torch.stack([torch.ones(31, 41), -pixel * columns, -pixel * rows], dim=-1).view(1, -1, 3)
+    ways = torch.nn.functional.normalize(ways, dim=2).expand(3, -1, -1)
+    rays = env.engine.rays(torch.tensor([0.0, 0.0, 1.0]).expand(ways.shape), ways).view(3, 31, 41).clamp(min=0.0)
+    far = torch.nn.functional.max_pool2d(rays[:, None], 3, 1, 1)[:, 0]
+    near = -torch.nn.functional.max_pool2d(-rays[:, None], 3, 1, 1)[:, 0]
+    plain = (far - near) < 0.05
+    assert (plain & (rays > 0.0)).sum() > 30
+    torch.testing.assert_close(seen[plain], rays[plain], rtol=1e-3, atol=1e-3)
+
+
+def test_up_is_up_and_left_is_left(boxes):
+    colours = picture(boxes({"camera": {**FRONT, "data": "rgb", "fov": 80.0}}))[0].int()
+    assert colours.shape == (31, 41, 3)
+    green = (colours[..., 1] > colours[..., 0] + 40).nonzero()
+    blue = (colours[..., 2] > colours[..., 0] + 40).nonzero()
+    red = (colours[..., 0] > colours[..., 1] + 40).nonzero()
+    assert green[:, 0].max() < 10  # above the middle row, 15
+    assert green[:, 1].float().mean().item() == pytest.approx(20.0, abs=0.6)
+    assert blue[:, 1].max() < 14  # to the left of the middle column, 20
+    assert blue[:, 0].float().mean().item() == pytest.approx(15.0, abs=0.6)
+    assert red.float().mean(dim=0).tolist() == pytest.approx([15.0, 20.0], abs=0.6)
+    assert colours[0, 0].tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("clip", "seen"),
+    [([0.01, 20.0], {2.0, 3.9}), ([0.01, 3.0], {2.0}), ([2.5, 20.0], {3.9}), ([0.5, 1.5], set())],
+)
+def test_what_is_nearer_or_farther_than_the_clip_is_not_seen(boxes, clip, seen):
+    depth = picture(boxes({"camera": {**FRONT, "fov": 80.0, "clip": clip}}))[0]
+    values = depth[depth > 0.0]
+    found = {2.0: ((values - 2.0).abs() < 1e-2).any(), 3.9: ((values - 3.9).abs() < 1e-2).any()}
+    assert {metres for metres, there in found.items() if there} == seen
+    assert bool(((depth == 0.0) | ((depth >= clip[0] - 1e-3) & (depth <= clip[1]))).all())
+
+
+@pytest.mark.parametrize("data", ["depth", "rgb"])
+def test_a_pixel_is_the_mean_of_its_samples(boxes, data):
+    soft = {**FRONT, "data": data, "width": 12, "height": 9, "samples": 3}
+    fine = {**soft, "width": 36, "height": 27, "samples": 1}
+    env = boxes({"soft": soft, "fine": fine})
+    blocks = picture(env, "fine").float().unflatten(2, (12, 3)).unflatten(1, (9, 3)).mean(dim=(2, 4))
+    assert len(blocks.unique()) > 4  # some edges run through pixels
+    torch.testing.assert_close(picture(env, "soft").float(), blocks, rtol=1e-5, atol=0.51 if data == "rgb" else 1e-5)
+
+
+def test_a_camera_may_look_straight_down(boxes):
+    down = {
+        "kind": "camera",
+        "data": "depth",
+        "width": 9,
+        "height": 9,
+        "eye": [4, 2, 3],
+        "lookat": [4, 2, 1],
+        "fov": 20.0,
+    }
+    depth = picture(boxes({"camera": down}))[0, :, :, 0]
+    assert depth[4, 4].item() == pytest.approx(1.9, abs=1e-4)
+    assert depth[0, 4].item() == 0.0
+
+
+def test_a_camera_of_the_mjcf_moves_with_its_body(boxes):
+    """The cart's camera slides past the slab's edge, 2 m ahead and 4 m below: one placed by hand sees the same."""
+    own = {"kind": "camera", "data": "depth", "width": 40, "height": 40, "entity": "robot", "camera": "ahead"}
+    held = {**own, "camera": None, "body": "cart", "eye": [0, 0, 0], "lookat": [1, 0, 0], "fov": 60.0}
+    del held["camera"]
+    env = boxes({"own": own, "held": held})
+    pictures = picture(env, "own").clone()
+    torch.testing.assert_close(picture(env, "held"), pictures, rtol=1e-5, atol=1e-5)
+    assert pictures.amax(dim=(1, 2, 3)).min() > 0.0
+    assert not torch.equal(pictures[0], pictures[1])  # the carts are in different places
+
+
+# --- when it is drawn ---
+
+
+def test_each_environment_has_the_picture_of_its_own_state(boxes):
+    env = boxes({"camera": CART}, num_envs=5)
+    for _ in range(2):
+        y = env.entities["robot"].data.joint_pos[:, 0]
+        columns = (picture(env)[..., 0] > 0.0).float().sum(dim=1)
+        middle = (columns * torch.arange(64)).sum(dim=1) / columns.sum(dim=1)
+        pixel = 24 / (2.0 * 2.9 * math.tan(math.radians(22.5)))  # pixels a metre where the sphere is seen
+        assert (middle - (31.5 - pixel * y)).abs().max() < 0.6
+        step(env, 2)
+
+
+def test_the_last_picture_of_an_episode_is_of_its_last_state_and_the_next_of_the_new_one(boxes):
+    observations = {"policy": {"image": {"func": "image", "sensor": "camera"}, "pos": {"func": "joint_pos"}}}
+    env = boxes({"camera": CART}, observations=observations)
+    env.reset(seed=4)
+    step(env, 2)
+    ending = step(env)
+    assert bool(ending.truncated.all())
+    last = ending.final_obs["policy"]
+    (pos,) = env.engine.field("qpos").T
+    torch.testing.assert_close(ending.obs["policy"][:, -1].double(), pos, rtol=1e-6, atol=1e-6)
+    assert (last[:, -1] - ending.obs["policy"][:, -1]).abs().min() > 0.01
+    for seen in (last.clone(), ending.obs["policy"].clone()):
+        qpos = env.engine.field("qpos")
+        qpos[:, 0] = seen[:, -1].double()
+        env.sensors["camera"].update(0.02)
+        torch.testing.assert_close(seen[:, :-1], picture(env).flatten(1), rtol=0.0, atol=1e-5)
+
+
+def test_an_environment_that_begins_anew_is_drawn_anew_and_the_others_are_not(boxes):
+    env = boxes({"camera": CART})
+    before = picture(env).clone()
+    env.engine.field("qpos")[:, 0] = torch.tensor([0.4, 0.4, 0.4]).double()
+    begun = env._select(torch.tensor([False, True, False]))
+    env.sensors["camera"].reset(begun)
+    after = picture(env)
+    assert torch.equal(after[[0, 2]], before[[0, 2]])
+    assert not torch.equal(after[1], before[1])
+    env.sensors["camera"].update(0.02)
+    assert torch.equal(picture(env)[0], picture(env)[1])
+
+
+def test_threads_change_nothing(boxes):
+    sensors = {"camera": CART, "colours": {**FRONT, "data": "rgb", "samples": 2}}
+    one, four = (boxes(sensors, f"sim.engine_threads={n}", num_envs=7) for n in (1, 4))
+    assert (one.sensors["camera"]._renderers.count, four.sensors["camera"]._renderers.count) == (1, 4)
+    for _ in range(4):
+        for name in sensors:
+            assert torch.equal(picture(one, name), picture(four, name))
+        step(one), step(four)
+
+
+def test_model_fields_of_a_worlds_own_show(boxes):
+    env = boxes({"camera": CART})
+    sizes = env.engine.expand("geom_size")
+    sizes[1, env.engine.model.geom("robot/cart").id] = 0.4
+    env.sensors["camera"].update(0.02)
+    seen = (picture(env) > 0.0).sum(dim=(1, 2, 3))
+    assert seen[1] > 3 * seen[0]
+    assert abs(int(seen[0]) - int(seen[2])) < 0.5 * int(seen[0])
+
+
+# --- what cannot be ---
+
+
+def test_the_gpu_engine_has_no_cameras(boxes):
+    with pytest.raises(ConfigError, match="cameras draw on a CPU: the GPU engine has none"):
+        boxes({"camera": CART}, "sim.engine=warp")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"entity": "robot", "camera": "ahed"}, "no camera 'ahed' in the MJCF of 'robot'; did you mean 'ahead'"),
+        ({"entity": "robot", "body": "wing"}, "wing"),
+        ({"entity": "car"}, "no entity 'car' in the scene"),
+        ({"camera": "ahead"}, "those of an entity: name it"),
+        ({"entity": "robot", "camera": "ahead", "fov": 30.0}, "has its own place and field of view: leave fov out"),
+        ({"clip": [2.0, 1.0]}, "2 is not below 1"),
+        ({"eye": [1, 0, 1]}, "eye and lookat are one point"),
+        ({"data": "colour"}, "data"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused_by_its_key(boxes, change, said):
+    camera = {**FRONT, **change}
+    if "camera" in change and "entity" in change:
+        camera = {key: value for key, value in camera.items() if key not in ("eye", "lookat", "fov")} | change
+    with pytest.raises(ConfigError) as refused:
+        boxes({"camera": camera})
+    (problem,) = refused.value.problems
+    assert problem.path.startswith("scene.sensors.camera")
+    assert said in f"{problem.message}; {problem.hint} {problem.path}"
+
+
+def test_closing_ends_the_threads_and_drawing(boxes):
+    before = threading.active_count()
+    env = boxes({"camera": CART}, "sim.engine_threads=2")
+    assert threading.active_count() == before + 2
+    env.close()
+    env.close()
+    assert threading.active_count() == before
+    env.sensors["camera"].update(0.02)
+    with pytest.raises(MachineError, match="the environment is closed"):
+        picture(env)
+
+
+def test_what_goes_wrong_in_a_thread_is_raised_where_somebody_looks(boxes):
+    env = boxes({"camera": CART})
+    renderers = env.sensors["camera"]._renderers
+
+    def fail(renderer):
+        raise ValueError("out of paint")
+
+    with pytest.raises(ValueError, match="out of paint"):
+        renderers.run([fail])
+    env.sensors["camera"].update(0.02)
+    assert picture(env).max() > 0.0  # and the threads work on
+
+
+PROGRAM = """
+import os, sys, torch
+from worlds import build
+from rlcli.errors import RlcliError
+env = build(sys.argv[1], 2)
+env.reset()
+assert env.sensors["camera"].image.max() > 0
+if sys.argv[2] == "fork":
+    child = os.fork()
+    if child == 0:
+        env.sensors["camera"].update(0.1)
+        try:
+            env.sensors["camera"].image
+        except RlcliError as error:
+            print(type(error).__name__, error.message)
+            sys.stdout.flush()
+            os._exit(0)
+        os._exit(1)
+    assert os.waitpid(child, 0)[1] == 0
+if sys.argv[2] == "raise":
+    raise SystemExit(3)
+"""
+
+
+def program(tmp_path, way, **variables):
+    folder = write(tmp_path / "task", edited(dump(TASK), scene={"sensors": {"camera": CART}}), boxes_xml=BOXES)
+    tests = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    path = os.pathsep.join([tests, os.environ.get("PYTHONPATH", "")])
+    env = {
+        k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM")
+    }
+    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", PROGRAM, str(folder), way]
+    return subprocess.run(command, env={**env, "PYTHONPATH": path, **variables}, capture_output=True, text=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("way", "code"), [("end", 0), ("raise", 3)])
+@pytest.mark.parametrize("backend", ["egl", "osmesa"])
+def test_a_process_that_never_closes_its_cameras_ends_in_peace(tmp_path, way, code, backend):
+    done = program(tmp_path, way, MUJOCO_GL=backend)
+    assert (done.returncode, done.stderr) == (code, "")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+def test_a_forked_process_is_told_instead_of_waiting_for_ever(tmp_path):
+    done = program(tmp_path, "fork")
+    assert done.returncode == 0, done.stderr
+    assert "MachineError cameras draw in the process that made the environment" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["check", "lint", "eval"])
+def test_without_opengl_a_task_with_a_camera_is_refused_as_the_machines_fault(tmp_path, command):
+    folder = write(tmp_path / "task", edited(dump(TASK), scene={"sensors": {"camera": CART}}), boxes_xml=BOXES)
+    arguments = [sys.executable, "-m", "rlcli", command, str(folder), *(["--policy", "zero"] * (command == "eval"))]
+    done = subprocess.run(arguments, env={**os.environ, "MUJOCO_GL": "disabled"}, capture_output=True, text=True)
+    assert done.returncode == 10
+    assert "drawing is switched off by MUJOCO_GL=disabled" in done.stderr
+    assert "Traceback" not in done.stderr

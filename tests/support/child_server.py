@@ -1,0 +1,89 @@
+"""A warm process that forks one child for each command: torch is imported once, and the children are real processes.
+
+Speaks JSON lines: {"start": {...}} forks and answers with a pid, {"wait": pid, "seconds": s} with an exit status.
+"""
+
+import importlib
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+WARM = (
+    "rlcli.cli.commands.train", "rlcli.cli.ui.progress_view", "rlcli.envs.managed", "rlcli.envs.direct",
+    "rlcli.rl.sb3.trainer", "rlcli.rl.ppo.trainer",
+    "rlcli.training.setup", "rlcli.training.runner",
+    "rlcli.training.loggers", "rlcli.training.checkpoint_writer", "rlcli.training.loop",
+    "rlcli.training.periodic_eval", "rlcli.training.launch", "rlcli.runs.restore",
+    "torch.utils.tensorboard", "torch._dynamo", "rlcli.mdp", "rlcli_tasks.cartpole",
+    "tensorboard.backend.event_processing.event_file_loader", "tensorboard.summary.writer.record_writer", "rich.live",
+)  # fmt: skip
+
+
+def serve() -> None:
+    for module in WARM:
+        importlib.import_module(module)
+    import torch
+
+    from rlcli.config.load import resolve
+    from rlcli.registry import find_task
+
+    torch.set_num_threads(1)
+    for task in ("cartpole", "cartpole-direct"):
+        resolve(find_task(task))  # signatures of terms and schemas of parameters are read once
+    tasks = len(os.listdir("/proc/self/task"))
+    answer(ready=True, threads=tasks)
+    for line in sys.stdin:
+        request = json.loads(line)
+        if "start" in request:
+            child = os.fork()
+            if child == 0:
+                live(**request["start"])
+            answer(pid=child)
+        else:
+            answer(status=waited(request["wait"], request["seconds"]))
+
+
+def answer(**content: object) -> None:
+    print(json.dumps(content), flush=True)
+
+
+def waited(pid: int, seconds: float) -> int | None:
+    """The exit code, negative for a signal; None if the child had to be killed because it did not end."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        done, status = os.waitpid(pid, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.005)
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    return None
+
+
+def live(arguments: list[str], folder: str, output: str, faults: list[dict[str, object]], signals: list[str]) -> None:
+    """The child: a command line in a folder, with faults in its system calls. Ends as a process that was started."""
+    os.chdir(folder)
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    for number, name in ((1, "out"), (2, "err")):
+        handle = os.open(f"{output}.{name}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(handle, number)
+        os.close(handle)
+    for name in signals:
+        signal.signal(getattr(signal, name), signal.SIG_IGN)
+    from support import fault_points
+
+    for fault in faults:
+        fault_points.plant(**fault)  # type: ignore[arg-type]
+    from rlcli.cli.app import main
+
+    sys.argv = ["rlcli", *arguments]
+    sys.exit(main())
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    serve()

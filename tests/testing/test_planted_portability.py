@@ -1,0 +1,422 @@
+"""The checks of threads, sizes, engines, restarts, versions and speed find what is planted for them."""
+
+import json
+import shutil
+from dataclasses import replace
+from importlib.util import find_spec
+
+import pytest
+
+from rlcli.cli.app import main
+from rlcli.registry import find_task
+from rlcli.testing import check_task, portability_checks, record_layout
+from rlcli.testing.task_under_test import TaskUnderTest
+
+
+def only(folder, *names):
+    """(findings, notes) of some checks."""
+    notes = {}
+    found = check_task(folder.write(), only=names, on_note=notes.__setitem__)
+    assert all(f.check in names and f.where and f.message and f.hint for f in found)
+    return found, notes
+
+
+# --- threads and sizes ---
+
+
+def test_what_depends_on_the_engines_threads_is_found(direct):
+    direct.replace("1.0 - self.obs_buf[:, 0].square()", "float(self.env.engine.threads)")
+    ((finding,), _) = only(direct, "threads")
+    assert (finding.severity, finding.where) == ("error", "reward")
+    assert "1 and 3 engine threads" in finding.message
+
+
+def test_rounding_that_depends_on_the_number_of_environments_is_found(direct):
+    direct.replace("1.0 - self.obs_buf[:, 0].square()", "self.obs_buf[:, 0] / self.num_envs")
+    ((finding,), _) = only(direct, "num-envs")
+    assert (finding.severity, finding.where) == ("error", "reward")
+    assert "8 and 3 environments" in finding.message
+
+
+def test_task_that_draws_from_torch_is_told_and_not_failed(direct):
+    direct.replace("self.draws(env_ids).uniform(-0.5, 0.5, (1,))", "torch.rand(len(env_ids), 1) - 0.5")
+    ((finding,), _) = only(direct, "num-envs")
+    assert finding.severity == "warning"
+    assert "draws from torch" in finding.message
+
+
+def test_curriculum_that_averages_over_episodes_is_told_and_not_failed(managed):
+    managed.terms = """
+class Harder:
+    def __init__(self, env) -> None:
+        self.level = torch.zeros(())
+
+    def __call__(self, selection) -> Tensor:
+        self.level += selection.count
+        return self.level
+
+    def state_dict(self):
+        return {"level": self.level.clone()}
+
+    def load_state_dict(self, state) -> None:
+        self.level.copy_(state["level"])
+
+
+def level(env) -> Tensor:
+    return env.curriculum_manager.terms[0].instance.level.expand(env.num_envs).clone() if hasattr(
+        env, "curriculum_manager") else torch.zeros(env.num_envs)
+"""
+    managed.config["curriculum"] = {"harder": {"func": "harder"}}
+    managed.config["rewards"]["level"] = {"func": "level", "weight": 1.0}
+    found, notes = only(managed, "num-envs", "checkpoint", "back-fill")
+    assert [(f.check, f.severity) for f in found] == [("num-envs", "warning")]
+    assert "curriculum" in found[0].message
+    assert "curriculum" in notes["back-fill"]
+
+
+# --- restarts ---
+
+
+HISTORY = """
+from rlcli.envs.observers import StepObserver
+
+class Seen(StepObserver):
+    def __init__(self, env, *, entity: Entity = "robot") -> None:
+        self._entity = entity
+        self._last = torch.zeros(env.num_envs, 1)
+        env.observers.add(self)
+
+    def after_physics(self) -> None:
+        self._last.copy_(self._entity.data.joint_pos)
+
+    def __call__(self) -> Tensor:
+        return self._last.clone()
+"""
+
+
+def test_history_that_is_not_filled_anew_at_a_reset_is_found(managed):
+    managed.terms = HISTORY
+    managed.config["observations"]["policy"]["seen"] = {"func": "seen"}
+    ((finding,), _) = only(managed, "back-fill")
+    assert "column 2 (seen)" in finding.where
+    assert "environment 1" in finding.message
+
+
+def test_history_that_is_filled_anew_is_in_order(managed):
+    managed.terms = HISTORY + (
+        "\n    def reset(self, selection) -> None:\n"
+        "        selection.write(self._last, selection.read(self._entity.data.joint_pos))\n"
+    )
+    managed.config["observations"]["policy"]["seen"] = {"func": "seen"}
+    assert only(managed, "back-fill") == ([], {})
+
+
+def test_histories_delays_and_noise_of_the_configuration_are_in_order(managed):
+    managed.config["observations"]["policy"]["angle"] |= {
+        "history": 3,
+        "delay": {"steps": [0, 2], "redraw": 0.5},
+        "noise": {"kind": "gaussian", "std": 0.1},
+    }
+    managed.config["commands"] = {
+        "place": {"func": "uniform_pose2d", "resampling_time_s": [0.04, 0.1], "x": [0.0, 1.0], "y": [0.0, 1.0]}
+    }
+    managed.config["observations"]["policy"]["asked"] = {"func": "generated_commands", "command": "place"}
+    managed.config["curriculum"] = {
+        "weight": {"func": "interpolate", "address": "rewards.upright.weight", "end": 20, "to": -2.0}
+    }
+    assert only(managed, "checkpoint", "threads", "num-envs", "repeated-observation")[0] == []
+    managed.config["curriculum"] = {}
+    assert only(managed, "back-fill") == ([], {})
+
+
+def test_direct_buffer_that_keeps_the_episode_before_is_found(direct):
+    direct.replace(
+        "    def pre_physics_step(self, actions):\n",
+        "    def post_reset(self):\n        self.last = torch.zeros(self.num_envs)\n\n"
+        "    def pre_physics_step(self, actions):\n        self.last.copy_(actions[:, 0])\n",
+    )
+    direct.replace("self.obs_buf[:, 1] = self.arms.get_joint_velocities()[:, 0]", "self.obs_buf[:, 1] = self.last")
+    ((finding,), _) = only(direct, "back-fill")
+    assert "obs_buf" in finding.where
+
+
+def test_memory_that_a_checkpoint_does_not_hold_is_found(managed):
+    managed.terms = """
+class Travelled:
+    def __init__(self, env, *, entity: Entity = "robot") -> None:
+        self._entity = entity
+        self.sums = self._summed(torch.zeros(env.num_envs))
+
+    def _summed(self, sum):
+        while True:
+            sum = sum + self._entity.data.joint_vel[:, 0].abs()
+            yield sum
+
+    def __call__(self) -> Tensor:
+        return next(self.sums)
+"""
+    managed.config["rewards"]["travelled"] = {"func": "travelled", "weight": -0.01}
+    ((finding,), _) = only(managed, "checkpoint")
+    assert finding.where == "reward"
+    assert "no checkpoint can hold Travelled.sums (generator)" in finding.hint
+    managed.path = managed.path.with_name("mended")
+    managed.terms = managed.terms.replace(
+        "return next(self.sums)",
+        "self.sum = getattr(self, 'sum', 0.0) + self._entity.data.joint_vel[:, 0].abs()\n"
+        "        return self.sum.clone()",
+    )
+    assert only(managed, "checkpoint") == ([], {})
+
+
+def test_command_whose_state_is_forgotten_is_found(managed):
+    managed.terms = """
+class Turn:
+    def __init__(self, env) -> None:
+        self.command = torch.zeros(env.num_envs, 1)
+        self.rate = torch.zeros(env.num_envs, 1)
+
+    def resample(self, selection) -> None:
+        selection.write(self.rate, selection.uniform(0.5, 1.0, (1,)))
+
+    def update(self) -> None:
+        self.command += self.rate
+
+    def reset(self, selection) -> None:
+        selection.write(self.command, 0.0)
+
+    def state_dict(self):
+        return {"command": self.command.clone()}
+
+    def load_state_dict(self, state) -> None:
+        self.command.copy_(state["command"])
+"""
+    managed.config["commands"] = {"turn": {"func": "turn", "resampling_time_s": [9.0, 9.0]}}
+    managed.config["observations"]["policy"]["asked"] = {"func": "generated_commands", "command": "turn"}
+    ((finding,), _) = only(managed, "checkpoint")
+    assert "asked" in finding.where
+
+
+def test_direct_task_that_counts_in_an_iterator_is_found_and_in_a_number_not(direct):
+    direct.replace(
+        "        self.rew_buf[:] = ",
+        "        self.count = getattr(self, 'count', None) or iter(range(999))\n"
+        "        self.rew_buf[:] = 0.01 * next(self.count) + ",
+    )
+    ((finding,), _) = only(direct, "checkpoint")
+    assert "(range_iterator)" in finding.hint
+    assert "of the task" in finding.hint
+    direct.replace("getattr(self, 'count', None) or iter(range(999))", "getattr(self, 'count', 0) + 1")
+    direct.replace("next(self.count)", "self.count")
+    direct.path = direct.path.with_name("mended")
+    assert only(direct, "checkpoint") == ([], {})
+
+
+# --- versions ---
+
+
+def test_layout_is_compared_only_where_it_was_recorded(managed):
+    found, notes = only(managed, "layout")
+    assert found == []
+    assert "--record-layout" in notes["layout"]
+    assert record_layout(managed.path).name == "task.layout.json"
+    assert only(managed, "layout") == ([], {})
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("order", "column 0 was 'angle[hinge]' and is 'rate[hinge]'"),
+        ("gone", "had 2 columns and has 1, other ones from column 1 on"),
+        ("scale", "'rate': scale was [0.1] and is [0.2]"),
+        ("group", "is new"),
+    ],
+)
+def test_observations_that_changed_since_they_were_recorded_are_found(change, says, managed):
+    record_layout(managed.write())
+    groups = managed.config["observations"]
+    if change == "order":
+        groups["policy"] = dict(reversed(groups["policy"].items()))
+    elif change == "gone":
+        groups["policy"].pop("rate")
+    elif change == "scale":
+        groups["policy"]["rate"]["scale"] = 0.2
+    else:
+        groups["critic"] = {"angle": {"func": "joint_pos"}}
+    ((finding,), _) = only(managed, "layout")
+    assert (finding.severity, finding.message) == ("error", says)
+    assert "task.layout.json" in finding.hint
+
+
+def test_actions_that_changed_since_they_were_recorded_are_found(direct):
+    file = record_layout(direct.write())
+    direct.path = direct.path.with_name("later")
+    file.rename(direct.write() / file.name)
+    direct.replace("num_actions = 1", "num_actions = 2")
+    direct.replace("self.params.max_effort * actions", "self.params.max_effort * actions[:, :1]")
+    ((finding,), _) = only(direct, "layout")
+    assert (finding.where, finding.message) == ("actions", "had 1 columns and has 2, other ones from column 1 on")
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"observations": 3}'])
+def test_file_that_is_no_layout_is_a_finding(text, managed):
+    (managed.write() / "task.layout.json").write_text(text)
+    ((finding,), _) = only(managed, "layout")
+    assert "is no recorded layout" in finding.message
+
+
+def test_the_command_records_the_layout_and_says_where(managed, capsys):
+    folder = str(managed.write())
+    assert main(["check", folder, "--only", "layout", "--record-layout"]) == 0
+    assert "task.layout.json" in capsys.readouterr().err
+    kept = json.loads((managed.path / "task.layout.json").read_text())
+    assert [term["name"] for term in kept["observations"]["policy"]] == ["angle", "rate"]
+    assert main(["check", folder, "--only", "layout", "observations.policy.rate.scale=3.0", "--json"]) == 9
+    document = json.loads(capsys.readouterr().out)
+    assert document["findings"][0]["check"] == "layout"
+
+
+# --- speed ---
+
+
+@pytest.mark.parametrize("where", ["reward", "reset"])
+def test_python_loop_over_environments_is_found_with_its_line(where, direct):
+    if where == "reward":
+        direct.replace(
+            "        self.rew_buf[:] = 1.0 - self.obs_buf[:, 0].square()",
+            "        for row in range(self.num_envs):\n            self.rew_buf[row] = 1.0 - self.obs_buf[row, 0] ** 2",
+        )
+    else:
+        direct.replace(
+            "        self.arms.set_joint_positions(angle, indices=env_ids)",
+            "        for row in range(len(env_ids)):\n"
+            "            self.arms.set_joint_positions(angle[row : row + 1], indices=env_ids[row : row + 1])",
+        )
+    ((finding,), notes) = only(direct, "speed")
+    lines = direct.task.splitlines()
+    line = int(finding.where.rpartition(":")[2])
+    assert finding.where.startswith(str(direct.path / "task.py"))
+    assert "row" in lines[line - 1]
+    assert "16 environments" in finding.message
+    assert "steps/s" in notes["speed"]
+
+
+def test_the_callers_trace_function_is_left_in_place(managed):
+    import sys
+
+    def trace(frame, event, value):
+        return None
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        only(managed, "speed")
+        assert sys.gettrace() is trace
+    finally:
+        sys.settrace(before)
+
+
+# --- the GPU's engine, on Warp's CPU device ---
+
+
+needs_warp = pytest.mark.skipif(find_spec("mujoco_warp") is None, reason="MuJoCo Warp comes with rlcli[gpu]")
+
+
+@needs_warp
+def test_task_in_order_runs_on_both_engines_and_can_be_captured(managed):
+    assert only(managed, "engines", "captured") == ([], {})
+
+
+@needs_warp
+def test_reset_that_only_the_cpu_engine_can_run_is_found(managed):
+    managed.terms = """
+def start_at(env, selection, *, entity: Entity = "robot") -> None:
+    entity.write_joint_positions(selection, 0.1 * torch.from_numpy(selection.ids)[:, None].float())
+"""
+    managed.config["events"]["at"] = {"func": "start_at", "mode": "reset"}
+    found, _ = only(managed, "engines")
+    assert [f.severity for f in found] == ["error"]
+    assert "'ids'" in found[0].message
+    assert "terms.py" in found[0].where
+    managed.config["sim"]["engine"] = "batch"
+    found, notes = only(managed, "engines", "captured")
+    assert found == []
+    assert "sim.engine: batch" in notes["engines"]
+
+
+@needs_warp
+def test_what_differs_between_the_engines_is_found(managed):
+    managed.terms = "def kind(env) -> Tensor:\n    return torch.full((env.num_envs,), float(env.engine.asynchronous))\n"
+    managed.config["rewards"]["kind"] = {"func": "kind", "weight": 1.0}
+    ((finding,), _) = only(managed, "engines")
+    assert finding.message.startswith("reward is ")
+
+
+@needs_warp
+def test_value_that_is_read_back_in_a_step_is_found_with_its_line(managed):
+    managed.terms = (
+        "def sign(env, *, entity: Entity = 'robot') -> Tensor:\n"
+        "    angle = entity.data.joint_pos[:, 0]\n"
+        "    return angle if float(angle.sum()) > 0.0 else -angle\n"
+    )
+    managed.config["rewards"]["sign"] = {"func": "sign", "weight": 1.0}
+    ((finding,), _) = only(managed, "captured")
+    assert finding.severity == "warning"
+    assert finding.where.endswith("terms.py:11")
+    assert "waits for the device" in finding.message
+
+
+@needs_warp
+def test_direct_task_with_ids_is_not_captured_and_the_reason_is_said(direct):
+    found, notes = only(direct, "engines", "captured")
+    assert found == []
+    assert "reset_idx takes ids" in notes["captured"]
+
+
+@needs_warp
+def test_model_that_the_gpu_engine_cannot_run_is_not_run_and_the_reason_is_said(managed):
+    managed.xml = managed.xml.replace("</mujoco>", '<option solver="PGS"/></mujoco>')
+    found, notes = only(managed, "engines")
+    assert found == []
+    assert "not take it" in notes["engines"]
+
+
+@pytest.fixture
+def shipped(tmp_path):
+    """cartpole with a policy in a folder of the test's own, and that folder."""
+    source = find_task("cartpole")
+    folder = shutil.copytree(source.policy, tmp_path / "policies" / "cartpole")
+    return replace(source, policy=folder), folder
+
+
+def edit_manifest(folder, change):
+    document = json.loads((folder / "manifest.json").read_text())
+    change(document)
+    (folder / "manifest.json").write_text(json.dumps(document))
+
+
+def test_a_shipped_policy_that_fits_is_no_finding(shipped):
+    assert list(portability_checks.policy(TaskUnderTest(shipped[0]))) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda m: m["layout"].update(step_dt=0.02), "does not fit the installed task"),
+        (lambda m: m["layout"]["observations"]["policy"].reverse(), "does not fit the installed task"),
+        (lambda m: m.update(agent="nobody"), "nobody"),
+        (lambda m: m["task"].update(name="cartpole-direct"), "is a policy for 'cartpole-direct'"),
+        (lambda m: m["files"]["policy.safetensors"].update(sha256="0" * 64), "is corrupt"),
+    ],
+)
+def test_a_shipped_policy_that_does_not_fit_is_a_finding(shipped, change, said):
+    source, folder = shipped
+    edit_manifest(folder, change)
+    (finding,) = portability_checks.policy(TaskUnderTest(source))
+    assert finding.severity == "error"
+    assert said in finding.message
+
+
+def test_a_task_without_a_policy_is_told_how_to_ship_one(managed):
+    found, notes = only(managed, "policy")
+    assert found == []
+    assert "--format bundle" in notes["policy"]

@@ -1,0 +1,99 @@
+"""Evaluations between iterations: they choose the best checkpoint, and training does not notice them."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from rlcli.cli.app import main
+from rlcli.training.loggers import read_metrics
+from rlcli.training.periodic_eval import PeriodicEval
+
+SMALL = ("--num-envs", "8", "--logger", "none", "-q", "sim.engine_threads=1", "agent.torch_threads=1")
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+def run_of(name):
+    (run,) = Path("runs").glob(f"*/*-{name}")
+    return run
+
+
+def train(task, name, *words):
+    assert main(["train", task, "--name", name, *SMALL, *words]) == 0
+    return run_of(name)
+
+
+def without_times(run, *, evaluation=True):
+    rows = read_metrics(run / "metrics.jsonl")
+    left = "Perf/" if evaluation else ("Perf/", "Eval/")
+    return [{name: value for name, value in row.items() if not name.startswith(left)} for row in rows]
+
+
+def weights(run):
+    return [file.read_bytes() for file in sorted(run.glob("checkpoints/*/policy.safetensors"))][-1]
+
+
+@pytest.mark.parametrize(("task", "agent"), [("cartpole", "sb3-ppo"), ("cartpole-direct", "ppo")])
+def test_evaluations_change_nothing_of_training(task, agent, capsys):
+    words = ("--agent", agent, "--max-iterations", "4", "episode_length_s=0.3", "agent.eval_episodes=4")
+    plain = train(task, "plain", *words)
+    tried = train(task, "tried", *words, "agent.eval_interval=2")
+    assert weights(plain) == weights(tried)
+    assert without_times(plain) == without_times(tried, evaluation=False)
+    with_trial = [row["iteration"] for row in without_times(tried) if "Eval/mean_reward" in row]
+    assert with_trial == [2, 4]
+
+
+def test_the_best_evaluation_has_a_checkpoint_of_its_own_and_a_name(capsys):
+    run = train(
+        "cartpole", "a", "--max-iterations", "4", "agent.eval_interval=1", "agent.eval_episodes=8", "agent.keep_last=1"
+    )
+    rows = without_times(run)
+    scores = {row["step"]: (row["Eval/success_rate"], row["Eval/mean_reward"]) for row in rows}
+    best = json.loads((run / "run.json").read_text())["best"]
+    assert scores[best] == max(scores.values())
+    assert min(step for step, score in scores.items() if score == scores[best]) == best
+    assert {0, best, max(scores)} == {int(f.parent.name) for f in run.glob("checkpoints/*/manifest.json")}
+    assert main(["eval", "--checkpoint", f"{run}@best", "--episodes", "4", "--num-envs", "4"]) == 0
+    assert "its best evaluation" in capsys.readouterr().err
+
+
+def test_a_resumed_run_remembers_its_best(capsys):
+    words = ("--agent", "ppo", "agent.eval_interval=1", "agent.eval_episodes=8", "agent.save_interval=1")
+    whole = train("cartpole", "whole", "--max-iterations", "4", *words)
+    cut = train("cartpole", "cut", "--max-iterations", "4", *words)
+    step = sorted(int(f.parent.name) for f in cut.glob("checkpoints/*/manifest.json"))[2]
+    assert main(["train", "--resume", f"{cut}@step:{step}", "--max-iterations", "4", "-q"]) == 0
+    assert without_times(cut) == without_times(whole)
+    best = [json.loads((run / "run.json").read_text())["best"] for run in (cut, whole)]
+    assert best[0] == best[1]
+    assert weights(cut) == weights(whole)
+
+
+def test_going_back_before_the_best_forgets_it(capsys):
+    words = ("--agent", "ppo", "agent.eval_interval=1", "agent.eval_episodes=8", "agent.save_interval=1")
+    run = train("cartpole", "a", "--max-iterations", "3", *words)
+    steps = sorted(int(f.parent.name) for f in run.glob("checkpoints/*/manifest.json"))
+    record = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps({**record, "best": steps[-1]}))
+    assert main(["train", "--resume", f"{run}@step:{steps[1]}", "--max-iterations", "2", "-q"]) == 0
+    assert json.loads((run / "run.json").read_text())["best"] in steps[:3]
+
+
+def test_success_counts_before_return():
+    trials = PeriodicEval(
+        lambda: None, 1, 1, [{"step": 7, "Eval/success_rate": 0.5, "Eval/mean_reward": 9.0}, {"step": 9}]
+    )
+    assert trials.best == 7
+    assert not trials.improves({"Eval/success_rate": 0.4, "Eval/mean_reward": 20.0})
+    assert not trials.improves({"Eval/success_rate": 0.5, "Eval/mean_reward": 9.0})
+    assert trials.improves({"Eval/success_rate": 0.5, "Eval/mean_reward": 9.5})
+    assert trials.improves({"Eval/success_rate": 0.6, "Eval/mean_reward": 1.0})

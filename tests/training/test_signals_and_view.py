@@ -1,0 +1,117 @@
+"""Stopping a training, and what it shows while it runs."""
+
+import json
+import os
+import pty
+import re
+import select
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+LONG = ("scene.num_envs=32", "sim.engine_threads=1", "agent.torch_threads=1", "--logger", "none")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("empty_folder")]
+
+
+def wait_for_training(process, seconds=60):
+    """Until metrics are being written."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline and process.poll() is None:
+        if any(file.stat().st_size for file in Path("runs").glob("*/*/metrics.jsonl")):
+            return
+        time.sleep(0.02)
+    raise AssertionError(process.communicate()[1])
+
+
+def test_configuration_and_checkpoint_0_come_first(start):
+    process = start("train", "cartpole", *LONG, "--max-iterations", 100_000)
+    deadline = time.monotonic() + 60
+    while not list(Path().glob("runs/*/*/run.json")) and time.monotonic() < deadline:
+        time.sleep(0.002)
+    (run,) = Path().glob("runs/*/*")
+    assert (run / "config.yaml").is_file()
+    maps = Path(f"/proc/{process.pid}/maps").read_text()
+    assert "libtorch" not in maps
+    assert "libmujoco" not in maps
+    wait_for_training(process)
+    assert (run / "checkpoints/000000000000/manifest.json").is_file()
+
+
+def on_a_terminal(*arguments):
+    """What a command writes to a terminal, and its exit code."""
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.environ.update(TERM="xterm-256color", COLUMNS="160", LINES="50")
+        os.execv(sys.executable, [sys.executable, "-m", "rlcli", *map(str, arguments)])
+    import fcntl
+    import struct
+    import termios
+
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 50, 160, 0, 0))
+    shown = b""
+    while select.select([terminal], [], [], 60)[0]:
+        try:
+            chunk = os.read(terminal, 65536)
+        except OSError:
+            break
+        if not chunk:
+            break
+        shown += chunk
+    os.close(terminal)
+    return shown.decode(errors="replace"), os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def test_a_terminal_shows_the_live_table():
+    shown, code = on_a_terminal("train", "cartpole", *LONG, "episode_length_s=0.3", "--max-iterations", 20)
+    assert code == 0, shown
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown)
+    for word in (
+        "iteration 20/20", "10,240 steps", "steps/s", "left", "physics", "task", "policy", "update",
+        "reward terms", "alive", "pole_pos", "terminations", "time_out", "cart_out_of_bounds",
+        "surrogate", "value", "mean_episode_length", "mean_reward", "learning_rate",
+    ):  # fmt: skip
+        assert word in text, word
+    assert "\x1b[" in shown
+    assert shown.count("\x1b[?25l") <= shown.count("\x1b[?25h")  # the cursor is back
+
+
+def test_a_mistake_on_a_terminal_is_one_message():
+    shown, code = on_a_terminal("train", "cartpole", "rewards.alive.wieght=2")
+    assert code == 3
+    assert "did you mean 'weight'" in shown
+    assert "Traceback" not in shown
+
+
+def test_elsewhere_plain_lines_and_the_run_on_stdout(start, only_run):
+    process = start("train", "cartpole", *LONG, "--max-iterations", 10)
+    out, err = process.communicate(timeout=60)
+    assert out == f"{only_run()}\n"
+    assert "\x1b" not in err
+    assert re.search(r"^iteration 10/10  5120 steps  \d+ steps/s.* left$", err, re.MULTILINE)
+    assert err.count("iteration ") <= 4
+    assert "rlcli play --checkpoint" in err
+
+
+def test_quiet_says_nothing_but_the_result(start, only_run):
+    out, err = start("train", "cartpole", *LONG, "-q", "--max-iterations", 2).communicate(timeout=60)
+    assert (out, err) == (f"{only_run()}\n", "")
+
+
+@pytest.mark.parametrize("more", [(), ("rewards.alive.wieght=2",), ("agent.learning_rate=1e30",)])
+def test_json_keeps_stdout_to_one_document(start, more):
+    out, _ = start("train", "cartpole", *LONG, *more, "--max-iterations", 2, "--json").communicate(timeout=60)
+    document = json.loads(out)
+    assert document["schema"] == 1
+    assert ("error" in document) == bool(more)
+
+
+def test_json_of_a_stopped_run_names_its_exit_code(start):
+    process = start("train", "cartpole", *LONG, "--max-iterations", 100_000, "--json")
+    wait_for_training(process)
+    process.send_signal(signal.SIGINT)
+    error = json.loads(process.communicate(timeout=60)[0])["error"]
+    assert (error["kind"], error["exit_code"]) == ("stopped", 130)
+    assert "rlcli train --resume" in error["hint"]

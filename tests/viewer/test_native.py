@@ -1,0 +1,80 @@
+"""The window's keys and captions; the window itself needs a display."""
+
+import pytest
+import yaml
+from support.worlds import CRITTER_TASK, build, critter
+
+from rlcli.config.load import resolve
+from rlcli.envs.make import make_env
+from rlcli.registry import find_task
+from rlcli.rl.acting import zero_policy
+from rlcli.viewer.native import captions, press
+from rlcli.viewer.playback import Playback
+
+SPACE, BACKSPACE, MINUS, EQUAL, RIGHT, DOWN, UP, PAGE_UP = 32, 259, 45, 61, 262, 264, 265, 266
+INSERT, DELETE, HOME, END = 260, 261, 268, 269
+
+
+@pytest.fixture
+def playback():
+    env = make_env(resolve(find_task("cartpole"), overrides=["scene.num_envs=3", "sim.engine_threads=1"]))
+    return Playback(env, zero_policy(env))
+
+
+def commanded(folder):
+    """A playback of a task with a velocity command."""
+    task = yaml.safe_load(CRITTER_TASK)
+    task["commands"] = {
+        "velocity": {"func": "uniform_velocity", "resampling_time_s": [1.0, 2.0], "lin_vel_x": [-1.0, 2.0]}
+    }
+    env = build(critter(folder, yaml.safe_dump(task, sort_keys=False)))
+    return Playback(env, zero_policy(env))
+
+
+def pressed(playback, *keys):
+    for key in keys:
+        press(playback, key)
+        playback.advance(0.0)
+    return playback.view
+
+
+def test_the_keys_ask_the_player(playback):
+    assert pressed(playback, SPACE).paused
+    assert not pressed(playback, SPACE).paused
+    assert pressed(playback, EQUAL, EQUAL).speed == 4.0
+    assert pressed(playback, MINUS).speed == 2.0
+    assert pressed(playback, UP).shown == 1
+    assert pressed(playback, DOWN, DOWN).shown == 2
+    steps = playback.steps
+    assert pressed(playback, RIGHT).paused
+    assert playback.steps == steps + 1
+    index = int(playback.env.episode_index[0])
+    pressed(playback, BACKSPACE)
+    assert int(playback.env.episode_index[0]) == index + 1
+
+
+@pytest.mark.parametrize("key", [PAGE_UP, 65, 0, -1])
+def test_keys_that_mean_nothing_here_do_nothing(playback, key):
+    before = playback.view
+    assert pressed(playback, key) == before
+
+
+def test_keys_turn_commands_within_their_ranges(tmp_path):
+    playback = commanded(tmp_path)
+    assert pressed(playback, END).held == {}
+    assert pressed(playback, INSERT, INSERT).held == {"vy": pytest.approx(0.4)}
+    assert pressed(playback, HOME, DELETE).held["vx"] == pytest.approx(-0.3)
+    names, values = captions(playback.view)
+    said = dict(zip(names.splitlines(), values.splitlines(), strict=True))
+    assert (said["> vx"], said["vy"], said["wz"]) == ("-0.3", "0.4", "as drawn")
+    pressed(playback, DELETE, DELETE)
+    assert playback.view.held["vx"] == pytest.approx(-0.9)
+    assert "vx" not in pressed(playback, DELETE).held
+
+
+def test_the_captions_say_what_is_shown(playback):
+    names, values = captions(pressed(playback, SPACE, UP))
+    said = dict(zip(names.splitlines(), values.splitlines(), strict=True))
+    assert said["speed"] == "paused"
+    assert said["environment"] == "1 of 3"
+    assert "checkpoint" not in said
