@@ -215,7 +215,7 @@ def _terms() -> Iterator[str]:
 
 def _terms_of(section: str) -> Iterator[tuple[str, Any]]:
     """The terms of a section, by the names that `func:` knows them by."""
-    from rlcli.config.terms import snake_case
+    from rlcli.config.term_signatures import snake_case
 
     module = importlib.import_module(f"rlcli.mdp.{section}")
     for name, value in vars(module).items():

@@ -13,7 +13,7 @@ import rlcli
 PACKAGE = Path(rlcli.__file__).parent
 REPOSITORY = PACKAGE.parent
 LAYERS = """
-    errors task trainers formats random machine settings text
+    errors task trainers formats random machine settings safe_text
     registry  config  sim  scene  managers  envs  mdp  rl  runs  replay  evaluation  deploy  viewer  reporting  testing
     training  adapters  tuning  doctor  scaffold  cli  gym  pytest_plugin
 """
@@ -31,7 +31,7 @@ LIGHT = [
     "trainers.py",
     "formats.py",
     "settings.py",
-    "text.py",
+    "safe_text.py",
     "config",
     "registry",
     "doctor",

@@ -12,7 +12,7 @@ from rlcli.config.layers import Origin, leaves
 from rlcli.config.load import Resolved
 from rlcli.config.schema import ObservationGroupConfig, TaskConfig
 from rlcli.config.strict_yaml import Path
-from rlcli.config.terms import SECTIONS, SignatureError, Vocabulary, params_model
+from rlcli.config.term_signatures import SECTIONS, SignatureError, Vocabulary, params_model
 
 _TAGS = {type(None): "null", bool: "bool", int: "int", float: "float", str: "str"}
 

@@ -17,7 +17,7 @@ from rlcli.config import messages
 from rlcli.config.layers import Layers, marked, read
 from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.strict_yaml import Document, Path
-from rlcli.config.terms import Vocabulary
+from rlcli.config.term_signatures import Vocabulary
 from rlcli.config.validation import PATCHES, TaskCheck, agent_names, term_entries
 from rlcli.errors import ConfigError, DependencyError, Problem
 from rlcli.formats import Note

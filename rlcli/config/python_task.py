@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from rlcli.config.schema import AgentConfig, TaskConfig
-from rlcli.config.terms import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
+from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
 from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, listing
 from rlcli.formats import Note
 from rlcli.registry import TaskSource, import_file, is_framework, load_object

@@ -14,7 +14,7 @@ from rlcli.config.foreign_keys import with_foreign
 from rlcli.config.layers import Layers, Origin, marked, parse_override, read
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
-from rlcli.config.terms import SECTIONS, Signature, SignatureError, Vocabulary, params_model, read_params
+from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, Vocabulary, params_model, read_params
 from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing
 from rlcli.formats import Note
 from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, load_entry

@@ -37,7 +37,7 @@ from rlcli.random import derive
 from rlcli.rl.acting import acting
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators
-from rlcli.runs.manifest import deployment_differences
+from rlcli.runs.checkpoint_manifest import deployment_differences
 from rlcli.runs.restore import policy_of, require_fit
 
 if TYPE_CHECKING:

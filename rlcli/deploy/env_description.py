@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from rlcli.config.schema import ActionConfig, ObservationConfig
-from rlcli.config.terms import params_model
+from rlcli.config.term_signatures import params_model
 from rlcli.deploy.formulas import Formula, control_formula, given, observation_formula, op
 from rlcli.envs.direct import DirectEnv
 from rlcli.errors import ConfigError, Problem

@@ -25,7 +25,7 @@ from rlcli.errors import MachineError, UsageError, VerdictError, require_known
 from rlcli.rl.policy import Policy, PolicySpec
 from rlcli.runs.atomic_io import sync_folder, write_synced
 from rlcli.runs.checkpoint import Checkpoint
-from rlcli.runs.manifest import deployment_of, layout_of
+from rlcli.runs.checkpoint_manifest import deployment_of, layout_of
 from rlcli.runs.restore import policy_of
 
 __all__ = ["BUNDLE", "FORMATS", "TOLERANCE", "Exported", "check_target", "export", "refusal", "require_self_contained"]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from rlcli.rl.policy import Policy
-from rlcli.runs.manifest import ActionColumns
+from rlcli.runs.checkpoint_manifest import ActionColumns
 
 
 class Deployed(nn.Module):

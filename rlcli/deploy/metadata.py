@@ -7,7 +7,7 @@ from typing import Any
 
 from rlcli.deploy.graph import Deployed
 from rlcli.runs.checkpoint import Checkpoint
-from rlcli.runs.manifest import DeploymentRecord, LayoutRecord
+from rlcli.runs.checkpoint_manifest import DeploymentRecord, LayoutRecord
 from rlcli.runs.run import RECORD
 
 SCHEMA = 2

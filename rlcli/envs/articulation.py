@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.entity import Entity
-from rlcli.sim.indexing import as_index
+from rlcli.sim.column_views import as_index
 from rlcli.sim.rotations import rotate_inverse
 from rlcli.sim.selection import Columns, write_rows
 

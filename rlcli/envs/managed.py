@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rlcli.config.schema import ObservationConfig
-from rlcli.config.terms import SELECTORS
+from rlcli.config.term_signatures import SELECTORS
 from rlcli.envs.layout import Layout, TermLayout
 from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.action import ActionManager, CommandMap
@@ -24,9 +24,9 @@ from rlcli.managers.observation_pipeline import Pipeline
 from rlcli.managers.reward import RewardManager
 from rlcli.managers.term import BoundTerm
 from rlcli.managers.termination import TerminationManager
+from rlcli.scene.joint_setup import ActuatorNeed
 from rlcli.scene.scene import Scene
-from rlcli.scene.scene_joints import ActuatorNeed
-from rlcli.sim.force_sensors import add_body_forces
+from rlcli.sim.acceleration_stage import add_body_forces
 from rlcli.sim.markers import Marker
 from rlcli.sim.selection import Selection
 from rlcli.sim.tensor_state import require_matching_tensors, substate

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rlcli.envs.step import StepRecord
-    from rlcli.sim.divergence import Divergence
+    from rlcli.sim.divergence_report import Divergence
 
 
 class StepObserver:

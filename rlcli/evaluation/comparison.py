@@ -17,7 +17,7 @@ from rlcli.evaluation.session import (
     find_policy,
     make_actor,
 )
-from rlcli.text import shorten
+from rlcli.safe_text import shorten
 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved

@@ -15,7 +15,7 @@ from torch import Tensor
 from rlcli.config.load import Resolved
 from rlcli.config.schema import TermConfig
 from rlcli.config.strict_yaml import Path
-from rlcli.config.terms import SELECTORS, Signature
+from rlcli.config.term_signatures import SELECTORS, Signature
 from rlcli.errors import ConfigError, DivergedError, Problem, ShapeError, TaskError, did_you_mean, listing
 from rlcli.managers.attribute_state import TermState
 from rlcli.managers.tunable import TunableValues

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from rlcli.errors import listing
 from rlcli.mdp.parameters import Entity
+from rlcli.mdp.randomization_base import element_names
 from rlcli.mdp.ranges import Pair, Ranges
-from rlcli.mdp.sampling import element_names
 from rlcli.mdp.term import BodyTerm, JointTerm
 from rlcli.scene.names import NameProblem
 from rlcli.sim.rotations import from_euler, multiply, random_quaternion

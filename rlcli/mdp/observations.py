@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rlcli.mdp.measures import HandleTerm, only, vector
 from rlcli.mdp.parameters import CameraSensor, Command, ContactSensor, Entity, RaySensor
+from rlcli.mdp.term_helpers import HandleTerm, only, vector
 from rlcli.sim.rotations import atan2, conjugate, length, multiply, roll_pitch_yaw, rotate_inverse, unique, wrap_to_pi
 from rlcli.task import Bodies, Joints, Sensors, Sites, reads_body_forces
 

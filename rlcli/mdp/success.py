@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from rlcli.mdp.measures import cosine, every, goal_in_world, goal_quat_in_world, only, vector
 from rlcli.mdp.parameters import Command, Entity
+from rlcli.mdp.term_helpers import cosine, every, goal_in_world, goal_quat_in_world, only, vector
 from rlcli.sim.rotations import length, turn_between, wrap_to_pi
 from rlcli.task import Bodies, Joints, Sites
 

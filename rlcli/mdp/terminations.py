@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rlcli.mdp.measures import cosine, goal_in_world, some, strongest_force
 from rlcli.mdp.parameters import Command, ContactSensor, Entity
+from rlcli.mdp.term_helpers import cosine, goal_in_world, some, strongest_force
 from rlcli.sim.rotations import length
 from rlcli.task import Joints, Range
 

@@ -35,7 +35,7 @@ def find_task(name: str) -> TaskSource:
     try:
         entry = find_entry(TASKS, name, what="task")
     except TaskError:
-        if name and (Path(name) / "task.yaml").is_file() and not _offered(name):
+        if name and Path(name).is_dir() and not _offered(name):
             return folder_task(Path(name))
         if "=" in name:
             raise TaskError(f"no task '{name}'", hint="overrides come after the task: TASK key.path=value") from None

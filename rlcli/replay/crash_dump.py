@@ -21,7 +21,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import MachineError
 from rlcli.replay.resimulate import ReplayWorld
 from rlcli.replay.trajectory import Header, World, write_trajectory
-from rlcli.sim.divergence import MAX_DESCRIBED, Call, Divergence
+from rlcli.sim.divergence_report import MAX_DESCRIBED, Call, Divergence
 
 _log = logging.getLogger(__name__)
 CALLS = 64

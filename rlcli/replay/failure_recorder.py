@@ -43,7 +43,7 @@ from rlcli.replay.trajectory import (
 )
 from rlcli.runs.atomic_io import write_atomic
 from rlcli.runs.safe_io import read_file
-from rlcli.sim.divergence import Divergence
+from rlcli.sim.divergence_report import Divergence
 
 _log = logging.getLogger(__name__)
 RECENT = 1024

@@ -22,7 +22,7 @@ from rlcli.errors import UsageError
 from rlcli.registry import TaskSource
 from rlcli.replay.trajectory import STATE_FIELDS, DivergencePoint, Trajectory, World
 from rlcli.runs.provenance import model_digest
-from rlcli.sim.divergence import WARNING_FIELDS, Call, Divergence
+from rlcli.sim.divergence_report import WARNING_FIELDS, Call, Divergence
 from rlcli.sim.engine import open_cpu_engine
 
 _PHYSICS_FIELDS = ("time", "qpos", "qvel", "act", "qacc_warmstart")

@@ -38,7 +38,7 @@ from rlcli.registry import TaskSource
 from rlcli.runs.atomic_io import disk_error, write_atomic
 from rlcli.runs.provenance import model_digest
 from rlcli.runs.restore import recorded_task
-from rlcli.sim.divergence import MAX_DESCRIBED
+from rlcli.sim.divergence_report import MAX_DESCRIBED
 
 if TYPE_CHECKING:
     from rlcli.envs.layout import TermLayout
@@ -124,7 +124,7 @@ class DivergencePoint(_Strict):
     time: float
     """Simulated time at its beginning [s]."""
     cause: str
-    """See `rlcli.sim.divergence.Divergence`."""
+    """See `rlcli.sim.divergence_report.Divergence`."""
     place: str
     """The joint, actuator or element."""
     value: str

@@ -23,7 +23,7 @@ from rlcli.config.messages import dotted
 from rlcli.errors import CheckpointError
 from rlcli.runs.metric_rows import is_number, read_rows
 from rlcli.runs.run import Run
-from rlcli.text import shorten
+from rlcli.safe_text import shorten
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from rlcli.errors import DependencyError
 from rlcli.reporting.panels import Item, Panel
-from rlcli.text import UNSAFE, shorten
+from rlcli.safe_text import UNSAFE, shorten
 
 FORMATS = (".png", ".svg", ".pdf")
 

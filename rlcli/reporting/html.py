@@ -14,7 +14,7 @@ from markupsafe import Markup, escape
 from rlcli import __version__
 from rlcli.reporting.run_page import Page
 from rlcli.reporting.task_card import Card
-from rlcli.text import UNSAFE, shorten
+from rlcli.safe_text import UNSAFE, shorten
 
 POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:; base-uri 'none'; form-action 'none'"

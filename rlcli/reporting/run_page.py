@@ -19,7 +19,7 @@ from rlcli.config.layers import leaves
 from rlcli.config.load import resolve
 from rlcli.config.messages import dotted
 from rlcli.config.schema import TaskConfig
-from rlcli.config.terms import Vocabulary
+from rlcli.config.term_signatures import Vocabulary
 from rlcli.errors import CheckpointError, RlcliError
 from rlcli.reporting.card_text import number
 from rlcli.reporting.curves import AXES, Curve, gather
@@ -124,7 +124,7 @@ def _card(run: Run, document: strict_yaml.Document | None, checkpoint: Path | No
 
 
 def _layout(checkpoint: Path | None) -> dict[str, Any] | None:
-    from rlcli.runs.manifest import LayoutRecord
+    from rlcli.runs.checkpoint_manifest import LayoutRecord
 
     if checkpoint is None:
         return None

@@ -18,7 +18,7 @@ from typing import Any
 from rlcli.config.load import Resolved
 from rlcli.config.schema import ObservationConfig, ObservationGroupConfig, TaskConfig, TermConfig
 from rlcli.config.source_classes import lineage
-from rlcli.config.terms import SECTIONS, SELECTORS, SignatureError, Vocabulary, first_paragraph, read_params
+from rlcli.config.term_signatures import SECTIONS, SELECTORS, SignatureError, Vocabulary, first_paragraph, read_params
 from rlcli.registry import TaskSource
 from rlcli.reporting.card_text import columns_text, modifier_text, noise_text, number, span, text_of, when_text
 

@@ -14,7 +14,7 @@ from rlcli.config.schema import ActuatorConfig
 from rlcli.random import stream
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem, match, match_values
-from rlcli.sim.indexing import as_index
+from rlcli.sim.column_views import as_index
 from rlcli.sim.selection import Selection
 from rlcli.sim.tensor_state import require_in_range
 

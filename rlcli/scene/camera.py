@@ -19,7 +19,7 @@ from torch import Tensor
 from rlcli.config.schema import CameraSensorConfig
 from rlcli.errors import ConfigError, MachineError, Problem
 from rlcli.scene.lazy_sensor import LazySensor
-from rlcli.scene.sensor_specs import CameraSensorSpec
+from rlcli.scene.sensor_builder import CameraSensorSpec
 from rlcli.sim.engine import Engine, ReplayableEngine
 from rlcli.sim.gl import open_context
 from rlcli.sim.selection import Selection, ids_of

@@ -14,11 +14,11 @@ from torch import Tensor
 from rlcli.config.schema import EntityConfig
 from rlcli.errors import TaskError
 from rlcli.scene.entity_data import EntityData
+from rlcli.scene.joint_setup import model_actuator_kind
 from rlcli.scene.names import match
-from rlcli.scene.scene_joints import model_actuator_kind
+from rlcli.sim.acceleration_stage import sensor_columns
+from rlcli.sim.column_views import as_index, id_tensor
 from rlcli.sim.engine import Engine
-from rlcli.sim.force_sensors import sensor_columns
-from rlcli.sim.indexing import as_index, id_tensor
 from rlcli.sim.rotations import rotate, rotate_inverse
 from rlcli.sim.selection import ALL, Columns, Field, Selection
 from rlcli.sim.state_cache import SimData

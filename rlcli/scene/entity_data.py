@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from rlcli.scene.defaults import default_joint_state, default_root_state
+from rlcli.scene.initial_state import default_joint_state, default_root_state
 from rlcli.scene.joint_efforts import JointEfforts
-from rlcli.scene.scene_joints import joint_settings
-from rlcli.sim.force_sensors import computes_body_forces
-from rlcli.sim.indexing import MAX_CACHED_VIEWS, CachedViews, as_index, id_tensor
+from rlcli.scene.joint_setup import joint_settings
+from rlcli.sim.acceleration_stage import computes_body_forces
+from rlcli.sim.column_views import MAX_CACHED_VIEWS, CachedViews, as_index, id_tensor
 from rlcli.sim.rotations import atan2, axis_x, cross, length, multiply, rotate, rotate_inverse, wrap_to_pi
 from rlcli.sim.selection import ALL, Columns, Field, Selection
 from rlcli.sim.state_cache import SimData

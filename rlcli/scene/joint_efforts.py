@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.sim.indexing import as_index
+from rlcli.sim.column_views import as_index
 from rlcli.sim.selection import Columns
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from torch import Tensor
 from rlcli.errors import did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem
+from rlcli.sim.column_views import as_index
 from rlcli.sim.engine import Engine
-from rlcli.sim.indexing import as_index
 from rlcli.sim.selection import Columns, Selection
 
 FIELDS: dict[str, str] = {

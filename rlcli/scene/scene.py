@@ -14,9 +14,9 @@ from rlcli.config.schema import EntityConfig, SceneConfig, SimConfig
 from rlcli.errors import ConfigError, Problem
 from rlcli.scene.entity_model import entity_model, name_all, write_masses
 from rlcli.scene.ground_and_lights import add_ground_plane, add_lights, add_materials
+from rlcli.scene.joint_setup import ActuatorNeed, SceneJoints
 from rlcli.scene.names import SceneProblem
-from rlcli.scene.scene_joints import ActuatorNeed, SceneJoints
-from rlcli.scene.sensor_specs import CameraSensorSpec, ContactSensorSpec, RaySensorSpec, SensorBuilder
+from rlcli.scene.sensor_builder import CameraSensorSpec, ContactSensorSpec, RaySensorSpec, SensorBuilder
 from rlcli.scene.terrain import Ground, add_ground, make_ground, terrain_problems
 from rlcli.sim.mujoco_log import quiet_mujoco
 

@@ -12,10 +12,10 @@ from rlcli.config.schema import GridPatternConfig, RaySensorConfig
 from rlcli.scene.camera import CameraSensor, make_cameras
 from rlcli.scene.entity import Entity
 from rlcli.scene.lazy_sensor import LazySensor
-from rlcli.scene.sensor_specs import CameraSensorSpec, ContactSensorSpec, RaySensorSpec
+from rlcli.scene.sensor_builder import CameraSensorSpec, ContactSensorSpec, RaySensorSpec
 from rlcli.scene.terrain_heights import HeightTable
-from rlcli.sim.force_sensors import sensor_columns
-from rlcli.sim.indexing import as_index
+from rlcli.sim.acceleration_stage import sensor_columns
+from rlcli.sim.column_views import as_index
 from rlcli.sim.rotations import rotate
 from rlcli.sim.selection import Selection
 from rlcli.sim.state_cache import SimData

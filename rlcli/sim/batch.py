@@ -17,9 +17,10 @@ from torch import Tensor
 from rlcli.config.schema import SimConfig
 from rlcli.errors import did_you_mean
 from rlcli.machine import available_cores
+from rlcli.sim.acceleration_stage import ACCELERATION_FIELDS, force_sensors
 from rlcli.sim.batch_model import engine_error
 from rlcli.sim.batch_state import BatchState
-from rlcli.sim.divergence import (
+from rlcli.sim.divergence_report import (
     DIVERGENCE_WARNINGS,
     ENGINE_ERROR,
     MAX_DESCRIBED,
@@ -29,7 +30,6 @@ from rlcli.sim.divergence import (
     Divergence,
     DivergenceReporter,
 )
-from rlcli.sim.force_sensors import ACCELERATION_FIELDS, force_sensors
 from rlcli.sim.mujoco_private import STATE_FIELDS, forward_of, without_profiler
 from rlcli.sim.selection import Field, IdSelection, Selection, ids_of
 from rlcli.sim.skippable_work import FIELDS_OF_SKIPPED_WORK

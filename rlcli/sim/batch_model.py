@@ -14,7 +14,7 @@ from torch import Tensor
 
 from rlcli import machine
 from rlcli.errors import DeviceError, DivergedError, did_you_mean
-from rlcli.sim.divergence import MORE_MEMORY
+from rlcli.sim.divergence_report import MORE_MEMORY
 from rlcli.sim.mujoco_log import quiet_mujoco
 from rlcli.sim.mujoco_private import expand_disable_flags, expanded_fields, make_batch, without_profiler
 from rlcli.sim.selection import Selection, ids_of

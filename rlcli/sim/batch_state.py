@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rlcli.sim.batch_model import INTEGRATION_STATE, BatchModel
-from rlcli.sim.divergence import HISTORY_MEMORY, Call, StateHistory, StateLayout
+from rlcli.sim.divergence_report import HISTORY_MEMORY, Call, StateHistory, StateLayout
 from rlcli.sim.mujoco_private import STATE_FIELDS, state_columns
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DependencyError, Problem
 from rlcli.machine import require_device
-from rlcli.sim.divergence import HISTORY_MEMORY, Call, Divergence, StateHistory, StateLayout
+from rlcli.sim.divergence_report import HISTORY_MEMORY, Call, Divergence, StateHistory, StateLayout
 from rlcli.sim.selection import Field, Selection
 
 if TYPE_CHECKING:

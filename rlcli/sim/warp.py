@@ -16,9 +16,9 @@ from torch import Tensor
 
 from rlcli.config.schema import SimConfig
 from rlcli.sim import warp_kernels
-from rlcli.sim.divergence import STATE_LIMIT, Divergence, StateLayout
-from rlcli.sim.force_sensors import force_sensors
-from rlcli.sim.indexing import as_index
+from rlcli.sim.acceleration_stage import force_sensors
+from rlcli.sim.column_views import as_index
+from rlcli.sim.divergence_report import STATE_LIMIT, Divergence, StateLayout
 from rlcli.sim.mask_selection import MaskSelection
 from rlcli.sim.selection import ALL, Field, Selection
 from rlcli.sim.warp_fields import FORCE, STATE

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 
-from rlcli.sim.force_sensors import ACCELERATION_FIELDS, force_sensors
+from rlcli.sim.acceleration_stage import ACCELERATION_FIELDS, force_sensors
 
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
 """What every world carries from step to step, and every reset restores."""

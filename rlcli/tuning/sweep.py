@@ -17,8 +17,8 @@ from rlcli.errors import CheckpointError, MachineError, UsageError, listing
 from rlcli.random import derive
 from rlcli.reporting.figures import check_drawing, scatter
 from rlcli.runs.atomic_io import disk_error, to_json, write_atomic
-from rlcli.runs.multi_seed import read_study, write_summary
 from rlcli.runs.run import STUDY
+from rlcli.runs.study import read_study, write_summary
 from rlcli.tuning.optuna_storage import open_study, without_password
 from rlcli.tuning.search_space import Parameter, read_parameters
 

@@ -14,8 +14,8 @@ from rlcli.reporting.curves import AXES, Curve, Line, gather
 from rlcli.reporting.figures import check_drawing, picture
 from rlcli.reporting.panels import choose
 from rlcli.runs.index import overview
-from rlcli.runs.multi_seed import create_study, read_study, runs_of, write_summary
 from rlcli.runs.run import open_run
+from rlcli.runs.study import create_study, read_study, runs_of, write_summary
 from rlcli.training.launch import TrainingRequest, run_record
 from rlcli.training.subprocesses import train_all
 

@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field
 
 from rlcli.config.dump import json_schema
 from rlcli.config.schema import StrictModel
-from rlcli.config.terms import Vocabulary
+from rlcli.config.term_signatures import Vocabulary
 
 
 class Outer:

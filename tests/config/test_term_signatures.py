@@ -9,7 +9,7 @@ from support.small_task import TASK
 from support.worlds import PENDULUM_TASK, build, edited, pendulum
 
 from rlcli.config.load import resolve
-from rlcli.config.terms import (
+from rlcli.config.term_signatures import (
     SECTIONS,
     Vocabulary,
     builtin_terms,

@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from rlcli.config.load import resolve
-from rlcli.config.terms import builtin_terms
+from rlcli.config.term_signatures import builtin_terms
 from rlcli.deploy import formulas
 from rlcli.deploy.deployed.run_policy import OPS, Controller
 from rlcli.deploy.env_description import describe
 from rlcli.envs.make import make_env
 from rlcli.registry import folder_task
-from rlcli.runs.manifest import OPS as KNOWN
-from rlcli.runs.manifest import DeploymentRecord, check_formula
+from rlcli.runs.checkpoint_manifest import OPS as KNOWN
+from rlcli.runs.checkpoint_manifest import DeploymentRecord, check_formula
 
 WALKER = """
 <mujoco>

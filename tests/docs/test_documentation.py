@@ -15,7 +15,7 @@ from support.fenced import all_blocks
 import rlcli.errors
 from rlcli.cli.app import build
 from rlcli.config.schema import TaskConfig
-from rlcli.config.terms import SECTIONS, builtin_terms
+from rlcli.config.term_signatures import SECTIONS, builtin_terms
 
 DOCS = ROOT / "docs"
 PAGES = sorted(page for page in DOCS.rglob("*.md") if not {"_build", "reference"} & set(page.relative_to(DOCS).parts))

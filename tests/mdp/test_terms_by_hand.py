@@ -11,7 +11,7 @@ from support.mdp_table import OBSERVATIONS, REWARDS, ROWS, SUCCESS, TERMINATIONS
 from support.mdp_worlds import bound, hand_made, put, sensors
 from support.worlds import build, edited, write
 
-from rlcli.config.terms import builtin_terms
+from rlcli.config.term_signatures import builtin_terms
 from rlcli.errors import ConfigError
 from rlcli.mdp import observations, rewards
 from rlcli.task import reads_body_forces

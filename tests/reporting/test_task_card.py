@@ -6,7 +6,7 @@ import pytest
 
 from rlcli.config.load import resolve
 from rlcli.config.schema import TaskConfig
-from rlcli.config.terms import Vocabulary
+from rlcli.config.term_signatures import Vocabulary
 from rlcli.registry import find_task
 from rlcli.reporting.task_card import Card, Column, Table, card, markdown, task_card
 

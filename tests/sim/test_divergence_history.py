@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from rlcli.config.schema import SimConfig
-from rlcli.sim import divergence
-from rlcli.sim.divergence import Divergence, StateHistory, StateLayout
+from rlcli.sim import divergence_report
+from rlcli.sim.divergence_report import Divergence, StateHistory, StateLayout
 from rlcli.sim.engine import open_cpu_engine
 
 MODEL = """
@@ -108,7 +108,7 @@ def test_calls_are_counted_on_from_where_another_history_ended():
     ("envs", "calls", "kept"), [(1, 64, 64), (2**14, 64, 64), (2**15, 64, 32), (2**21, 64, 1), (1, 0, 1)]
 )
 def test_a_history_takes_64_mb_and_always_keeps_a_call(envs, calls, kept, monkeypatch):
-    monkeypatch.setattr(divergence.np, "empty", lambda shape: np.zeros(1))
+    monkeypatch.setattr(divergence_report.np, "empty", lambda shape: np.zeros(1))
     state = np.broadcast_to(np.zeros((1, 8)), (envs, 8))
     assert StateHistory(state, 8, np.zeros(8), calls).calls == kept
 

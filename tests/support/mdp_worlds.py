@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import yaml
 
-from rlcli.config.terms import snake_case
+from rlcli.config.term_signatures import snake_case
 from support.mdp_numbers import FEET, GRAVITY, TIP, states
 from support.worlds import CRITTER, build, dump, write
 

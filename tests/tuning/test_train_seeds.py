@@ -12,8 +12,8 @@ from support.run_comparison import content, newest, rows_of
 
 from rlcli.errors import UsageError
 from rlcli.runs.index import overview, overviews
-from rlcli.runs.multi_seed import read_seeds
 from rlcli.runs.run_ref import list_runs
+from rlcli.runs.study import read_seeds
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 

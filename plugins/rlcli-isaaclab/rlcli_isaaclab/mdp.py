@@ -10,7 +10,7 @@ import functools
 import importlib
 from typing import Any
 
-from rlcli.config.terms import SECTIONS, builtin_terms
+from rlcli.config.term_signatures import SECTIONS, builtin_terms
 from rlcli.errors import did_you_mean
 from rlcli_isaaclab.config_class import MISSING, configclass
 from rlcli_isaaclab.managers import ActionTermCfg, CommandTermCfg, SceneEntityCfg

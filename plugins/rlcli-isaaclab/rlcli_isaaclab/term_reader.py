@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from rlcli.config.terms import Signature, SignatureError, builtin_terms, snake_case
+from rlcli.config.term_signatures import Signature, SignatureError, builtin_terms, snake_case
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.managers import CommandTerm, SceneEntityCfg

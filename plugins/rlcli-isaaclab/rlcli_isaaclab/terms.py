@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rlcli.config.schema import Names, Number, StrictModel
-from rlcli.config.terms import SECTIONS, Parameter, Signature, SignatureError
+from rlcli.config.term_signatures import SECTIONS, Parameter, Signature, SignatureError
 from rlcli.sim.selection import Selection
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import rlcli
-from rlcli.config.terms import SECTIONS, builtin_terms
+from rlcli.config.term_signatures import SECTIONS, builtin_terms
 
 PAGE = Path(rlcli.__path__[0]).parent / "docs" / "isaaclab-terms.md"
 ROW = re.compile(r"^\| `([^`]+)` \| (same|not possible|not offered|`[a-z0-9_]+`) \| (.*) \|$")

@@ -12,7 +12,7 @@ from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import RunsDir
 from rlcli.cli.ui.tables import cell
 from rlcli.errors import did_you_mean, listing
-from rlcli.text import shorten
+from rlcli.safe_text import shorten
 
 if TYPE_CHECKING:
     from rlcli.runs.index import Overview

@@ -113,7 +113,7 @@ def _compare(
 ) -> None:
     """Compare the best trial's settings with the task's own."""
     from rlcli.cli.ui.sweep_tables import print_comparison
-    from rlcli.runs.multi_seed import read_seeds
+    from rlcli.runs.study import read_seeds
     from rlcli.tuning.optuna_storage import check_optuna, storage_errors
     from rlcli.tuning.sweep import find_sweep
     from rlcli.tuning.sweep_compare import compare

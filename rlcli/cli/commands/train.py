@@ -105,8 +105,8 @@ def command(
 def _study(request: TrainingRequest, seeds: str | None, jobs: int | None, seed: int | None) -> list[int] | Path | None:
     """Return the seeds of a new study, or the folder of a study to resume; None for a single training."""
     from rlcli.rl import distributed
-    from rlcli.runs.multi_seed import read_seeds
     from rlcli.runs.run import STUDY
+    from rlcli.runs.study import read_seeds
 
     study = None
     if request.resume is not None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rlcli.cli.ui.terminal import supports_styles
-from rlcli.text import UNSAFE
+from rlcli.safe_text import UNSAFE
 
 if TYPE_CHECKING:
     from rlcli.reporting.heat_map import HeatMap

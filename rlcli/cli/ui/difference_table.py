@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from rlcli.cli.ui.console import console
-from rlcli.text import shorten
+from rlcli.safe_text import shorten
 
 if TYPE_CHECKING:
     from rlcli.runs.config_diff import Difference, Section

@@ -1,7 +1,7 @@
 """Terms of a manager-based task: the keys that all terms of a section have.
 
 Terms are open here: their parameters are the keyword-only parameters of the function they name, checked by
-`rlcli.config.terms`.
+`rlcli.config.term_signatures`.
 """
 
 from __future__ import annotations

@@ -8,11 +8,18 @@ from typing import Any, Literal
 import mujoco
 import torch
 
-from rlcli.mdp.sampling import DrawingTerm, FieldRandomization, RangeKeys, matching_elements, on_host, require_able
+from rlcli.mdp.randomization_base import (
+    DrawingTerm,
+    FieldRandomization,
+    RangeKeys,
+    matching_elements,
+    on_host,
+    require_able,
+)
 from rlcli.mdp.term import ActuatorTerm, JointTerm
+from rlcli.scene.joint_setup import model_actuator_kind
 from rlcli.scene.model_fields import FIELDS, ModelField
 from rlcli.scene.names import NameProblem
-from rlcli.scene.scene_joints import model_actuator_kind
 from rlcli.sim.selection import Columns, Selection
 from rlcli.task import Entity
 

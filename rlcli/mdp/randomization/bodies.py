@@ -8,7 +8,7 @@ from typing import Any, Literal
 import mujoco
 
 from rlcli.errors import listing
-from rlcli.mdp.sampling import (
+from rlcli.mdp.randomization_base import (
     SMALLEST,
     AxisRandomization,
     FieldRandomization,

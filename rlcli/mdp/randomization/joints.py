@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rlcli.mdp.sampling import DrawingTerm, Randomization, RangeKeys, require_able
+from rlcli.mdp.randomization_base import DrawingTerm, Randomization, RangeKeys, require_able
 from rlcli.mdp.term import JointTerm, TendonTerm
 from rlcli.scene.model_fields import ModelField
 from rlcli.sim.selection import Selection

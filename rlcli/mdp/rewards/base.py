@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rlcli.mdp.measures import asked_speed, vector
 from rlcli.mdp.parameters import Command, Entity, RaySensor
+from rlcli.mdp.term_helpers import asked_speed, vector
 from rlcli.sim.rotations import length, roll_pitch_yaw
 from rlcli.sim.selection import Columns, Selection
 from rlcli.sim.tensor_state import TensorState

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rlcli.mdp.measures import asked_speed, every, is_moving, paired, strongest_force
 from rlcli.mdp.parameters import Command, ContactSensor, Entity
 from rlcli.mdp.term import Term
+from rlcli.mdp.term_helpers import asked_speed, every, is_moving, paired, strongest_force
 from rlcli.sim.rotations import length
 from rlcli.sim.selection import Selection
 from rlcli.sim.tensor_state import TensorState

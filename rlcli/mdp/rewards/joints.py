@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rlcli.mdp.measures import asked_speed, is_moving, total
 from rlcli.mdp.parameters import Command, Entity
 from rlcli.mdp.term import JointTerm
+from rlcli.mdp.term_helpers import asked_speed, is_moving, total
 from rlcli.sim.rotations import length
 from rlcli.sim.selection import Selection
 from rlcli.task import Joints

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from rlcli.mdp.measures import HandleTerm, goal_in_world, goal_quat_in_world, only
 from rlcli.mdp.parameters import Command, Entity
+from rlcli.mdp.term_helpers import HandleTerm, goal_in_world, goal_quat_in_world, only
 from rlcli.sim.rotations import axis_x, axis_y, axis_z, length, turn_between
 from rlcli.task import Bodies, Joints, Sites
 
