@@ -160,7 +160,7 @@ class DirectEnv(VecEnv):
         self.task: DirectTask = task_class(self, params)
         self.task.set_up_scene(scene)
         if task_class.motors:
-            scene.add_motors()
+            scene.joints.add_motors()
 
     def _task_class(self) -> type[DirectTask]:
         """The task's class, imported."""

@@ -44,7 +44,7 @@ class ManagedEnv(VecEnv):
     """
 
     def _prepare_scene(self, scene: Scene) -> None:
-        scene.add_actuators(self._actuator_needs())
+        scene.joints.add_actuators(self._actuator_needs())
         if any(getattr(term, "reads_body_forces", False) for term in self._judging_terms()):
             add_body_forces(scene.spec)
         for config in self.config.events.values():

@@ -1,1 +1,1 @@
-"""The scene of a task: MJCF, entities, actuators, sensors and terrain, as specification and as running objects."""
+"""Scene of a task: MJCF, entities, actuators, sensors and terrain."""

@@ -1,8 +1,9 @@
-"""Cameras of a scene: images of every environment, rendered offscreen by threads with an OpenGL context each."""
+"""Camera sensors: images of every environment, rendered offscreen by threads with one OpenGL context each."""
 
 from __future__ import annotations
 
 import copy
+import functools
 import os
 import queue
 import threading
@@ -30,16 +31,16 @@ _VISIBLE_CATEGORIES = int(mujoco.mjtCatBit.mjCAT_STATIC | mujoco.mjtCatBit.mjCAT
 _INTEGRATION_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _MAX_GEOMS = 10_000
 _JOIN_TIMEOUT = 5.0
-"""How long to wait for a thread to end [s]."""
+"""Longest time to wait for a thread to end [s]."""
 
 
 class CameraSensor(LazySensor):
-    """One image of every environment, rendered when it is read, at most once a step.
+    """Camera that renders one image of every environment when it is read, at most once per step.
 
     Args:
-        name: of the sensor.
+        name: name of the sensor.
         spec: the camera in the model.
-        engine: whose states are rendered.
+        engine: the engine whose states are rendered.
         renderers: threads that render.
     """
 
@@ -51,15 +52,16 @@ class CameraSensor(LazySensor):
         shape = (config.height, config.width, _CHANNELS[config.data])
         kind = torch.uint8 if config.data == "rgb" else torch.float32
         self.names = [name]
-        """The sensor."""
+        """Names of the sensor's columns: only its own name."""
         self._image = torch.zeros(engine.num_envs, *shape, dtype=kind)
         self._pixels = self._image.numpy()
 
     @property
     def image(self) -> Tensor:
-        """The images, rows from the top. rgb: (num_envs, h, w, 3) uint8; else (num_envs, h, w, 1) float32 [m].
+        """Images, the top row first. rgb: (num_envs, h, w, 3) uint8; else (num_envs, h, w, 1) float32 [m].
 
-        Nothing within `clip` is 0 m. Where a pixel is the mean of several samples, those that see nothing count as 0 m.
+        A distance of 0 m means that nothing is within `clip`. Where a pixel is the mean of several samples, samples
+        without a hit count as 0 m.
         """
         if not self._current:
             self._current = True
@@ -67,35 +69,34 @@ class CameraSensor(LazySensor):
         return self._image
 
     def on_moved(self, selection: Selection) -> None:
-        """Render the selected environments anew, if the image has been read in this step."""
+        """Render the selected environments again, if the image has been read in this step."""
         if self._current:
             self._render(ids_of(selection))
 
     def close(self) -> None:
-        """Free the contexts, which all cameras of the scene share."""
+        """Free the OpenGL contexts, which all cameras of the scene share."""
         self._renderers.close()
 
     def _render(self, ids: NDArray[np.int64]) -> None:
+        """Render some environments, an equal share in each thread."""
         engine, config, camera, pixels = self._engine, self.config, self._camera, self._pixels
 
-        def work_on(share: NDArray[np.int64]) -> Callable[[CameraRenderer], None]:
-            def work(renderer: CameraRenderer) -> None:
-                for env in share.tolist():
-                    renderer.load_state(engine, env)
-                    renderer.render(camera, config, pixels[env])
+        def render_share(share: NDArray[np.int64], renderer: CameraRenderer) -> None:
+            for env in share.tolist():
+                renderer.load_state(engine, env)
+                renderer.render(camera, config, pixels[env])
 
-            return work
-
-        self._renderers.run([work_on(share) for share in np.array_split(ids, self._renderers.count) if len(share)])
+        shares = np.array_split(ids, self._renderers.count)
+        self._renderers.run([functools.partial(render_share, share) for share in shares if len(share)])
 
 
 class CameraRenderer:
-    """An OpenGL context with its buffers; one thread makes, uses and frees it.
+    """OpenGL context with its buffers, which one thread makes, uses and frees.
 
     Args:
-        model: of the scene.
-        width: of the largest image, in samples.
-        height: likewise.
+        model: model of the scene.
+        width: width of the largest image [samples].
+        height: height of the largest image [samples].
 
     Raises:
         MachineError: if no OpenGL works on this machine.
@@ -105,7 +106,7 @@ class CameraRenderer:
         self._model = self._shared_model = model
         self._data = mujoco.MjData(model)
         self._context, _ = open_context(width, height, in_thread=True)
-        small = copy.copy(model)  # buffers of the viewer's size would be cleared for every picture
+        small = copy.copy(model)  # buffers of the viewer's size would be cleared for every image
         small.vis.global_.offwidth, small.vis.global_.offheight = width, height
         small.vis.quality.offsamples, small.vis.quality.shadowsize = 0, 0
         self._mjr = mujoco.MjrContext(small, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -119,7 +120,7 @@ class CameraRenderer:
         self._option = mujoco.MjvOption()
 
     def load_state(self, engine: ReplayableEngine, env: int) -> None:
-        """Load the state of a world, and its own model, as far as they are visible."""
+        """Load the visible part of a world's state and model."""
         if engine.expanded_fields():
             if self._model is self._shared_model:
                 self._model = copy.copy(self._shared_model)
@@ -135,7 +136,7 @@ class CameraRenderer:
             mujoco.mj_tendon(model, data)
 
     def render(self, camera: int, config: CameraSensorConfig, out: NDArray[Any]) -> None:
-        """Render the world that was loaded last. out (h, w, c)"""
+        """Render the last loaded world into `out`. (h, w, c)"""
         scene, flags = self._scene, mujoco.mjtRndFlag
         self._view.fixedcamid = camera
         mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._view, _VISIBLE_CATEGORIES, scene)
@@ -166,10 +167,10 @@ class RendererPool:
     """Threads that render, each with a `CameraRenderer`.
 
     Args:
-        model: of the scene.
-        width: of the largest image, in samples.
-        height: likewise.
-        threads: how many.
+        model: model of the scene.
+        width: width of the largest image [samples].
+        height: height of the largest image [samples].
+        threads: number of threads.
 
     Raises:
         MachineError: if no OpenGL works on this machine.
@@ -180,7 +181,7 @@ class RendererPool:
         self._orders: list[_Orders] = []
         self._threads: list[threading.Thread] = []
         self._end = weakref.finalize(self, _end_threads, self._orders, self._threads, self._process)
-        for number in range(threads):  # one after the other: the first finds out which OpenGL works
+        for number in range(threads):  # one after the other: the first one finds out which OpenGL works
             orders: _Orders = queue.SimpleQueue()
             ready: _Replies = queue.SimpleQueue()
             thread = threading.Thread(
@@ -204,27 +205,27 @@ class RendererPool:
         return len(self._threads)
 
     def run(self, work: Sequence[Callable[[CameraRenderer], None]]) -> None:
-        """Do each piece of work in a thread of its own.
+        """Run each function in a thread of its own and wait for all of them.
 
         Raises:
             MachineError: after `close`, or in a process that was forked from the one that opened the contexts.
         """
         if os.getpid() != self._process:
             raise MachineError(
-                "cameras draw in the process that made the environment, and this is a fork of it",
-                hint="make the environment in the new process, or start that with 'spawn'",
+                "cameras render only in the process that made the environment; this process is a fork of it",
+                hint="make the environment in the new process, or start the process with 'spawn'",
             )
         if not self._end.alive:
-            raise MachineError("the environment is closed: its cameras draw no more")
+            raise MachineError("the environment is closed: its cameras cannot render any more")
         done: _Replies = queue.SimpleQueue()
-        for piece, orders in zip(work, self._orders, strict=False):
-            orders.put((piece, done))
-        replies = [done.get() for _ in work]
+        for function, orders in zip(work, self._orders, strict=False):
+            orders.put((function, done))
+        replies = [done.get() for _ in work]  # wait for all threads before an error is raised
         for reply in replies:
             _raise(reply)
 
     def close(self) -> None:
-        """End the threads, which free their contexts."""
+        """End the threads, each of which frees its context."""
         self._end()
         if os.getpid() == self._process:
             for thread in self._threads:
@@ -232,17 +233,17 @@ class RendererPool:
 
 
 def make_cameras(specs: Mapping[str, CameraSensorSpec], engine: Engine) -> dict[str, CameraSensor]:
-    """Make the cameras that the scene has put into the model.
+    """Make the camera sensors of a compiled scene.
 
     Raises:
-        ConfigError: on an engine whose states are not on the CPU.
+        ConfigError: for an engine whose states are not on the CPU.
         MachineError: if no OpenGL works on this machine.
     """
     if not specs:
         return {}
     if (states := engine.replayable) is None:
         hint = "--device cpu, and no sim.engine: warp"
-        message = "cameras draw on a CPU: the GPU engine has none"
+        message = "cameras need the CPU engine; the GPU engine cannot render them"
         raise ConfigError([Problem("scene", f"scene.sensors.{name}", message, hint) for name in specs])
     configs = [spec.config for spec in specs.values()]
     width, height = (max(c.samples * getattr(c, edge) for c in configs) for edge in ("width", "height"))
@@ -255,7 +256,7 @@ _Orders = queue.SimpleQueue[tuple[Callable[[CameraRenderer], None], _Replies] | 
 
 
 def _render_orders(model: mujoco.MjModel, width: int, height: int, orders: _Orders, ready: _Replies) -> None:
-    """Render in a thread: OpenGL requires that one thread makes, uses and frees a context."""
+    """Run the main loop of a thread: OpenGL requires that one thread makes, uses and frees a context."""
     try:
         renderer = CameraRenderer(model, width, height)
     except BaseException as error:
@@ -263,22 +264,22 @@ def _render_orders(model: mujoco.MjModel, width: int, height: int, orders: _Orde
         return
     ready.put(None)
     while (order := orders.get()) is not None:
-        piece, done = order
+        function, done = order
         try:
-            piece(renderer)
+            function(renderer)
         except BaseException as error:
             done.put(error)
         else:
             done.put(None)
-        del order, piece, done  # nothing of an environment is held while waiting
+        del order, function, done  # hold no reference to an environment while waiting
     renderer.free()
 
 
 def _end_threads(orders: list[_Orders], threads: list[threading.Thread], process: int) -> None:
     if os.getpid() != process:
-        return  # the threads stayed behind in the process that forked
-    for some in orders:
-        some.put(None)
+        return  # a fork has no copies of the threads
+    for thread_orders in orders:
+        thread_orders.put(None)
     if threading.current_thread() is threading.main_thread():
         for thread in threads:
             thread.join(_JOIN_TIMEOUT)
@@ -290,9 +291,9 @@ def _raise(reply: BaseException | None) -> None:
 
 
 def _set_clip_planes(view: mujoco.MjvGLCamera, near: float, far: float) -> None:
-    """Set the near and the far plane; the field of view stays."""
+    """Set the near and the far plane without changing the field of view."""
     if not view.orthographic:
-        for name in ("center", "width", "bottom", "top"):  # measured on the near plane
+        for name in ("center", "width", "bottom", "top"):  # MuJoCo measures them on the near plane
             value = getattr(view, f"frustum_{name}") * near / view.frustum_near
             setattr(view, f"frustum_{name}", value)
     view.frustum_near, view.frustum_far = near, far
@@ -301,9 +302,9 @@ def _set_clip_planes(view: mujoco.MjvGLCamera, near: float, far: float) -> None:
 def _depth_in_metres(
     nearness: NDArray[np.float32], view: mujoco.MjvGLCamera, *, along_ray: bool
 ) -> NDArray[np.float32]:
-    """Return the depths of a buffer that is 1 at the near plane and 0 at the far one; 0 where nothing is seen. (h, w)
+    """Return the depths of a depth buffer that is 1 at the near plane and 0 at the far one. (h, w) [m]
 
-    Along the camera's axis, or along the ray through each pixel.
+    Depths are along the camera's axis, or along the ray through each pixel; 0 where nothing is seen.
     """
     near, far = np.float32(view.frustum_near), np.float32(view.frustum_far)
     if view.orthographic:
@@ -318,7 +319,7 @@ def _depth_in_metres(
 
 
 def _ray_lengths(height: int, width: int, view: mujoco.MjvGLCamera) -> NDArray[np.float32]:
-    """Return the length of the ray through each pixel to depth 1, rows from the bottom. (h, w)"""
+    """Return the length of the ray through each pixel to depth 1, the bottom row first. (h, w)"""
     rows, columns = ((np.arange(count) + 0.5) / count for count in (height, width))
     half = view.frustum_width or 0.5 * (view.frustum_top - view.frustum_bottom) * width / height
     y = (view.frustum_bottom + rows * (view.frustum_top - view.frustum_bottom)) / view.frustum_near
@@ -328,7 +329,7 @@ def _ray_lengths(height: int, width: int, view: mujoco.MjvGLCamera) -> NDArray[n
 
 
 def _downsample(values: NDArray[Any], samples: int) -> NDArray[Any]:
-    """Return means of blocks, with rows from the top instead of the bottom. (h s, w s, c) -> (h, w, c)"""
+    """Return the means of s x s blocks, with the top row first instead of last. (h s, w s, c) -> (h, w, c)"""
     if samples > 1:
         rows = np.stack([values[k::samples] for k in range(samples)]).sum(axis=0, dtype=np.float32)
         values = np.stack([rows[:, k::samples] for k in range(samples)]).sum(axis=0) / np.float32(samples * samples)

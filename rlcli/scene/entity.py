@@ -1,4 +1,4 @@
-"""A robot or object of the scene: its elements by name, and how to set its state."""
+"""Entity: a robot or object of the scene, its elements by name, and setters of its state."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _KINDS = {
     "Tendons": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
     "Pairs": (mujoco.mjtObj.mjOBJ_PAIR, "npair"),
 }
-"""Kinds of elements: MuJoCo's type, and the model's field that counts them."""
+"""Kind of element -> MuJoCo's type, and the field of the model that counts them."""
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 class Entity:
-    """One attached model. Joints are its hinges and slides in the model's order; a free joint is its root."""
+    """Robot or object of the scene. Its joints are the hinges and slides in the model's order, without a free root."""
 
     def __init__(self, name: str, config: EntityConfig, engine: Engine, sim: SimData) -> None:
         self.name = name
@@ -50,24 +50,24 @@ class Entity:
         self.sim = sim
         model = engine.model
         self.ids = {alias: _ids(model, name, kind, getattr(model, count)) for alias, (kind, count) in _KINDS.items()}
-        """Ids in the model, by kind: Joints, Bodies, ..."""
+        """Ids in the model by kind: Joints, Bodies, ..."""
         self.ids["Joints"] = self.ids["Joints"][np.isin(model.jnt_type[self.ids["Joints"]], _SCALAR)]
         self.joint_ids, self.body_ids, self.site_ids = self.ids["Joints"], self.ids["Bodies"], self.ids["Sites"]
         self.actuator_ids, self.geom_ids = self.ids["Actuators"], self.ids["Geoms"]
         self.names = {alias: _names(model, name, kind, self.ids[alias]) for alias, (kind, _) in _KINDS.items()}
-        """Names without the entity's prefix, by kind."""
+        """Names by kind, without the entity's prefix."""
         self.joint_names = self.names["Joints"]
         self.qpos_columns = id_tensor(model.jnt_qposadr[self.joint_ids], engine.device)
         self.dof_columns = id_tensor(model.jnt_dofadr[self.joint_ids], engine.device)
         self.root_body = int(self.body_ids[0]) if len(self.body_ids) else 0
         self.root_qpos, self.root_dof = self._root(model)
         self.mocap = int(model.body_mocapid[self.root_body])
-        """Number of the mocap body that the root is; -1: none."""
+        """Index of the root among MuJoCo's mocap bodies; -1 if the root is not a mocap body."""
         self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
-        self._places: dict[tuple[int, ...], tuple[Columns, Field, Columns]] = {}
+        self._targets: dict[tuple[int, ...], tuple[Columns, Field, Columns]] = {}
         self.data = EntityData(self, sim)
         self.actuators: list[ActuatorModel] = []
-        """Models that drive joints between physics steps; filled once the entity stands."""
+        """Actuator models of its joints; they are made after the entity."""
 
     @property
     def is_floating(self) -> bool:
@@ -75,10 +75,14 @@ class Entity:
         return self.root_qpos is not None
 
     def select(self, alias: str, patterns: str | Sequence[str]) -> tuple[Columns, list[str]]:
-        """Names or regexes of Joints, Bodies, ... -> an index into this entity's columns, and the names it stands for.
+        """Return an index into this entity's columns, and the names of the elements that it selects.
+
+        Args:
+            alias: the kind of element: Joints, Bodies, ...
+            patterns: names or regular expressions.
 
         Raises:
-            NameProblem: for what the model does not have.
+            NameProblem: for a pattern that matches no element.
         """
         names = self.names[alias]
         singular = {"Bodies": "body"}.get(alias, alias[:-1].lower())
@@ -89,28 +93,28 @@ class Entity:
         return self._index(positions), [names[p] for p in positions]
 
     def actuators_of(self, kind: str) -> list[tuple[int, int]]:
-        """(joint column, actuator id) of every joint that a motor, position or velocity actuator drives."""
+        """Return (joint column, actuator id) of every joint with a MuJoCo actuator of a kind: motor, position, ..."""
         model = self.engine.model
+        columns = {joint: column for column, joint in enumerate(self.joint_ids.tolist())}
         found = []
-        for a in self.actuator_ids.tolist():
-            made = model_actuator_kind(model, a)
-            joint = int(model.actuator_trnid[a, 0])
-            if made == kind and joint in self.joint_ids:
-                found.append((self.joint_ids.tolist().index(joint), a))
+        for actuator in self.actuator_ids.tolist():
+            joint = int(model.actuator_trnid[actuator, 0])
+            if joint in columns and model_actuator_kind(model, actuator) == kind:
+                found.append((columns[joint], actuator))
         return sorted(found)
 
     def write_joint_positions(self, selection: Selection, values: Tensor, joints: Columns = ALL) -> None:
         """Set joint positions of the selected environments. values (rows, k) [m or rad]"""
-        field, columns = self._place(self._qpos, self.qpos_columns, joints)
+        field, columns = self._target(self._qpos, self.qpos_columns, joints)
         selection.write(field, values, columns)
 
     def write_joint_velocities(self, selection: Selection, values: Tensor, joints: Columns = ALL) -> None:
         """Set joint velocities of the selected environments. values (rows, k) [m/s or rad/s]"""
-        field, columns = self._place(self._qvel, self.dof_columns, joints)
+        field, columns = self._target(self._qvel, self.dof_columns, joints)
         selection.write(field, values, columns)
 
     def write_root_pose(self, selection: Selection, position: Tensor, quat: Tensor) -> None:
-        """Set the pose of a free or mocap root in its world. position (rows, 3) [m], quat (rows, 4) w, x, y, z"""
+        """Set the pose of a free or mocap root, world frame. position (rows, 3) [m], quat (rows, 4) w, x, y, z"""
         if self.mocap >= 0:
             selection.write(self.engine.field("mocap_pos")[:, self.mocap], position)
             selection.write(self.engine.field("mocap_quat")[:, self.mocap], quat)
@@ -119,21 +123,30 @@ class Entity:
         selection.write(self._qpos, torch.cat([position, quat], dim=1), slice(root, root + 7))
 
     def write_root_velocity(self, selection: Selection, linear_w: Tensor, angular_w: Tensor) -> None:
-        """Set the root's velocity, world frame; set the pose first. linear [m/s] and angular [rad/s], (rows, 3) each"""
+        """Set the root's velocity, world frame; set the pose first.
+
+        Args:
+            selection: the environments.
+            linear_w: linear velocity. (rows, 3) [m/s]
+            angular_w: angular velocity. (rows, 3) [rad/s]
+        """
         root, dof = self.floating()
         quat = selection.read(self._qpos, slice(root + 3, root + 7)).float()
         local = rotate_inverse(quat, angular_w)  # a free joint's angular velocity is in the body's frame
         selection.write(self._qvel, torch.cat([linear_w, local], dim=1), slice(dof, dof + 6))
 
     def read_root_velocity(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """The root's velocity as it is now, also where it has just been set, world frame. (rows, 3) each"""
+        """Return the root's linear and angular velocity, world frame, read from the engine. (rows, 3) each
+
+        Unlike `data.root_lin_vel_w`, the result includes a velocity that has just been set.
+        """
         qpos, dof = self.floating()
         velocity = selection.read(self._qvel, slice(dof, dof + 6)).float()
         quat = selection.read(self._qpos, slice(qpos + 3, qpos + 7)).float()
         return velocity[:, :3], rotate(quat, velocity[:, 3:])
 
     def floating(self) -> tuple[int, int]:
-        """Where the free joint of the root lies in qpos and in qvel.
+        """Return the first column of the root's free joint in qpos and in qvel.
 
         Raises:
             TaskError: if the root is fixed to the world.
@@ -145,16 +158,17 @@ class Entity:
     def _index(self, positions: Sequence[int]) -> Columns:
         return as_index(positions, self.engine.device)
 
-    def _place(self, field: Tensor, of: Tensor, joints: Columns) -> tuple[Field, Columns]:
-        """Where in a field of the engine joints lie: of consecutive columns the part that is these alone."""
-        key = (id(of), joints.start, joints.stop, joints.step) if isinstance(joints, slice) else (id(of), id(joints))
-        if key not in self._places:
-            columns = self._index(of[joints].tolist())
+    def _target(self, field: Tensor, field_columns: Tensor, joints: Columns) -> tuple[Field, Columns]:
+        """Return the engine's field and the columns of some joints in it; for consecutive columns, a view of these."""
+        index = (joints.start, joints.stop, joints.step) if isinstance(joints, slice) else (id(joints),)
+        key = (id(field_columns), *index)
+        if key not in self._targets:
+            columns = self._index(field_columns[joints].tolist())
             if isinstance(columns, slice):
                 field, columns = field[:, columns], ALL
-            # the joints stay referenced, so that their id is not given to another tensor
-            self._places[key] = (joints, self.engine.as_field(field), columns)
-        return self._places[key][1:]
+            # the index stays referenced, so that Python does not give its id to another tensor
+            self._targets[key] = (joints, self.engine.as_field(field), columns)
+        return self._targets[key][1:]
 
     def _root(self, model: mujoco.MjModel) -> tuple[int | None, int | None]:
         joint = int(model.body_jntadr[self.root_body])

@@ -1,9 +1,9 @@
-"""What terms read of an entity: joints, root, gravity, bodies and sites, in every environment."""
+"""State of an entity as terms read it: joints, root, gravity, bodies and sites, in every environment."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
 
 
 class EntityData:
-    """The state of an entity in every environment, float32, positions in the environment's frame.
+    """State of an entity in every environment, in float32; positions are in the environment's frame.
 
-    Read it, do not write it: most attributes are live views. Setters are methods of `Entity`.
+    Do not write to the attributes: most are live views of the state. Set the state with the methods of `Entity`.
     """
 
     def __init__(self, entity: Entity, sim: SimData) -> None:
         self._entity = entity
         self._sim = sim
-        self._cache: dict[Hashable, tuple[int, Tensor]] = {}
+        self._cache: dict[str, tuple[int, Tensor]] = {}
         self._pos, self._vel = CachedViews(), CachedViews()
         self._default_pos, self._default_vel = CachedViews(), CachedViews()
         self._limit_views = {soft: (CachedViews(), CachedViews()) for soft in (False, True)}
@@ -42,17 +42,17 @@ class EntityData:
         self._qpos_index = as_index(entity.qpos_columns.tolist(), device)
         self._dof_index = as_index(entity.dof_columns.tolist(), device)
         self._body_index = as_index(entity.body_ids.tolist(), device)
-        # consecutive columns: a view of the copied state, made once
+        # joints in consecutive columns: a view of the copied state, made once
         self._joint_pos = sim.qpos[:, self._qpos_index] if isinstance(self._qpos_index, slice) else None
         self._joint_vel = sim.qvel[:, self._dof_index] if isinstance(self._dof_index, slice) else None
         ranges = torch.tensor(model.jnt_range[entity.joint_ids], dtype=torch.float32, device=device)
         limited = torch.tensor(model.jnt_limited[entity.joint_ids], dtype=torch.bool, device=device)
         infinite = torch.tensor([-torch.inf, torch.inf], device=device)
         self.joint_pos_limits = torch.where(limited[:, None], ranges, infinite)
-        """Lower and upper limit of each joint, infinite where it has none. (k, 2) [m or rad]"""
+        """Lower and upper limit of each joint, infinite for a joint without limits. (k, 2) [m or rad]"""
         soft = torch.stack(self._soft_limits(*ranges.unbind(dim=1)), dim=1)
         self.soft_joint_pos_limits = torch.where(limited[:, None], soft, infinite)
-        """The limits, drawn in by `soft_joint_pos_limit_factor`. (k, 2) [m or rad]"""
+        """The limits, narrowed about their middle by `soft_joint_pos_limit_factor`. (k, 2) [m or rad]"""
         self._limits = {
             soft: tuple(end[None] for end in limits.unbind(dim=1))
             for soft, limits in ((False, self.joint_pos_limits), (True, self.soft_joint_pos_limits))
@@ -71,7 +71,7 @@ class EntityData:
             [joint_settings(entity.config, name).velocity_limit or math.inf for name in entity.joint_names],
             device=device,
         )
-        """Speed limit of each joint, `velocity_limit`, infinite where it has none. (k,) [m/s or rad/s]"""
+        """Speed limit of each joint, `velocity_limit`; infinite for a joint without one. (k,) [m/s or rad/s]"""
         self._gravity = torch.tensor(model.opt.gravity, dtype=torch.float32, device=device).expand(num_envs, -1)
         self._down = _direction(self._gravity)
         self._tree_root = id_tensor(model.body_rootid[entity.body_ids], device)
@@ -98,23 +98,23 @@ class EntityData:
         return self._once("joint_vel", lambda: self._sim.qvel[:, self._dof_index])
 
     def joint_pos_of(self, joints: Columns) -> Tensor:
-        """`joint_pos[:, joints]`, for what is read in every step: a view is made once. (num_envs, k) [m or rad]"""
-        return self._pos.of(self.joint_pos if self._joint_pos is None else self._joint_pos, joints)
+        """Return `joint_pos[:, joints]`; the view is made once, for terms of every step. (num_envs, k) [m or rad]"""
+        return self._pos.of(self.joint_pos, joints)
 
     def joint_vel_of(self, joints: Columns) -> Tensor:
-        """`joint_vel[:, joints]`, likewise. (num_envs, k) [m/s or rad/s]"""
-        return self._vel.of(self.joint_vel if self._joint_vel is None else self._joint_vel, joints)
+        """Return `joint_vel[:, joints]`; the view is made once. (num_envs, k) [m/s or rad/s]"""
+        return self._vel.of(self.joint_vel, joints)
 
     def default_joint_pos_of(self, joints: Columns) -> Tensor:
-        """`default_joint_pos[:, joints]`, likewise. (num_envs, k) [m or rad]"""
+        """Return `default_joint_pos[:, joints]`; the view is made once. (num_envs, k) [m or rad]"""
         return self._default_pos.of(self.default_joint_pos, joints)
 
     def default_joint_vel_of(self, joints: Columns) -> Tensor:
-        """`default_joint_vel[:, joints]`, likewise. (num_envs, k) [m/s or rad/s]"""
+        """Return `default_joint_vel[:, joints]`; the view is made once. (num_envs, k) [m/s or rad/s]"""
         return self._default_vel.of(self.default_joint_vel, joints)
 
     def read_default_joints(self, selection: Selection, joints: Columns = ALL) -> tuple[Tensor, Tensor]:
-        """Default positions and velocities of some joints, for a moment as `read_view`. (rows, k) each"""
+        """Return default positions and velocities of some joints, with the limits of `read_view`. (rows, k) each"""
         position, velocity = self.default_joint_pos, self.default_joint_vel
         if not isinstance(joints, slice):
             return selection.read_view(position, joints), selection.read_view(velocity, joints)
@@ -127,13 +127,13 @@ class EntityData:
         return selection.read_view(known[2]), selection.read_view(known[3])
 
     def joint_limits_of(self, joints: Columns, soft: bool = False) -> tuple[Tensor, Tensor]:
-        """`joint_limits` of some joints, likewise. (num_envs or 1, k) each"""
+        """Return `joint_limits` of some joints; the views are made once. (num_envs or 1, k) each"""
         low, high = self.joint_limits(soft)
         lows, highs = self._limit_views[soft]
         return lows.of(low, joints), highs.of(high, joints)
 
     def joint_angle_of(self, joints: Columns) -> Tensor:
-        """`joint_pos[:, joints]` wrapped to [-pi, pi], computed once a step: do not write to it. (num_envs, k) [rad]"""
+        """Return `joint_pos[:, joints]` wrapped to [-pi, pi], computed once per step. (num_envs, k) [rad]"""
         stamp, known = self._sim.stamp, self._angles.get(id(joints))
         if known is not None and known[0] is joints and known[1] == stamp:
             return known[2]
@@ -203,18 +203,18 @@ class EntityData:
 
     @property
     def heading_w(self) -> Tensor:
-        """Direction of the root's x axis in the horizontal plane, about z from the world's x. (num_envs,) [rad]"""
+        """Angle of the root's x axis about the world's z axis, from the world's x axis. (num_envs,) [rad]"""
         return self._once("heading_w", lambda: atan2(self.forward_w[:, 1], self.forward_w[:, 0]))
 
     @property
     def gravity_w(self) -> Tensor:
-        """Gravity, the environment's own where it differs between environments. (num_envs, 3) [m/s^2]"""
+        """Gravity, with its randomisation. (num_envs, 3) [m/s^2]"""
         own = self._entity.engine.expanded("opt.gravity")
         return self._gravity if own is None else self._once("gravity_w", lambda: own.float().view(-1, 3))
 
     @property
     def down_w(self) -> Tensor:
-        """Direction of gravity, length 1; -z where there is none. (num_envs, 3)"""
+        """Direction of gravity, length 1; -z where gravity is 0. (num_envs, 3)"""
         if self._entity.engine.expanded("opt.gravity") is None:
             return self._down
         return self._once("down_w", lambda: _direction(self.gravity_w))
@@ -226,30 +226,30 @@ class EntityData:
 
     @property
     def computed_effort(self) -> Tensor:
-        """What actuators would put on the joints without limits on forces. (num_envs, k) [N or N m]
+        """Efforts of the actuators on the joints without force limits. (num_envs, k) [N or N m]
 
-        Of actuator models, in the last substep. Of MuJoCo's actuators with a fixed gain, no or an affine bias and no
-        dynamics of their own (motor, position, velocity), by the present state and controls. Others count as 0.
+        Actuator models: efforts of the last substep. Motor, position and velocity actuators of MuJoCo (fixed gain, no
+        bias or an affine one, no dynamics): computed from the present state and controls. Other actuators count as 0.
         """
         return self._once("computed_effort", self._efforts.without_limits)
 
     @property
     def joint_effort_limits(self) -> Tensor:
-        """Largest effort of the actuators on each joint, infinite where nothing limits it. (1 or num_envs, k)
+        """Largest effort of the actuators on each joint; infinite without a limit. (1 or num_envs, k) [N or N m]
 
-        [N or N m] From force limits of actuators and joints, and control limits of motors.
+        It follows from the force limits of actuators and joints, and from the control limits of motors.
         """
         return self._once("joint_effort_limits", self._efforts.limits)
 
     @property
     def withheld_effort(self) -> Tensor:
-        """How much less than `computed_effort` limits let through, >= 0. (num_envs, k) [N or N m]"""
+        """Magnitude of the effort that the limits remove from `computed_effort`, >= 0. (num_envs, k) [N or N m]"""
         return self._once("withheld_effort", self._efforts.removed_by_limits)
 
     def joint_limits(self, soft: bool = False) -> tuple[Tensor, Tensor]:
-        """Lower and upper position limits as they are now, infinite where there is none. (num_envs or 1, k) each
+        """Return the lower and upper position limits, with their randomisation. (num_envs or 1, k) each [m or rad]
 
-        `joint_pos_limits` are those of the configuration; these follow a randomisation.
+        Limits are infinite for a joint without limits. `joint_pos_limits` has the limits without randomisation.
         """
         ranges = self._entity.engine.expanded("jnt_range")
         if ranges is None:
@@ -311,7 +311,7 @@ class EntityData:
     def body_lin_acc_w(self) -> Tensor:
         """Accelerations of the bodies' frame origins over the last substep, world frame. (num_envs, bodies, 3) [m/s^2]
 
-        0 at rest, and that of gravity in free fall.
+        The acceleration is 0 at rest and equals gravity in free fall.
         """
 
         def compute() -> Tensor:
@@ -319,15 +319,16 @@ class EntityData:
             angular, linear = acceleration[..., :3], acceleration[..., 3:]
             at_origin = linear + cross(angular, self._from_tree_com(self.body_pos_w))
             turning = cross(self.body_ang_vel_w, self.body_lin_vel_w)
-            return at_origin + turning + self.gravity_w[:, None]  # MuJoCo's accelerations are against gravity
+            # MuJoCo's cacc contains -gravity, as an accelerometer measures it
+            return at_origin + turning + self.gravity_w[:, None]
 
         return self._once("body_lin_acc_w", compute)
 
     @property
     def body_incoming_wrench_b(self) -> Tensor:
-        """Force and torque by which each body's parent holds it, in the body's frame. (num_envs, bodies, 6) [N, N m]
+        """Force and torque of each body's parent on the body, body frame. (num_envs, bodies, 6) [N, N m]
 
-        Of the last substep; the torque is about the body's frame origin.
+        Values of the last substep; the torque is about the origin of the body's frame.
         """
 
         def compute() -> Tensor:
@@ -375,12 +376,13 @@ class EntityData:
         return self._sim.derived_field("sensordata")
 
     def _soft_limits(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-        """Return limits drawn in by `soft_joint_pos_limit_factor`."""
+        """Return the limits, narrowed about their middle by `soft_joint_pos_limit_factor`."""
         middle, half = 0.5 * (low + high), 0.5 * self._entity.config.soft_joint_pos_limit_factor * (high - low)
         return middle - half, middle + half
 
     def _velocity_at(self, points: Tensor) -> Tensor:
-        """Velocity of a point of each body: MuJoCo gives that at the centre of mass of the body's tree."""
+        """Return the velocity of a point of each body, world frame. (num_envs, bodies, 3) [m/s]"""
+        # MuJoCo's cvel is the velocity at the centre of mass of the body's kinematic tree
         velocity = self._sim.derived_field("cvel")[:, self._body_index]
         return velocity[..., 3:] + cross(velocity[..., :3], self._from_tree_com(points))
 
@@ -390,12 +392,13 @@ class EntityData:
     def _body_force(self, name: str) -> Tensor:
         if not self._computes_body_forces:
             raise ValueError(
-                "reads accelerations or forces of bodies, which MuJoCo computes only where a sensor needs them: mark"
-                " the term with rlcli.task.reads_body_forces, or give the MJCF an accelerometer, force or torque sensor"
+                "reads accelerations or forces of bodies, which MuJoCo computes only if a sensor needs them: mark the"
+                " term with rlcli.task.reads_body_forces, or add an accelerometer, force or torque sensor to the MJCF"
             )
         return self._sim.derived_field(name)
 
-    def _once(self, name: Hashable, compute: Callable[[], Tensor]) -> Tensor:
+    def _once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
+        """Return a value that is computed once per step."""
         stamp, value = self._cache.get(name, (-1, None))
         if stamp != self._sim.stamp or value is None:
             value = compute()
@@ -404,7 +407,7 @@ class EntityData:
 
 
 def _direction(gravity: Tensor) -> Tensor:
-    """Where gravity points, length 1; -z where there is none. (n, 3)"""
+    """Return the direction of gravity, length 1; -z where gravity is 0. (n, 3)"""
     size = length(gravity)[:, None]
     down = torch.zeros_like(gravity)
     down[:, 2].fill_(-1.0)

@@ -1,4 +1,4 @@
-"""The model of one entity before it is attached to a scene: an MJCF, or a body with one geom."""
+"""Model of one entity before it is attached to a scene: an MJCF, or a body with one geom."""
 
 from __future__ import annotations
 
@@ -9,40 +9,32 @@ import mujoco
 import numpy as np
 
 from rlcli.config.schema import EntityConfig
-from rlcli.errors import MissingModelError, TaskError
+from rlcli.errors import MissingModelError, TaskError, one_line
 from rlcli.registry import model_file
 from rlcli.scene.names import SceneProblem
 from rlcli.scene.untrusted_mjcf import BadModel, model_roots, read_mjcf
-
-_SHAPES = {
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "plane": mujoco.mjtGeom.mjGEOM_PLANE,
-}
 
 
 def entity_model(name: str, entity: EntityConfig, root: Path, *, installed: bool) -> mujoco.MjSpec:
     """Return the model of an entity: its MJCF, or a body with one geom.
 
     Args:
-        name: of the entity.
-        entity: its configuration.
+        name: name of the entity.
+        entity: configuration of the entity.
         root: the task's folder.
-        installed: whether the task is installed: its files are trusted.
+        installed: whether the task is installed: the files of an installed task are trusted.
 
     Raises:
-        SceneProblem: if its MJCF cannot be read.
-        MissingModelError: if the user has to provide its model.
+        SceneProblem: if the MJCF cannot be read.
+        MissingModelError: if the user has to provide the model.
     """
     if entity.model is None:
         return _shape_model(entity)
-    return _load_mjcf(entity, ("scene", "entities", name), root, installed)
+    return _load_mjcf(entity, ("scene", "entities", name, "model"), root, installed)
 
 
 def name_all(child: mujoco.MjSpec) -> None:
-    """Give what the MJCF leaves unnamed a name: an entity knows its elements by the prefix of their names."""
+    """Name the elements that the MJCF leaves unnamed: an entity finds its elements by the prefix of their names."""
     for kind, elements in (
         ("body", child.bodies[1:]),
         ("joint", child.joints),
@@ -64,9 +56,9 @@ def name_all(child: mujoco.MjSpec) -> None:
 
 
 def write_masses(child: mujoco.MjSpec) -> None:
-    """Write down the mass and inertia of every body: attaching would lose the MJCF's `settotalmass`."""
+    """Set the mass and inertia of every body explicitly: attaching would lose the MJCF's `settotalmass`."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # MuJoCo means to drop the attribute; models have it
+        warnings.simplefilter("ignore")  # MuJoCo has deprecated the attribute, but models still use it
         model = child.compile()
     for body in child.bodies[1:]:
         compiled = model.body(body.name)
@@ -79,37 +71,37 @@ def write_masses(child: mujoco.MjSpec) -> None:
 
 
 def _load_mjcf(entity: EntityConfig, path: tuple[str, ...], root: Path, installed: bool) -> mujoco.MjSpec:
-    """The MJCF of an entity."""
+    """Read the MJCF of an entity."""
     assert entity.model is not None
     try:
         file = model_file(root, entity.model).resolve()
     except MissingModelError:
         raise
     except TaskError as error:
-        raise SceneProblem((*path, "model"), error.message, error.hint) from None
+        raise SceneProblem(path, error.message, error.hint) from None
     if ":" not in entity.model and not file.is_relative_to(root):
-        raise SceneProblem((*path, "model"), f"'{entity.model}' lies outside the task's folder {root}")
+        raise SceneProblem(path, f"'{entity.model}' lies outside the task's folder {root}")
     if not file.is_file():
         have = sorted(str(p.relative_to(root)) for p in root.rglob("*.xml"))
         hint = f"MJCF files there: {', '.join(have) or 'none'}"
-        raise SceneProblem((*path, "model"), f"no file '{entity.model}' in {root}", hint)
+        raise SceneProblem(path, f"no file '{entity.model}' in {root}", hint)
     try:
         installed = installed or ":" in entity.model
         return read_mjcf(file, model_roots(root, entity.model), installed=installed)
     except BadModel as error:
-        message = f"'{entity.model}' is not a valid MJCF: {' '.join(str(error).split())}"
-        raise SceneProblem((*path, "model"), message) from None
+        raise SceneProblem(path, f"'{entity.model}' is not a valid MJCF: {one_line(error)}") from None
 
 
 def _shape_model(entity: EntityConfig) -> mujoco.MjSpec:
-    """A body with one geom."""
+    """Return a model of one body with one geom."""
     assert entity.shape is not None
     assert entity.size is not None
     child = mujoco.MjSpec()
     body = child.worldbody.add_body(name="body", mocap=entity.mocap)
     if entity.free:
         body.add_freejoint(name="root")
-    half = [edge / 2 for edge in entity.size]
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{entity.shape.upper()}")
+    half = [edge / 2 for edge in entity.size]  # MuJoCo's sizes are half lengths
     sizes = {
         "box": half,
         "sphere": entity.size,
@@ -119,7 +111,7 @@ def _shape_model(entity: EntityConfig) -> mujoco.MjSpec:
     }
     size = sizes[entity.shape]
     body.add_geom(
-        name="geom", type=_SHAPES[entity.shape], size=[*size, *[0.0] * (3 - len(size))], rgba=[*entity.color, 1.0],
+        name="geom", type=kind, size=[*size, *[0.0] * (3 - len(size))], rgba=[*entity.color, 1.0],
         friction=[entity.friction, 0.005, 0.0001], density=entity.density or 1000.0,
         mass=np.nan if entity.mass is None else entity.mass,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Surroundings of a scene: a ground plane, the material of the ground, the sky, lights."""
+"""Ground plane, ground material, sky and lights of a scene."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rlcli.config.schema import GroundConfig, LightsConfig
 
 
 def add_ground_plane(spec: mujoco.MjSpec, ground: GroundConfig) -> None:
-    """A plane under everything."""
+    """Add a ground plane at height 0."""
     add_materials(spec)
     spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[ground.size / 2, ground.size / 2, 1.0],
@@ -17,7 +17,7 @@ def add_ground_plane(spec: mujoco.MjSpec, ground: GroundConfig) -> None:
 
 
 def add_materials(spec: mujoco.MjSpec) -> None:
-    """What the ground looks like, and the sky."""
+    """Add the material of the ground and the sky."""
     spec.add_texture(
         name="ground", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
         rgb1=[0.86, 0.88, 0.90], rgb2=[0.77, 0.79, 0.82], width=512, height=512,
@@ -31,7 +31,7 @@ def add_materials(spec: mujoco.MjSpec) -> None:
 
 
 def add_lights(spec: mujoco.MjSpec, lights: LightsConfig) -> None:
-    """Light from everywhere, and light from one side."""
+    """Add ambient light (dome) and directional light (distant)."""
     headlight = spec.visual.headlight
     if lights.dome is not None:
         strength = min(1.0, lights.dome.intensity / 1000.0)

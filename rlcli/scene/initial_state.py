@@ -1,4 +1,4 @@
-"""Where an entity starts: its joints and its root as the MJCF and the entity's configuration have them."""
+"""Default state of an entity: its joints and its root, from the MJCF and the entity's configuration."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:
-    """Default joint positions and velocities: the MJCF's qpos0, with the entity's `init` over it. (k,), (k,)
+    """Return default joint positions and velocities: the MJCF's qpos0, overridden by the entity's `init`. (k,), (k,)
 
     Raises:
         NameProblem: if `init` names a joint that the model does not have.
@@ -32,20 +32,20 @@ def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:
 
 
 def default_root_state(entity: Entity) -> Tensor:
-    """Default root pose and velocity: those of the MJCF, with the entity's configuration over them. (13,)
+    """Return the default root pose and velocity, from the MJCF and the entity's configuration. (13,)
 
     Raises:
-        NameProblem: if `init` gives a velocity to a root that is fixed.
+        NameProblem: if `init` has a velocity and the root is fixed.
     """
     model = entity.engine.model
     if entity.root_qpos is not None:
         pose = model.qpos0[entity.root_qpos : entity.root_qpos + 7]
-    elif not entity.root_body:  # geoms of the world only
+    elif not entity.root_body:  # the entity has no body, only geoms of the world
         pose = np.concatenate([entity.config.pos, entity.config.quat])
     else:
         body = entity.root_body
         pose = np.concatenate([model.body_pos[body], model.body_quat[body]])
     velocity = [*entity.config.init.lin_vel, *entity.config.init.ang_vel]
     if entity.root_qpos is None and any(velocity):
-        raise NameProblem(f"entity '{entity.name}' has no free root", "lin_vel and ang_vel are those of a free root")
+        raise NameProblem(f"entity '{entity.name}' has no free root", "remove lin_vel and ang_vel: they need one")
     return torch.tensor([*pose, *velocity], dtype=torch.float32)

@@ -10,16 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.sim.column_views import as_index
-from rlcli.sim.selection import Columns
-
 if TYPE_CHECKING:
-    from rlcli.scene.actuators import ActuatorModel
     from rlcli.scene.entity import Entity
 
 
 class JointEfforts:
-    """The actuators on an entity's joints whose force is gain x control + an affine function of the joint's state."""
+    """Efforts on an entity's joints, from actuator models and from simple actuators of MuJoCo.
+
+    A simple actuator has a fixed gain, no bias or an affine one, and no dynamics of its own: its force is
+    gain x control + constant + k1 x length + k2 x velocity, where length and velocity are gear x those of the joint.
+    """
 
     def __init__(self, entity: Entity) -> None:
         self._entity = entity
@@ -56,55 +56,49 @@ class JointEfforts:
         self._driven[self._columns] = True
         self._no_range = torch.tensor([-math.inf, math.inf], device=device)
         self._clamped = (self._control_limited & ~self._is_motor)[:, None]
-        self._columns_of_models: list[tuple[ActuatorModel, Columns]] = []
 
     def without_limits(self) -> Tensor:
         """Return the efforts before limits. (num_envs, k)"""
         entity = self._entity
         gear, q, v = self._gear, entity.data.joint_pos[:, self._columns], entity.data.joint_vel[:, self._columns]
-        gain, bias = self._now("actuator_gainprm"), self._now("actuator_biasprm")
-        low, high = torch.where(self._clamped, self._now("actuator_ctrlrange"), self._no_range).unbind(-1)
+        gain, bias = self._current("actuator_gainprm"), self._current("actuator_biasprm")
+        low, high = torch.where(self._clamped, self._current("actuator_ctrlrange"), self._no_range).unbind(-1)
         control = entity.engine.field("ctrl")[:, self._ids].float().clamp(low, high)
         affine = torch.where(self._is_motor, 0.0, bias[..., 0] + bias[..., 1] * gear * q + bias[..., 2] * gear * v)
-        efforts = self._by_joint(gear * (gain[..., 0] * control + affine))
-        for model, columns in self._models():
-            efforts[:, columns] = model.computed_effort
+        efforts = self._sum_by_joint(gear * (gain[..., 0] * control + affine))
+        for model in entity.actuators:
+            efforts[:, model.columns] = model.computed_effort
         return efforts
 
     def removed_by_limits(self) -> Tensor:
-        """Return how much limits reduce the efforts. (num_envs, k)"""
+        """Return by how much the limits reduce the efforts. (num_envs, k)"""
         data = self._entity.data
-        beyond = (data.computed_effort.abs() - data.joint_effort_limits).clamp_(min=0.0)
-        for model, columns in self._models():
-            beyond[:, columns] = (model.computed_effort - model.applied_effort).abs_()
-        return beyond
+        excess = (data.computed_effort.abs() - data.joint_effort_limits).clamp_(min=0.0)
+        for model in self._entity.actuators:
+            excess[:, model.columns] = (model.computed_effort - model.applied_effort).abs_()
+        return excess
 
     def limits(self) -> Tensor:
         """Return the largest efforts. (1 or num_envs, k)"""
-        gain, force = self._now("actuator_gainprm")[..., 0], self._now("actuator_forcerange")
+        gain, force = self._current("actuator_gainprm")[..., 0], self._current("actuator_forcerange")
         largest = torch.where(self._force_limited, force.abs().amax(dim=-1), math.inf)
-        control = (gain[..., None] * self._now("actuator_ctrlrange")).abs().amax(dim=-1)
+        control = (gain[..., None] * self._current("actuator_ctrlrange")).abs().amax(dim=-1)
         largest = torch.where(self._control_limited & self._is_motor, torch.minimum(largest, control), largest)
         limits = torch.minimum(
-            torch.where(self._driven, self._by_joint(self._gear.abs() * largest), math.inf), self._joint_limits
+            torch.where(self._driven, self._sum_by_joint(self._gear.abs() * largest), math.inf), self._joint_limits
         )
         if self._entity.actuators:
             limits = limits.expand(self._entity.engine.num_envs, -1).clone()
-        for model, columns in self._models():
-            limits[:, columns] = model.effort_limit
+        for model in self._entity.actuators:
+            limits[:, model.columns] = model.effort_limit
         return limits
 
-    def _models(self) -> list[tuple[ActuatorModel, Columns]]:
-        """The entity's actuator models, which are made after it, with the joints that they drive."""
-        if len(self._columns_of_models) != len(self._entity.actuators):
-            device = self._entity.engine.device
-            self._columns_of_models = [(m, as_index(m.joints, device)) for m in self._entity.actuators]
-        return self._columns_of_models
-
-    def _by_joint(self, values: Tensor) -> Tensor:
+    def _sum_by_joint(self, values: Tensor) -> Tensor:
+        """Return the sum over the actuators of each joint. (rows, actuators) -> (rows, k)"""
         total = torch.zeros(len(values), len(self._joint_limits), device=values.device)
         return total.index_add_(1, self._columns, values)
 
-    def _now(self, name: str) -> Tensor:
+    def _current(self, name: str) -> Tensor:
+        """Return a model field of the actuators, with its randomisation. (1 or num_envs, actuators, n)"""
         own = self._entity.engine.expanded(name)
         return self._constant[name] if own is None else own[:, self._ids].float()

@@ -1,7 +1,8 @@
-"""The joints of a scene's entities: what the configuration changes of them, and the actuators that they get."""
+"""Joint settings of the configuration, written into the model, and the actuators that are added to it."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,12 +15,12 @@ from rlcli.config.schema import EntityConfig, JointConfig
 from rlcli.scene.names import NameProblem, SceneProblem, match
 
 _KNOWN_ACTUATORS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtGain.mjGAIN_FIXED))
-"""Transmission, dynamics and gain of the actuators whose kind is known."""
+"""Transmission, dynamics and gain of motor, position and velocity actuators."""
 
 
 @dataclass(frozen=True, slots=True)
 class ActuatorNeed:
-    """An action term needs an actuator of a kind on some joints of an entity."""
+    """Request of an action term for actuators of a kind on some joints of an entity."""
 
     entity: str
     joints: str | list[str]
@@ -28,12 +29,12 @@ class ActuatorNeed:
 
 
 class SceneJoints:
-    """Hinges and slides of the entities that are attached so far.
+    """Hinges and slides of the entities that have been attached to a scene.
 
     Args:
-        spec: the scene.
-        entities: the configuration of each entity.
-        problems: what they do not fit is added here.
+        spec: specification of the scene.
+        entities: configuration of each entity.
+        problems: list to which problems of the configuration are added.
     """
 
     def __init__(self, spec: mujoco.MjSpec, entities: Mapping[str, EntityConfig], problems: list[SceneProblem]) -> None:
@@ -42,60 +43,51 @@ class SceneJoints:
         self._problems = problems
 
     def add_actuators(self, needs: Iterable[ActuatorNeed]) -> None:
-        """Add the actuators that are asked for and that the MJCF does not have."""
+        """Add the required actuators that the MJCF does not have."""
         for need in needs:
             if need.entity not in self._entities:
-                continue  # the term's own binding says so
-            names = [joint.name.removeprefix(f"{need.entity}/") for joint in self._scalar_joints(need.entity)]
-            try:
+                continue  # binding the term reports an unknown entity
+            names = self._joint_names(need.entity)
+            with contextlib.suppress(NameProblem):  # binding the term reports an unknown joint
                 models = self._entities[need.entity].actuators.values()
                 modelled = {names[p] for model in models for p in match(model.joints, names, "joint")}
                 for position in match(need.joints, names, "joint"):
                     if names[position] not in modelled:
                         self._add_actuator(need.entity, names[position], need.kind)
-            except NameProblem:
-                continue  # likewise
 
     def add_motors(self) -> None:
-        """Give every hinge and slide joint without an actuator a motor: a direct task may set any effort."""
+        """Add a motor to every hinge and slide without an actuator: a direct task may set any effort."""
         driven = {actuator.target for actuator in self._spec.actuators}
         for entity in self._entities:
-            for joint in self._scalar_joints(entity):
-                if joint.name not in driven:
-                    self._add_actuator(entity, joint.name.removeprefix(f"{entity}/"), "motor")
+            for joint in self._joint_names(entity):
+                if f"{entity}/{joint}" not in driven:
+                    self._add_actuator(entity, joint, "motor")
 
     def override(self, name: str, entity: EntityConfig, *, degrees: bool) -> None:
-        """Write what the entity's `joints` say into the model; `degrees`: the unit that its MJCF has angles in."""
-        joints = self._scalar_joints(name)
-        names = [joint.name.removeprefix(f"{name}/") for joint in joints]
+        """Write the entity's `joints` settings into the model.
+
+        Args:
+            name: name of the entity.
+            entity: configuration of the entity.
+            degrees: whether its MJCF has angles in degrees instead of radians.
+        """
+        joints, names = self._scalar_joints(name), self._joint_names(name)
         for pattern, change in entity.joints.items():
-            try:
-                positions = match(pattern, names, "joint")
-            except NameProblem as problem:
-                path = ("scene", "entities", name, "joints", pattern)
-                self._problems.append(SceneProblem(path, str(problem), problem.hint))
-                continue
-            for position in positions:
+            for position in self._match(("scene", "entities", name, "joints", pattern), pattern, names):
                 _override(joints[position], change, degrees=degrees)
                 self._set_gains_and_limits(joints[position].name, change)
                 if change.actuator is not None:
                     self._add_actuator(name, names[position], change.actuator)
 
     def add_models(self, name: str, entity: EntityConfig) -> None:
-        """Give the joints of actuator models a motor each, without limits of its own, in place of what they have."""
-        names = [joint.name.removeprefix(f"{name}/") for joint in self._scalar_joints(name)]
+        """Replace the actuators on the joints of actuator models by one motor each, without limits of its own."""
+        names = self._joint_names(name)
         owner: dict[str, str] = {}
         for key, config in entity.actuators.items():
-            path = ("scene", "entities", name, "actuators", key)
-            try:
-                joints = [names[position] for position in match(config.joints, names, "joint")]
-            except NameProblem as problem:
-                self._problems.append(SceneProblem((*path, "joints"), str(problem), problem.hint))
-                continue
-            for joint in joints:
+            path = ("scene", "entities", name, "actuators", key, "joints")
+            for joint in [names[position] for position in self._match(path, config.joints, names)]:
                 if joint in owner:
-                    message = f"joint '{joint}' is driven by '{owner[joint]}' already"
-                    self._problems.append(SceneProblem((*path, "joints"), message))
+                    self._problems.append(SceneProblem(path, f"joint '{joint}' is driven by '{owner[joint]}' already"))
                     continue
                 owner[joint] = key
                 target = f"{name}/{joint}"
@@ -104,8 +96,16 @@ class SceneJoints:
                 motor = self._spec.add_actuator(name=target, target=target, trntype=mujoco.mjtTrn.mjTRN_JOINT)
                 motor.set_to_motor()
 
+    def _match(self, path: tuple[str, ...], patterns: str | list[str], names: list[str]) -> list[int]:
+        """Return the positions of matching joints; report patterns that do not fit as a problem at `path`."""
+        try:
+            return match(patterns, names, "joint")
+        except NameProblem as problem:
+            self._problems.append(SceneProblem(path, str(problem), problem.hint))
+            return []
+
     def _set_gains_and_limits(self, joint: str, change: JointConfig) -> None:
-        """Set gains and limits of the joint's actuators."""
+        """Set gains and limits of a joint's actuators."""
         for actuator in self._spec.actuators:
             if actuator.target != joint or actuator.trntype != mujoco.mjtTrn.mjTRN_JOINT:
                 continue
@@ -145,16 +145,16 @@ class SceneJoints:
         scalar = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
         return [j for j in self._spec.joints if j.name.startswith(f"{entity}/") and j.type in scalar]
 
+    def _joint_names(self, entity: str) -> list[str]:
+        return [joint.name.removeprefix(f"{entity}/") for joint in self._scalar_joints(entity)]
+
 
 def joint_settings(entity: EntityConfig, joint: str) -> JointConfig:
-    """What an entity's configuration says of a joint, later matches over earlier ones."""
+    """Return the settings of a joint; of several matching patterns, later ones override earlier ones."""
     merged: dict[str, object] = {}
     for pattern, change in entity.joints.items():
-        try:
-            matched = bool(match(pattern, [joint], "joint"))
-        except NameProblem:
-            matched = False
-        if matched:
+        with contextlib.suppress(NameProblem):  # the pattern matches other joints only
+            match(pattern, [joint], "joint")
             merged.update(change.model_dump(exclude_none=True))
     return JointConfig.model_validate(merged)
 
@@ -191,19 +191,19 @@ def _override(joint: mujoco.MjsJoint, change: JointConfig, *, degrees: bool) -> 
         value, attribute = getattr(change, key), key.replace("_", "")
         if value is not None:
             current = getattr(joint, attribute)
-            if isinstance(current, np.ndarray):  # MuJoCo 4 has polynomial damping and stiffness: the linear term
+            if isinstance(current, np.ndarray):  # MuJoCo 4: coefficients of a polynomial, the linear one first
                 current[:] = 0.0
                 current[0] = value
             else:
                 setattr(joint, attribute, value)
     if change.range is not None:
-        # a spec keeps angles in the unit of the MJCF it came from
-        turn = 180.0 / np.pi if degrees and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
-        joint.range = [turn * end for end in change.range]
+        # a spec keeps angles in the unit of its MJCF; ours are in radians
+        unit = 180.0 / np.pi if degrees and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
+        joint.range = [unit * end for end in change.range]
         joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
 
 
 def _limit_effort(actuator: mujoco.MjsActuator, effort: float) -> None:
-    force = effort / (abs(actuator.gear[0]) or 1.0)  # MuJoCo's limit is before the gear, ours is on the joint
+    force = effort / (abs(actuator.gear[0]) or 1.0)  # MuJoCo limits the force before the gear, `effort` after it
     actuator.forcerange = [-force, force]
     actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE

@@ -1,4 +1,4 @@
-"""Model fields that may differ between worlds: where their values lie, and what depends on them."""
+"""Model fields that may differ between worlds: their elements, their values, and the constants derived from them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FIELDS: dict[str, str] = {
     **dict.fromkeys(("pair_friction", "pair_solref", "pair_solimp", "pair_margin", "pair_gap"), "Pairs"),
     **dict.fromkeys(("opt.gravity",), ""),
 }
-"""Field -> what its rows belong to; '' for the whole world. Everything else is the same in all worlds."""
+"""Field -> kind of element of its rows; '' for the whole world. All other fields are the same in all worlds."""
 
 DERIVED_FROM = frozenset(
     [
@@ -41,17 +41,17 @@ DERIVED_FROM = frozenset(
         *("tendon_stiffness", "tendon_damping", "tendon_armature"),
     ]
 )
-"""Fields from which MuJoCo derives constants: whoever writes one has `Engine.set_constants` called afterwards."""
+"""Fields from which MuJoCo derives constants: after a write to one, `Engine.set_constants` must be called."""
 
 
 class ModelField:
-    """Some elements of a model field in every world: their original values, and a place to write.
+    """Some elements of a model field in every world, and their original values.
 
     Args:
-        entity: whose elements they are.
-        name: of the field.
-        elements: which, as an index into the entity's names of that kind; None for a field of the whole world.
-        axes: which of an element's values; None for all.
+        entity: the entity that has the elements.
+        name: name of the field.
+        elements: index into the entity's names of that kind; None for a field of the whole world.
+        axes: selected values of each element; None for all.
 
     Raises:
         ValueError: for a field that cannot differ between worlds, or an axis that it does not have.
@@ -70,44 +70,44 @@ class ModelField:
             raise NameProblem(f"{name} has no axis {bad[0]}", f"axes: 0 to {self.width - 1}")
         self.axes = list(range(self.width)) if axes is None else list(axes)
         self.values = _expand(engine, name).view(engine.num_envs, -1)
-        """The field in every world, flattened. (num_envs, n)"""
+        """Values of the field in every world, flattened. (num_envs, n)"""
         columns = [i * self.width + axis for i in ids for axis in self.axes]
         self.columns = as_index(columns, engine.device)
         self.shape = (len(ids), len(self.axes))
         original = torch.as_tensor(rows[ids][:, self.axes].copy(), dtype=self.values.dtype)
         self.original = original.to(engine.device)
-        """What the compiled model has there. (elements, axes)"""
+        """Values of the compiled model. (elements, axes)"""
 
     def write(self, selection: Selection, values: Tensor) -> None:
         """Set the selected worlds' values. (rows, elements, axes)"""
         selection.write(self.values, values.to(self.values.dtype).flatten(1), self.columns)
 
     def read(self, selection: Selection) -> Tensor:
-        """The selected worlds' values. (rows, elements, axes)"""
+        """Return the selected worlds' values. (rows, elements, axes)"""
         return selection.read(self.values, self.columns).view(-1, *self.shape)
 
 
 def element_ids(entity: Entity, name: str, elements: Columns) -> list[int]:
-    """Rows of a field in the model, in the order of an index into the entity's names."""
+    """Return the rows of a model field that belong to an index into the entity's names, in its order."""
     if name in ("qpos0", "qpos_spring"):
-        every = entity.qpos_columns.cpu()
+        rows = entity.qpos_columns.cpu()
     elif name.startswith("dof_"):
-        every = entity.dof_columns.cpu()
+        rows = entity.dof_columns.cpu()
     else:
-        every = torch.as_tensor(entity.ids[FIELDS[name]])
-    return every[elements.cpu() if isinstance(elements, Tensor) else elements].tolist()
+        rows = torch.as_tensor(entity.ids[FIELDS[name]])
+    return rows[elements.cpu() if isinstance(elements, Tensor) else elements].tolist()
 
 
 def model_rows(engine: Engine, name: str) -> np.ndarray:
-    """What the compiled model has in a field, one element a row. (elements, values each)
+    """Return the values of a field in the compiled model, one element per row. (elements, values each)
 
     Raises:
         ValueError: for a field that cannot differ between worlds.
     """
     if name not in FIELDS:
         near = did_you_mean(name, FIELDS)
-        can = f"fields that can: {listing(sorted(FIELDS), 60)}"
-        raise NameProblem(f"'{name}' cannot differ between environments", f"{near}; {can}" if near else can)
+        allowed = f"fields that can: {listing(sorted(FIELDS), 60)}"
+        raise NameProblem(f"'{name}' cannot differ between environments", f"{near}; {allowed}" if near else allowed)
     owner, attribute = (engine.model.opt, name[4:]) if name.startswith("opt.") else (engine.model, name)
     value = np.asarray(getattr(owner, attribute), dtype=np.float64)
     return value.reshape(1, -1) if name.startswith("opt.") else value.reshape(len(value), -1)
@@ -117,6 +117,6 @@ def _expand(engine: Engine, name: str) -> Tensor:
     try:
         return engine.expand(name)
     except ValueError:
-        can = [field for field in FIELDS if engine.can_expand(field)]
+        allowed = [field for field in FIELDS if engine.can_expand(field)]
         message = f"'{name}' cannot differ between environments on this engine"
-        raise NameProblem(message, f"fields that can: {listing(sorted(can), 60)}") from None
+        raise NameProblem(message, f"fields that can: {listing(sorted(allowed), 60)}") from None

@@ -1,4 +1,4 @@
-"""Names and regular expressions of the YAML -> positions in a list of names, in exactly the order written."""
+"""Matching of names and regular expressions against the names of a model, in the order of the configuration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Value = TypeVar("Value")
 
 
 class NameProblem(ValueError):
-    """A name or regex that does not fit the model; `hint` names those that do."""
+    """A name or regular expression that does not fit the model; `hint` lists the names that exist."""
 
     def __init__(self, message: str, hint: str | None = None) -> None:
         super().__init__(message)
@@ -20,7 +20,7 @@ class NameProblem(ValueError):
 
 
 class SceneProblem(NameProblem):
-    """A part of the scene's configuration that does not fit the models; `path` is its key."""
+    """A part of the scene's configuration that does not fit the models; `path` is its key in the YAML."""
 
     def __init__(self, path: tuple[str, ...], message: str, hint: str | None = None) -> None:
         super().__init__(message, hint)
@@ -28,12 +28,17 @@ class SceneProblem(NameProblem):
 
 
 def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> list[int]:
-    """Positions of the names that the patterns match in full.
+    """Return the positions of the names that the patterns match in full.
 
-    The patterns' order is kept; within one regex the order is that of `names`.
+    Positions are in the order of the patterns; the matches of one regular expression are in the order of `names`.
+
+    Args:
+        patterns: names or regular expressions.
+        names: names of the model.
+        what: the kind of element, for messages: joint, body, ...
 
     Raises:
-        NameProblem: a pattern matches nothing, is not a regex, or a name is matched twice.
+        NameProblem: if a pattern matches no name or is no regular expression, or if a name is matched twice.
     """
     positions: list[int] = []
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
@@ -46,10 +51,10 @@ def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> lis
 
 
 def match_values(values: Mapping[str, Value], names: Sequence[str], what: str) -> list[Value | None]:
-    """The value that a mapping from names or regexes gives each name; None for a name that it leaves out.
+    """Return the value of each name in a mapping from names or regular expressions; None for a name without a match.
 
     Raises:
-        NameProblem: as `match`.
+        NameProblem: under the conditions of `match`.
     """
     found: list[Value | None] = [None] * len(names)
     taken: dict[int, str] = {}

@@ -1,9 +1,8 @@
-"""From the scene's configuration to a compiled MuJoCo model: named entities, ground, lights, actuators."""
+"""Scene under construction: from its configuration to a compiled MuJoCo model."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TypeVar
 
@@ -11,33 +10,27 @@ import mujoco
 import numpy as np
 
 from rlcli.config.schema import EntityConfig, SceneConfig, SimConfig
-from rlcli.errors import ConfigError, Problem
+from rlcli.errors import ConfigError, Problem, one_line
 from rlcli.scene.entity_model import entity_model, name_all, write_masses
 from rlcli.scene.ground_and_lights import add_ground_plane, add_lights, add_materials
-from rlcli.scene.joint_setup import ActuatorNeed, SceneJoints
+from rlcli.scene.joint_setup import SceneJoints
 from rlcli.scene.names import SceneProblem
-from rlcli.scene.sensor_builder import CameraSensorSpec, ContactSensorSpec, RaySensorSpec, SensorBuilder
-from rlcli.scene.terrain import Ground, add_ground, make_ground, terrain_problems
+from rlcli.scene.sensor_builder import SensorBuilder, SensorSpec
+from rlcli.scene.terrain import Ground, TerrainConfig, add_ground, make_ground, terrain_problems
 from rlcli.sim.mujoco_log import quiet_mujoco
-
-_INTEGRATORS = {
-    "euler": mujoco.mjtIntegrator.mjINT_EULER,
-    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
-    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
-    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-}
 
 _OPTIONS = (
     "integrator", "cone", "jacobian", "solver", "tolerance", "ls_tolerance", "noslip_tolerance", "iterations",
     "ls_iterations", "noslip_iterations", "ccd_iterations", "ccd_tolerance", "impratio", "density", "viscosity",
     "wind", "magnetic", "disableflags", "enableflags", "disableactuator",
 )  # fmt: skip
+"""Physics options that the scene takes from the first MJCF."""
 
 View = TypeVar("View")
 
 
 class Scene:
-    """A scene under construction; `spec` is open to a direct task's `set_up_scene` until it is compiled."""
+    """Scene under construction; a direct task's `set_up_scene` may change `spec` until it is compiled."""
 
     def __init__(self, config: SceneConfig, sim: SimConfig, root: Path, *, installed: bool = False) -> None:
         quiet_mujoco()  # attaching a model whose options differ from the scene's logs each of them
@@ -49,47 +42,38 @@ class Scene:
         self.spec.copy_during_attach = True
         self.problems: list[SceneProblem] = []
         self.views: list[object] = []
-        self.sensors: dict[str, ContactSensorSpec | RaySensorSpec | CameraSensorSpec] = {}
+        self.sensors: dict[str, SensorSpec] = {}
         self.ground: Ground | None = None
-        self._joints = SceneJoints(self.spec, self.config.entities, self.problems)
+        self.joints = SceneJoints(self.spec, self.config.entities, self.problems)
         for name, entity in config.entities.items():
             self._attach(name, entity)
-        self._options()
+        self._set_options()
         if config.terrain is not None:
-            self._terrain()
+            self._add_terrain(config.terrain)
         elif config.ground is not None:
             add_ground_plane(self.spec, config.ground)
         add_lights(self.spec, config.lights)
-        self._sensors()
+        self._add_sensors()
 
     def add(self, view: View) -> View:
-        """Register a view; it is bound to the simulation once the model is compiled."""
+        """Register a view, which is bound to the simulation after the model is compiled."""
         self.views.append(view)
         return view
 
-    def add_actuators(self, needs: Iterable[ActuatorNeed]) -> None:
-        """Add the actuators that are asked for and that the MJCF does not have."""
-        self._joints.add_actuators(needs)
-
-    def add_motors(self) -> None:
-        """Give every hinge and slide joint without an actuator a motor: a direct task may set any effort."""
-        self._joints.add_motors()
-
     def compile(self) -> mujoco.MjModel:
-        """Compile to an MjModel.
+        """Compile the scene to an MjModel.
 
         Raises:
             ConfigError: if MuJoCo refuses the model.
         """
         try:
             with warnings.catch_warnings():
-                # attach reports options of the MJCF that the scene's own replace; sim: says which hold
+                # MuJoCo warns about options of the MJCF that `sim` overrides
                 warnings.simplefilter("ignore")
-                model = self.spec.compile()
+                return self.spec.compile()
         except ValueError as error:
-            message = f"MuJoCo cannot compile the model: {' '.join(str(error).split())}"
+            message = f"MuJoCo cannot compile the model: {one_line(error)}"
             raise ConfigError([Problem("scene", "", message)]) from None
-        return model
 
     def _attach(self, name: str, entity: EntityConfig) -> None:
         try:
@@ -100,7 +84,7 @@ class Scene:
             self.attach(name, entity, child)
 
     def attach(self, name: str, entity: EntityConfig, child: mujoco.MjSpec) -> None:
-        """Add an entity to the scene; `child` is its model, which `entity.model` need not name."""
+        """Add an entity to the scene; its model is `child`, also if `entity.model` is another one."""
         self.config.entities[name] = entity
         name_all(child)
         if child.compiler.settotalmass > 0:
@@ -111,30 +95,29 @@ class Scene:
                 if hasattr(child.option, option):
                     setattr(self.spec.option, option, getattr(child.option, option))
         for key in list(child.keys):
-            child.delete(key)  # keyframes of one entity have the wrong size in a scene of several
+            child.delete(key)  # a keyframe of one entity has the wrong size in a scene of several entities
         self.spec.memory = max(self.spec.memory, child.memory)
         quat = np.asarray(entity.quat) / np.linalg.norm(entity.quat)
         frame = self.spec.worldbody.add_frame(pos=entity.pos, quat=quat)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             self.spec.attach(child, prefix=f"{name}/", frame=frame)
-        self._joints.override(name, entity, degrees=bool(child.compiler.degree))
-        self._joints.add_models(name, entity)
+        self.joints.override(name, entity, degrees=bool(child.compiler.degree))
+        self.joints.add_models(name, entity)
 
-    def _options(self) -> None:
+    def _set_options(self) -> None:
+        """Set the options of `sim`, which override those of the MJCF."""
         option = self.spec.option
         option.timestep = self.sim.dt
         option.gravity = self.sim.gravity
         if self.sim.integrator is not None:
-            option.integrator = _INTEGRATORS[self.sim.integrator]
+            option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{self.sim.integrator.upper()}")
         if self.sim.iterations is not None:
             option.iterations = self.sim.iterations
         if self.sim.ls_iterations is not None:
             option.ls_iterations = self.sim.ls_iterations
 
-    def _terrain(self) -> None:
-        config = self.config.terrain
-        assert config is not None
+    def _add_terrain(self, config: TerrainConfig) -> None:
         found = list(terrain_problems(config, self.root))
         self.problems += [SceneProblem(("scene", "terrain", *path), text, hint) for path, text, hint in found]
         if not found:
@@ -142,7 +125,7 @@ class Scene:
             self.ground = make_ground(config, self.root)
             add_ground(self.spec, self.ground, "ground")
 
-    def _sensors(self) -> None:
+    def _add_sensors(self) -> None:
         builder = SensorBuilder(self.spec, self.config.entities, self.ground)
         for name, config in self.config.sensors.items():
             try:

@@ -1,4 +1,4 @@
-"""The sensors that a scene adds to its model, and their specifications for the classes that read them."""
+"""Sensors that a scene adds to its model, and their specifications for the classes that read them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rlcli.config.schema import CameraSensorConfig, ContactSensorConfig, EntityConfig, RaySensorConfig
+from rlcli.config.schema import CameraSensorConfig, ContactSensorConfig, EntityConfig, RaySensorConfig, SensorConfig
 from rlcli.errors import did_you_mean, listing
 from rlcli.scene.names import NameProblem, SceneProblem, match
 from rlcli.scene.terrain import TERRAIN_BODY, Ground
@@ -17,14 +17,14 @@ from rlcli.scene.terrain import TERRAIN_BODY, Ground
 _CONTACT_DATA = mujoco.mjtConDataField
 _FOUND_AND_FORCE = (1 << int(_CONTACT_DATA.mjCONDATA_FOUND)) | (1 << int(_CONTACT_DATA.mjCONDATA_FORCE))
 _NET_FORCE = 3
-"""Of a contact sensor's reductions the one that adds all contacts up, in the world frame."""
+"""Reduction of a contact sensor that adds up all contacts in the world frame (mjCONREDUCE_NETFORCE)."""
 _DRAWN_GROUPS = (0, 1, 2)
-"""Geom groups that viewers draw."""
+"""Geom groups that viewers draw by default."""
 
 
 @dataclass(frozen=True, slots=True)
 class ContactSensorSpec:
-    """A contact sensor in the model: its bodies, and the MJCF sensors of each, whose forces add up."""
+    """Contact sensor in the model: its bodies, and the MJCF sensors of each body, whose forces are added up."""
 
     config: ContactSensorConfig
     bodies: list[str]
@@ -33,38 +33,39 @@ class ContactSensorSpec:
 
 @dataclass(frozen=True, slots=True)
 class RaySensorSpec:
-    """A ray sensor in the model: the full name of its body, and the geom groups that it sees (None: all)."""
+    """Ray sensor in the model: the full name of its body, and the geom groups that it sees (None: all)."""
 
     config: RaySensorConfig
     body: str
     groups: tuple[int, ...] | None
     ground: Ground | None = None
-    """What heights are looked up in, instead of casting rays."""
+    """Terrain in which heights are looked up instead of casting rays; None: cast rays."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraSensorSpec:
-    """A camera sensor in the model: the full name of its camera."""
+    """Camera sensor in the model: the full name of its camera."""
 
     config: CameraSensorConfig
     camera: str
 
 
+SensorSpec = ContactSensorSpec | RaySensorSpec | CameraSensorSpec
+
+
 class SensorBuilder:
-    """Adds sensors to the model of a scene, after its entities and its ground."""
+    """Builder that adds sensors to the model of a scene, after its entities and its ground."""
 
     def __init__(self, spec: mujoco.MjSpec, entities: Mapping[str, EntityConfig], ground: Ground | None) -> None:
         self._spec = spec
         self._entities = entities
         self._ground = ground
 
-    def add(
-        self, name: str, config: ContactSensorConfig | RaySensorConfig | CameraSensorConfig
-    ) -> ContactSensorSpec | RaySensorSpec | CameraSensorSpec:
+    def add(self, name: str, config: SensorConfig) -> SensorSpec:
         """Add a sensor.
 
         Raises:
-            SceneProblem: if it names what the models do not have.
+            SceneProblem: if the configuration does not fit the models.
         """
         path = ("scene", "sensors", name)
         if isinstance(config, ContactSensorConfig):
@@ -74,10 +75,7 @@ class SensorBuilder:
         return self._rays(config, path)
 
     def _contacts(self, name: str, config: ContactSensorConfig, path: tuple[str, ...]) -> ContactSensorSpec:
-        """For each body and what it may touch, a sensor of the model: net force on the body, and how many contacts.
-
-        The body is the second of the two, which makes the force the one that acts on it.
-        """
+        """Add an MJCF sensor for each pair of a body and a partner, which measures net force and contact count."""
         bodies = self._bodies(config.entity, config.bodies, path, "bodies")
         solid = [body for body in self._bodies(config.entity, ".*", path, "bodies") if self._can_touch(body)]
         for body in bodies:
@@ -85,22 +83,24 @@ class SensorBuilder:
                 have = listing([b.removeprefix(f"{config.entity}/") for b in solid]) if solid else "none"
                 short = body.removeprefix(f"{config.entity}/")
                 message = f"body '{short}' has no geom that can touch anything"
-                raise SceneProblem((*path, "bodies"), message, f"bodies that have: {have}")
-        made: list[list[str]] = []
+                raise SceneProblem((*path, "bodies"), message, f"bodies with such a geom: {have}")
+        sensors: list[list[str]] = []
         for slot, body in enumerate(bodies):
-            made.append([])
+            sensors.append([])
             for number, other in enumerate(self._contact_partners(config, path)):
                 sensor = self._spec.add_sensor(name=f"//{name}/{slot}/{number}", type=mujoco.mjtSensor.mjSENS_CONTACT)
                 if other is not None:
                     sensor.objtype, sensor.objname = other
+                # the force of a contact sensor acts on the second of its two elements
                 sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, body
                 sensor.intprm[:3] = [_FOUND_AND_FORCE, _NET_FORCE, 1]
-                made[-1].append(sensor.name)
-        return ContactSensorSpec(config, [body.removeprefix(f"{config.entity}/") for body in bodies], made)
+                sensors[-1].append(sensor.name)
+        return ContactSensorSpec(config, [body.removeprefix(f"{config.entity}/") for body in bodies], sensors)
 
     def _contact_partners(
         self, config: ContactSensorConfig, path: tuple[str, ...]
     ) -> list[tuple[mujoco.mjtObj, str] | None]:
+        """Return type and name of the elements whose contacts count; None for any element."""
         against = config.against
         if against is None:
             return [None]
@@ -114,8 +114,9 @@ class SensorBuilder:
         if against.bodies is not None:
             bodies = self._bodies(against.entity, against.bodies, path, "bodies")
             return [(mujoco.mjtObj.mjOBJ_BODY, body) for body in bodies]
-        every = self._bodies(against.entity, ".*", path, "bodies")
-        roots = [body for body in every if not self._spec.body(body).parent.name.startswith(f"{against.entity}/")]
+        bodies = self._bodies(against.entity, ".*", path, "bodies")
+        roots = [body for body in bodies if not self._spec.body(body).parent.name.startswith(f"{against.entity}/")]
+        # an XBODY stands for a body and all its descendants
         return [(mujoco.mjtObj.mjOBJ_XBODY, body) for body in roots]
 
     def _rays(self, config: RaySensorConfig, path: tuple[str, ...]) -> RaySensorSpec:
@@ -126,8 +127,9 @@ class SensorBuilder:
         if not config.lookup:
             return RaySensorSpec(config, body, groups)
         if self._ground is None or self._ground.blocks:
-            lacks = "the scene has no terrain" if self._ground is None else "the terrain has boxes"
-            raise SceneProblem((*path, "lookup"), f"there is no table of heights to look in: {lacks}", "lookup: false")
+            reason = "the scene has no terrain" if self._ground is None else "the terrain has boxes"
+            message = f"heights cannot be looked up: {reason}"
+            raise SceneProblem((*path, "lookup"), message, "lookup: false")
         return RaySensorSpec(config, body, groups, self._ground)
 
     def _camera(self, name: str, config: CameraSensorConfig, path: tuple[str, ...]) -> CameraSensorSpec:
@@ -146,15 +148,15 @@ class SensorBuilder:
         return CameraSensorSpec(config, prefix + config.camera)
 
     def _body(self, entity: str, pattern: str | None, path: tuple[str, ...]) -> str:
-        """Return the full name of a body of an entity: of its first one without a pattern."""
+        """Return the full name of the one matching body of an entity; of its first body if there is no pattern."""
         bodies = self._bodies(entity, ".*" if pattern is None else pattern, path, "body")
         if pattern is not None and len(bodies) > 1:
             short = listing([body.removeprefix(f"{entity}/") for body in bodies])
-            raise SceneProblem((*path, "body"), f"'{pattern}' is several bodies: {short}", "name one")
+            raise SceneProblem((*path, "body"), f"'{pattern}' matches several bodies: {short}", "name one of them")
         return bodies[0]
 
     def _bodies(self, entity: str, patterns: str | list[str], path: tuple[str, ...], key: str) -> list[str]:
-        """Full names of bodies of an entity."""
+        """Return the full names of the matching bodies of an entity."""
         if entity not in self._entities:
             near = did_you_mean(entity, self._entities) or f"entities: {listing(self._entities)}"
             raise SceneProblem((*path, "entity"), f"no entity '{entity}' in the scene", near)
@@ -166,6 +168,7 @@ class SensorBuilder:
             raise SceneProblem((*path, key), str(problem), problem.hint) from None
 
     def _can_touch(self, body: str) -> bool:
+        """Return whether a geom of the body can have contacts."""
         geoms = self._spec.body(body).geoms
         paired = {name for pair in self._spec.pairs for name in (pair.geomname1, pair.geomname2)}
         return any(geom.contype or geom.conaffinity or (geom.name and geom.name in paired) for geom in geoms)
@@ -176,7 +179,7 @@ class SensorBuilder:
         return [geom for geom in self._spec.worldbody.geoms if geom.name == "ground"]
 
     def _group_of_ground(self, path: tuple[str, ...]) -> int:
-        """The geom group of the ground, made its own: a group is what a ray can be told to see."""
+        """Move the ground to a geom group of its own and return it: rays select geoms by group."""
         ground = self._ground_geoms()
         if not ground:
             raise SceneProblem(path, "the scene has no ground", "add scene.ground or scene.terrain, or write sees: all")
@@ -184,17 +187,17 @@ class SensorBuilder:
         taken = {int(geom.group) for geom in self._spec.geoms if geom.name not in names}
         free = [group for group in _DRAWN_GROUPS if group not in taken]
         if not free:
-            message = f"geoms of the entities are in all groups that are drawn, {listing(map(str, _DRAWN_GROUPS))}"
-            raise SceneProblem(path, message, "leave one of them to the ground in the MJCF, or write sees: all")
+            message = f"the entities have geoms in all groups that are drawn: {listing(map(str, _DRAWN_GROUPS))}"
+            raise SceneProblem(path, message, "leave one group free for the ground in the MJCF, or write sees: all")
         for geom in ground:
             geom.group = free[0]
         return free[0]
 
 
 def _look_rotation(ray: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation of a camera that looks along a ray with z up, or x where it looks along z.
+    """Return the orientation (w, x, y, z) of a camera that looks along a ray, with the world's z axis up.
 
-    A camera looks along its own -z axis.
+    A camera looks along its own -z axis. If the ray is parallel to the world's z axis, x is used for up.
     """
     back = -ray / np.linalg.norm(ray)
     right = np.cross([0.0, 0.0, 1.0], back)

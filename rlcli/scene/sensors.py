@@ -1,4 +1,4 @@
-"""Contact sensors, ray sensors and cameras of a scene, as terms see them: (num_envs, ...) tensors, always current."""
+"""Contact sensors and ray sensors of a scene, whose readings are (num_envs, ...) tensors."""
 
 from __future__ import annotations
 
@@ -12,25 +12,27 @@ from rlcli.config.schema import GridPatternConfig, RaySensorConfig
 from rlcli.scene.camera import CameraSensor, make_cameras
 from rlcli.scene.entity import Entity
 from rlcli.scene.lazy_sensor import LazySensor
-from rlcli.scene.sensor_builder import CameraSensorSpec, ContactSensorSpec, RaySensorSpec
+from rlcli.scene.sensor_builder import CameraSensorSpec, ContactSensorSpec, RaySensorSpec, SensorSpec
 from rlcli.scene.terrain_heights import HeightTable
 from rlcli.sim.acceleration_stage import sensor_columns
 from rlcli.sim.column_views import as_index
 from rlcli.sim.rotations import rotate
 from rlcli.sim.selection import Selection
 from rlcli.sim.state_cache import SimData
+from rlcli.sim.tensor_state import TensorState
 
 _TIMES = ("air_time", "contact_time", "last_air_time", "last_contact_time")
 _FLAGS = ("first_contact", "first_air", "found")
 _STATE_NAMES = (*_TIMES, *_FLAGS, "force_history")
-"""What a contact sensor carries from step to step."""
+"""Attributes of a contact sensor that are saved in a checkpoint."""
 
 
-class ContactSensor:
-    """Net contact forces on k bodies, and for how long each has been in contact or in the air.
+class ContactSensor(TensorState):
+    """Net contact forces on k bodies, and how long each body has been in contact or in the air.
 
-    Times count environment steps: the step in which contact begins counts as the last of the air time and as the first
-    of the contact time. An episode starts with all times 0, so its first contact or lift-off is none that changed.
+    Times are whole environment steps. The step in which contact begins counts as the last of the air time and as the
+    first of the contact time. All times are 0 at the start of an episode, so that the first step of an episode sets
+    neither `first_contact` nor `first_air`.
     """
 
     def __init__(self, spec: ContactSensorSpec, sim: SimData) -> None:
@@ -38,7 +40,7 @@ class ContactSensor:
         engine = sim.engine
         n, k, device = engine.num_envs, len(spec.bodies), engine.device
         self.names = spec.bodies
-        """The bodies, a slot each."""
+        """Names of the k bodies."""
         self._threshold = spec.config.force_threshold
         self._others = len(spec.sensors[0])
         sensors = [engine.model.sensor(name).id for names in spec.sensors for name in names]
@@ -55,13 +57,13 @@ class ContactSensor:
         self.force = self.force_history[:, 0]
         """Net contact force on each body in the last substep, world frame. (num_envs, k, 3) [N]"""
         self.air_time = times[0]
-        """How long each body has been in the air; 0 in contact. (num_envs, k) [s]"""
+        """Time since each body has been in the air; 0 in contact. (num_envs, k) [s]"""
         self.contact_time = times[1]
-        """How long each body has been in contact; 0 in the air. (num_envs, k) [s]"""
+        """Time since each body has been in contact; 0 in the air. (num_envs, k) [s]"""
         self.last_air_time = times[2]
-        """How long each body was in the air before its last contact. (num_envs, k) [s]"""
+        """Time that each body was in the air before its last contact. (num_envs, k) [s]"""
         self.last_contact_time = times[3]
-        """How long each body was in contact before it last lifted off. (num_envs, k) [s]"""
+        """Time that each body was in contact before it last lifted off. (num_envs, k) [s]"""
         self.first_contact = flags[0]
         """Whether contact began in the last step. (num_envs, k)"""
         self.first_air = flags[1]
@@ -70,7 +72,7 @@ class ContactSensor:
         """Whether each body is in contact. (num_envs, k)"""
 
     def update(self, dt: float) -> None:
-        """Take in what a step has measured."""
+        """Update forces and times after an environment step of `dt` seconds."""
         for age in range(self.force_history.shape[1] - 1, 0, -1):
             self.force_history[:, age] = self.force_history[:, age - 1]
         force, found = self._measure(self._sim.derived_field("sensordata"))
@@ -85,7 +87,7 @@ class ContactSensor:
         self.contact_time *= found
 
     def reset(self, selection: Selection) -> None:
-        """Begin new episodes: no times, no history, and the forces of the start state."""
+        """Clear times and history of new episodes, and read the forces of their start state."""
         for values in (self._times, self._flags, self.force_history):
             selection.write(values, 0)
         if self._sim.engine.forces_after_reset:
@@ -94,22 +96,17 @@ class ContactSensor:
             selection.write(self.found, found)
 
     def on_moved(self, selection: Selection) -> None:
-        """Forces are those of the last step, wherever an event has put the bodies since."""
+        """Do nothing: forces are those of the last step, also if an event has moved the bodies since."""
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: the sensor holds no resources."""
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """What the sensor carries from step to step."""
-        return {name: getattr(self, name).clone() for name in _STATE_NAMES}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore the state returned by `state_dict()`."""
-        for name in _STATE_NAMES:
-            getattr(self, name).copy_(state[name])
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors that are saved in a checkpoint."""
+        return {name: getattr(self, name) for name in _STATE_NAMES}
 
     def _measure(self, sensordata: Tensor) -> tuple[Tensor, Tensor]:
-        """Return net forces (rows, k, 3), and whether they are contacts (rows, k)."""
+        """Return net forces (rows, k, 3), and whether each body is in contact (rows, k)."""
         values = torch.unflatten(sensordata[:, self._columns], 1, (-1, self._others, 4))
         total = values[:, :, 0]
         for other in range(1, self._others):
@@ -122,7 +119,7 @@ class ContactSensor:
 
 
 class RaySensor(LazySensor):
-    """Distances along r rays from a body. Rays are cast when they are read, at most once a step."""
+    """Distances along r rays from a body. The rays are cast when a value is read, at most once per step."""
 
     def __init__(self, spec: RaySensorSpec, sim: SimData, entity: Entity) -> None:
         super().__init__()
@@ -139,7 +136,7 @@ class RaySensor(LazySensor):
         self._unit = torch.eye(3, device=engine.device)
         n, r = engine.num_envs, len(starts)
         self.names = [f"ray_{i}" for i in range(r)]
-        """The rays."""
+        """Names of the r rays."""
         self._distance = torch.zeros(n, r, device=engine.device)
         self._missed = torch.zeros(n, r, dtype=torch.bool, device=engine.device)
         self._hits = torch.zeros(n, r, 3, device=engine.device)
@@ -148,7 +145,7 @@ class RaySensor(LazySensor):
 
     @property
     def distance(self) -> Tensor:
-        """Distance along each ray to what it hits, `max_distance` where it hits nothing. (num_envs, r) [m]"""
+        """Distance along each ray to the first hit; `max_distance` without a hit. (num_envs, r) [m]"""
         self._cast()
         return self._distance
 
@@ -160,18 +157,18 @@ class RaySensor(LazySensor):
 
     @property
     def hits(self) -> Tensor:
-        """Where each ray ends, world frame. (num_envs, r, 3) [m]"""
+        """End point of each ray, world frame. (num_envs, r, 3) [m]"""
         self._cast()
         return self._hits
 
     @property
     def position(self) -> Tensor:
-        """The sensor's own position, world frame. (num_envs, 3) [m]"""
+        """Position of the sensor, world frame. (num_envs, 3) [m]"""
         self._cast()
         return self._position
 
     def on_moved(self, selection: Selection) -> None:
-        """Cast anew for the selected environments, if rays have been cast in this step."""
+        """Cast the rays of the selected environments again, if rays have been cast in this step."""
         if not self._current:
             return
         position, quat = self._pose()
@@ -187,6 +184,7 @@ class RaySensor(LazySensor):
                 buffer.copy_(values)
 
     def _rays(self, position: Tensor, quat: Tensor, selection: Selection | None = None) -> tuple[Tensor, ...]:
+        """Return distances, misses, end points and sensor positions, in the order of `_buffers`."""
         self._sim.forward_moved()
         axes = self._axes(quat)
         position = position + _rotated(axes, self._offset)[:, 0]
@@ -202,19 +200,20 @@ class RaySensor(LazySensor):
         return distance, missed, points + directions * distance[..., None], position
 
     def _pose(self) -> tuple[Tensor, Tensor]:
+        """Return position (num_envs, 3) and orientation (num_envs, 4) of the sensor's body."""
         if self._root is not None:
             qpos = self._sim.qpos
             return qpos[:, self._root : self._root + 3], qpos[:, self._root + 3 : self._root + 7]
         return self._sim.derived_field("xpos")[:, self._body], self._sim.derived_field("xquat")[:, self._body]
 
     def _axes(self, quat: Tensor) -> Tensor | None:
-        """The axes of the sensor's frame in the world, one below the other; None: the world's. (rows, 3, 3)"""
+        """Return the axes of the sensor's frame in the world as rows; None for the world's axes. (rows, 3, 3)"""
         if self._config.alignment == "world":
             return None
         x, y, z = (rotate(quat, axis.expand(len(quat), 3)) for axis in self._unit)
         if self._config.alignment == "base":
             return torch.stack([x, y, z], dim=1)
-        ahead, left = x[:, 0] + 1e-12, x[:, 1]  # a body that points straight up heads along x
+        ahead, left = x[:, 0] + 1e-12, x[:, 1]  # 1e-12: the yaw of a body that points straight up is 0
         norm = (ahead * ahead + left * left).sqrt()
         cos, sin, zero = ahead / norm, left / norm, torch.zeros_like(norm)
         rows = [cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1.0]
@@ -222,15 +221,11 @@ class RaySensor(LazySensor):
 
 
 Sensor = ContactSensor | RaySensor | CameraSensor
-"""What `scene.sensors` has."""
+"""A sensor of `scene.sensors`."""
 
 
-def make_sensors(
-    specs: Mapping[str, ContactSensorSpec | RaySensorSpec | CameraSensorSpec],
-    sim: SimData,
-    entities: Mapping[str, Entity],
-) -> dict[str, Sensor]:
-    """Make the sensors that the scene has put into the model, in the order of `specs`."""
+def make_sensors(specs: Mapping[str, SensorSpec], sim: SimData, entities: Mapping[str, Entity]) -> dict[str, Sensor]:
+    """Make the sensors of a compiled scene, in the order of `specs`."""
     cameras = {name: spec for name, spec in specs.items() if isinstance(spec, CameraSensorSpec)}
     made: dict[str, Sensor] = dict(make_cameras(cameras, sim.engine))
     for name, spec in specs.items():
@@ -242,7 +237,7 @@ def make_sensors(
 
 
 def _pattern(config: RaySensorConfig) -> tuple[Tensor, Tensor]:
-    """Starts relative to the sensor, and unit directions. (r, 3) each"""
+    """Return the start points of the rays relative to the sensor, and their unit directions. (r, 3) each [m]"""
     if not isinstance(config.pattern, GridPatternConfig):
         directions = torch.tensor(config.pattern)
         return torch.zeros_like(directions), torch.nn.functional.normalize(directions, dim=1)
@@ -254,13 +249,16 @@ def _pattern(config: RaySensorConfig) -> tuple[Tensor, Tensor]:
 
 
 def _line(size: float, resolution: float) -> Tensor:
-    """Points at the resolution's distance, centred, that fit in the size."""
+    """Return centred points at a distance of `resolution` that fit in `size` [m]."""
     count = math.floor(size / resolution + 1e-6) + 1
     return (torch.arange(count) - (count - 1) / 2) * resolution
 
 
 def _rotated(axes: Tensor | None, vectors: Tensor) -> Tensor:
-    """Vectors of the sensor's frame in the world. (r, 3) -> (rows, r, 3), one row where the frame is the world's"""
+    """Return vectors of the sensor's frame in the world frame. (r, 3) -> (rows, r, 3)
+
+    There is one row if the sensor's frame is the world's (axes None).
+    """
     if axes is None:
         return vectors[None]
     x, y, z = axes[:, None].unbind(2)

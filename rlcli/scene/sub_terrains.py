@@ -1,7 +1,7 @@
-"""Sub-terrains: the heights of one patch, or the blocks it is built of.
+"""Sub-terrains: the heights of one patch of terrain, or the blocks that it is built of.
 
-A patch is an array of heights [m] at the corners of its cells, x along the first axis. Its outermost heights are 0, so
-that any two patches fit together.
+A patch is an array of heights [m] at the corners of its cells, with x along the first axis. The heights along its edges
+are 0, so that any two patches fit together.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _EPS = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """An upright block: its corners in the patch, and the height of its top [m]."""
+    """Upright block: two opposite corners in the patch, and the height of its top [m]."""
 
     low: tuple[float, float]
     high: tuple[float, float]
@@ -30,121 +30,136 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class PatchSite:
-    """Size, resolution and difficulty of a patch to make."""
+    """Size, resolution and difficulty of a patch."""
 
     size: tuple[float, float]
-    """Along x and y [m]."""
+    """Extent along x and y [m]."""
     resolution: float
-    """Between two heights [m]."""
+    """Distance between two heights [m]."""
     difficulty: float
-    """In [0, 1]."""
+    """Difficulty in [0, 1]."""
     random: np.random.Generator
 
     def flat(self) -> Heights:
-        """Heights of 0."""
+        """Return heights of 0."""
         nx, ny = (round(edge / self.resolution) + 1 for edge in self.size)
         return np.zeros((nx, ny))
 
     def axes(self) -> tuple[Heights, Heights]:
-        """Coordinates of the heights along x, as a column, and along y, as a row [m]."""
+        """Return the coordinates of the heights along x, as a column, and along y, as a row [m]."""
         nx, ny = self.flat().shape
         x, y = (np.arange(n, dtype=np.float64) * self.resolution for n in (nx, ny))
         return x[:, None], y[None]
 
     def at_difficulty(self, ends: tuple[float, float]) -> float:
-        """The value between those of difficulty 0 and 1."""
+        """Return the value at the patch's difficulty; `ends` are the values at difficulty 0 and 1."""
         return ends[0] + (ends[1] - ends[0]) * self.difficulty
 
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """A finished patch."""
+    """Finished patch."""
 
     heights: Heights
-    """Of its surface, blocks included; 0 along the edges."""
+    """Heights of its surface, blocks included; 0 along the edges [m]."""
     blocks: tuple[Block, ...] = ()
-    """What is to be built of boxes instead of a height field."""
+    """Blocks that become boxes instead of a part of the height field."""
 
 
-def make_patch(config: schema.PatchConfig, plot: PatchSite) -> Patch:
-    """A sub-terrain of some difficulty."""
-    made = _MAKERS[type(config)](config, plot)
+def make_patch(config: schema.PatchConfig, site: PatchSite) -> Patch:
+    """Make a sub-terrain of the site's difficulty."""
+    made = _MAKERS[type(config)](config, site)
     if isinstance(made, np.ndarray):
         return Patch(_with_zero_edges(made))
-    heights = plot.flat()
+    heights = site.flat()
     for block in made:
-        _raise_to_block(heights, plot, block)
+        _raise_to_block(heights, site, block)
     return Patch(_with_zero_edges(heights), tuple(made) if config.boxes else ())  # type: ignore[attr-defined]
 
 
-def _flat(config: schema.FlatPatchConfig, plot: PatchSite) -> Heights:
-    return plot.flat()
+def ring(outer: Block, inner: Block) -> list[Block]:
+    """Return four blocks that fill the area between two rectangles, at the height of the outer one."""
+    (x0, y0), (x1, y1) = outer.low, outer.high
+    (left, front), (right, back) = inner.low, inner.high
+    return [
+        Block((x0, y0), (x1, front), outer.top),
+        Block((x0, back), (x1, y1), outer.top),
+        Block((x0, front), (left, back), outer.top),
+        Block((right, front), (x1, back), outer.top),
+    ]
 
 
-def _noise(config: schema.NoisePatchConfig, plot: PatchSite) -> Heights:
-    bound = plot.at_difficulty(config.height)
-    coarse = [np.linspace(0.0, edge, max(2, round(edge / config.spacing) + 1)) for edge in plot.size]
-    drawn = plot.random.uniform(-bound, bound, (len(coarse[0]), len(coarse[1])))
-    x, y = plot.axes()
+def _flat(config: schema.FlatPatchConfig, site: PatchSite) -> Heights:
+    return site.flat()
+
+
+def _noise(config: schema.NoisePatchConfig, site: PatchSite) -> Heights:
+    bound = site.at_difficulty(config.height)
+    coarse = [np.linspace(0.0, edge, max(2, round(edge / config.spacing) + 1)) for edge in site.size]
+    drawn = site.random.uniform(-bound, bound, (len(coarse[0]), len(coarse[1])))
+    x, y = site.axes()
+    # bilinear interpolation: first along x, then along y
     along_x = np.stack([np.interp(x[:, 0], coarse[0], column) for column in drawn.T], axis=1)
     return np.stack([np.interp(y[0], coarse[1], row) for row in along_x])
 
 
-def _slope(config: schema.SlopePatchConfig, plot: PatchSite) -> Heights:
-    run = np.minimum(_edge_distance(plot), (min(plot.size) - config.platform) / 2)
-    return run * plot.at_difficulty(config.slope) * (-1.0 if config.inverted else 1.0)
+def _slope(config: schema.SlopePatchConfig, site: PatchSite) -> Heights:
+    run = np.minimum(_edge_distance(site), (min(site.size) - config.platform) / 2)
+    return run * site.at_difficulty(config.slope) * (-1.0 if config.inverted else 1.0)
 
 
-def _waves(config: schema.WavesPatchConfig, plot: PatchSite) -> Heights:
-    x, y = (2.0 * np.pi * config.count * axis / edge for axis, edge in zip(plot.axes(), plot.size, strict=True))
-    return 0.5 * plot.at_difficulty(config.amplitude) * (np.sin(x) + np.sin(y))
+def _waves(config: schema.WavesPatchConfig, site: PatchSite) -> Heights:
+    x, y = (2.0 * np.pi * config.count * axis / edge for axis, edge in zip(site.axes(), site.size, strict=True))
+    return 0.5 * site.at_difficulty(config.amplitude) * (np.sin(x) + np.sin(y))
 
 
-def _obstacles(config: schema.ObstaclesPatchConfig, plot: PatchSite) -> Heights:
-    heights, draw = plot.flat(), plot.random
+def _obstacles(config: schema.ObstaclesPatchConfig, site: PatchSite) -> Heights:
+    heights, draw = site.flat(), site.random
     for _ in range(config.count):
         edges = draw.uniform(*config.width, 2)
-        low = draw.uniform(0.0, 1.0, 2) * (np.array(plot.size) - edges)
-        top = plot.at_difficulty(config.height) * draw.choice([-1.0, -0.5, 0.5, 1.0])
-        _raise_to_block(heights, plot, Block(tuple(low), tuple(low + edges), top))
-    _raise_to_block(heights, plot, _platform_block(config.platform, plot, 0.0))
+        low = draw.uniform(0.0, 1.0, 2) * (np.array(site.size) - edges)
+        top = site.at_difficulty(config.height) * draw.choice([-1.0, -0.5, 0.5, 1.0])
+        _raise_to_block(heights, site, Block(tuple(low), tuple(low + edges), top))
+    _raise_to_block(heights, site, _platform_block(config.platform, site))
     return heights
 
 
-def _stones(config: schema.StonesPatchConfig, plot: PatchSite) -> Heights:
-    """Rows of stones, each row shifted at random; the gaps are what lies between them."""
-    heights = plot.flat() - config.depth
-    width, gap = plot.at_difficulty((config.width[1], config.width[0])), plot.at_difficulty(config.gap)
+def _stones(config: schema.StonesPatchConfig, site: PatchSite) -> Heights:
+    """Return rows of stones over a pit, each row shifted at random."""
+    heights = site.flat() - config.depth
+    width, gap = site.at_difficulty((config.width[1], config.width[0])), site.at_difficulty(config.gap)
     x = 0.0
-    while x < plot.size[0] - _EPS:
-        y = -plot.random.uniform(0.0, width)
-        while y < plot.size[1] - _EPS:
-            _raise_to_block(heights, plot, Block((x, y), (x + width, y + width), 0.0))
+    while x < site.size[0] - _EPS:
+        y = -site.random.uniform(0.0, width)
+        while y < site.size[1] - _EPS:
+            _raise_to_block(heights, site, Block((x, y), (x + width, y + width), 0.0))
             y += width + gap
         x += width + gap
-    _raise_to_block(heights, plot, _platform_block(config.platform, plot, 0.0))
+    _raise_to_block(heights, site, _platform_block(config.platform, site))
     return heights
 
 
-def _stairs(config: schema.StairsPatchConfig, plot: PatchSite) -> list[Block]:
-    """Rings of four blocks each, from the outside inwards, and the platform."""
-    rise = plot.at_difficulty(config.step_height) * (-1.0 if config.inverted else 1.0)
-    steps = int((min(plot.size) - config.platform) / 2 / config.step_width + _EPS)
+def _stairs(config: schema.StairsPatchConfig, site: PatchSite) -> list[Block]:
+    """Return rings of four blocks each, from the outside inwards, and the platform."""
+    rise = site.at_difficulty(config.step_height) * (-1.0 if config.inverted else 1.0)
+    steps = int((min(site.size) - config.platform) / 2 / config.step_width + _EPS)
+
+    def inset(margin: float, top: float) -> Block:
+        return Block((margin, margin), (site.size[0] - margin, site.size[1] - margin), top)
+
     blocks = []
     for step in range(steps):
-        near = step * config.step_width
-        blocks += _ring(near, near + config.step_width, plot.size, step * rise)
-    rest = steps * config.step_width
-    high = (plot.size[0] - rest, plot.size[1] - rest)
-    return [*blocks, Block((rest, rest), high, steps * rise)]
+        margin, top = step * config.step_width, step * rise
+        blocks += ring(inset(margin, top), inset(margin + config.step_width, top))
+    return [*blocks, inset(steps * config.step_width, steps * rise)]
 
 
-def _grid(config: schema.GridPatchConfig, plot: PatchSite) -> list[Block]:
-    bound = plot.at_difficulty(config.height)
-    nx, ny = (max(1, int(edge / config.cell + _EPS)) for edge in plot.size)
-    dx, dy = plot.size[0] / nx, plot.size[1] / ny
-    tops = plot.random.uniform(-bound, bound, (nx, ny))
-    x, y = ((np.arange(n) + 0.5) * d - edge / 2 for n, d, edge in ((nx, dx, plot.size[0]), (ny, dy, plot.size[1])))
+def _grid(config: schema.GridPatchConfig, site: PatchSite) -> list[Block]:
+    bound = site.at_difficulty(config.height)
+    nx, ny = (max(1, int(edge / config.cell + _EPS)) for edge in site.size)
+    dx, dy = site.size[0] / nx, site.size[1] / ny
+    tops = site.random.uniform(-bound, bound, (nx, ny))
+    x, y = ((np.arange(n) + 0.5) * d - edge / 2 for n, d, edge in ((nx, dx, site.size[0]), (ny, dy, site.size[1])))
     reach = config.platform / 2
     tops[(abs(x)[:, None] < reach) & (abs(y)[None] < reach)] = 0.0
     return [
@@ -164,30 +179,21 @@ _MAKERS: dict[type[schema.PatchConfig], Callable[[Any, PatchSite], Heights | lis
 }
 
 
-def _edge_distance(plot: PatchSite) -> Heights:
-    """Distance of every height from the nearest edge [m]."""
-    x, y = plot.axes()
-    return np.minimum(np.minimum(x, plot.size[0] - x), np.minimum(y, plot.size[1] - y))
+def _edge_distance(site: PatchSite) -> Heights:
+    """Return the distance of every height from the nearest edge [m]."""
+    x, y = site.axes()
+    return np.minimum(np.minimum(x, site.size[0] - x), np.minimum(y, site.size[1] - y))
 
 
-def _platform_block(platform: float, plot: PatchSite, top: float) -> Block:
-    low, high = (tuple((edge + sign * platform) / 2 for edge in plot.size) for sign in (-1, 1))
-    return Block(low, high, top)  # type: ignore[arg-type]
+def _platform_block(platform: float, site: PatchSite) -> Block:
+    """Return a block of height 0 in the middle of a patch."""
+    low, high = (tuple((edge + sign * platform) / 2 for edge in site.size) for sign in (-1, 1))
+    return Block(low, high, 0.0)  # type: ignore[arg-type]
 
 
-def _ring(near: float, far: float, size: tuple[float, float], top: float) -> list[Block]:
-    x, y = size
-    return [
-        Block((near, near), (x - near, far), top),
-        Block((near, y - far), (x - near, y - near), top),
-        Block((near, far), (far, y - far), top),
-        Block((x - far, far), (x - near, y - far), top),
-    ]
-
-
-def _raise_to_block(heights: Heights, plot: PatchSite, block: Block) -> None:
-    """Set the heights that a block covers to that of its top."""
-    x, y = plot.axes()
+def _raise_to_block(heights: Heights, site: PatchSite, block: Block) -> None:
+    """Set the heights that a block covers to the height of its top."""
+    x, y = site.axes()
     inside_x = (x[:, 0] >= block.low[0] - _EPS) & (x[:, 0] <= block.high[0] + _EPS)
     inside_y = (y[0] >= block.low[1] - _EPS) & (y[0] <= block.high[1] + _EPS)
     heights[np.ix_(inside_x, inside_y)] = block.top

@@ -1,13 +1,14 @@
-"""The terrain of a scene: patches put together in the model, and where on it each environment stands."""
+"""Terrain of a scene: patches joined in the model, and the start position of each environment on it."""
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -17,7 +18,8 @@ from torch import Tensor
 
 from rlcli import random
 from rlcli.config import schema
-from rlcli.scene.sub_terrains import Block, Heights, Patch, PatchSite, make_patch
+from rlcli.config.schema import TerrainConfig
+from rlcli.scene.sub_terrains import Block, Heights, Patch, PatchSite, make_patch, ring
 from rlcli.sim.selection import Selection
 from rlcli.sim.tensor_state import require_in_range
 
@@ -25,38 +27,38 @@ if TYPE_CHECKING:
     from rlcli.scene.entity import Entity
 
 TERRAIN_BODY = "terrain"
-"""The body of the terrain's geoms."""
+"""Body that has the geoms of the terrain."""
 _MAX_HEIGHTS = 1 << 24
 _MAX_HEADER = 10_000
-"""Bytes of a NumPy file's header."""
+"""Largest header of a NumPy file [bytes]."""
 _START, _MOVE = random.stream("terrain.start"), random.stream("terrain.move")
 _SCATTER = random.stream("terrain.scatter")
 _SPAWN_HALF_WIDTH = 0.5
-"""Half the edge of the square in a patch's middle whose highest point is where its origin lies [m]."""
+"""Half the edge of the square in the middle of a patch whose highest point gives the height of its origin [m]."""
 _THICKNESS = 0.5
-"""How far ground reaches below its lowest point [m]."""
+"""Thickness of the ground below its lowest point [m]."""
+_BOX, _HFIELD = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_HFIELD
 
-TerrainConfig: TypeAlias = schema.TerrainGeneratorConfig | schema.TerrainHeightsConfig
-TerrainProblem: TypeAlias = tuple[tuple[str, ...], str, str | None]
-"""Path below scene.terrain, what is wrong, what to do."""
+TerrainProblem = tuple[tuple[str, ...], str, str | None]
+"""Key below scene.terrain, message, hint."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """A terrain as numbers."""
+    """Heights, blocks and origins of a terrain."""
 
     heights: Heights
-    """Of the height field, x along the first axis, its middle at the world's origin [m]."""
+    """Heights of the height field, x along the first axis, its middle at the world's origin [m]."""
     resolution: float
-    """Between two heights [m]."""
+    """Distance between two heights [m]."""
     border: float
-    """Flat ground about it [m]."""
+    """Width of the flat ground around the height field [m]."""
     friction: float
     """Sliding friction."""
     blocks: tuple[Block, ...]
-    """In world coordinates."""
+    """Blocks in world coordinates."""
     origins: NDArray[np.float32]
-    """Of the patches. (rows, columns, 3) [m]"""
+    """Origins of the patches. (rows, columns, 3) [m]"""
     patch: tuple[float, float]
     """Extent of a patch along x and y [m]."""
 
@@ -69,7 +71,7 @@ def terrain_problems(config: TerrainConfig, root: Path) -> Iterator[TerrainProbl
     cells = [edge / config.resolution for edge in config.patch]
     if any(abs(n - round(n)) > 1e-6 or n < 2 for n in cells):
         edges = " x ".join(f"{edge:g}" for edge in config.patch)
-        message = f"a patch of {edges} m is not a whole number of cells of {config.resolution:g} m, two at least"
+        message = f"a patch of {edges} m is not a whole number of cells of {config.resolution:g} m, at least two"
         yield ("patch",), message, "change patch or resolution"
         return
     count = round(cells[0]) * config.rows * round(cells[1]) * config.columns
@@ -84,7 +86,7 @@ def terrain_problems(config: TerrainConfig, root: Path) -> Iterator[TerrainProbl
 
 
 def make_ground(config: TerrainConfig, root: Path) -> Ground:
-    """Heights, blocks and origins; the same ones for the same configuration."""
+    """Make the heights, blocks and origins of a terrain; the same configuration gives the same ground."""
     if isinstance(config, schema.TerrainHeightsConfig):
         heights = _read_heights(root / config.file).astype(np.float64)
         nx, ny = heights.shape
@@ -111,58 +113,42 @@ def make_ground(config: TerrainConfig, root: Path) -> Ground:
 
 
 def add_ground(spec: mujoco.MjSpec, ground: Ground, material: str) -> None:
-    """Put a terrain into a model: a height field, boxes, and a border."""
+    """Add a terrain to a model: a height field, boxes, and a border."""
     body, prefix = spec.worldbody.add_body(name=TERRAIN_BODY), f"//{TERRAIN_BODY}"
-    friction = [ground.friction, 0.005, 0.0001]
+    add_geom = functools.partial(body.add_geom, material=material, friction=[ground.friction, 0.005, 0.0001])
     nx, ny = ground.heights.shape
     half = [0.5 * (n - 1) * ground.resolution for n in (nx, ny)]
     lowest, span = float(ground.heights.min()), float(np.ptp(ground.heights))
-    flat = span < 1e-9
-    if flat:
-        body.add_geom(
-            name=f"{prefix}/flat", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, _THICKNESS],
-            pos=[0.0, 0.0, lowest - _THICKNESS], material=material, friction=friction,
-        )  # fmt: skip
+    if span < 1e-9:  # MuJoCo refuses a height field without a height difference
+        add_geom(name=f"{prefix}/flat", type=_BOX, size=[*half, _THICKNESS], pos=[0.0, 0.0, lowest - _THICKNESS])
     else:
-        values = ground.heights.T.astype(np.float32).ravel()
+        values = ground.heights.T.astype(np.float32).ravel()  # MuJoCo's rows are along y
         spec.add_hfield(name=TERRAIN_BODY, nrow=ny, ncol=nx, size=[*half, span, _THICKNESS], userdata=values)
-        body.add_geom(
-            name=f"{prefix}/heights", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=TERRAIN_BODY,
-            pos=[0.0, 0.0, lowest], material=material, friction=friction,
-        )  # fmt: skip
+        add_geom(name=f"{prefix}/heights", type=_HFIELD, hfieldname=TERRAIN_BODY, pos=[0.0, 0.0, lowest])
     floor = min(lowest, 0.0) - _THICKNESS
-    border = _border(half, ground.border)
-    for number, block in enumerate([*ground.blocks, *border]):
-        size = [(block.high[i] - block.low[i]) / 2 for i in (0, 1)]
-        middle = [(block.high[i] + block.low[i]) / 2 for i in (0, 1)]
-        body.add_geom(
-            name=f"{prefix}/box_{number}", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*size, (block.top - floor) / 2],
-            pos=[*middle, (block.top + floor) / 2], material=material, friction=friction,
-        )  # fmt: skip
+    for number, block in enumerate([*ground.blocks, *_border(half, ground.border)]):
+        size = [*((block.high[i] - block.low[i]) / 2 for i in (0, 1)), (block.top - floor) / 2]
+        middle = [*((block.high[i] + block.low[i]) / 2 for i in (0, 1)), (block.top + floor) / 2]
+        add_geom(name=f"{prefix}/box_{number}", type=_BOX, size=size, pos=middle)
 
 
 class Terrain:
-    """Where each environment stands. A level is a row of patches, a type a column.
+    """Start position of each environment. A level is a row of patches, a type is a column.
 
     Args:
         ground: the terrain in the model.
-        config: its configuration.
-        origins: the environments' start places, kept up to date. (num_envs, 3) [m]
-        seed: of the start levels.
-        shared_streams: environment i stands where i % shared_streams does; 0: each for itself.
+        config: configuration of the terrain.
+        origins: start positions of the environments; this object updates them. (num_envs, 3) [m]
+        seed: seed of the start levels.
+        shared_streams: environments i and i % shared_streams have the same start; 0: every environment has its own.
     """
 
     def __init__(
-        self,
-        ground: Ground,
-        config: TerrainConfig,
-        origins: Tensor,
-        seed: int,
-        shared_streams: int = 0,
+        self, ground: Ground, config: TerrainConfig, origins: Tensor, seed: int, shared_streams: int = 0
     ) -> None:
         device, count = origins.device, len(origins)
         self.origins = torch.from_numpy(ground.origins).to(device)
-        """Start place on each patch. (rows, columns, 3) [m]"""
+        """Start position on each patch. (rows, columns, 3) [m]"""
         self._names = np.arange(count) % (shared_streams or max(1, count))
         self.types = torch.from_numpy(self._names).to(device) % self.origins.shape[1]
         """Column of each environment. (num_envs,) int64"""
@@ -178,23 +164,29 @@ class Terrain:
 
     @property
     def rows(self) -> int:
-        """How many levels there are."""
+        """Number of levels."""
         return len(self.origins)
 
     def start(self, seed: int) -> None:
-        """Put every environment on its start level, which depends on the seed and its number alone."""
+        """Move every environment to its start level, which depends only on the seed and its number."""
         keys = random.row_keys(seed, self._names, np.zeros_like(self._names))
         self.levels.copy_(torch.from_numpy(random.integers(keys, _START, 0, 1, self._start_levels)[:, 0]))
         self._env_origins.copy_(self.origins[self.levels, self.types])
 
     def move(self, selection: Selection, up: Tensor, down: Tensor) -> None:
-        """Move environments a level up or down; who has passed the last level gets a random one. (rows,) bool each"""
+        """Move environments a level up or down; an environment above the last level gets a random level.
+
+        Args:
+            selection: the environments.
+            up: environments that move up. (rows,) bool
+            down: environments that move down, unless they move up. (rows,) bool
+        """
         levels = selection.read(self.levels) + up.long() - (down & ~up).long()
-        anywhere = selection.stream(_MOVE).choice(self.rows)
-        self._set_levels(selection, torch.where(levels >= self.rows, anywhere, levels.clamp(min=0)))
+        drawn = selection.stream(_MOVE).choice(self.rows)
+        self._set_levels(selection, torch.where(levels >= self.rows, drawn, levels.clamp(min=0)))
 
     def scatter(self, selection: Selection) -> None:
-        """Put environments on random levels, each on its own kind of ground."""
+        """Move environments to random levels; their columns do not change."""
         self._set_levels(selection, selection.stream(_SCATTER).choice(self.rows))
 
     def _set_levels(self, selection: Selection, levels: Tensor) -> None:
@@ -202,15 +194,15 @@ class Terrain:
         selection.write(self._env_origins, self.origins[levels, selection.read_view(self.types)])
 
     def place_entities(self, entities: Iterable[Entity], selection: Selection) -> None:
-        """Move floating and mocap entities from their default place to the environment's start place."""
+        """Set the pose of floating and mocap entities to the default pose, moved by the environment's origin."""
         for entity in entities:
             if entity.is_floating or entity.mocap >= 0:
                 default = selection.read_view(entity.data.default_root_state)
-                place = default[:, :3] + selection.read_view(self._env_origins)
-                entity.write_root_pose(selection, place, default[:, 3:7])
+                position = default[:, :3] + selection.read_view(self._env_origins)
+                entity.write_root_pose(selection, position, default[:, 3:7])
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The levels."""
+        """Return a copy of the levels."""
         return {"levels": self.levels.clone()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
@@ -223,7 +215,7 @@ class Terrain:
 def _choose_patch(
     config: schema.TerrainGeneratorConfig, row: int, column: int, draw: np.random.Generator
 ) -> tuple[schema.PatchConfig, float]:
-    """Kind and difficulty of a patch."""
+    """Return the kind and the difficulty of a patch."""
     kinds = list(config.sub_terrains.values())
     shares = np.cumsum([kind.proportion for kind in kinds])
     low, high = config.difficulty
@@ -237,38 +229,35 @@ def _choose_patch(
 
 
 def _spawn_height(heights: Heights, resolution: float) -> float:
-    """The highest point in the middle of a patch."""
+    """Return the height of the highest point in the middle of a patch [m]."""
     reach = round(_SPAWN_HALF_WIDTH / resolution)
     x, y = (n // 2 for n in heights.shape)
     return float(heights[max(0, x - reach) : x + reach + 1, max(0, y - reach) : y + reach + 1].max())
 
 
 def _heights_below_blocks(patch: Patch) -> Heights:
-    """Heights that stay below a patch's blocks."""
+    """Return heights that stay below the blocks of a patch [m]."""
     lowest = min(block.top for block in patch.blocks)
     inside = np.zeros_like(patch.heights)
     inside[1:-1, 1:-1] = lowest - 0.05 if lowest < 0.0 else 0.0
     return inside
 
 
-def _shifted(block: Block, by: NDArray[np.float64]) -> Block:
-    x, y = by.tolist()
+def _shifted(block: Block, offset: NDArray[np.float64]) -> Block:
+    x, y = offset.tolist()
     return Block((block.low[0] + x, block.low[1] + y), (block.high[0] + x, block.high[1] + y), block.top)
 
 
 def _border(half: list[float], width: float) -> list[Block]:
+    """Return the blocks of the flat ground around a height field."""
     if width == 0.0:
         return []
     x, y = half
-    return [
-        Block((-x - width, -y - width), (x + width, -y), 0.0),
-        Block((-x - width, y), (x + width, y + width), 0.0),
-        Block((-x - width, -y), (-x, y), 0.0),
-        Block((x, -y), (x + width, y), 0.0),
-    ]
+    return ring(Block((-x - width, -y - width), (x + width, y + width), 0.0), Block((-x, -y), (x, y), 0.0))
 
 
 def _patch_problems(patch: schema.PatchConfig, edge: float, resolution: float) -> Iterator[tuple[str, str, str | None]]:
+    """Yield key, message and hint for each problem of a sub-terrain."""
     platform = getattr(patch, "platform", 0.0)
     if platform >= edge:
         yield "platform", f"a platform of {platform:g} m does not fit in a patch of {edge:g} m", None
@@ -288,19 +277,20 @@ def _read_heights(file: Path) -> NDArray[Any]:
     """Return the array of an untrusted NumPy file.
 
     Raises:
-        ValueError: if it is none, or has more heights than a height field can.
+        ValueError: if the file is not a NumPy file, or has more heights than a height field can have.
     """
     with file.open("rb") as opened:
         size = os.fstat(opened.fileno()).st_size
         if size > _MAX_HEIGHTS * 8 + _MAX_HEADER:
-            raise ValueError(f"it has {size:,} bytes, more than {_MAX_HEIGHTS:,} heights need")
+            raise ValueError(f"the file has {size:,} bytes, more than {_MAX_HEIGHTS:,} heights need")
         try:
             return np.asarray(np.lib.format.read_array(opened, allow_pickle=False, max_header_size=_MAX_HEADER))
-        except (MemoryError, RecursionError, SyntaxError, TokenError) as error:  # of a header that promises too much
-            raise ValueError(f"its header is malformed ({type(error).__name__})") from None
+        except (MemoryError, RecursionError, SyntaxError, TokenError) as error:  # errors of a malicious header
+            raise ValueError(f"the header is malformed ({type(error).__name__})") from None
 
 
 def _file_problems(config: schema.TerrainHeightsConfig, root: Path) -> Iterator[TerrainProblem]:
+    """Yield the problems of a terrain's height file."""
     file = (root / config.file).resolve()
     if not file.is_relative_to(root.resolve()):
         yield ("file",), f"'{config.file}' lies outside the task's folder {root}", None
@@ -316,6 +306,6 @@ def _file_problems(config: schema.TerrainHeightsConfig, root: Path) -> Iterator[
         return
     if heights.ndim != 2 or min(heights.shape) < 2:
         found = f"found shape {heights.shape}"
-        yield ("file",), f"'{config.file}' must hold a table of heights, two by two at least; {found}", None
+        yield ("file",), f"'{config.file}' must contain a table of heights, at least 2 by 2; {found}", None
     elif heights.dtype.kind not in "fiu" or not np.isfinite(heights).all():
-        yield ("file",), f"'{config.file}' must hold finite numbers; found {heights.dtype}", None
+        yield ("file",), f"'{config.file}' must contain finite numbers; found {heights.dtype}", None

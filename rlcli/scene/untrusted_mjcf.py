@@ -1,9 +1,9 @@
-"""Reading untrusted MJCF: which files it may open, and how much memory and time it may take.
+"""Reader of untrusted MJCF, with limits on the files that a model may open and on its memory and compile time.
 
-The text is read here before MuJoCo sees it. Files that it includes or loads must lie in the folders that its task may
-read, links followed; what could keep the compiler busy for ever is counted. A model that asks for much, though not for
-too much, is compiled first in a process of its own, under limits of memory and time; one that asks for little, which is
-every ordinary robot, is compiled at once: the reading costs milliseconds, a process half a second.
+The text is parsed here before MuJoCo reads it. Files that a model includes or loads must lie in the folders that its
+task may read, after links are resolved. The elements that take compile time are counted. An expensive model is first
+compiled in a subprocess with limits on memory and time; a model above a second threshold is refused. All ordinary
+robots are below the first threshold and are compiled at once: parsing takes milliseconds, a subprocess half a second.
 """
 
 from __future__ import annotations
@@ -20,56 +20,65 @@ from xml.parsers import expat
 import mujoco
 import numpy as np
 
+from rlcli.errors import one_line
 from rlcli.machine import read_plain
 from rlcli.registry import chosen_model, model_file
 from rlcli.sim.mujoco_log import quiet_mujoco
 
-MOST_TEXT = 16 * 1024 * 1024
-MOST_ASSET = 256 * 1024 * 1024
-MOST_FILES = 1000
-MOST_DEPTH = 200
-MOST_MEMORY = 4 * 1024**3
-MUCH, TOO_MUCH = 5_000, 1_000_000
-"""Elements (after replication), and what else costs as much as one: see `_WEIGHTS`."""
+_MAX_TEXT = 16 * 1024 * 1024
+_MAX_ASSET = 256 * 1024 * 1024
+_MAX_FILES = 1000
+_MAX_DEPTH = 200
+_MAX_MEMORY = 4 * 1024**3
+SUBPROCESS_COST, _MAX_COST = 5_000, 1_000_000
+"""Elements after replication; `_element_cost` counts an expensive element as several."""
 TIME_S = 30
-_ITERATIONS = 100_000
+_MAX_ITERATIONS = 100_000
 _TEXT = (".xml", ".mjcf", ".urdf")
 
 
 class BadModel(ValueError):
-    """A model that is not opened; the message names the file and the reason."""
+    """Error for a model that is refused; the message has the file and the reason."""
 
 
 def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False) -> mujoco.MjSpec:
-    """A model, once it has been looked at.
+    """Check a model and read it.
 
     Args:
-        file: its MJCF.
-        roots: folders that it and what it loads must lie in.
-        installed: whether it belongs to an installed package, which is trusted not to ask for too much.
+        file: MJCF of the model.
+        roots: folders that must contain the model and all files that it loads.
+        installed: whether the model belongs to an installed package, whose size is trusted.
 
     Raises:
-        BadModel: if it is refused, or MuJoCo does not take it.
+        BadModel: if the model is refused, or MuJoCo cannot read it.
     """
     scan = _MjcfScan(file, [root.resolve() for root in roots])
     if not any(file.resolve().is_relative_to(root) for root in scan.roots):
         raise BadModel(f"{file}: lies outside of {scan.roots[0]}")
     scan.read(file)
-    if not installed and scan.cost > TOO_MUCH:
-        raise BadModel(f"{file}: asks for too much: {scan.costliest} ({scan.cost:,.0f} elements in all)")
-    if not installed and scan.cost > MUCH:
+    if not installed and scan.cost > _MAX_COST:
+        raise BadModel(
+            f"{file}: too large: as expensive as {scan.cost:,.0f} elements, {_MAX_COST:,} are allowed;"
+            f" the most expensive part is {scan.costliest}"
+        )
+    if not installed and scan.cost > SUBPROCESS_COST:
         _compile_in_subprocess(file)
     try:
         quiet_mujoco()
         spec = mujoco.MjSpec.from_file(str(file))
     except ValueError as error:
-        raise BadModel(_one_line(error)) from None
+        raise BadModel(one_line(error)) from None
     _check_options(spec, file)
     return spec
 
 
 def model_roots(root: Path, model: str) -> list[Path]:
-    """Folders that a model of a task in `root` may read: its task's or package's; `model` as `model_file` takes it."""
+    """Return the folders that a model may read: those of its task or of its package.
+
+    Args:
+        root: the task's folder.
+        model: the model as in the YAML: a file of the task, or `package:...` and the like, as for `model_file`.
+    """
     task, _, inner = chosen_model(root, model).rpartition(":")
     if not task:
         return package_roots(root)
@@ -80,7 +89,7 @@ def model_roots(root: Path, model: str) -> list[Path]:
 
 
 def package_roots(root: Path) -> list[Path]:
-    """A task's folder, and the Python package that it is part of."""
+    """Return a task's folder, and the topmost Python package that contains it."""
     top = root.resolve()
     while (top / "__init__.py").is_file() and (top.parent / "__init__.py").is_file():
         top = top.parent
@@ -89,57 +98,58 @@ def package_roots(root: Path) -> list[Path]:
 
 @dataclass(slots=True)
 class _MjcfScan:
-    """What a model and the files that it includes ask for."""
+    """Parser that checks a model and all files that it includes or loads."""
 
     main: Path
     roots: list[Path]
     cost: float = 0.0
     costliest: str = ""
-    _most: float = 0.0
-    _seen: list[Path] = field(default_factory=list)
-    _assets: set[str] = field(default_factory=lambda: {""})
-    _loads: list[tuple[Path, int, str, str]] = field(default_factory=list)
+    _max_cost: float = 0.0
+    _texts: list[Path] = field(default_factory=list)
+    _asset_folders: set[str] = field(default_factory=lambda: {""})
+    _assets: list[tuple[Path, int, str, str]] = field(default_factory=list)
+    """File, line, element and file name of each asset to load."""
 
     def read(self, file: Path) -> None:
-        """Read the model, then what it includes, then see to what it loads.
+        """Parse the model and the files that it includes; then check the assets that it loads.
 
         Raises:
             BadModel: if anything is refused.
         """
         self._read_text(file)
-        for number, (where, line, element, name) in enumerate(self._loads):
-            if number >= MOST_FILES:
-                raise BadModel(f"{self.main}: loads more than {MOST_FILES} files")
-            folders = [base / folder for base in (self.main.parent, where.parent) for folder in self._assets]
-            for found in self._allowed_files(where, line, element, name, folders):
-                self._check_asset(found, where, line)
+        if len(self._assets) > _MAX_FILES:
+            raise BadModel(f"{self.main}: loads more than {_MAX_FILES} files")
+        for source, line, element, name in self._assets:
+            for found in self._allowed_files(source, line, element, name):
+                self._check_asset(found, source, line)
 
     def _read_text(self, file: Path) -> None:
         if file.suffix.lower() not in _TEXT:
             raise BadModel(
-                f"{file}: not MJCF: models are text, {', '.join(_TEXT)}; compiled ones (.mjb) are not opened"
+                f"{file}: not MJCF: models are text, {', '.join(_TEXT)}; compiled models (.mjb) are not opened"
             )
-        if len(self._seen) >= MOST_FILES:
-            raise BadModel(f"{self.main}: includes more than {MOST_FILES} files")
-        self._seen.append(file)
+        if len(self._texts) >= _MAX_FILES:
+            raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files")
+        self._texts.append(file)
         try:
-            data = read_plain(file, MOST_TEXT)
+            data = read_plain(file, _MAX_TEXT)
         except OSError as error:
             raise BadModel(f"{file}: {error.strerror or error}") from None
         includes: list[tuple[int, str, str]] = []
-        stack: list[float] = [1.0]
+        copies: list[float] = [1.0]
+        """How often each open element is replicated."""
         parser = expat.ParserCreate("utf-8")
 
         def start(name: str, attributes: dict[str, str]) -> None:
             line = parser.CurrentLineNumber
-            if len(stack) > MOST_DEPTH:
-                raise BadModel(f"{file}:{line}: nested deeper than {MOST_DEPTH} elements")
-            times = stack[-1]
-            self._count(file, line, name, attributes, times)
-            stack.append(times * (max(1.0, _number(attributes.get("count"))) if name == "replicate" else 1.0))
+            if len(copies) > _MAX_DEPTH:
+                raise BadModel(f"{file}:{line}: nested deeper than {_MAX_DEPTH} elements")
+            self._add_cost(copies[-1] * _element_cost(name, attributes), f"{name} at {file}:{line}")
+            _check_numbers(file, line, name, attributes)
+            copies.append(copies[-1] * (max(1.0, _number(attributes.get("count"))) if name == "replicate" else 1.0))
             for key in ("meshdir", "texturedir", "assetdir"):
                 if key in attributes:
-                    self._assets.add(attributes[key])
+                    self._asset_folders.add(attributes[key])
             for key, value in attributes.items():
                 if not key.startswith("file") or not value:
                     continue
@@ -148,10 +158,10 @@ class _MjcfScan:
                 if name in ("include", "model") or "xml" in attributes.get("content_type", ""):
                     includes.append((line, name, value))
                 elif key != "filename" or name in ("mesh", "texture"):
-                    self._loads.append((file, line, name, value))
+                    self._assets.append((file, line, name, value))
 
         def end(name: str) -> None:
-            stack.pop()
+            copies.pop()
 
         def refuse(*_: Any) -> None:
             raise BadModel(f"{file}:{parser.CurrentLineNumber}: a DOCTYPE is not allowed in a model")
@@ -166,32 +176,22 @@ class _MjcfScan:
         except ValueError as error:
             raise BadModel(str(error) if isinstance(error, BadModel) else f"{file}: not XML: {error}") from None
         for line, element, name in includes:
-            folders = [base / folder for base in (self.main.parent, file.parent) for folder in self._assets]
-            for found in self._allowed_files(file, line, element, name, folders):
-                if found not in self._seen:
+            for found in self._allowed_files(file, line, element, name):
+                if found not in self._texts:
                     self._read_text(found)
 
-    def _count(self, file: Path, line: int, name: str, attributes: dict[str, str], times: float) -> None:
-        cost = times * _element_cost(name, attributes)
+    def _add_cost(self, cost: float, source: str) -> None:
         self.cost += cost
-        if cost > self._most:
-            self._most, self.costliest = cost, f"{name} at {file}:{line}"
-        if name == "size":
-            for key, value in attributes.items():
-                most = MOST_MEMORY if key == "memory" else 1_000_000
-                if _number(value) > most:
-                    raise BadModel(f'{file}:{line}: size {key}="{value[:40]}" is more than {most:,}')
-        if name == "compiler" or name == "option":
-            for key, value in attributes.items():
-                if any(word.lower().lstrip("+-")[:3] in ("nan", "inf") for word in value.split()):
-                    raise BadModel(f'{file}:{line}: {name} {key}="{value[:40]}" is not a finite number')
+        if cost > self._max_cost:
+            self._max_cost, self.costliest = cost, source
 
-    def _allowed_files(self, file: Path, line: int, element: str, name: str, folders: list[Path]) -> Iterator[Path]:
-        """The files that a name may stand for; none if there is none, which MuJoCo says."""
+    def _allowed_files(self, file: Path, line: int, element: str, name: str) -> Iterator[Path]:
+        """Yield the existing files that MuJoCo may open for a file name; MuJoCo reports a file that does not exist."""
         if "\0" in name or "://" in name:
             raise BadModel(f"{file}:{line}: {element}: '{name}' is not the name of a file")
         seen: set[Path] = set()
-        for folder in folders:
+        # MuJoCo looks in the folder of the main file and of the including one, with and without an asset folder
+        for folder in [base / inner for base in (self.main.parent, file.parent) for inner in self._asset_folders]:
             try:
                 path = (folder / name).resolve()
                 inside = any(path.is_relative_to(root) for root in self.roots)
@@ -210,20 +210,29 @@ class _MjcfScan:
         if not path.is_file():
             raise BadModel(f"{file}:{line}: '{path}' is not a plain file")
         size = path.stat().st_size
-        if size > MOST_ASSET:
-            raise BadModel(f"{file}:{line}: '{path}' is larger than {MOST_ASSET:,} bytes")
+        if size > _MAX_ASSET:
+            raise BadModel(f"{file}:{line}: '{path}' is larger than {_MAX_ASSET:,} bytes")
         cost = size / 20_000
         with path.open("rb") as opened:
             head = opened.read(24)
-        if head[:8] == b"\x89PNG\r\n\x1a\n":
+        if head[:8] == b"\x89PNG\r\n\x1a\n":  # a small file may decompress to a huge image: width x height
             cost = max(cost, int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big") / 10_000)
-        self.cost += cost
-        if cost > self._most:
-            self._most, self.costliest = cost, f"'{path}'"
+        self._add_cost(cost, f"'{path}'")
+
+
+def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str]) -> None:
+    """Refuse sizes that are too large, and options that are not finite."""
+    for key, value in attributes.items():
+        limit = _MAX_MEMORY if key == "memory" else 1_000_000
+        if name == "size" and _number(value) > limit:
+            raise BadModel(f'{file}:{line}: size {key}="{value[:40]}" is more than {limit:,}')
+        is_option = name in ("compiler", "option")
+        if is_option and any(word.lower().lstrip("+-")[:3] in ("nan", "inf") for word in value.split()):
+            raise BadModel(f'{file}:{line}: {name} {key}="{value[:40]}" is not a finite number')
 
 
 def _element_cost(name: str, attributes: dict[str, str]) -> float:
-    """How many ordinary elements an element costs."""
+    """Return the cost of an element, in ordinary elements."""
     counts = [max(1.0, _number(word)) for word in attributes.get("count", "").split()]
     if name in ("flexcomp", "composite"):
         return 1.0 + 10.0 * math.prod(counts)
@@ -240,7 +249,7 @@ def _element_cost(name: str, attributes: dict[str, str]) -> float:
 
 
 def _number(text: str | None) -> float:
-    """A number, with MuJoCo's K, M, G and T; what is none counts as 0, and MuJoCo says what it is."""
+    """Return a number, which may end in MuJoCo's K, M, G, T, P or E; 0 for text that MuJoCo will refuse."""
     text = (text or "").strip()
     factor = {"k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40, "p": 2**50, "e": 2**60}.get(text[-1:].lower(), 1)
     try:
@@ -251,14 +260,14 @@ def _number(text: str | None) -> float:
 
 
 def _check_options(spec: mujoco.MjSpec, file: Path) -> None:
-    """Options that MuJoCo takes and no simulation survives."""
+    """Refuse options that MuJoCo accepts but that break every simulation."""
     option = spec.option
     if not (math.isfinite(option.timestep) and option.timestep > 0):
         raise BadModel(f"{file}: option timestep is {option.timestep:g}; it must be above 0")
     for name in ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "sdf_iterations"):
         value = int(getattr(option, name, 0))
-        if not 0 <= value <= _ITERATIONS:
-            raise BadModel(f"{file}: option {name} is {value}; it must be between 0 and {_ITERATIONS:,}")
+        if not 0 <= value <= _MAX_ITERATIONS:
+            raise BadModel(f"{file}: option {name} is {value}; it must be between 0 and {_MAX_ITERATIONS:,}")
     for name in ("gravity", "wind", "magnetic", "tolerance", "impratio", "density", "viscosity"):
         if not np.isfinite(getattr(option, name)).all():
             raise BadModel(f"{file}: option {name} is not finite")
@@ -266,23 +275,23 @@ def _check_options(spec: mujoco.MjSpec, file: Path) -> None:
     positions = sum(widths.get(joint.type, 1) for joint in spec.joints)
     for key in spec.keys:
         if len(key.qpos) not in (0, positions):
-            raise BadModel(f"{file}: keyframe '{key.name}' has {len(key.qpos)} positions, and the model {positions}")
+            raise BadModel(f"{file}: keyframe '{key.name}' has {len(key.qpos)} positions; the model has {positions}")
 
 
 def _compile_in_subprocess(file: Path) -> None:
-    """Compile in a process of its own that the system ends when it takes too much.
+    """Compile a model in a subprocess, which the system ends if it exceeds its memory or time.
 
     Raises:
-        BadModel: if it does not end well.
+        BadModel: if compiling fails.
     """
-    command = [sys.executable, "-P", "-c", _SUBPROCESS_CODE, str(file), str(MOST_MEMORY), str(TIME_S)]
+    command = [sys.executable, "-P", "-c", _SUBPROCESS_CODE, str(file), str(_MAX_MEMORY), str(TIME_S)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=2 * TIME_S)
     except subprocess.TimeoutExpired:
         raise BadModel(f"{file}: compiling it takes more than {TIME_S} s") from None
     if done.returncode == 0:
         return
-    limits = f"{TIME_S} s of time or {MOST_MEMORY >> 30} GiB of memory"
+    limits = f"{TIME_S} s of time or {_MAX_MEMORY >> 30} GiB of memory"
     why = done.stdout.strip() or f"compiling it takes more than {limits}, or crashes (exit {done.returncode})"
     raise BadModel(f"{file}: {' '.join(why.split())[:500]}")
 
@@ -296,19 +305,15 @@ log.logto_file = log.logto_console = False
 log.set()
 try:
     import resource
-    for what, most in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, time), (resource.RLIMIT_CORE, 0)):
-        hard = resource.getrlimit(what)[1]
-        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(what, (most, most))
+    for kind, limit in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, time), (resource.RLIMIT_CORE, 0)):
+        hard = resource.getrlimit(kind)[1]
+        limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+        resource.setrlimit(kind, (limit, limit))
 except (ImportError, ValueError, OSError):
-    pass  # the parent's patience is the limit
+    pass  # no limits on this system; the timeout of the parent process remains
 try:
     mujoco.MjSpec.from_file(file).compile()
 except (ValueError, MemoryError, RuntimeError) as error:
     print(error or type(error).__name__)
     sys.exit(1)
 """
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

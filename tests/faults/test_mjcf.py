@@ -81,23 +81,23 @@ NAMED = {
     "a model outside": (model(asset='<model name="m" file="../outside.xml"/>'), "lies outside"),
     "a compiled model as asset": (model(asset='<model name="m" file="bin.mjb"/>'), "compiled models"),
     "a resource of another kind": (model(asset='<mesh name="m" file="http://example.invalid/m.obj"/>'), "not the name"),
-    "a picture of four terapixels": (model(asset='<texture name="t" type="2d" file="huge.png"/>'), "too much"),
-    "a thousand million copies": (model(body='<replicate count="1000000000"><geom size="1"/></replicate>'), "too much"),
+    "a picture of four terapixels": (model(asset='<texture name="t" type="2d" file="huge.png"/>'), "too large: as expensive as"),
+    "a thousand million copies": (model(body='<replicate count="1000000000"><geom size="1"/></replicate>'), "too large: as expensive as"),
     "copies of copies of copies": (
         model(body='<replicate count="1000">' * 3 + '<geom size="1"/>' + "</replicate>" * 3),
-        "too much",
+        "too large: as expensive as",
     ),
     "a flex of 3000 cubed": (
         model(body='<flexcomp name="f" type="grid" count="3000 3000 3000" spacing="1 1 1" dim="3"/>'),
-        "too much",
+        "too large: as expensive as",
     ),
     "a height field of 100,000 squared": (
         model(asset='<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/>'),
-        "too much",
+        "too large: as expensive as",
     ),
     "a texture of 100,000 squared": (
         model(asset='<texture name="t" type="2d" builtin="flat" width="100000" height="1000000"/>'),
-        "too much",
+        "too large: as expensive as",
     ),
     "a time step of nothing": (model('<option timestep="0"/>'), "timestep is 0"),
     "a time step below nothing": (model('<option timestep="-1"/>'), "timestep is -1"),
@@ -173,7 +173,7 @@ def test_the_command_says_it_with_exit_code_3(task, capsys, monkeypatch):
 
 def test_a_compiled_model_is_not_opened(task):
     (task / "task.yaml").write_text(TASK.replace("model.xml", "bin.mjb"))
-    with pytest.raises(ConfigError, match=r"compiled ones \(.mjb\) are not opened"):
+    with pytest.raises(ConfigError, match=r"compiled models \(.mjb\) are not opened"):
         make_env(resolve(folder_task(task)))
 
 
@@ -213,7 +213,7 @@ def test_a_model_that_asks_for_much_is_compiled_under_limits_first(tmp_path, mon
 def test_a_machine_without_limits_still_reads_models(tmp_path, monkeypatch):
     file = tmp_path / "model.xml"
     file.write_text(model())
-    monkeypatch.setattr(untrusted_mjcf, "MUCH", 0)
+    monkeypatch.setattr(untrusted_mjcf, "SUBPROCESS_COST", 0)
     hidden = "import sys; sys.modules['resource'] = None\n"
     monkeypatch.setattr(untrusted_mjcf, "_SUBPROCESS_CODE", hidden + untrusted_mjcf._SUBPROCESS_CODE)
     assert len(read_mjcf(file, [tmp_path]).geoms) == 1

@@ -252,7 +252,7 @@ def test_model_fields_of_a_worlds_own_show(boxes):
 
 
 def test_the_gpu_engine_has_no_cameras(boxes):
-    with pytest.raises(ConfigError, match="cameras draw on a CPU: the GPU engine has none"):
+    with pytest.raises(ConfigError, match="cameras need the CPU engine; the GPU engine cannot render them"):
         boxes({"camera": CART}, "sim.engine=warp")
 
 
@@ -353,7 +353,7 @@ def test_a_process_that_never_closes_its_cameras_ends_in_peace(tmp_path, way, co
 def test_a_forked_process_is_told_instead_of_waiting_for_ever(tmp_path):
     done = program(tmp_path, "fork")
     assert done.returncode == 0, done.stderr
-    assert "MachineError cameras draw in the process that made the environment" in done.stdout
+    assert "MachineError cameras render only in the process that made the environment" in done.stdout
 
 
 @pytest.mark.slow

@@ -418,13 +418,13 @@ def test_a_checkpoint_carries_times_and_history(tmp_path):
         (rays(pattern={"size": [1, 1], "resolution": 0}), "pattern.resolution: expected a number > 0", None),
         (rays(pattern=[[0, 0, 0]]), "feet.pattern.0: a direction must not be zero", None),
         (rays(pattern=[]), "feet.pattern: ", None),
-        (rays(pattern=[[0, 0, -1]], body="leg_.*"), "feet.body: 'leg_.*' is several bodies", "name one"),
+        (rays(pattern=[[0, 0, -1]], body="leg_.*"), "feet.body: 'leg_.*' matches several bodies", "name one of them"),
         (rays(pattern=[[0, 0, -1]], body="head"), "feet.body: no body matches 'head'", "torso"),
         (rays(pattern=[[0, 0, -1]], sees=[6]), "feet.sees", None),
         (rays(pattern=[[0, 1, -1]], lookup=True, alignment="yaw"), "feet: lookup is for rays straight down", None),
         (rays(**DOWN), "feet: lookup is for rays straight down", None),
         (rays(**DOWN, alignment="yaw", sees="all"), "feet: lookup is for rays that see", None),
-        (rays(**DOWN, alignment="yaw"), "feet.lookup: there is no table of heights to look in: the scene has no terra",
+        (rays(**DOWN, alignment="yaw"), "feet.lookup: heights cannot be looked up: the scene has no terra",
          "lookup: false"),
     ],
 )  # fmt: skip
@@ -438,7 +438,7 @@ def test_a_sensor_that_does_not_fit_is_refused_with_its_place(tmp_path, sensor, 
 
 
 def test_a_body_that_nothing_can_touch_is_refused_with_those_that_can_be(tmp_path):
-    with pytest.raises(ConfigError, match=r"scene.sensors.x.bodies: body 'tag' has no geom .*; bodies that have: box$"):
+    with pytest.raises(ConfigError, match=r"scene.sensors.x.bodies: body 'tag' has no geom .*; bodies with such a geom: box$"):
         boxes(tmp_path, {"x": contact(entity="low", bodies=["box", "tag"])})
 
 

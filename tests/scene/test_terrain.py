@@ -410,7 +410,7 @@ def test_what_lies_under_the_ground_finds_none_in_the_table():
 def test_boxes_are_in_no_table_of_heights(tmp_path):
     down = {"kind": "rays", "pattern": [[0.0, 0.0, -1.0]], "alignment": "world", "lookup": True}
     stairs = generator(sub_terrains={"it": {"kind": "stairs", "boxes": True}})
-    with pytest.raises(ConfigError, match=r"scene.sensors.scan.lookup: there is no table .*: the terrain has boxes"):
+    with pytest.raises(ConfigError, match=r"scene.sensors.scan.lookup: heights cannot be looked up: the terrain has boxes"):
         on_terrain(tmp_path, stairs, 1, scene={"sensors": {"scan": down}})
 
 
@@ -469,16 +469,16 @@ def test_a_terrain_that_does_not_fit_is_refused_with_its_place(tmp_path, change,
         (None, "hill.npy", "terrain.file: no file 'hill.npy'"),
         (b"no numbers", "hill.npy", "terrain.file: 'hill.npy' is not a NumPy file"),
         (b"PK\3\4 and no zip", "hill.npy", "terrain.file: 'hill.npy' is not a NumPy file"),
-        (b"\x93NUMPY\1\0\x08\0{'descr\n", "hill.npy", "its header is malformed"),
+        (b"\x93NUMPY\1\0\x08\0{'descr\n", "hill.npy", "the header is malformed"),
         (
             b"\x93NUMPY\1\0\x4f\0"
             + b"{'descr':'<f8','fortran_order':False,'shape':(1000000000000,1000)}".ljust(78)
             + b"\n",
             "hill.npy",
-            "its header is malformed",
+            "the header is malformed",
         ),
-        (np.zeros(5), "hill.npy", "must hold a table of heights, two by two at least; found shape (5,)"),
-        (np.full((3, 3), np.nan), "hill.npy", "must hold finite numbers"),
+        (np.zeros(5), "hill.npy", "must contain a table of heights, at least 2 by 2; found shape (5,)"),
+        (np.full((3, 3), np.nan), "hill.npy", "must contain finite numbers"),
         (np.array([[None, 1], [2, 3]], dtype=object), "hill.npy", "is not a NumPy file"),
         (None, "../hill.npy", "lies outside the task's folder"),
     ],

@@ -63,7 +63,7 @@ class OigeEnv(DirectEnv):
             self.stage.attach(scene, joint_forces=self._reads(_MEASURED))
         if self._reads(_LIFTED):  # MuJoCo looks at any compensation only where the model has some
             scene.spec.bodies[-1].gravcomp = scene.spec.bodies[-1].gravcomp or _NEXT_TO_NONE
-        scene.add_motors()
+        scene.joints.add_motors()
         _ground(scene, self.block.get("sim", {}).get("default_physics_material") or {})
 
     def _settings(self) -> dict[str, Any]:
