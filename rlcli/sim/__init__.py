@@ -1,1 +1,1 @@
-"""Simulation: from MJCF files to an engine that steps many copies of one model."""
+"""Physics engines that step many worlds of one model, and selections of these worlds."""

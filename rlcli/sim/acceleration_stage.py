@@ -11,7 +11,7 @@ ACCELERATION_FIELDS = frozenset(
         *("act_dot", "cacc", "cfrc_int", "cfrc_ext"),
     ]
 )
-"""Fields of MjData that the acceleration stage writes. They are read as the last substep left them."""
+"""Fields of MjData that the acceleration stage writes. They keep the values of the last substep."""
 _BODY_FORCE_SENSORS = [
     int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}"))
     for kind in ("ACCELEROMETER", "FORCE", "TORQUE", "FRAMELINACC", "FRAMEANGACC")

@@ -1,4 +1,4 @@
-"""The CPU engine, on `mujoco.batch.Batch`: a C++ thread pool over state rows, bit-identical at any thread count."""
+"""CPU engine on `mujoco.batch.Batch`, a C++ thread pool; results are bit-identical for any number of threads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rlcli.config.schema import SimConfig
 from rlcli.errors import did_you_mean
 from rlcli.machine import available_cores
 from rlcli.sim.acceleration_stage import ACCELERATION_FIELDS, force_sensors
-from rlcli.sim.batch_model import engine_error
+from rlcli.sim.batch_model import engine_call
 from rlcli.sim.batch_state import BatchState
 from rlcli.sim.divergence_report import (
     DIVERGENCE_WARNINGS,
@@ -31,26 +31,27 @@ from rlcli.sim.divergence_report import (
     DivergenceReporter,
 )
 from rlcli.sim.mujoco_private import STATE_FIELDS, forward_of, without_profiler
-from rlcli.sim.selection import Field, IdSelection, Selection, ids_of
+from rlcli.sim.selection import Field, Groups, IdSelection, Selection, as_array, ids_of
 from rlcli.sim.skippable_work import FIELDS_OF_SKIPPED_WORK
+from rlcli.sim.tensor_state import substate
 
 _MOTION_FIELDS = frozenset(
     ["time", "qpos", "qvel", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"]
 )
-"""Fields of a state of which physics changes positions and velocities alone, and what follows from these."""
+"""Fields of a state in which a physics step changes only positions, velocities, time and the warm start."""
 _NONE, _VEL, _ACC = (
     int(s) for s in (mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL, mujoco.mjtStage.mjSTAGE_ACC)
 )
 
 
 class BatchEngine(BatchState):
-    """Many worlds of one model on CPU threads. Physics is float64.
+    """Engine that steps many worlds of one model on CPU threads, in float64.
 
     Args:
         model: the compiled model.
-        num_envs: worlds.
-        config: of the simulation. With `external_forces`, `cfrc_ext` is computed exactly: Batch itself computes it for
-            models with certain sensors alone, and with RK4 at the wrong one of a substep's stages.
+        num_envs: number of worlds.
+        config: configuration of the simulation. With `external_forces`, `cfrc_ext` is computed exactly: Batch computes
+            it only for models with certain sensors, and with RK4 at the wrong stage of a substep.
 
     Raises:
         DeviceError: for more worlds than the machine's memory holds.
@@ -76,11 +77,11 @@ class BatchEngine(BatchState):
             self.state_layout, self._rows, self._batch.warning, self._expanded, self._max_velocity
         )
         self._bound_inputs: list[NDArray[np.float64]] = []
-        """Bound fields of the state except positions and velocities: terms may write to them."""
+        """Bound fields of the state, without positions and velocities, to which terms may write."""
         self._substep_fields = config.derived_fields == "substep"
         self.step_stage = _NONE
-        """mjtStage that the last substep ends with, for the bound fields."""
-        # a start state gets what `mj_forward` computes, warm start included
+        """Stage (mjtStage) that is computed after the last substep, for the bound fields."""
+        # start states get everything that `mj_forward` computes, including the warm start
         self._forward_stage = _ACC if self._substep_fields else _NONE
         self._forward_rows = forward_of(self._batch)
         self._external: Tensor | None = None
@@ -95,26 +96,26 @@ class BatchEngine(BatchState):
 
     @property
     def replayable(self) -> Self:
-        """This engine: its calls can be stepped again bit for bit."""
+        """This engine, whose calls can be stepped again bit for bit."""
         return self
 
     @property
     def divergences(self) -> int:
-        """Number of worlds that diverged, ever."""
+        """Number of divergences since the start."""
         return sum(self.divergence_causes.values())
 
     def use_torch_stream(self) -> None:
-        """Do nothing: calls return when their work is done."""
+        """Do nothing: a CPU has no streams."""
 
     def field(self, name: str) -> Tensor:
-        """Return a live view of an MjData field. For a derived one, the last substep computes its stage from now on."""
+        """Return a live view of an MjData field; from now on, `step` computes the stage of a derived field."""
         if name not in self._fields:
             if name not in DATA_FIELDS:
                 raise ValueError(f"'{name}' is not an MjData field; {did_you_mean(name, DATA_FIELDS) or ''}")
             if name in FIELDS_OF_SKIPPED_WORK:
                 self._skip_nothing()
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # torch has no read-only tensors; derived views must only be read
+                warnings.simplefilter("ignore")  # torch warns about the read-only arrays of derived fields
                 bound = self._bind(name)
             if self._of_substep(name):
                 self._forward_stage = _ACC
@@ -122,7 +123,7 @@ class BatchEngine(BatchState):
                 if not self._substep_fields and not self._only_of_acceleration_stage(name):
                     self.step_stage = _VEL
                     self._forward_stage = max(self._forward_stage, _VEL)
-                self._forward_all()  # until then, the new field holds zeros
+                self._forward_all()  # before it, the new field holds zeros
             self._fields[name] = bound
             if name in STATE_FIELDS:
                 if self.state_layout.columns(name).stop > self.history.width:
@@ -132,7 +133,7 @@ class BatchEngine(BatchState):
         return self._fields[name]
 
     def _bind(self, name: str) -> Tensor:
-        """Return a field as a tensor; a part of the state as a view of it, so that neighbours can be one view."""
+        """Return a field as a tensor; a field of the state as a view of the state, so that two can be joined."""
         values = self._batch.bind(name)
         if name not in STATE_FIELDS:
             return torch.from_numpy(values)
@@ -146,39 +147,40 @@ class BatchEngine(BatchState):
             with without_profiler:
                 self._batch.step(nstep=nstep, stage=self.step_stage if derive else _NONE)
         except SimulationError:
-            self._failed |= self._batch.status != 0  # their rows are as they were; the others have been stepped
+            self._failed |= self._batch.status != 0  # failed worlds have their old state; the others have stepped
             self._error = " ".join(self._batch.error(int(self._failed.argmax())).split()) or self._error
         if self._external is not None and derive:
             self._compute_external_forces(self._external.numpy())
 
     def _compute_external_forces(self, forces: NDArray[np.float64]) -> None:
-        """Compute `cfrc_ext` of the last substep. It is 0 where nothing touches, pushes or holds a body."""
-        acts = self._contact_counts.reshape(-1) > 0
+        """Compute `cfrc_ext` of the last substep; it is 0 in a world without contacts, forces and equalities."""
+        has_forces = self._contact_counts.reshape(-1) > 0
         if "xfrc_applied" in self._fields:
-            acts |= self._fields["xfrc_applied"].numpy().any(axis=(1, 2))
+            has_forces |= self._fields["xfrc_applied"].numpy().any(axis=(1, 2))
         if self.model.neq:
-            acts[:] = True
-        forces[~acts] = 0.0
-        for world in acts.nonzero()[0]:
+            has_forces[:] = True
+        forces[~has_forces] = 0.0
+        for world in has_forces.nonzero()[0]:
             self._batch.get_data(world, self._data)
             mujoco.mj_rnePostConstraint(self.model, self._data)
             forces[world] = self._data.cfrc_ext
 
     def diverged(self, motion_is_finite: bool = False) -> Tensor | None:
-        """Return the worlds that diverged since the last call; `described_divergences` then has the first of them.
+        """Return the worlds that diverged since the last call, (num_envs,) bool; None if there are none.
 
-        MuJoCo resets a diverging world by itself, to finite values, and clears its counters as it does: so they are
-        read after every step and put back to zero, and the state alone would show nothing. What gives no warning is
-        not finite afterwards: the sum of all states then is not, either. That sum takes longer than all other checks
-        of a state. Where physics changes positions and velocities alone, and the caller has checked these, the inputs
-        that terms may have written to are summed instead.
+        `described_divergences` then has the first of them. MuJoCo itself resets a diverging world to finite values, so
+        that its state shows nothing; its warning counters do, and they are read and cleared after every step. A
+        divergence without a warning leaves a state that is not finite, and then the sum of all states is not finite.
+
+        This sum takes longer than all other checks. If physics changes only positions and velocities, and the caller
+        has checked these (`motion_is_finite`), only the inputs that terms may have written to are summed.
         """
         self.described_divergences = []
         warned = np.count_nonzero(self._warning_words) > 0
         finite = False
         if motion_is_finite and self._only_motion:
             finite = all([math.isfinite(np.add.reduce(values, axis=None)) for values in self._bound_inputs])
-        # of whole rows: skipping the columns that nobody writes takes longer
+        # the sum of whole rows is faster than a sum without the columns that never change
         finite = finite or math.isfinite(self._state.sum().item()) or bool(self._state.isfinite().all())
         fast = self._max_velocity < STATE_LIMIT and bool((np.abs(self._qvel) > self._max_velocity).any())
         if not warned and finite and not self._error and not fast:
@@ -192,7 +194,7 @@ class BatchEngine(BatchState):
         return torch.from_numpy(bad)
 
     def _find_diverged(self, finite: bool) -> tuple[NDArray[np.bool_], NDArray[np.object_]]:
-        """Return which worlds diverged, and the cause of each; put the counters back to zero."""
+        """Return which worlds diverged, and the cause of each; clear the warning counters."""
         counts = self._batch.warning[:, :, 1]
         for name, kind in OTHER_WARNINGS.items():
             self.warnings[name] += int((counts[:, kind] > 0).sum())
@@ -224,14 +226,11 @@ class BatchEngine(BatchState):
         if self._forward_stage == _NONE:
             return
         forces = self._forces(selection) if self._reset_stage < self._forward_stage else []
-        kept = [field[where].clone() for field, where in forces]
-        try:
-            with without_profiler:
-                self._forward_rows(ids_of(selection), min(self._forward_stage, self._reset_stage))
-        except SimulationError as error:
-            raise engine_error(error) from None
-        for (field, where), values in zip(forces, kept, strict=True):
-            field[where] = values
+        saved = [field[index].clone() for field, index in forces]
+        with engine_call():
+            self._forward_rows(ids_of(selection), min(self._forward_stage, self._reset_stage))
+        for (field, index), values in zip(forces, saved, strict=True):
+            field[index] = values
 
     def _forces(self, selection: Selection) -> list[tuple[Tensor, Any]]:
         """Return the bound fields of the acceleration stage, and the index of the selected worlds' values in each."""
@@ -243,13 +242,13 @@ class BatchEngine(BatchState):
         ]
 
     def reset(self, selection: Selection) -> None:
-        """Put the selected worlds into the default state: the whole row, controls and warm start included."""
+        """Put the selected worlds into the default state, including controls and warm start."""
         ids = ids_of(selection)
         self._rows[ids] = self._default
         self.history.start_episodes(ids)
         if not self.forces_after_reset:
-            for field, where in self._forces(selection):  # no force has acted on a start state yet
-                field[where] = 0.0
+            for field, index in self._forces(selection):  # no force has acted on a start state yet
+                field[index] = 0.0
 
     def as_field(self, tensor: Tensor) -> NDArray[Any]:
         """Return an array of the same memory."""
@@ -257,58 +256,47 @@ class BatchEngine(BatchState):
 
     def select(self, mask: Field, seed: int, counters: Field) -> IdSelection | None:
         """Return the worlds where `mask` holds, as ids; None for none."""
-        ids = (mask if isinstance(mask, np.ndarray) else mask.numpy()).nonzero()[0]
+        ids = as_array(mask).nonzero()[0]
         if not len(ids):
             return None
-        counted = counters if isinstance(counters, np.ndarray) else counters.numpy()
-        return IdSelection(ids, seed, counted[ids], shared_streams=self.shared_streams)
+        return IdSelection(ids, seed, as_array(counters)[ids], shared_streams=self.shared_streams)
 
     def rays(
-        self,
-        points: Tensor,
-        directions: Tensor,
-        *,
-        groups: tuple[int, ...] | None = None,
-        exclude: int = -1,
-        selection: Selection | None = None,
+        self, points: Tensor, directions: Tensor, *, groups: Groups, exclude: int, selection: Selection | None
     ) -> Tensor:
-        """Return distances from points to the first geom along unit directions, -1 for none. (rows, rays)"""
-        seen = None if groups is None else np.array([g in groups for g in range(mujoco.mjNGROUP)], dtype=np.uint8)
+        """Return distances from points to the first geom along unit directions, -1 for none. (rows, rays) [m]"""
+        visible = None if groups is None else np.array([g in groups for g in range(mujoco.mjNGROUP)], dtype=np.uint8)
         ids = None if selection is None else ids_of(selection).astype(np.int32)
-        try:
-            with without_profiler:
-                distance, _ = self._batch.ray(
-                    points.double().numpy(), directions.double().numpy(), geomgroup=seen, bodyexclude=exclude, ids=ids
-                )
-        except SimulationError as error:
-            raise engine_error(error) from None
+        start, along = points.double().numpy(), directions.double().numpy()
+        with engine_call():
+            distance, _ = self._batch.ray(start, along, geomgroup=visible, bodyexclude=exclude, ids=ids)
         return torch.from_numpy(distance).float()
 
     def check_finite(self, values: Tensor, what: str) -> None:
-        """Do nothing: on a CPU, values are checked where they are computed."""
+        """Do nothing: on a CPU, values are checked when they are computed."""
 
     def report_nonfinite(self) -> list[str]:
-        """Return nothing."""
+        """Return an empty list: `check_finite` does nothing."""
         return []
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of what the worlds carry from step to step.
+        """Return copies of the worlds' state.
 
-        Also of the bound fields of the last substep, which no forward pass from the state restores.
+        It includes the bound fields of the last substep, which a forward pass from the state cannot restore.
         """
         substep = {f"substep.{name}": value.clone() for name, value in self._fields.items() if self._of_substep(name)}
         return {**super().state_dict(), **substep}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned; compute derived fields anew.
+        """Restore the state returned by `state_dict()`, and compute derived fields again.
 
         Raises:
-            ValueError: for a model field that cannot differ between worlds, or of another shape.
+            ValueError: for a model field that cannot differ between worlds, or that has another shape.
         """
         super().load_state_dict(state)
-        substep = {n.removeprefix("substep."): values for n, values in state.items() if n.startswith("substep.")}
+        substep = substate(state, "substep.")
         for name in substep:
-            self.field(name)  # bound when the state was saved; here it may be bound later
+            self.field(name)  # bind it here too; it was bound when the state was saved
         if self._forward_stage != _NONE:
             with without_profiler:
                 self._batch.forward(stage=self._forward_stage)
@@ -316,27 +304,24 @@ class BatchEngine(BatchState):
             self._fields[name].copy_(values)
 
     def close(self) -> None:
-        """Do nothing: Python frees everything."""
+        """Do nothing: Python frees threads and memory."""
 
     def _forward_all(self) -> None:
         """Compute the bound fields of every world from its state; fields of the last substep keep their values."""
-        kept = {name: value.clone() for name, value in self._fields.items() if self._of_substep(name)}
-        try:
-            with without_profiler:
-                self._batch.forward(stage=self._forward_stage)
-        except SimulationError as error:
-            raise engine_error(error) from None
-        for name, value in kept.items():
+        saved = {name: value.clone() for name, value in self._fields.items() if self._of_substep(name)}
+        with engine_call():
+            self._batch.forward(stage=self._forward_stage)
+        for name, value in saved.items():
             self._fields[name].copy_(value)
 
     def _only_of_acceleration_stage(self, name: str) -> bool:
-        """Return whether the acceleration stage alone writes the field, or every sensor of `sensordata`."""
+        """Return whether only the acceleration stage writes the field; for `sensordata`, all of its sensors."""
         if name == "sensordata":
             return len(self._force_sensors) == int(self.model.nsensordata)
         return name in ACCELERATION_FIELDS
 
     def _of_substep(self, name: str) -> bool:
-        """Return whether the field holds values that only a substep computes."""
+        """Return whether the field has values of the last substep, which the state does not determine."""
         if name in ACCELERATION_FIELDS or (name == "sensordata" and self._force_sensors):
             return True
         return bool(self._substep_fields) and name not in STATE_FIELDS

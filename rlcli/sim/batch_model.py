@@ -1,8 +1,10 @@
-"""The model of the CPU engine's worlds, and the model fields that differ between them."""
+"""Model of the CPU engine's worlds, and the model fields that differ between them."""
 
 from __future__ import annotations
 
+import contextlib
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rlcli import machine
-from rlcli.errors import DeviceError, DivergedError, did_you_mean
+from rlcli.errors import DeviceError, DivergedError, did_you_mean, one_line
 from rlcli.sim.divergence_report import MORE_MEMORY
 from rlcli.sim.mujoco_log import quiet_mujoco
 from rlcli.sim.mujoco_private import expand_disable_flags, expanded_fields, make_batch, without_profiler
@@ -28,13 +30,13 @@ _FLAGS = frozenset(
         *("actuator_forcelimited", "eq_active0", "opt.disableactuator"),
     ]
 )
-"""Integers of a model that are neither an address nor a count nor a type: no value of them is out of range."""
+"""Integer fields of a model that are flags: no value of them can make MuJoCo read outside of its arrays."""
 _MIN_STATES_PER_ENV = 3
-"""Least memory of an environment, in integration states; the built-in tasks take 3.3 to 16."""
+"""Least memory of an environment, as a number of integration states; the built-in tasks need 3.3 to 16."""
 
 
 class BatchModel:
-    """Worlds on CPU threads, and the model fields that differ between them.
+    """Base of the CPU engine: its worlds, and the model fields that differ between them.
 
     Raises:
         DeviceError: for more worlds than the machine's memory holds.
@@ -49,7 +51,7 @@ class BatchModel:
         self._disable_flags = model.opt.disableflags
         self._batch = make_batch(model, num_envs, threads, skipped_flags=skippable_flags(model), persistent=persistent)
         self._skips = True
-        """Whether steps skip what changes no state."""
+        """Whether steps skip the work that does not change the state."""
         self._expanded = expanded_fields(self._batch)
         self.own_constants = False
         """Whether `set_constants` has been called."""
@@ -77,11 +79,8 @@ class BatchModel:
 
     def set_constants(self, selection: Selection | None = None) -> None:
         """Recompute the constants that MuJoCo derives from model fields."""
-        try:
-            with without_profiler:
-                self._batch.set_const(None if selection is None else ids_of(selection).astype(np.int32))
-        except SimulationError as error:
-            raise engine_error(error) from None
+        with engine_call():
+            self._batch.set_const(None if selection is None else ids_of(selection).astype(np.int32))
         self.own_constants = True
 
     def own_model_fields(self, env: int) -> dict[str, NDArray[Any]]:
@@ -92,35 +91,44 @@ class BatchModel:
         """Expand a model field and set its values, which were read from a file.
 
         Raises:
-            ValueError: for values that do not fit, or that could make MuJoCo read outside of its arrays.
+            ValueError: for values of another shape or type, or that could make MuJoCo read outside of its arrays.
         """
         target = self.expand(name)
         if target.shape != values.shape or target.dtype != values.dtype:
             raise ValueError(f"model field '{name}' is {tuple(values.shape)}, not {tuple(target.shape)}")
         if not target.dtype.is_floating_point and name not in _FLAGS and not torch.equal(target, values):
-            raise ValueError(f"model field '{name}' is part of the model's structure, and not the model's")
+            raise ValueError(f"model field '{name}' is part of the model's structure and must equal the model's")
         target.copy_(values)
 
     def write_own_model(self, env: int, model: mujoco.MjModel) -> None:
-        """Write the model of one world into a copy of the model. Who steps the copy skips nothing."""
+        """Write the model of one world into a copy of the model, with the disable flags of the original model."""
         self._batch.get_model(env, model)
         if "opt.disableflags" not in self._expanded:
             model.opt.disableflags = self._disable_flags
 
     def _skip_nothing(self) -> None:
-        """Have MuJoCo compute from now on all that the model's own flags say."""
+        """From now on, compute everything that the flags of the original model do not disable."""
         if self._skips:
             self._skips = False
             expand_disable_flags(self._batch)[:] = self._disable_flags
 
 
-def engine_error(error: SimulationError) -> DivergedError:
-    """Return what to raise for an error of `mujoco.batch`."""
-    return DivergedError(f"the physics engine stopped: {' '.join(str(error).split())}", hint=MORE_MEMORY)
+@contextlib.contextmanager
+def engine_call() -> Iterator[None]:
+    """Turn MuJoCo's profiler off during a call of `mujoco.batch`.
+
+    Raises:
+        DivergedError: for an error of `mujoco.batch`.
+    """
+    try:
+        with without_profiler:
+            yield
+    except SimulationError as error:
+        raise DivergedError(f"the physics engine stopped: {one_line(error)}", hint=MORE_MEMORY) from None
 
 
 def _require_memory(model: mujoco.MjModel, num_envs: int) -> None:
-    """Refuse worlds that do not fit into memory: a kernel that overcommits would kill the process later.
+    """Refuse worlds that do not fit into memory: a system that overcommits would kill the process later.
 
     Raises:
         DeviceError: if they do not fit.
@@ -129,7 +137,7 @@ def _require_memory(model: mujoco.MjModel, num_envs: int) -> None:
     free = min(machine.memory(), machine.memory_limit() or sys.maxsize)
     if each * num_envs > free:
         raise DeviceError(
-            f"{num_envs} environments need {each * num_envs / 2**30:.1f} GiB at the least,"
+            f"{num_envs} environments need at least {each * num_envs / 2**30:.1f} GiB,"
             f" {free / 2**30:.1f} GiB are free on this machine",
-            hint="fewer environments: --num-envs",
+            hint="use fewer environments: --num-envs",
         )

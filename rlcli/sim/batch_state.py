@@ -1,4 +1,4 @@
-"""The integration states of the CPU engine's worlds: read, written, recorded and saved."""
+"""Integration states of the CPU engine's worlds: access, recording and checkpoints."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from torch import Tensor
 from rlcli.sim.batch_model import INTEGRATION_STATE, BatchModel
 from rlcli.sim.divergence_report import HISTORY_MEMORY, Call, StateHistory, StateLayout
 from rlcli.sim.mujoco_private import STATE_FIELDS, state_columns
+from rlcli.sim.tensor_state import substate
 
 
 class BatchState(BatchModel):
-    """Worlds on CPU threads, and their integration states."""
+    """Base of the CPU engine: its worlds and their integration states."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, threads: int, *, persistent: bool) -> None:
         super().__init__(model, num_envs, threads, persistent=persistent)
@@ -34,11 +35,11 @@ class BatchState(BatchModel):
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
 
     def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
-        """Record the last calls of `step`: as many as `calls`, or as fit into `memory` bytes."""
+        """Record the last calls of `step`: `calls` of them, or as many as fit into `memory` bytes."""
         self._new_history(self.history.width, calls, memory)
 
     def recorded_calls(self, env: int) -> list[Call]:
-        """Return the last calls of a world in its running episode, the oldest first."""
+        """Return the recorded calls of a world in its present episode, the oldest first."""
         return self.history.calls_of(env)
 
     def state_row(self, env: int) -> NDArray[np.float64]:
@@ -77,10 +78,10 @@ class BatchState(BatchModel):
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned.
+        """Restore the state returned by `state_dict()`.
 
         Raises:
-            ValueError: for a model field that cannot differ between worlds, or of another shape.
+            ValueError: for a model field that cannot differ between worlds, or that has another shape.
         """
         self._state.copy_(state["state"])
         width = self.history.width
@@ -88,14 +89,13 @@ class BatchState(BatchModel):
             self._record_all_columns()
         self.history.clear()
         self._batch.warning[:] = state["warning"].numpy()
-        for name, values in state.items():
-            if name.startswith("model."):
-                self.load_model_field(name.removeprefix("model."), values)
+        for name, values in substate(state, "model.").items():
+            self.load_model_field(name, values)
         if bool(state["constants"]):
             self.set_constants()
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return a world as MjModel and MjData, forwarded. Later calls for the same world update the same objects."""
+        """Return the model and the data of a world after `mj_forward`; a later call for it updates the same objects."""
         is_new = env not in self._worlds
         if is_new:
             self._worlds[env] = (copy.copy(self.model), self._batch.get_data(env))

@@ -1,4 +1,4 @@
-"""How much room a world needs for contacts and constraints: MuJoCo Warp allocates both beforehand."""
+"""Estimate of the contacts and constraints of a world, for which MuJoCo Warp allocates memory in advance."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from rlcli.sim.skippable_work import colliding_pairs
 
 _TRIALS, _STEPS = 8, 100
 _MARGIN = 3
-"""How many times what a short random simulation needed is set aside, where the model's own bound is larger."""
+"""Factor between the capacity and the maximum of a short random simulation."""
 _DEFAULT_CONTACTS = 8
-"""Contacts that two geoms may have where nothing better is known (two boxes)."""
+"""Largest number of contacts of a pair of geoms that is not in `_PAIR_CONTACTS`, such as two boxes."""
 _HFIELD_CONTACTS = 50
-"""Contacts that a geom may have with a height field: MuJoCo keeps no more of a pair."""
+"""Largest number of contacts of a geom with a height field (mjMAXCONPAIR)."""
 _G = mujoco.mjtGeom
 _PAIR_CONTACTS = {
     (_G.mjGEOM_PLANE, _G.mjGEOM_SPHERE): 1,
@@ -29,33 +29,36 @@ _PAIR_CONTACTS = {
     (_G.mjGEOM_CAPSULE, _G.mjGEOM_CAPSULE): 2,
     (_G.mjGEOM_CAPSULE, _G.mjGEOM_BOX): 2,
 }
+"""Pair of geom types -> its largest number of contacts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Capacity:
-    """Room in a world: contacts, and rows of the constraint Jacobian."""
+    """Largest numbers of contacts, and of rows of the constraint Jacobian, in a world."""
 
     contacts: int
     constraints: int
 
 
 def required_capacity(model: mujoco.MjModel, contacts: int | None = None, constraints: int | None = None) -> Capacity:
-    """Room for what the model can need: its own bound, or a multiple of what a random simulation needs if that is less.
+    """Return the capacity that a model needs.
+
+    It is the smaller one of the model's upper bound and a multiple of the maximum of a random simulation.
 
     Args:
         model: the compiled model.
-        contacts: a setting that replaces the estimate.
-        constraints: likewise.
+        contacts: number of contacts that replaces the estimate; None: estimate.
+        constraints: number of constraint rows that replaces the estimate; None: estimate.
     """
-    most_contacts, most_rows = _upper_bound(model)
+    bound_contacts, bound_rows = _upper_bound(model)
     sampled_contacts, sampled_rows = _sampled_maximum(model)
-    found_contacts = min(most_contacts, max(32, _MARGIN * sampled_contacts))
-    found_rows = min(most_rows, max(64, _MARGIN * sampled_rows))
+    found_contacts = min(bound_contacts, max(32, _MARGIN * sampled_contacts))
+    found_rows = min(bound_rows, max(64, _MARGIN * sampled_rows))
     return Capacity(contacts or max(1, found_contacts), constraints or max(1, found_rows))
 
 
 def _upper_bound(model: mujoco.MjModel) -> tuple[int, int]:
-    """Contacts of every pair of geoms that may touch, and all rows that they, joints and equalities can make."""
+    """Return the contacts of all pairs of geoms that may touch, and the rows of contacts, joints and equalities."""
     contacts = rows = 0
     for a, b in colliding_pairs(model):
         kinds = tuple(sorted((_G(model.geom_type[a]), _G(model.geom_type[b])), key=int))
@@ -72,12 +75,13 @@ def _upper_bound(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 def _contact_rows(model: mujoco.MjModel, condim: int) -> int:
+    """Return the number of constraint rows of a contact."""
     pyramidal = model.opt.cone == int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
     return 1 if condim == 1 else 2 * (condim - 1) if pyramidal else condim
 
 
 def _sampled_maximum(model: mujoco.MjModel) -> tuple[int, int]:
-    """The most contacts and rows seen in short simulations under random controls, from shaken start poses."""
+    """Return the largest numbers of contacts and rows in short simulations with random velocities and controls."""
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     contacts = rows = 0
     for _ in range(_TRIALS):
@@ -92,7 +96,7 @@ def _sampled_maximum(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 def _move_on_height_field(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator) -> None:
-    """Put free roots somewhere else on a height field: an environment may start anywhere on it."""
+    """Move free roots to a random point of a height field: an environment may start anywhere on it."""
     fields = np.flatnonzero(model.geom_type == int(_G.mjGEOM_HFIELD))
     if not len(fields):
         return

@@ -1,4 +1,4 @@
-"""The engine protocol: many worlds of one model, on a CPU or a GPU."""
+"""Protocol of engines, which step many worlds of one model on a CPU or a GPU."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DependencyError, Problem
 from rlcli.machine import require_device
 from rlcli.sim.divergence_report import HISTORY_MEMORY, Call, Divergence, StateHistory, StateLayout
-from rlcli.sim.selection import Field, Selection
+from rlcli.sim.selection import Field, Groups, Selection
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 
 class Engine(Protocol):
-    """`num_envs` worlds of `model`. Fields are torch tensors `(num_envs, ...)` on `device`, in the engine's dtype."""
+    """Engine that steps `num_envs` worlds of `model`.
+
+    Fields are torch tensors `(num_envs, ...)` on `device`: float64 on a CPU, float32 on a GPU.
+    """
 
     num_envs: int
     device: torch.device
@@ -32,9 +35,9 @@ class Engine(Protocol):
     shared_streams: int
     """Worlds i and i % shared_streams draw the same random numbers; 0: every world has its own stream."""
     asynchronous: bool
-    """Whether reading a value waits for a device: then nothing on the path of a step may."""
+    """Whether reading a value in Python waits for a device; if so, no code of a step may read one."""
     forces_after_reset: bool
-    """Whether `forward` computes fields of the acceleration stage; else `reset` puts them to 0."""
+    """Whether `forward` computes fields of the acceleration stage; if not, `reset` sets them to 0."""
 
     @property
     def replayable(self) -> ReplayableEngine | None:
@@ -42,33 +45,34 @@ class Engine(Protocol):
 
     @property
     def divergences(self) -> int:
-        """Number of worlds that diverged, ever."""
+        """Number of divergences since the start."""
 
     @property
     def divergence_causes(self) -> dict[str, int]:
-        """Number of worlds that diverged, by cause."""
+        """Number of divergences since the start, by cause."""
 
     @property
     def described_divergences(self) -> list[Divergence]:
-        """The first worlds of the last `diverged`; on an `asynchronous` engine the first one ever."""
+        """First divergences of the last call of `diverged`; on an `asynchronous` engine, the first since the start."""
 
     def use_torch_stream(self) -> None:
-        """Launch on torch's current stream from now on; called before a step."""
+        """Launch on torch's current CUDA stream from now on; called before a step."""
 
     def field(self, name: str) -> Tensor:
         """Return a live view of an MjData field: state fields are writable, derived ones (xpos, ...) are not.
 
-        Position- and velocity-dependent fields are current after `step` and `forward`; acceleration-dependent ones
-        (qacc, actuator_force, ...) are those of the last substep. With `sim.derived_fields: substep` all are.
+        Fields that depend on positions and velocities are current after `step` and `forward`. Fields that depend on
+        accelerations (qacc, actuator_force, ...) have the values of the last substep. With
+        `sim.derived_fields: substep` all derived fields have the values of the last substep.
         """
 
     def can_expand(self, name: str) -> bool:
         """Return whether a model field may differ between worlds."""
 
     def expand(self, name: str) -> Tensor:
-        """Return a model field with a value for every world, live and writable. (num_envs, ...)
+        """Return a model field with values of its own for every world, live and writable. (num_envs, ...)
 
-        After writing masses, inertias, positions and the like, call `set_constants`.
+        After a write to masses, inertias, positions and the like, call `set_constants`.
         """
 
     def expanded(self, name: str) -> Tensor | None:
@@ -78,18 +82,19 @@ class Engine(Protocol):
         """Return the names of the model fields that have been expanded."""
 
     def set_constants(self, selection: Selection | None = None) -> None:
-        """Recompute the constants that MuJoCo derives from model fields, after a write to expanded ones.
+        """Recompute the constants that MuJoCo derives from model fields, after a write to expanded fields.
 
-        In the selected worlds, or in all; an `asynchronous` engine always does it in all.
+        Args:
+            selection: the worlds; None: all. An `asynchronous` engine always recomputes all worlds.
         """
 
     def step(self, nstep: int, *, derive: bool = True) -> None:
         """Advance every world by `nstep` physics steps; without `derive`, derived fields keep their values."""
 
     def diverged(self, motion_is_finite: bool = False) -> Tensor | None:
-        """Return the worlds in which the last `step` diverged, (num_envs,) bool; None for none. Call it once a step.
+        """Return the worlds that diverged in the last `step`, (num_envs,) bool; None for none. Call it once per step.
 
-        An `asynchronous` engine has already put them back into the state before the step.
+        An `asynchronous` engine has already restored their state before the step.
 
         Args:
             motion_is_finite: whether the caller has checked that all positions and velocities are finite.
@@ -105,52 +110,51 @@ class Engine(Protocol):
         """Set the joint state that `reset` restores. (nq,), (nv,)"""
 
     def as_field(self, tensor: Tensor) -> Field:
-        """Return the memory of a tensor in the form that `select` and its selections read and write at least cost."""
+        """Return the memory of a tensor in the form that selections of this engine read and write fastest."""
 
     def select(self, mask: Field, seed: int, counters: Field) -> Selection | None:
-        """Return the worlds where `mask` holds, with their random streams; None if it is known that there are none."""
-
-    def rays(
-        self,
-        points: Tensor,
-        directions: Tensor,
-        *,
-        groups: tuple[int, ...] | None = None,
-        exclude: int = -1,
-        selection: Selection | None = None,
-    ) -> Tensor:
-        """Return distances from points to the first geom along unit directions, -1 for none. (rows, rays) float32
+        """Return a selection of the worlds where `mask` is true; None if it is known to be empty.
 
         Args:
-            points: world frame [m]; a row for every world, or for those of the selection as it reads fields.
-                (rows, rays, 3) float32
-            directions: of length 1. (rows, rays, 3) float32
+            mask: the worlds. (num_envs,) bool
+            seed: seed of the selection's random numbers.
+            counters: number of each world's random stream. (num_envs,) int64
+        """
+
+    def rays(
+        self, points: Tensor, directions: Tensor, *, groups: Groups, exclude: int, selection: Selection | None
+    ) -> Tensor:
+        """Return distances from points to the first geom along unit directions, -1 for none. (rows, rays) [m]
+
+        Args:
+            points: start points, world frame; one row per world, or per row of `selection`. (rows, rays, 3) float32
+            directions: vectors of length 1. (rows, rays, 3) float32
             groups: geom groups that the rays can hit; None: all.
-            exclude: a body whose geoms the rays cannot hit.
+            exclude: a body whose geoms the rays cannot hit; -1: none.
             selection: the worlds; None: all.
         """
 
     def check_finite(self, values: Tensor, what: str) -> None:
-        """Check on the device, without waiting, whether all values are finite."""
+        """Check on the device, without waiting for it, whether all values are finite; `what` is their name."""
 
     def report_nonfinite(self) -> list[str]:
-        """Return what `check_finite` found since the last call."""
+        """Return the names of the values for which `check_finite` failed since the last call."""
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of everything the worlds carry from step to step."""
+        """Return copies of the worlds' state."""
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Restore the state returned by `state_dict()`."""
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return one world as MuJoCo's own structures, for drawing and debugging."""
+        """Return the model and the data of one world, for drawing and debugging."""
 
     def close(self) -> None:
         """Free threads and memory."""
 
 
 class ReplayableEngine(Engine, Protocol):
-    """An engine whose worlds have integration states on the CPU, which it steps again bit for bit."""
+    """Engine whose worlds have integration states on the CPU, from which it steps again bit for bit."""
 
     own_constants: bool
     """Whether `set_constants` has been called."""
@@ -158,10 +162,10 @@ class ReplayableEngine(Engine, Protocol):
     history: StateHistory
 
     def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
-        """Record the last calls of `step`: as many as `calls`, or as fit into `memory` bytes."""
+        """Record the last calls of `step`: `calls` of them, or as many as fit into `memory` bytes."""
 
     def recorded_calls(self, env: int) -> list[Call]:
-        """Return the last calls of a world in its running episode, the oldest first."""
+        """Return the recorded calls of a world in its present episode, the oldest first."""
 
     def state_row(self, env: int) -> NDArray[np.float64]:
         """Return a copy of a world's integration state. (nstate,)"""
@@ -182,11 +186,11 @@ class ReplayableEngine(Engine, Protocol):
         """Expand a model field and set its values, which were read from a file.
 
         Raises:
-            ValueError: for values that do not fit, or that could make MuJoCo read outside of its arrays.
+            ValueError: for values of another shape or type, or that could make MuJoCo read outside of its arrays.
         """
 
     def write_own_model(self, env: int, model: mujoco.MjModel) -> None:
-        """Write the model of one world into a copy of the model."""
+        """Write the model of one world into a copy of the model, with the disable flags of the original model."""
 
 
 def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, device: str = "cpu") -> Engine:
@@ -195,7 +199,7 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
     Raises:
         DependencyError: if the GPU engine is not installed.
         ConfigError: for a model that the engine cannot run.
-        DeviceError: for a missing device, or more worlds than its memory holds.
+        DeviceError: if the device is missing, or its memory does not hold all worlds.
     """
     on_cpu = device.partition(":")[0] == "cpu"
     engine = config.engine if config.engine != "auto" else "batch" if on_cpu else "warp"

@@ -1,6 +1,6 @@
-"""Which OpenGL to draw with, chosen when something must be drawn and never before.
+"""Choice of the OpenGL library, made when the first image is rendered.
 
-With MUJOCO_GL unset: a display's GL if there is a display, else EGL, else OSMesa.
+If MUJOCO_GL is not set: the OpenGL of the display if there is a display, else EGL, else OSMesa.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from rlcli.errors import MachineError
+from rlcli.errors import MachineError, one_line
 
 _PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6", "glfw": "a running display server"}
 
 
 def opengl_import_error(error: BaseException) -> MachineError | None:
-    """What to say where MuJoCo could not be imported for what MUJOCO_GL says; None for any other error.
+    """Return an error with a hint if the import of MuJoCo failed because of MUJOCO_GL; None for any other error.
 
-    MuJoCo loads the library of its choice at import, whether or not something is drawn.
+    MuJoCo loads the library that MUJOCO_GL names when it is imported, even if nothing is rendered.
     """
     chosen = os.environ.get("MUJOCO_GL", "").strip()
     raised_in = [frame.filename for frame in traceback.extract_tb(error.__traceback__) if frame.name == "<module>"]
@@ -29,33 +29,33 @@ def opengl_import_error(error: BaseException) -> MachineError | None:
     backend = chosen.lower()
     if backend not in _PACKAGES:
         return MachineError(
-            f"MUJOCO_GL={chosen}: MuJoCo knows no such OpenGL",
-            hint="egl, osmesa, glfw or disable; unset MUJOCO_GL: rlcli then takes what works",
+            f"MUJOCO_GL={chosen}: MuJoCo has no such OpenGL backend",
+            hint="use egl, osmesa, glfw or disable, or unset MUJOCO_GL: rlcli then chooses one that works",
         )
     return MachineError(
-        f"MUJOCO_GL={chosen}: its library cannot be loaded ({' '.join(str(error).split())[:100]})",
-        hint=f"install {_PACKAGES[backend]}, or unset MUJOCO_GL: rlcli then takes what works",
+        f"MUJOCO_GL={chosen}: its library cannot be loaded ({one_line(error, 100)})",
+        hint=f"install {_PACKAGES[backend]}, or unset MUJOCO_GL: rlcli then chooses one that works",
     )
 
 
 def has_display() -> bool:
-    """Whether a window could be opened."""
+    """Return whether there is a display for windows."""
     if sys.platform.startswith("linux"):
         return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     return True
 
 
 def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[Any, str]:
-    """A current OpenGL context and the name of what made it.
+    """Open an OpenGL context, make it current and return it with the name of its backend.
 
     Args:
-        width: of its pictures.
-        height: likewise.
-        in_thread: it is opened, and used, in a thread that is not the main one: a display's GL, which has to be opened
-            there, is then the last to be tried.
+        width: width of the images [pixels].
+        height: height of the images [pixels].
+        in_thread: whether the calling thread is not the main thread. GLFW, which must be opened in the main thread, is
+            then tried last.
 
     Raises:
-        MachineError: if nothing works, with what was tried and what to install.
+        MachineError: if no backend works; the message has all that were tried and the packages to install.
     """
     tried = []
     backends = candidates()
@@ -67,36 +67,36 @@ def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[A
             context.make_current()
             if backend == "glfw" and not _has_window():
                 raise MachineError("the display does not answer")
-        except Exception as error:  # every backend fails in its own way: missing library, device, display
-            tried.append(f"{backend} ({' '.join(str(error).split())[:100] or type(error).__name__})")
+        except Exception as error:  # each backend raises other errors: missing library, device, display
+            tried.append(f"{backend} ({one_line(error, 100)})")
             _unload_opengl()
             continue
         return context, backend
     packages = " or ".join(_PACKAGES.get(backend, backend) for backend in candidates())
     raise MachineError(
-        f"nothing can draw on this machine; tried {', '.join(tried)}",
+        f"no OpenGL backend works on this machine; tried {', '.join(tried)}",
         hint=f"install {packages} (Debian, Ubuntu: apt install libegl1 libosmesa6), or set MUJOCO_GL",
     )
 
 
 def _has_window() -> bool:
-    """GLFW says with a warning alone that it has none."""
+    """Return whether GLFW opened a window: it raises no error if it cannot."""
     import glfw
 
     return bool(glfw.get_current_context())
 
 
 def candidates() -> list[str]:
-    """The libraries to try, in this order.
+    """Return the OpenGL backends to try, the best one first.
 
     Raises:
-        MachineError: if MUJOCO_GL says that nothing is to be drawn.
+        MachineError: if MUJOCO_GL disables rendering.
     """
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
     if chosen in ("egl", "osmesa", "glfw", "cgl"):
         return [chosen]
     if chosen in ("disable", "disabled", "off", "false", "0"):
-        raise MachineError(f"drawing is switched off by MUJOCO_GL={chosen}", hint="unset MUJOCO_GL")
+        raise MachineError(f"rendering is disabled by MUJOCO_GL={chosen}", hint="unset MUJOCO_GL")
     if sys.platform == "darwin":
         return ["cgl", "glfw"]
     if sys.platform == "win32":
@@ -105,7 +105,7 @@ def candidates() -> list[str]:
 
 
 def _unload_opengl() -> None:
-    """PyOpenGL fixes its platform at import; the next backend needs it fresh."""
+    """Remove PyOpenGL from the imported modules: it chooses its platform at import, for one backend only."""
     os.environ.pop("PYOPENGL_PLATFORM", None)
     for name in [
         n for n in sys.modules if n.partition(".")[0] == "OpenGL" or n in ("mujoco.egl", "mujoco.osmesa", "mujoco.glfw")

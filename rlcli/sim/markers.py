@@ -1,7 +1,7 @@
-"""What is drawn beside the bodies of every environment: arrows, spheres and frames, none of them part of the physics.
+"""Arrows, spheres and frames that viewers draw in every environment; they are not part of the physics.
 
-A command term that has a method `markers()` returns some; it is called when a viewer draws, never in a step. Places are
-in the world as `entity.data.root_pos_w` is, one row an environment; where one is not finite nothing is drawn.
+The method `markers()` of a command term returns markers. It is called when a viewer draws, never in a step. Positions
+are in the same frame as `entity.data.root_pos_w`, one row per environment; a position that is not finite is not drawn.
 """
 
 from __future__ import annotations
@@ -11,45 +11,45 @@ from typing import NamedTuple, TypeAlias
 from torch import Tensor
 
 Color: TypeAlias = tuple[float, float, float, float]
-"""Red, green, blue, opacity, each from 0 to 1."""
+"""Red, green, blue and opacity, each from 0 to 1."""
 COMMANDED: Color = (0.1, 0.9, 0.1, 1.0)
-"""Green: what a command asks for."""
+"""Green, for commanded values."""
 ACTUAL: Color = (0.1, 0.3, 1.0, 1.0)
-"""Blue: what there is instead."""
+"""Blue, for actual values."""
 
 
 class Arrow(NamedTuple):
-    """An arrow; where it is no longer than its radius it is not drawn."""
+    """Arrow, which is not drawn if its length is at most its radius."""
 
     start: Tensor
-    """Where it begins. (num_envs, 3) [m]"""
+    """Start point. (num_envs, 3) [m]"""
     end: Tensor
-    """Where its tip is. (num_envs, 3) [m]"""
+    """Tip. (num_envs, 3) [m]"""
     color: Color = COMMANDED
     radius: float = 0.015
-    """Of its shaft [m]."""
+    """Radius of the shaft [m]."""
 
 
 class Sphere(NamedTuple):
-    """A sphere."""
+    """Sphere."""
 
     center: Tensor
-    """Where it is. (num_envs, 3) [m]"""
+    """Centre. (num_envs, 3) [m]"""
     color: Color = COMMANDED
     radius: float = 0.02
-    """In metres."""
+    """Radius [m]."""
 
 
 class Frame(NamedTuple):
-    """The axes of a pose: x red, y green, z blue."""
+    """Axes of a pose: x red, y green, z blue."""
 
     position: Tensor
-    """Where it is. (num_envs, 3) [m]"""
+    """Origin. (num_envs, 3) [m]"""
     quat: Tensor
-    """Its orientation (w, x, y, z), of length 1. (num_envs, 4)"""
+    """Orientation (w, x, y, z), of length 1. (num_envs, 4)"""
     length: float = 0.1
-    """Of each axis [m]."""
+    """Length of each axis [m]."""
 
 
 Marker: TypeAlias = Arrow | Sphere | Frame
-"""One shape in every environment."""
+"""One shape in each environment."""

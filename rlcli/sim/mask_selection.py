@@ -1,9 +1,8 @@
-"""A selection as a mask over all environments: a GPU uses it without a host sync."""
+"""Selection as a mask over all environments, which a GPU can use without a host sync."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +15,11 @@ from rlcli.sim.selection import ALL, Columns
 
 
 class MaskSelection:
-    """Every row takes part in the arithmetic; only masked ones are written. Draws are those of `IdSelection`."""
+    """Selection of the environments where a mask is true.
+
+    All rows take part in the arithmetic; only the masked rows are written. The random numbers equal those of
+    `IdSelection`.
+    """
 
     def __init__(
         self, mask: Tensor, seed: int, counters: Tensor, stream: np.uint64 | None = None, shared_streams: int = 0
@@ -30,11 +33,11 @@ class MaskSelection:
 
     @property
     def count(self) -> Tensor:
-        """How many environments are selected. ()"""
+        """Number of selected environments. ()"""
         return self.mask.sum()
 
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
-        """Uniform in [low, high). (num_envs, *shape)"""
+        """Draw uniform numbers in [low, high). (num_envs, *shape)"""
         if isinstance(low, Tensor):
             return torch.addcmul(low, self._uniform(0.0, 1.0, shape), high - low)
         if isinstance(high, Tensor):
@@ -42,22 +45,19 @@ class MaskSelection:
         return self._uniform(low, high, shape)
 
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
-        """Gaussian. (num_envs, *shape)"""
-        out, index = self._allocate(shape, 2)
-        inputs = [self._start(), self._counter_array(), int(self._stream), index, self._num_streams()]
-        self._launch(warp_kernels.draw_normal, inputs, out)
-        return out.view(len(self.mask), *shape).mul_(std).add_(mean)
+        """Draw Gaussian numbers. (num_envs, *shape)"""
+        return self._draw(warp_kernels.draw_normal, shape, 2).mul_(std).add_(mean)
 
     def choice(self, options: int, shape: tuple[int, ...] = ()) -> Tensor:
-        """Whole numbers in [0, options), each as likely. (num_envs, *shape)"""
+        """Draw integers in [0, options) with equal probability. (num_envs, *shape) int64"""
         return self._uniform(0.0, 1.0, shape).double().mul_(options).long()
 
     def read(self, field: Tensor, columns: Columns = ALL) -> Tensor:
-        """All rows of a (num_envs, ...) tensor, copied."""
+        """Return a copy of all rows of a (num_envs, ...) tensor."""
         return field.clone() if columns is ALL else field[:, columns].clone()
 
     def read_view(self, field: Tensor, columns: Columns = ALL) -> Tensor:
-        """All rows of a (num_envs, ...) tensor, where possible the tensor itself."""
+        """Return all rows of a (num_envs, ...) tensor, if possible as a view."""
         return field if columns is ALL else field[:, columns]
 
     def write(self, field: Tensor, values: Tensor | float, columns: Columns = ALL) -> None:
@@ -80,47 +80,35 @@ class MaskSelection:
         self.write(field, part + values, columns)
 
     def mean(self, values: Tensor) -> Tensor:
-        """Mean of a (num_envs,) tensor over the masked rows. ()"""
+        """Return the mean of a (num_envs,) tensor over the masked rows; 0 for no rows. ()"""
         return torch.where(self.mask, values.float(), 0.0).sum() / self.count.clamp(min=1)
 
     def where(self, mask: Tensor) -> MaskSelection:
-        """Those of the rows where `mask` (num_envs,) holds."""
+        """Return a selection of the rows where `mask` (num_envs,) is true too."""
         return MaskSelection(self.mask & mask, self._seed, self._counters, self._stream, self._shared_streams)
 
     def env_ids(self) -> Tensor:
-        """The masked rows' numbers; waits for the device. (rows,) int64"""
+        """Return the numbers of the masked rows; this waits for the device. (rows,) int64"""
         return self.mask.nonzero()[:, 0]
 
     def union(self, other: MaskSelection) -> MaskSelection:
-        """The rows that are in either."""
+        """Return a selection of the rows that are in one of two selections."""
         return MaskSelection(self.mask | other.mask, self._seed, self._counters, shared_streams=self._shared_streams)
 
     def stream(self, stream: np.uint64) -> MaskSelection:
-        """The same rows drawing from another stream."""
+        """Return a selection of the same rows that draws from another stream."""
         return MaskSelection(self.mask, self._seed, self._counters, stream, self._shared_streams)
 
     def _uniform(self, low: float, high: float, shape: tuple[int, ...]) -> Tensor:
-        out, index = self._allocate(shape, 1)
-        inputs = [self._start(), self._counter_array(), int(self._stream), index, self._num_streams(), low, high - low]
-        self._launch(warp_kernels.draw_uniform, inputs, out)
-        return out.view(len(self.mask), *shape)
+        return self._draw(warp_kernels.draw_uniform, shape, 1, low, high - low)
 
-    def _allocate(self, shape: tuple[int, ...], words: int) -> tuple[Tensor, int]:
-        """Return a (num_envs, count) tensor for a draw, and the index of its first random word."""
-        count = math.prod(shape)
+    def _draw(self, kernel: wp.Kernel, shape: tuple[int, ...], words: int, *parameters: float) -> Tensor:
+        """Launch a kernel that makes each number from some random words. (num_envs, *shape)"""
+        num_envs, count, device = len(self.mask), math.prod(shape), self.mask.device
+        out = torch.empty(num_envs, count, device=device)
         index, self._drawn = self._drawn, self._drawn + words * count
-        return torch.empty(len(self.mask), count, device=self.mask.device), index
-
-    def _num_streams(self) -> int:
-        """Return how many random streams there are: one for each environment, unless environments share some."""
-        return self._shared_streams or len(self.mask)
-
-    def _start(self) -> int:
-        return int(random.start(self._seed)[0])
-
-    def _counter_array(self) -> wp.array:
-        return wp.from_torch(self._counters.contiguous())
-
-    def _launch(self, kernel: wp.Kernel, inputs: list[Any], out: Tensor) -> None:
-        if out.shape[1]:
-            wp.launch(kernel, tuple(out.shape), inputs, [wp.from_torch(out)], device=wp.device_from_torch(out.device))
+        if count:
+            start, counters = int(random.start(self._seed)[0]), wp.from_torch(self._counters.contiguous())
+            inputs = [start, counters, int(self._stream), index, self._shared_streams or num_envs, *parameters]
+            wp.launch(kernel, (num_envs, count), inputs, [wp.from_torch(out)], device=wp.device_from_torch(device))
+        return out.view(num_envs, *shape)

@@ -1,4 +1,4 @@
-"""MuJoCo's log."""
+"""Settings of MuJoCo's log."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import mujoco
 
 
 def quiet_mujoco() -> None:
-    """Keep MuJoCo from writing MUJOCO_LOG.TXT into the user's folder and warnings onto the terminal.
+    """Stop MuJoCo from writing MUJOCO_LOG.TXT into the current folder and warnings to the terminal.
 
     The engines read MuJoCo's warning counters instead.
     """

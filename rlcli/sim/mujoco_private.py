@@ -1,6 +1,6 @@
-"""Private names of MuJoCo: those of `mujoco.batch`, and the clock variable of MuJoCo's C library.
+"""Private names of MuJoCo that rlcli uses: those of `mujoco.batch`, and the clock variable of MuJoCo's C library.
 
-A new version of MuJoCo may rename any of them, so they are used in this module alone.
+A new version of MuJoCo may rename any of them, so they are used only in this module.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def _private(owner: object, name: str) -> Any:
 
 
 STATE_FIELDS: dict[str, mujoco.mjtState] = _private(mujoco.batch, "_STATE_FIELDS")
-"""Fields of MjData that belong to the integration state -> their component of it."""
+"""Field of MjData that belongs to the integration state -> its component of the state."""
 
 
 def make_batch(
@@ -52,11 +52,11 @@ def make_batch(
     """Make a batch of worlds.
 
     Args:
-        model: stays as it is: other threads may step it.
-        num_envs: worlds.
-        threads: that step them.
+        model: the compiled model; it is copied, because other threads may step it.
+        num_envs: number of worlds.
+        threads: number of threads that step them.
         skipped_flags: disable flags (mjtDisableBit) that are set in the batch in addition to the model's.
-        persistent: keep one MjData for each world.
+        persistent: whether each world has an MjData of its own.
 
     Raises:
         DependencyError: if the installed version of MuJoCo lacks a private name that is used here.
@@ -81,7 +81,7 @@ def expanded_fields(batch: Batch) -> dict[str, NDArray[Any]]:
 
 
 def expand_disable_flags(batch: Batch) -> NDArray[np.int32]:
-    """Return disable flags of each world, live, without listing them among the expanded fields."""
+    """Return the disable flags of each world, live, without an entry in the expanded fields. (num_envs,)"""
     flags: NDArray[np.int32] = batch._b.expand("opt.disableflags").view(np.int32)
     return flags
 
@@ -98,9 +98,10 @@ def forward_of(batch: Batch) -> Callable[[NDArray[np.int64], int], None]:
 
 
 class _WithoutProfiler:
-    """Context in which MuJoCo does not read the clock. Timers of threads that step elsewhere meanwhile are wrong.
+    """Context in which MuJoCo's profiler does not read the clock.
 
-    `mjcb_time` is a variable of MuJoCo's C library. Python's `set_mjcb_time(None)` puts the bindings' own clock there.
+    It sets `mjcb_time`, a variable of MuJoCo's C library, to NULL. Python's `set_mjcb_time(None)` cannot do that: it
+    sets the clock of the bindings. The timers of threads that step MuJoCo elsewhere at the same time are wrong.
     """
 
     def __init__(self) -> None:
@@ -114,7 +115,7 @@ class _WithoutProfiler:
             for path in Path(mujoco.__file__).parent.glob(name):
                 with contextlib.suppress(OSError, ValueError):
                     return ctypes.c_void_p.in_dll(ctypes.CDLL(str(path)), "mjcb_time")
-        return ctypes.c_void_p()  # a build of MuJoCo with another layout: its profiler stays on
+        return ctypes.c_void_p()  # this build of MuJoCo has another layout: its profiler stays on
 
     def __enter__(self) -> None:
         with self._lock:
@@ -128,7 +129,7 @@ class _WithoutProfiler:
     ) -> None:
         with self._lock:
             self._inside -= 1
-            if not self._inside and self._callback.value is None:  # no other callback was set meanwhile
+            if not self._inside and self._callback.value is None:  # not None: other code has set a callback
                 self._callback.value = self._clock
 
 

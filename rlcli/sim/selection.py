@@ -1,7 +1,7 @@
-"""Selections of environments for resets and events: neither ids nor masks, only operations on their rows.
+"""Selections of environments for resets and events, with operations on their rows.
 
-On the CPU a selection is a short list of ids; an engine inside a CUDA graph can only use a mask over all. Terms
-written against this interface run on both.
+On a CPU a selection is a short list of ids. In a CUDA graph it must be a mask over all environments. A term that uses
+only the methods of `Selection` runs on both.
 """
 
 from __future__ import annotations
@@ -18,52 +18,54 @@ from rlcli import random
 
 Columns: TypeAlias = slice | Tensor
 Field: TypeAlias = Any
-"""A (num_envs, ...) tensor, or what the engine's `as_field` gives for it: to make that costs as much as to read some
-rows of it, so whoever reads in every step keeps it."""
+"""A (num_envs, ...) tensor, or the result of the engine's `as_field` for it. `as_field` takes as long as reading a few
+rows, so a term that reads in every step calls it once."""
+Groups: TypeAlias = tuple[int, ...] | None
+"""Geom groups; None: all."""
 ALL = slice(None)
 
 
 def in_place(tensor: Tensor) -> Any:
-    """The same memory as what small steps in place cost least on: on a CPU a numpy array, whose calls cost half.
+    """Return the same memory in the form that is fastest for small operations in place.
 
-    `+=`, `*=` and `[...] =` read alike on both.
+    On a CPU this is a numpy array, whose calls take half the time of torch's. `+=`, `*=` and `[...] =` work on both.
     """
     return tensor.numpy() if tensor.device.type == "cpu" else tensor
 
 
 def one_column(columns: Columns, count: int, parameter: str) -> int:
-    """The one column that an index into `count` columns stands for.
+    """Return the single column that an index into `count` columns selects.
 
     Raises:
-        ValueError: if it stands for several.
+        ValueError: if it selects no column or several.
     """
     found = torch.arange(count)[columns if isinstance(columns, slice) else columns.cpu()].tolist()
     if len(found) != 1:
-        raise ValueError(f"'{parameter}' stands for {len(found)} elements, and this term needs one")
+        raise ValueError(f"'{parameter}' selects {len(found)} elements; this term needs exactly one")
     return int(found[0])
 
 
 class Selection(Protocol):
-    """Rows are the selected environments, in order; `shape` is that of one row's draw."""
+    """Some environments, one row each, in order. `shape` is the shape of one row's random numbers."""
 
     @property
     def count(self) -> int | Tensor:
-        """How many environments are selected."""
+        """Number of selected environments."""
 
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
-        """Uniform in [low, high). (rows, *shape)"""
+        """Draw uniform numbers in [low, high). (rows, *shape)"""
 
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
-        """Gaussian. (rows, *shape)"""
+        """Draw Gaussian numbers. (rows, *shape)"""
 
     def choice(self, options: int, shape: tuple[int, ...] = ()) -> Tensor:
-        """Whole numbers in [0, options), each as likely. (rows, *shape)"""
+        """Draw integers in [0, options) with equal probability. (rows, *shape) int64"""
 
     def read(self, field: Field, columns: Columns = ALL) -> Tensor:
-        """The rows of a (num_envs, ...) tensor."""
+        """Return a copy of the rows of a (num_envs, ...) tensor."""
 
     def read_view(self, field: Field, columns: Columns = ALL) -> Tensor:
-        """Return the rows, or the tensor itself: do not write to the result, nor keep it past a write to the tensor."""
+        """Return the rows, or the tensor itself: do not write to the result, and do not use it after a write."""
 
     def write(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
         """Set the rows of a (num_envs, ...) tensor."""
@@ -72,41 +74,55 @@ class Selection(Protocol):
         """Add to the rows of a (num_envs, ...) tensor."""
 
     def mean(self, values: Tensor) -> Tensor:
-        """Mean of a (num_envs,) tensor over the rows. ()"""
+        """Return the mean of a (num_envs,) tensor over the rows. ()"""
 
     def where(self, mask: Field) -> Selection | None:
-        """Those of the rows where `mask` (num_envs,) holds; None if it is known that there are none."""
+        """Return a selection of the rows where `mask` (num_envs,) is true; None if it is known to be empty."""
 
     def union(self, other: Any) -> Selection:
-        """The rows that are in this selection or in another of the same engine."""
+        """Return a selection of the rows that are in one of two selections of the same engine."""
 
     def env_ids(self) -> Tensor:
-        """The rows' numbers, for code that wants ids; on a GPU this waits for the device. (rows,) int64"""
+        """Return the numbers of the environments; on a GPU this waits for the device. (rows,) int64"""
 
     def stream(self, stream: np.uint64) -> Selection:
-        """The same rows drawing from another stream."""
+        """Return a selection of the same rows that draws from another stream."""
+
+
+def as_array(values: Any) -> Any:
+    """Return a CPU tensor as an array of the same memory; return any other value unchanged."""
+    return values.numpy() if isinstance(values, Tensor) else values
 
 
 def write_rows(field: Field, rows: NDArray[np.int64], values: Tensor | float, columns: Columns = ALL) -> None:
     """Set some rows of a (num_envs, ...) tensor on the CPU."""
-    into = field if isinstance(field, np.ndarray) else field.numpy()
-    into[rows if columns is ALL else _index(rows, columns)] = values.numpy() if isinstance(values, Tensor) else values
+    as_array(field)[_index(rows, columns)] = as_array(values)
 
 
 def _index(rows: NDArray[np.int64], columns: Columns) -> Any:
+    """Return an index of some columns in some rows."""
+    if columns is ALL:
+        return rows
     return (rows, columns) if isinstance(columns, slice) else (rows[:, None], columns.numpy())
 
 
 def ids_of(selection: Selection) -> NDArray[np.int64]:
-    """The rows of a selection on the CPU, sorted. (rows,)"""
+    """Return the sorted ids of a selection on the CPU. (rows,)"""
     assert isinstance(selection, IdSelection)
     return selection.ids
 
 
 class IdSelection:
-    """A selection as a sorted list of ids, on the CPU. Its draws may be sent to a device.
+    """Selection as a sorted list of ids, on the CPU.
 
-    With `shared_streams`, environments i and i % shared_streams draw the same.
+    Args:
+        ids: the selected environments, sorted. (rows,)
+        seed: seed of the random numbers.
+        counters: number of each row's random stream, usually its episode. (rows,)
+        stream: the stream to draw from; None: 0.
+        device: device of the random numbers; None: the CPU.
+        shared_streams: environments i and i % shared_streams draw the same random numbers; 0: every environment has
+            its own stream.
     """
 
     def __init__(
@@ -129,31 +145,30 @@ class IdSelection:
 
     @property
     def count(self) -> int:
-        """How many environments are selected."""
+        """Number of selected environments."""
         return len(self.ids)
 
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
-        """Uniform in [low, high). (rows, *shape)"""
-        least = low.numpy(force=True) if isinstance(low, Tensor) else low
-        most = high.numpy(force=True) if isinstance(high, Tensor) else high
-        return self._placed(random.uniform(*self._next(math.prod(shape))), most - least, least, shape)
+        """Draw uniform numbers in [low, high). (rows, *shape)"""
+        lowest = low.numpy(force=True) if isinstance(low, Tensor) else low
+        highest = high.numpy(force=True) if isinstance(high, Tensor) else high
+        return self._scaled(random.uniform(*self._next(math.prod(shape))), highest - lowest, lowest, shape)
 
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
-        """Gaussian. (rows, *shape)"""
+        """Draw Gaussian numbers. (rows, *shape)"""
         size = math.prod(shape)
-        keys, stream, index, _ = self._next(2 * size)
+        keys, stream, index, _ = self._next(2 * size)  # two uniform numbers make a Gaussian one
         scale = std.numpy(force=True) if isinstance(std, Tensor) else std
         offset = mean.numpy(force=True) if isinstance(mean, Tensor) else mean
-        return self._placed(random.normal(keys, stream, index, size), scale, offset, shape)
+        return self._scaled(random.normal(keys, stream, index, size), scale, offset, shape)
 
     def choice(self, options: int, shape: tuple[int, ...] = ()) -> Tensor:
-        """Whole numbers in [0, options), each as likely. (rows, *shape)"""
+        """Draw integers in [0, options) with equal probability. (rows, *shape) int64"""
         return self._tensor(self._shaped(random.integers(*self._next(math.prod(shape)), options), shape))
 
     def read(self, field: Field, columns: Columns = ALL) -> Tensor:
-        """The rows of a (num_envs, ...) tensor, copied."""
-        values = field if isinstance(field, np.ndarray) else field.numpy()
-        return torch.from_numpy(values[self.ids if columns is ALL else _index(self.ids, columns)])
+        """Return a copy of the rows of a (num_envs, ...) tensor."""
+        return torch.from_numpy(as_array(field)[_index(self.ids, columns)])
 
     read_view = read
 
@@ -163,18 +178,15 @@ class IdSelection:
 
     def add(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
         """Add to the rows of a (num_envs, ...) tensor."""
-        into = field if isinstance(field, np.ndarray) else field.numpy()
-        into[self.ids if columns is ALL else _index(self.ids, columns)] += (
-            values.numpy() if isinstance(values, Tensor) else values
-        )
+        as_array(field)[_index(self.ids, columns)] += as_array(values)
 
     def mean(self, values: Tensor) -> Tensor:
-        """Mean of a (num_envs,) tensor over the rows. ()"""
+        """Return the mean of a (num_envs,) tensor over the rows. ()"""
         return self.read(values).float().mean()
 
     def where(self, mask: Field) -> IdSelection | None:
-        """Those of the rows where `mask` (num_envs,) holds; None for nobody."""
-        chosen = (mask if isinstance(mask, np.ndarray) else mask.numpy())[self.ids]
+        """Return a selection of the rows where `mask` (num_envs,) is true; None if there are none."""
+        chosen = as_array(mask)[self.ids]
         if chosen.all():
             return self
         if not chosen.any():
@@ -184,25 +196,25 @@ class IdSelection:
         )
 
     def union(self, other: IdSelection) -> IdSelection:
-        """The rows that are in either; one that is in both draws as it does here."""
+        """Return a selection of the rows in one of two selections; a row in both has the stream that it has here."""
         ids, first = np.unique(np.concatenate([self.ids, other.ids]), return_index=True)
         counters = np.concatenate([self._counters, other._counters])[first]
         return IdSelection(ids, self._seed, counters, self._stream, self._device, self._shared_streams)
 
     def env_ids(self) -> Tensor:
-        """The rows' numbers. (rows,) int64"""
+        """Return the numbers of the environments. (rows,) int64"""
         return torch.from_numpy(self.ids)
 
     def stream(self, stream: np.uint64) -> IdSelection:
-        """The same rows drawing from another stream."""
+        """Return a selection of the same rows that draws from another stream."""
         other = IdSelection(self.ids, self._seed, self._counters, stream, self._device, self._shared_streams)
         other._keys = self._row_keys()
         return other
 
-    def _placed(
+    def _scaled(
         self, drawn: NDArray[Any], scale: float | NDArray[Any], offset: float | NDArray[Any], shape: tuple[int, ...]
     ) -> Tensor:
-        # in numpy: the arrays are short, and its calls cost half of torch's
+        # in numpy: the arrays are short, and numpy's calls take half the time of torch's
         values = self._shaped(drawn, shape)
         values *= scale
         values += offset
@@ -222,5 +234,6 @@ class IdSelection:
         return self._keys
 
     def _next(self, count: int) -> tuple[random.Keys, np.uint64, int, int]:
+        """Return the arguments of `random.uniform` for the next `count` numbers of each row."""
         index, self._drawn = self._drawn, self._drawn + count
         return self._row_keys(), self._stream, index, count

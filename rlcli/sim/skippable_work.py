@@ -1,8 +1,8 @@
-"""Work that MuJoCo may skip in a step without changing a bit of the result.
+"""Work that MuJoCo can skip in a step without changing a bit of the state.
 
-MuJoCo prepares collision detection even for geoms of which no two may touch, and gathers the constraints of a single
-tree into islands, of which there is one. Its Python bindings also keep the engine's profiler on, some thirty reads of
-the clock a step, a third of the time of a small model: see `rlcli.sim.mujoco_private.without_profiler`.
+MuJoCo prepares collision detection even if no two geoms may touch, and it searches constraint islands even in a model
+of one kinematic tree, which is one island. Its Python bindings also keep the profiler on, which reads the clock about
+thirty times per step, a third of the time of a small model: see `rlcli.sim.mujoco_private.without_profiler`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ FIELDS_OF_SKIPPED_WORK = frozenset(
 
 
 def skippable_flags(model: mujoco.MjModel) -> int:
-    """Return the disable flags (mjtDisableBit) that change no bit of MuJoCo's states.
+    """Return the disable flags (mjtDisableBit) that do not change a bit of the model's states.
 
-    Valid as long as no integer of the model changes: integers decide which geoms may touch.
+    The flags are valid as long as no integer field of the model changes: integers decide which geoms may touch.
     """
     flags = 0
     if not model.npair and not model.nflex and next(colliding_pairs(model), None) is None:
@@ -35,25 +35,25 @@ def skippable_flags(model: mujoco.MjModel) -> int:
 
 
 def colliding_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
-    """Yield the pairs of geoms that MuJoCo's filters let touch.
+    """Yield the pairs of geoms that may touch according to MuJoCo's filters.
 
-    Their bits match, and their bodies are neither welded nor parent and child. Explicit pairs, which skip the filters,
-    are not among them.
+    The contype and conaffinity of the two match, and their bodies are neither welded together nor parent and child.
+    Explicit pairs of the MJCF, to which no filter applies, are not included.
     """
     weld = model.body_weldid
-    above = weld[model.body_parentid[weld]]
-    families = not model.opt.disableflags & int(_D.mjDSBL_FILTERPARENT)
+    parent = weld[model.body_parentid[weld]]
+    filters_parents = not model.opt.disableflags & int(_D.mjDSBL_FILTERPARENT)
     excluded = model.exclude_signature
     kind, affinity = model.geom_contype, model.geom_conaffinity
     solid = np.flatnonzero(kind | affinity)
     moves = weld[model.geom_bodyid] > 0
     for a in solid:
-        # of two that stand still none touches the other, and a terrain may have thousands
+        # two static geoms never touch; leave them out early, because a terrain may have thousands
         others = solid[(solid > a) & (moves[a] | moves[solid])]
         others = others[((kind[a] & affinity[others]) | (kind[others] & affinity[a])) != 0]
         one, many = model.geom_bodyid[a], model.geom_bodyid[others]
         welded = weld[many] == weld[one]
-        related = (weld[one] > 0) & (weld[many] > 0) & ((weld[one] == above[many]) | (weld[many] == above[one]))
+        related = (weld[one] > 0) & (weld[many] > 0) & ((weld[one] == parent[many]) | (weld[many] == parent[one]))
         signature = (np.minimum(one, many) << 16) + np.maximum(one, many)
-        for b in others[~(welded | (families & related) | np.isin(signature, excluded))]:
+        for b in others[~(welded | (filters_parents & related) | np.isin(signature, excluded))]:
             yield int(a), int(b)

@@ -1,4 +1,4 @@
-"""The joint state of all worlds in float32, copied once a step; derived fields are cast when they are read."""
+"""Cache of the engine's state in float32: joint states are copied once per step, derived fields when they are read."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from rlcli.sim.selection import Selection, ids_of
 
 
 def is_finite(values: Tensor) -> bool:
-    """Whether every value is finite, in one pass where they are: a finite sum has finite summands only."""
+    """Return whether all values are finite; one pass is enough if they are, because then their sum is finite."""
     return math.isfinite(values.sum().item()) or bool(values.isfinite().all())
 
 
 class SimData:
-    """The engine's joint state as float32, copied once a step, and derived fields cast when read.
+    """Engine's joint state in float32, copied once per step, and derived fields, cast when they are read.
 
-    `qpos` (num_envs, nq) and `qvel` (num_envs, nv) keep their storage for ever, so views of them stay valid. Where the
-    engine keeps the two side by side they are one copy; where its own are float32, they are the engine's own.
+    `qpos` (num_envs, nq) and `qvel` (num_envs, nv) never change their storage, so views of them stay valid. If they are
+    neighbours in the engine's memory, both are copied at once; if the engine is in float32, they are its own tensors.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -31,21 +31,22 @@ class SimData:
         self._copies = [source.to(torch.float32).contiguous() for source in self._sources]
         self._flat = [copy.view(-1) for copy in self._copies]
         own = self._copies[0] is self._sources[0]
-        # an engine in float64 is on the CPU, where small copies cost numpy half of torch's
+        # an engine in float64 is on the CPU, where numpy copies small arrays in half the time of torch
         pairs = [] if own else zip(self._copies, self._sources, strict=True)
         self._stale = [(copy.numpy(), source.numpy()) for copy, source in pairs]
         self._saved = [copy.copy() for copy, _ in self._stale]
         self.qpos = self._copies[0][:, : qpos.shape[1]]
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
+        """Number of updates; a cached value with an older stamp is out of date."""
         self._saved_at, self._summed = -1, (-1, 0.0)
         self._moved: Selection | None = None
         self._derived: dict[str, tuple[int, Tensor]] = {}
 
     def on_moved(self, selection: Selection) -> None:
-        """Update the selected worlds, whose state has been written.
+        """Update the derived fields of the selected worlds after a write to their state.
 
-        An engine that computes all worlds at once does so when it is next read: once, however often worlds move.
+        An engine that can only update all worlds at once does so at the next read, once for several calls.
         """
         if not self.engine.asynchronous:
             self.engine.forward(selection)
@@ -54,7 +55,7 @@ class SimData:
         self.refresh_rows(selection)
 
     def forward_moved(self) -> None:
-        """Compute the derived fields of worlds that have moved, where that has been put off."""
+        """Compute the derived fields of worlds for which `on_moved` has postponed it."""
         if self._moved is not None:
             selection, self._moved = self._moved, None
             self.engine.forward(selection)
@@ -66,14 +67,14 @@ class SimData:
         self.stamp += 1
 
     def refresh_rows(self, selection: Selection) -> None:
-        """Copy the state of the selected worlds, and drop what was computed from it."""
+        """Copy the state of the selected worlds, and drop the values computed from it."""
         for copy, source in self._stale:
             rows = ids_of(selection)
             copy[rows] = source[rows]
         self.stamp += 1
 
     def save_good_state(self) -> None:
-        """Save the state of every world; `restore_rows` writes it back."""
+        """Save the state of every world for `restore_rows`."""
         if self._saved_at == self.stamp:
             return
         self._saved_at = self.stamp
@@ -87,18 +88,19 @@ class SimData:
             source[rows] = saved[rows]
 
     def is_finite(self) -> bool:
-        """Whether every position and velocity is a finite number, as the last `refresh` found them."""
+        """Return whether all positions and velocities were finite at the last `refresh`."""
         return math.isfinite(self._squares()) or all(bool(flat.isfinite().all()) for flat in self._flat)
 
     def out_of_bounds(self, limit: float) -> Tensor | None:
-        """Worlds with a position or a velocity that is not finite or beyond `limit`; None for none. (num_envs,) bool"""
-        # the sum of all squares bounds each of them, is not finite where one is not, and rounds by far less than half
+        """Return the worlds with a value that is not finite or beyond `limit`; None for none. (num_envs,) bool"""
+        # the sum of all squares is an upper bound of each, and not finite if one is not; 0.5 covers its rounding
         if self._squares() <= 0.5 * limit * limit:
             return None
         bad = [~(copy.abs() <= limit).all(dim=1) for copy in self._copies]
         return torch.stack(bad).any(dim=0)
 
     def _squares(self) -> float:
+        """Return the sum of the squares of all positions and velocities, computed once per step."""
         at, total = self._summed
         if at != self.stamp:
             total = 0.0
@@ -108,7 +110,7 @@ class SimData:
         return total
 
     def derived_field(self, name: str) -> Tensor:
-        """A derived field as float32, cast once a step. (num_envs, ...)"""
+        """Return a derived field in float32, cast once per step. (num_envs, ...)"""
         self.forward_moved()
         stamp, value = self._derived.get(name, (-1, None))
         if stamp != self.stamp or value is None:
@@ -118,7 +120,7 @@ class SimData:
 
 
 def _joined(left: Tensor, right: Tensor) -> Tensor | None:
-    """Two 2-d views as one, where they are neighbouring columns of the same storage; else None."""
+    """Return two 2-d views as one if they are neighbouring columns of the same storage; else None."""
     neighbours = (
         left.dtype == right.dtype
         and left.stride() == right.stride()

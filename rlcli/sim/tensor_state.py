@@ -1,4 +1,4 @@
-"""Checks of saved tensors before they are copied into their places."""
+"""State of objects as tensors, and checks of saved tensors before they are restored."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 class TensorState:
-    """Base class of an object whose state is a few tensors, which are restored in place."""
+    """Base class of objects whose state is a few tensors, which are restored in place."""
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors themselves, by their keys in `state_dict`."""
@@ -33,12 +33,12 @@ def require_matching_tensors(saved: Mapping[str, Tensor], own: Mapping[str, Tens
     """Check that saved tensors have the shapes and types of their targets: `copy_` would broadcast or round them.
 
     Args:
-        saved: what was read.
-        own: where it goes; names that only one of both has are passed over.
-        what: the part that was read, for the message.
+        saved: tensors of the file.
+        own: their targets; names that are in only one of the two are ignored.
+        what: the part of the file, for the message.
 
     Raises:
-        ValueError: naming the first tensor that differs.
+        ValueError: with the name of the first tensor that differs.
     """
     for name, value in own.items():
         found = saved.get(name)
@@ -50,7 +50,7 @@ def require_in_range(value: Tensor, low: int, high: int, what: str) -> None:
     """Check that indices are within their range.
 
     Raises:
-        ValueError: naming them.
+        ValueError: with their smallest and largest value.
     """
     if value.numel() and not bool(((value >= low) & (value <= high)).all()):
         raise ValueError(f"'{what}' is {int(value.min())} to {int(value.max())}, allowed is {low} to {high}")

@@ -1,7 +1,7 @@
-"""The GPU engine, on MuJoCo Warp: every world in one launch, float32, fit for capture in a CUDA graph.
+"""GPU engine on MuJoCo Warp: all worlds in one launch, in float32, ready for capture in a CUDA graph.
 
-It also runs on Warp's CPU device, slowly: that is how its tests run where there is no GPU. Results are not
-bit-identical from run to run (atomic additions).
+It also runs on Warp's CPU device, slowly, for tests on machines without a GPU. Results are not bit-identical from run
+to run, because MuJoCo Warp adds with atomic operations.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rlcli.sim.acceleration_stage import force_sensors
 from rlcli.sim.column_views import as_index
 from rlcli.sim.divergence_report import STATE_LIMIT, Divergence, StateLayout
 from rlcli.sim.mask_selection import MaskSelection
-from rlcli.sim.selection import ALL, Field, Selection
+from rlcli.sim.selection import ALL, Field, Groups, Selection
 from rlcli.sim.warp_fields import FORCE, STATE
 from rlcli.sim.warp_memory import OVERFLOW_SETTINGS, overflow_error
 from rlcli.sim.warp_rays import RayCaster
@@ -28,13 +28,13 @@ from rlcli.sim.warp_state import WarpState
 
 
 class WarpEngine(WarpState):
-    """Many worlds of one model on a GPU.
+    """Engine that steps many worlds of one model on a GPU.
 
     Args:
         model: the compiled model.
-        num_envs: worlds.
-        config: of the simulation. With `external_forces`, `cfrc_ext` is computed, which MuJoCo Warp does for models
-            with certain sensors alone.
+        num_envs: number of worlds.
+        config: configuration of the simulation. With `external_forces`, `cfrc_ext` is computed for every model; MuJoCo
+            Warp itself computes it only for models with certain sensors.
         device: cuda, cuda:N, or cpu.
 
     Raises:
@@ -45,7 +45,7 @@ class WarpEngine(WarpState):
     threads = 1
     asynchronous = True
     replayable = None
-    """A GPU does not give the same bits again."""
+    """None: a GPU does not compute the same bits again."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, config: SimConfig, device: str) -> None:
         super().__init__(model, num_envs, config, device)
@@ -57,7 +57,7 @@ class WarpEngine(WarpState):
         self._force_columns = as_index(force_sensors(model), self.device)
         self._ray_caster = RayCaster(self._model, self._data, num_envs)
         self._checked: list[str] = []
-        """What `check_finite` has been called with; the index of each is that of its flag."""
+        """Names of the values passed to `check_finite`; the index of a name is the index of its flag."""
         with self._setting_up():
             self._default_qpos = torch.tensor(model.qpos0, dtype=torch.float32, device=self.device)
             self._default_qvel = torch.zeros(model.nv, device=self.device)
@@ -69,17 +69,17 @@ class WarpEngine(WarpState):
 
     @property
     def divergences(self) -> int:
-        """Number of worlds that diverged, ever; waits for the device."""
+        """Number of divergences since the start; reading it waits for the device."""
         return int(self._counts.sum())
 
     @property
     def divergence_causes(self) -> dict[str, int]:
-        """Number of worlds that diverged, by cause; waits for the device."""
+        """Number of divergences since the start, by cause; reading it waits for the device."""
         return {name: count for name, count in zip(warp_kernels.CAUSES, self._counts.tolist(), strict=True) if count}
 
     @property
     def described_divergences(self) -> list[Divergence]:
-        """The first world that ever diverged; waits for the device."""
+        """First divergence since the start, or an empty list; reading it waits for the device."""
         world, cause, column = self._first.tolist()
         if not world:
             return []
@@ -87,7 +87,7 @@ class WarpEngine(WarpState):
         return [Divergence(world - 1, name, StateLayout(self.model, {}).element_at(name.split()[0], column))]
 
     def use_torch_stream(self) -> None:
-        """Let Warp launch on torch's current stream, so that the two take turns."""
+        """Launch Warp's kernels on torch's current stream, so that kernels of both run in order."""
         if self.device.type == "cuda":
             stream = torch.cuda.current_stream(self.device)
             if self._device.stream.cuda_stream != stream.cuda_stream:
@@ -105,9 +105,10 @@ class WarpEngine(WarpState):
                 self._graphs[nstep, derive] = self._capture(nstep, derive)
 
     def diverged(self, motion_is_finite: bool = False) -> Tensor:
-        """Return the worlds that the last step drove out of bounds. (num_envs,)
+        """Return the worlds that diverged in the last step, (num_envs,) bool.
 
-        They are back in the state before the step, at rest, and so are their bound derived fields, which terms read.
+        Their state before the step has been restored, with controls and warm start set to 0. This call also restores
+        their bound derived fields, which terms read.
         """
         with self._launching():
             for name, last in self._last_derived.items():
@@ -115,9 +116,9 @@ class WarpEngine(WarpState):
         return self._diverged
 
     def forward(self, selection: Selection) -> None:
-        """Compute the bound derived fields; those of the acceleration stage for the selected worlds only.
+        """Compute the bound derived fields; those of the acceleration stage only in the selected worlds.
 
-        A selected world goes back to its present state if it diverges.
+        The present state of the selected worlds is saved, and restored if they diverge in the next step.
         """
         assert isinstance(selection, MaskSelection)
         self._forward(selection)
@@ -128,7 +129,7 @@ class WarpEngine(WarpState):
                 self._launch_rows(warp_kernels.save_rows, selection.mask, now, last)
 
     def reset(self, selection: Selection) -> None:
-        """Put the selected worlds into the default state, applied forces included."""
+        """Put the selected worlds into the default state, including applied forces."""
         assert isinstance(selection, MaskSelection)
         with self._launching():
             wp.launch(
@@ -155,41 +156,35 @@ class WarpEngine(WarpState):
         return tensor
 
     def select(self, mask: Field, seed: int, counters: Field) -> MaskSelection:
-        """Return the worlds where `mask` holds; only the device knows whether there are any."""
+        """Return a selection of the worlds where `mask` is true; it is never None, as that would wait for the device."""
         assert isinstance(mask, Tensor)
         assert isinstance(counters, Tensor)
         return MaskSelection(mask, seed, counters, shared_streams=self.shared_streams)
 
     def rays(
-        self,
-        points: Tensor,
-        directions: Tensor,
-        *,
-        groups: tuple[int, ...] | None = None,
-        exclude: int = -1,
-        selection: Selection | None = None,
+        self, points: Tensor, directions: Tensor, *, groups: Groups, exclude: int, selection: Selection | None
     ) -> Tensor:
-        """Return distances from points to the first geom along unit directions, -1 for none. (num_envs, rays)"""
-        self.field("geom_xpos")  # current from now on
+        """Return distances from points to the first geom along unit directions, -1 for none. (num_envs, rays) [m]"""
+        self.field("geom_xpos")  # bind it, so that every step updates the geoms' positions
         with self._launching():
             return self._ray_caster.cast(points, directions, groups, exclude)
 
     def check_finite(self, values: Tensor, what: str) -> None:
-        """Have the device check whether all values are finite; `report_nonfinite` returns the result."""
+        """Launch a check of whether all values are finite; `report_nonfinite` returns its result."""
         if what not in self._checked:
             self._checked.append(what)
             if len(self._checked) > len(self._flags):
                 self._flags = torch.cat([self._flags, torch.zeros_like(self._flags)])
         with self._launching():
-            flat = values.view(len(values), -1) if values.is_contiguous() else values.contiguous().view(len(values), -1)
+            flat = values.contiguous().view(len(values), -1)
             inputs = [wp.from_torch(flat), wp.from_torch(self._flags), self._checked.index(what)]
             wp.launch(warp_kernels.flag_nonfinite, dim=tuple(flat.shape), inputs=inputs, device=self._device)
 
     def report_nonfinite(self) -> list[str]:
-        """Return what was not finite since the last call.
+        """Return the names of the values that were not finite since the last call.
 
         Raises:
-            DivergedError: if contacts or constraints did not fit, with the setting to raise.
+            DivergedError: if contacts or constraints exceeded their capacity; the hint has the setting to raise.
         """
         flags = self._flags.tolist()
         found = 0
@@ -203,12 +198,12 @@ class WarpEngine(WarpState):
         return [what for what, flag in zip(self._checked, flags, strict=False) if flag]
 
     def close(self) -> None:
-        """Drop the captured graphs; Python frees the memory."""
+        """Drop the captured CUDA graphs; Python frees the memory."""
         self._graphs.clear()
 
     def _advance(self, nstep: int, derive: bool) -> None:
         for _ in range(nstep):
-            self._catch_up()
+            self._update_velocities()
             mjw.step(self._model, self._data)
         if derive and self._external_forces:
             mjw.rne_postconstraint(self._model, self._data)
@@ -218,7 +213,7 @@ class WarpEngine(WarpState):
             self._derive()
 
     def _check_bounds(self) -> None:
-        """Put diverged worlds back, before anything is derived from their state."""
+        """Restore diverged worlds before fields are derived from their state."""
         last, found = (self._last_qpos, self._last_qvel), (self._diverged, self._counts, self._first, self._overflowed)
         wp.launch(
             warp_kernels.check_bounds,
@@ -234,10 +229,11 @@ class WarpEngine(WarpState):
             with self._launching():
                 self._derive()
             return
-        before = self._before_forward()
+        before = self._substep_values()
         with self._launching():
-            self._catch_up()
+            self._update_velocities()
             mjw.forward(self._model, self._data)
+        # a forward pass computes all worlds: restore those that are not selected
         for name, old in before.items():
             now = self.field(name)
             new = now.clone()
@@ -251,7 +247,7 @@ class WarpEngine(WarpState):
         wp.launch(kernel, dim=flat[0].shape, inputs=[wp.from_torch(mask), *flat], device=self._device)
 
     def _capture(self, nstep: int, derive: bool) -> Any:
-        stream = wp.Stream(self._device)  # torch's default stream cannot be recorded
+        stream = wp.Stream(self._device)  # torch's default stream cannot be captured
         with wp.ScopedStream(stream), wp.ScopedCapture(stream=stream, force_module_load=False) as capture:
             self._advance(nstep, derive)
         return capture.graph

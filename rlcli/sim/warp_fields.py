@@ -1,4 +1,4 @@
-"""Fields of the GPU engine's worlds: which are state, and which stage of a step computes the others."""
+"""Fields of the GPU engine's worlds: the state, and the stage of a step that computes each derived field."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import mujoco
 from rlcli.sim.acceleration_stage import ACCELERATION_FIELDS, force_sensors
 
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
-"""What every world carries from step to step, and every reset restores."""
+"""Fields of the state, which every reset restores."""
 INPUTS = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
-"""Further state, with the model's values until a term binds it."""
+"""Further fields of the state, which have the model's values until a term binds them."""
 _KINEMATIC_FIELDS = frozenset(
     [
         *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos"),
         *("site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir", "subtree_com", "ten_length", "cinert"),
     ]
 )
-"""Derived fields of the position stage that kinematics alone give."""
+"""Derived fields of the position stage that need only kinematics."""
 _MOTION_FIELDS = frozenset(["cvel", "cdof", "cdof_dot"])
-"""Fields of the velocity stage that the motion of bodies alone gives: no inertias, no contacts, no constraints."""
+"""Derived fields of the velocity stage that need only the motion of bodies: no inertias, contacts and constraints."""
 _MOTION_SENSORS = frozenset(
     int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
     for name in (
@@ -27,13 +27,13 @@ _MOTION_SENSORS = frozenset(
         *("JOINTVEL", "BALLANGVEL", "FRAMELINVEL", "FRAMEANGVEL", "SUBTREELINVEL", "SUBTREEANGMOM"),
     )
 )
-"""Sensors before the acceleration stage that read nothing else."""
+"""Sensors of the position and velocity stages that need only the motion of bodies."""
 KINEMATICS, VELOCITY, FORCE = range(3)
-"""Groups of derived fields."""
+"""Groups of derived fields, by the stage that computes them."""
 
 
 class FieldStages:
-    """The stages that compute the fields of a model's worlds."""
+    """Stages that compute the fields of a model's worlds."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         force_columns = force_sensors(model)

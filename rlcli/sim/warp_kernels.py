@@ -1,15 +1,15 @@
 """Warp kernels of the GPU engine: counter-based random numbers, the check for divergence, resets by mask.
 
-Each does in one launch what would take torch ten: inside a captured step the launches are what costs.
+Each kernel replaces about ten launches of torch: in a captured step, the number of launches determines the time.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-wp.config.log_level = wp.LOG_ERROR  # standard output belongs to data
+wp.config.log_level = wp.LOG_ERROR  # keep Warp's messages out of the standard output of commands
 wp.init()
-# nothing here is differentiated: half the code to compile
+# without code for gradients, which are not needed, kernels compile in half the time
 wp.set_module_options({"enable_backward": False})
 
 _GOLDEN = wp.constant(wp.uint64(0x9E3779B97F4A7C15))
@@ -18,12 +18,12 @@ _MIX2 = wp.constant(wp.uint64(0x94D049BB133111EB))
 _TO_UNIT = wp.constant(wp.float32(2.0**-24))
 _TOO_LARGE = wp.constant(wp.float32(1e10))
 CAUSES = ("qpos not finite", "qpos out of bounds", "qvel not finite", "qvel out of bounds")
-"""Causes of a divergence, by number."""
+"""Causes of a divergence; `check_bounds` counts each by its index."""
 
 
 @wp.func
 def mix(x: wp.uint64) -> wp.uint64:
-    """SplitMix64's finaliser, as `rlcli.random.mix`."""
+    """Return the output of SplitMix64's finaliser, as `rlcli.random.mix` does."""
     x = x ^ (x >> wp.uint64(30))
     x = x * _MIX1
     x = x ^ (x >> wp.uint64(27))
@@ -33,7 +33,7 @@ def mix(x: wp.uint64) -> wp.uint64:
 
 @wp.func
 def unit(start: wp.uint64, counter: wp.int64, stream: wp.uint64, env: int, index: int) -> float:
-    """The `index`th number of a stream in an environment, in [0, 1): the bits of `rlcli.random.uniform`."""
+    """Return the number of an index in a random stream, in [0, 1), with the bits of `rlcli.random.uniform`."""
     key = mix(mix(wp.uint64(env) * _GOLDEN + start) + wp.uint64(counter) * _GOLDEN)
     word = mix(key + wp.uint64(index + 1) * _GOLDEN + stream)
     return wp.float32(word >> wp.uint64(40)) * _TO_UNIT
@@ -50,7 +50,7 @@ def draw_uniform(
     span: float,
     out: wp.array2d(dtype=float),
 ):
-    """Uniform in [low, low + span). out (num_envs, count)"""
+    """Draw uniform numbers in [low, low + span). out (num_envs, count)"""
     env, column = wp.tid()
     out[env, column] = unit(start, counters[env], stream, env % num_streams, index + column) * span + low
 
@@ -64,7 +64,7 @@ def draw_normal(
     num_streams: int,
     out: wp.array2d(dtype=float),
 ):
-    """Standard normal, by Box and Muller. out (num_envs, count)"""
+    """Draw standard normal numbers with the Box-Muller transform. out (num_envs, count)"""
     env, column = wp.tid()
     count = out.shape[1]
     u = unit(start, counters[env], stream, env % num_streams, index + column)
@@ -88,13 +88,14 @@ def check_bounds(
     first: wp.array(dtype=wp.int32),
     overflowed: wp.array(dtype=wp.int32),
 ):
-    """Find worlds whose state is not finite, beyond MuJoCo's limit or too fast; restore their last good state.
+    """Find worlds whose state is not finite, beyond MuJoCo's limit or too fast, and restore their last good state.
 
-    `counts` has a number for each of `CAUSES`; `first` holds the number of the first such world ever, counted from 1,
-    with its cause and the column. Overflows of capacities are added to `overflowed`, except for diverged worlds.
+    `counts` has the number of divergences by index of `CAUSES`. `first` has the first world that diverged since the
+    start, counted from 1, its cause and its column. Exceeded capacities are added to `overflowed`, except those of
+    diverged worlds.
     """
     world = wp.tid()
-    bad = wp.int32(0)  # a plain number would be a constant
+    bad = wp.int32(0)  # 0 or index in CAUSES + 1; wp.int32, because Warp treats a plain number as a constant
     column = wp.int32(0)
     for i in range(qvel.shape[1]):
         x = qvel[world, i]
@@ -150,7 +151,7 @@ def restore_diverged(diverged: wp.array(dtype=wp.bool), now: wp.array2d(dtype=fl
 
 @wp.kernel
 def save_rows(mask: wp.array(dtype=wp.bool), now: wp.array2d(dtype=float), last: wp.array2d(dtype=float)):
-    """Save the masked rows as the last ones."""
+    """Save the masked rows as their last values."""
     world, column = wp.tid()
     if mask[world]:
         last[world, column] = now[world, column]
@@ -185,7 +186,7 @@ def reset_worlds(
 
 @wp.kernel
 def flag_nonfinite(values: wp.array2d(dtype=float), flag: wp.array(dtype=wp.int32), index: int):
-    """Raise a flag if a value is not finite."""
+    """Set a flag to 1 if a value is not finite."""
     row, column = wp.tid()
     if not wp.isfinite(values[row, column]):
         flag[index] = 1

@@ -1,4 +1,4 @@
-"""Memory of the GPU engine: for a model and its worlds, and for their contacts and constraints."""
+"""Memory of the GPU engine: model and worlds on the device, and the capacity for contacts and constraints."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import mujoco_warp as mjw
 import torch
 import warp as wp
 
-from rlcli.errors import ConfigError, DeviceError, DivergedError, Problem
+from rlcli.errors import ConfigError, DeviceError, DivergedError, Problem, one_line
 from rlcli.sim.capacity import Capacity
 from rlcli.sim.skippable_work import skippable_flags
 
@@ -23,13 +23,13 @@ OVERFLOW_SETTINGS = {
     mjw.OverflowType.HFIELD: "contacts_per_env",
     mjw.OverflowType.EPA_HORIZON: "contacts_per_env",
 }
-"""Capacities that a step may exceed -> the setting that raises them. Solver iterations are no capacity."""
+"""Capacity that a step may exceed -> setting that raises it. Overflows of solver iterations are not included."""
 
 
 def put_on_device(
     model: mujoco.MjModel, num_envs: int, device: torch.device, capacity: Capacity
 ) -> tuple[mjw.Model, mjw.Data]:
-    """Put a model and its worlds on a device; called where Warp launches there.
+    """Put a model and its worlds on a device, which must be Warp's current device.
 
     Raises:
         ConfigError: for a model that MuJoCo Warp cannot run.
@@ -39,14 +39,14 @@ def put_on_device(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             on_device = mjw.put_model(model)
-        if not on_device.nsensorcollision:  # the same pass measures distances
+        if not on_device.nsensorcollision:  # distance sensors need the collision pass
             on_device.opt.disableflags |= skippable_flags(model) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-        on_device.opt.warn_overflow = 0  # printing stops the device; `report_nonfinite` raises
+        on_device.opt.warn_overflow = 0  # printing waits for the device; `report_nonfinite` raises instead
         if device.type == "cpu":
             on_device.opt.graph_conditional = False
     except (NotImplementedError, ValueError) as error:
-        message = f"the GPU engine (MuJoCo Warp) cannot run this model: {' '.join(str(error).split())}"
-        hint = "--device cpu runs it; or change the option in the MJCF"
+        message = f"the GPU engine (MuJoCo Warp) cannot run this model: {one_line(error)}"
+        hint = "use --device cpu, or change the option in the MJCF"
         raise ConfigError([Problem("scene", "", message, hint)]) from None
     try:
         return on_device, _make_data(model, num_envs, capacity)
@@ -57,15 +57,15 @@ def put_on_device(
 
 
 def overflow_error(found: int, capacity: Capacity) -> DivergedError:
-    """Return what to raise for exceeded capacities; `found` has the bit of each."""
+    """Return the error for exceeded capacities; `found` has a bit of `OVERFLOW_SETTINGS` for each."""
     settings = {setting for bit, setting in OVERFLOW_SETTINGS.items() if found & int(bit)}
     kinds = " and ".join(bit.name.lower() for bit in OVERFLOW_SETTINGS if found & int(bit) and bit.name)
     now = {"contacts_per_env": capacity.contacts, "constraints_per_env": capacity.constraints}
     advice = " ".join(f"sim.{setting}={2 * now[setting]}" for setting in sorted(settings))
     return DivergedError(
-        f"the GPU engine ran out of room ({kinds}): {capacity.contacts} contacts and {capacity.constraints} constraints"
-        " an environment were set aside, and the results since are wrong",
-        hint=f"give it more: {advice}",
+        f"the GPU engine ran out of memory for contacts ({kinds}): it has {capacity.contacts} contacts and"
+        f" {capacity.constraints} constraints per environment; the results since the overflow are wrong",
+        hint=f"raise the capacity: {advice}",
     )
 
 
@@ -74,18 +74,18 @@ def _make_data(model: mujoco.MjModel, num_envs: int, capacity: Capacity) -> mjw.
 
 
 def _memory_error(model: mujoco.MjModel, num_envs: int, device: torch.device, capacity: Capacity) -> DeviceError:
-    some = 64
-    sample = sum(_byte_count(value) for value in vars(_make_data(model, some, capacity)).values())
+    """Return an error with the needed and the free memory, and a number of environments that would fit."""
+    sample = 64
+    each = sum(_byte_count(value) for value in vars(_make_data(model, sample, capacity)).values()) / sample
     free = wp.device_from_torch(device).free_memory if device.type == "cuda" else 0
-    fits = int(0.8 * free / (sample / some))
     return DeviceError(
-        f"{num_envs} environments need {sample / some * num_envs / 2**30:.1f} GiB,"
-        f" {free / 2**30:.1f} GiB are free on {device}",
-        hint=f"--num-envs {max(1, fits)} would fit",
+        f"{num_envs} environments need {each * num_envs / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free on {device}",
+        hint=f"--num-envs {max(1, int(0.8 * free / each))} would fit",
     )
 
 
 def _byte_count(value: object) -> int:
+    """Return the bytes of a Warp array, or of all arrays in a dataclass."""
     if isinstance(value, wp.array):
         return int(value.capacity)
     if dataclasses.is_dataclass(value):

@@ -1,4 +1,4 @@
-"""The model of the GPU engine's worlds on its device, and the model fields that differ between them."""
+"""Model of the GPU engine's worlds on its device, and the model fields that differ between them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _BOUNDS = ("geom_aabb", "geom_rbound")
 
 
 class WarpModel:
-    """Worlds on a device of Warp, and the model fields that differ between them.
+    """Base of the GPU engine: its worlds on a device of Warp, and the model fields that differ between them.
 
     Raises:
         ConfigError: for a model that MuJoCo Warp cannot run.
@@ -48,7 +48,7 @@ class WarpModel:
             self.device = torch.device("cuda", torch.cuda.current_device())
         self._device = wp.device_from_torch(self.device)
         self._graphs: dict[tuple[int, bool], Any] = {}
-        """Captured steps, by `nstep` and `derive`."""
+        """CUDA graphs of `step`, by `nstep` and `derive`."""
         self._expanded: dict[str, Tensor] = {}
         with self._setting_up():
             self._model, self._data = put_on_device(model, num_envs, self.device, self.capacity)
@@ -82,7 +82,7 @@ class WarpModel:
         return list(self._expanded)
 
     def set_constants(self, selection: Selection | None = None) -> None:
-        """Recompute the constants that MuJoCo derives from model fields."""
+        """Recompute the constants that MuJoCo derives from model fields, in all worlds."""
         for name in (*_CONSTANTS, *(_BOUNDS if "geom_size" in self._expanded else ())):
             array = getattr(self._model, name, None)
             if array is not None and array.size:
@@ -91,6 +91,7 @@ class WarpModel:
             mjw.set_const(self._model, self._data)
 
     def _owner(self, name: str) -> tuple[Any, str]:
+        """Return the structure of MuJoCo Warp that has a model field, and the field's name in it."""
         return (self._model.opt, name[4:]) if name.startswith("opt.") else (self._model, name)
 
     @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""The fields of the GPU engine's worlds: bound, derived from the state, and saved."""
+"""Fields of the GPU engine's worlds: bound, derived from the state, and saved in checkpoints."""
 
 from __future__ import annotations
 
@@ -15,28 +15,30 @@ from torch import Tensor
 
 from rlcli.config.schema import SimConfig
 from rlcli.errors import did_you_mean
-from rlcli.sim.tensor_state import require_matching_tensors
+from rlcli.sim.tensor_state import require_matching_tensors, substate
 from rlcli.sim.warp_fields import FORCE, INPUTS, KINEMATICS, STATE, VELOCITY, FieldStages
 from rlcli.sim.warp_model import WarpModel
 
 _HOLDING_EQUALITIES = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
-"""Equality constraints that hold bodies together."""
+"""Types of equality constraints that hold bodies together."""
 
 
 class WarpState(WarpModel):
-    """Worlds on a device of Warp, and their fields."""
+    """Base of the GPU engine: its worlds on a device of Warp, and their fields."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, config: SimConfig, device: str) -> None:
         super().__init__(model, num_envs, config, device)
         self._fields: dict[str, Tensor] = {}
         """Bound fields of the data."""
         self._start_inputs: dict[str, Tensor] = {}
+        """Default values of bound `INPUTS`, which a reset restores."""
         self._last_derived: dict[str, Tensor] = {}
-        """Derived fields of the last state that did not diverge."""
+        """Derived fields of each world's last state that did not diverge."""
         self._derived: set[int] = set()
         """Groups of derived fields that are bound."""
-        self._motion_alone = True
+        self._needs_only_motion = True
         self._overwritten: dict[str, wp.array] = {}
+        """Copies of fields that `fwd_velocity` overwrites."""
         self._substep_fields = config.derived_fields == "substep"
         self._stages = FieldStages(model)
         self._holds_bodies = bool(np.isin(model.eq_type, _HOLDING_EQUALITIES).any())
@@ -47,27 +49,27 @@ class WarpState(WarpModel):
             self._last_qpos, self._last_qvel = qpos.clone(), qvel.clone()
 
     def field(self, name: str) -> Tensor:
-        """Return a live view of an MjData field; for a derived one, `step` computes its stage from now on."""
+        """Return a live view of an MjData field; from now on, `step` computes the stage of a derived field."""
         if name not in self._fields:
             array = getattr(self._data, name, None)
             if not isinstance(array, wp.array) or array.ndim == 0 or array.shape[0] != self.num_envs:
                 known = [f.name for f in dataclasses.fields(self._data)]
                 raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {did_you_mean(name, known) or ''}")
-            kept = self._before_forward()
+            saved = self._substep_values()
             self._fields[name] = wp.to_torch(array)
-            if name in INPUTS:  # still as the model has it
+            if name in INPUTS:  # it still has the model's value
                 self._start_inputs[name] = self._fields[name].view(self.num_envs, -1).clone()
             stages = self._stages.stages_of(name)
             self._derived |= stages
-            self._motion_alone = all(map(self._stages.needs_only_motion, self._fields))
-            if name in ("cacc", "cfrc_int"):  # the velocity stage uses their memory for its own accelerations
+            self._needs_only_motion = all(map(self._stages.needs_only_motion, self._fields))
+            if name in ("cacc", "cfrc_int"):  # the velocity stage uses their memory for intermediate values
                 self._overwritten[name] = wp.empty_like(array)
-            self._graphs.clear()
+            self._graphs.clear()  # they do not compute the new field
             if stages:
                 with self._launching():
-                    self._catch_up()
-                    mjw.forward(self._model, self._data)  # a field that is bound late is that of the state
-                for other, values in kept.items():
+                    self._update_velocities()
+                    mjw.forward(self._model, self._data)  # compute the new field from the present state
+                for other, values in saved.items():
                     self._fields[other].copy_(values)
                 if FORCE in stages or (self._substep_fields and self._fields[name].dtype == torch.float32):
                     self._last_derived[name] = self._fields[name].clone()
@@ -85,17 +87,15 @@ class WarpState(WarpModel):
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore the state returned by `state_dict()`; compute derived fields anew."""
-        for name, values in state.items():
-            if name.startswith("model."):
-                field = name.removeprefix("model.")
-                if not values.is_floating_point() and self.expanded(field) is None:
-                    raise ValueError(f"model field '{field}' is part of the model's structure, and not the model's")
-                require_matching_tensors({field: values}, {field: self.expand(field)}, "engine")
-                self.expand(field).copy_(values)
-        substep = {n.removeprefix("substep."): values for n, values in state.items() if n.startswith("substep.")}
+        """Restore the state returned by `state_dict()`, and compute derived fields again."""
+        for name, values in substate(state, "model.").items():
+            if not values.is_floating_point() and self.expanded(name) is None:
+                raise ValueError(f"model field '{name}' is part of the model's structure and must equal the model's")
+            require_matching_tensors({name: values}, {name: self.expand(name)}, "engine")
+            self.expand(name).copy_(values)
+        substep = substate(state, "substep.")
         for name in substep:
-            self.field(name)  # bound when the state was saved; here it may be bound later
+            self.field(name)  # bind it here too; it was bound when the state was saved
         for name, values in state.items():
             if name in (*STATE, *INPUTS):
                 self.field(name).copy_(values)
@@ -109,7 +109,7 @@ class WarpState(WarpModel):
             last.copy_(self._fields[name])
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return a world as MjModel and MjData, forwarded. Later calls for the same world update the same objects."""
+        """Return the model and the data of a world after `mj_forward`; a later call for it updates the same objects."""
         if env not in self._worlds:
             model = copy.copy(self.model)
             self._worlds[env] = (model, mujoco.MjData(model))
@@ -128,10 +128,10 @@ class WarpState(WarpModel):
         mujoco.mj_forward(model, data)
         return model, data
 
-    def _catch_up(self) -> None:
-        """Compute the velocities of bodies before constraints use them.
+    def _update_velocities(self) -> None:
+        """Compute the velocities of bodies before connect and weld constraints use them.
 
-        MuJoCo Warp 4.0 makes connect and weld constraints first, from the velocities of the last pass: those of the
+        MuJoCo Warp 4.0 makes these constraints before it updates the velocities. They would use the velocities of the
         step before, or of the episode before.
         """
         if self._holds_bodies:
@@ -139,33 +139,33 @@ class WarpState(WarpModel):
             mjw.com_vel(self._model, self._data)
 
     def _derive(self) -> None:
-        """Compute the bound derived fields from the state; those of forces are the last substep's."""
+        """Compute the bound derived fields from the state, except those of the acceleration stage."""
         m, d = self._model, self._data
         if VELOCITY not in self._derived:
             if KINEMATICS in self._derived:
                 mjw.fwd_kinematics(m, d)
             return
-        if self._motion_alone:
+        if self._needs_only_motion:
             mjw.fwd_kinematics(m, d)
             mjw.com_vel(m, d)
         else:
-            self._catch_up()
+            self._update_velocities()
             mjw.fwd_position(m, d, factorize=False)
-            for name, kept in self._overwritten.items():
-                wp.copy(kept, getattr(d, name))
+            for name, saved in self._overwritten.items():
+                wp.copy(saved, getattr(d, name))
             mjw.fwd_velocity(m, d)
-            for name, kept in self._overwritten.items():
-                wp.copy(getattr(d, name), kept)
+            for name, saved in self._overwritten.items():
+                wp.copy(getattr(d, name), saved)
         if "sensordata" in self._fields:
             mjw.sensor_pos(m, d)
             mjw.sensor_vel(m, d)
 
     def _of_substep(self) -> list[str]:
-        """Return the bound fields that hold values of the last substep."""
+        """Return the bound fields that have values of the last substep, which the state does not determine."""
         stages = {name: self._stages.stages_of(name) for name in self._fields}
         return [name for name, of in stages.items() if FORCE in of or (self._substep_fields and of)]
 
-    def _before_forward(self) -> dict[str, Tensor]:
-        """Return copies of the values of the last substep that a forward pass would overwrite."""
+    def _substep_values(self) -> dict[str, Tensor]:
+        """Return copies of the values of the last substep, which a forward pass would overwrite."""
         names = [*self._of_substep(), "qacc_warmstart"]
         return {name: self._fields[name].clone() for name in names if name in self._fields}
