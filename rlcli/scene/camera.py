@@ -9,6 +9,7 @@ import queue
 import threading
 import weakref
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, wait
 from typing import Any
 
 import mujoco
@@ -154,8 +155,8 @@ class CameraRenderer:
             return
         nearness = np.empty((rect.height, rect.width), np.float32)
         mujoco.mjr_readPixels(None, nearness, rect, self._mjr)
-        metres = _depth_in_metres(nearness, scene.camera[0], along_ray=config.data == "distance")
-        out[:] = _downsample(metres[..., None], config.samples)
+        depths = _depths(nearness, scene.camera[0], along_ray=config.data == "distance")
+        out[:] = _downsample(depths[..., None], config.samples)
 
     def free(self) -> None:
         """Free the context."""
@@ -183,7 +184,7 @@ class RendererPool:
         self._end = weakref.finalize(self, _end_threads, self._orders, self._threads, self._process)
         for number in range(threads):  # one after the other: the first one finds out which OpenGL works
             orders: _Orders = queue.SimpleQueue()
-            ready: _Replies = queue.SimpleQueue()
+            ready: Future[None] = Future()
             thread = threading.Thread(
                 target=_render_orders,
                 args=(model, width, height, orders, ready),
@@ -194,7 +195,7 @@ class RendererPool:
             self._orders.append(orders)
             self._threads.append(thread)
             try:
-                _raise(ready.get())
+                ready.result()
             except BaseException:
                 self.close()
                 raise
@@ -217,12 +218,12 @@ class RendererPool:
             )
         if not self._end.alive:
             raise MachineError("the environment is closed: its cameras cannot render any more")
-        done: _Replies = queue.SimpleQueue()
-        for function, orders in zip(work, self._orders, strict=False):
-            orders.put((function, done))
-        replies = [done.get() for _ in work]  # wait for all threads before an error is raised
-        for reply in replies:
-            _raise(reply)
+        futures: list[Future[None]] = [Future() for _ in work]
+        for function, future, orders in zip(work, futures, self._orders, strict=False):
+            orders.put((function, future))
+        wait(futures)  # for all threads, before an error is raised
+        for future in futures:
+            future.result()
 
     def close(self) -> None:
         """End the threads, each of which frees its context."""
@@ -251,27 +252,24 @@ def make_cameras(specs: Mapping[str, CameraSensorSpec], engine: Engine) -> dict[
     return {name: CameraSensor(name, spec, states, renderers) for name, spec in specs.items()}
 
 
-_Replies = queue.SimpleQueue[BaseException | None]
-_Orders = queue.SimpleQueue[tuple[Callable[[CameraRenderer], None], _Replies] | None]
+_Orders = queue.SimpleQueue[tuple[Callable[[CameraRenderer], None], Future[None]] | None]
 
 
-def _render_orders(model: mujoco.MjModel, width: int, height: int, orders: _Orders, ready: _Replies) -> None:
+def _render_orders(model: mujoco.MjModel, width: int, height: int, orders: _Orders, ready: Future[None]) -> None:
     """Run the main loop of a thread: OpenGL requires that one thread makes, uses and frees a context."""
     try:
         renderer = CameraRenderer(model, width, height)
     except BaseException as error:
-        ready.put(error)
+        ready.set_exception(error)
         return
-    ready.put(None)
+    ready.set_result(None)
     while (order := orders.get()) is not None:
-        function, done = order
+        function, future = order
         try:
-            function(renderer)
+            future.set_result(function(renderer))
         except BaseException as error:
-            done.put(error)
-        else:
-            done.put(None)
-        del order, function, done  # hold no reference to an environment while waiting
+            future.set_exception(error)
+        del order, function, future  # hold no reference to an environment while waiting
     renderer.free()
 
 
@@ -285,11 +283,6 @@ def _end_threads(orders: list[_Orders], threads: list[threading.Thread], process
             thread.join(_JOIN_TIMEOUT)
 
 
-def _raise(reply: BaseException | None) -> None:
-    if reply is not None:
-        raise reply
-
-
 def _set_clip_planes(view: mujoco.MjvGLCamera, near: float, far: float) -> None:
     """Set the near and the far plane without changing the field of view."""
     if not view.orthographic:
@@ -299,23 +292,21 @@ def _set_clip_planes(view: mujoco.MjvGLCamera, near: float, far: float) -> None:
     view.frustum_near, view.frustum_far = near, far
 
 
-def _depth_in_metres(
-    nearness: NDArray[np.float32], view: mujoco.MjvGLCamera, *, along_ray: bool
-) -> NDArray[np.float32]:
+def _depths(nearness: NDArray[np.float32], view: mujoco.MjvGLCamera, *, along_ray: bool) -> NDArray[np.float32]:
     """Return the depths of a depth buffer that is 1 at the near plane and 0 at the far one. (h, w) [m]
 
     Depths are along the camera's axis, or along the ray through each pixel; 0 where nothing is seen.
     """
     near, far = np.float32(view.frustum_near), np.float32(view.frustum_far)
     if view.orthographic:
-        metres = far - nearness * (far - near)
+        depths = far - nearness * (far - near)
     else:
-        metres = near * far / (near + nearness * (far - near))
+        depths = near * far / (near + nearness * (far - near))
         if along_ray:
             height, width = nearness.shape
-            metres *= _ray_lengths(height, width, view)
-    metres[nearness == 0.0] = 0.0
-    return metres
+            depths *= _ray_lengths(height, width, view)
+    depths[nearness == 0.0] = 0.0
+    return depths
 
 
 def _ray_lengths(height: int, width: int, view: mujoco.MjvGLCamera) -> NDArray[np.float32]:

@@ -67,10 +67,8 @@ class EntityData:
         """Default joint velocities. (num_envs, k) [m/s or rad/s]"""
         self.default_root_state = default_root_state(entity).to(device).expand(num_envs, -1).clone()
         """Default root pose and velocity: position, quat (w, x, y, z), linear, angular. (num_envs, 13)"""
-        self.joint_vel_limits = torch.tensor(
-            [joint_settings(entity.config, name).velocity_limit or math.inf for name in entity.joint_names],
-            device=device,
-        )
+        speeds = [joint_settings(entity.config, name).velocity_limit or math.inf for name in entity.joint_names]
+        self.joint_vel_limits = torch.tensor(speeds, device=device)
         """Speed limit of each joint, `velocity_limit`; infinite for a joint without one. (k,) [m/s or rad/s]"""
         self._gravity = torch.tensor(model.opt.gravity, dtype=torch.float32, device=device).expand(num_envs, -1)
         self._down = _direction(self._gravity)
@@ -285,12 +283,14 @@ class EntityData:
     @property
     def body_lin_vel_w(self) -> Tensor:
         """Velocities of the bodies' frame origins, world frame. (num_envs, bodies, 3) [m/s]"""
-        return self._once("body_lin_vel_w", lambda: self._velocity_at(self.body_pos_w))
+        bodies, roots = self._body_index, self._tree_root
+        return self._once("body_lin_vel_w", lambda: self._velocity_at(self.body_pos_w, bodies, roots))
 
     @property
     def body_com_lin_vel_w(self) -> Tensor:
         """Velocities of the bodies' centres of mass, world frame. (num_envs, bodies, 3) [m/s]"""
-        return self._once("body_com_lin_vel_w", lambda: self._velocity_at(self.body_com_pos_w))
+        bodies, roots = self._body_index, self._tree_root
+        return self._once("body_com_lin_vel_w", lambda: self._velocity_at(self.body_com_pos_w, bodies, roots))
 
     @property
     def body_lin_vel_b(self) -> Tensor:
@@ -317,7 +317,7 @@ class EntityData:
         def compute() -> Tensor:
             acceleration = self._body_force("cacc")[:, self._body_index]
             angular, linear = acceleration[..., :3], acceleration[..., 3:]
-            at_origin = linear + cross(angular, self._from_tree_com(self.body_pos_w))
+            at_origin = linear + cross(angular, self._from_tree_com(self.body_pos_w, self._tree_root))
             turning = cross(self.body_ang_vel_w, self.body_lin_vel_w)
             # MuJoCo's cacc contains -gravity, as an accelerometer measures it
             return at_origin + turning + self.gravity_w[:, None]
@@ -334,7 +334,7 @@ class EntityData:
         def compute() -> Tensor:
             wrench = self._body_force("cfrc_int")[:, self._body_index]
             force = wrench[..., 3:]
-            torque = wrench[..., :3] - cross(self._from_tree_com(self.body_pos_w), force)
+            torque = wrench[..., :3] - cross(self._from_tree_com(self.body_pos_w, self._tree_root), force)
             quat = self.body_quat_w
             return torch.cat([rotate_inverse(quat, force), rotate_inverse(quat, torque)], dim=-1)
 
@@ -361,14 +361,8 @@ class EntityData:
     @property
     def site_lin_vel_w(self) -> Tensor:
         """Velocities of the sites, world frame. (num_envs, sites, 3) [m/s]"""
-
-        def compute() -> Tensor:
-            roots = self._tree_root_of_sites
-            arm = self.site_pos_w - self._sim.derived_field("subtree_com")[:, roots]
-            velocity = self._sim.derived_field("cvel")[:, self._site_body]
-            return velocity[..., 3:] + cross(velocity[..., :3], arm)
-
-        return self._once("site_lin_vel_w", compute)
+        bodies, roots = self._site_body, self._tree_root_of_sites
+        return self._once("site_lin_vel_w", lambda: self._velocity_at(self.site_pos_w, bodies, roots))
 
     @property
     def sensordata(self) -> Tensor:
@@ -380,14 +374,15 @@ class EntityData:
         middle, half = 0.5 * (low + high), 0.5 * self._entity.config.soft_joint_pos_limit_factor * (high - low)
         return middle - half, middle + half
 
-    def _velocity_at(self, points: Tensor) -> Tensor:
+    def _velocity_at(self, points: Tensor, bodies: Columns, roots: Tensor) -> Tensor:
         """Return the velocity of a point of each body, world frame. (num_envs, bodies, 3) [m/s]"""
         # MuJoCo's cvel is the velocity at the centre of mass of the body's kinematic tree
-        velocity = self._sim.derived_field("cvel")[:, self._body_index]
-        return velocity[..., 3:] + cross(velocity[..., :3], self._from_tree_com(points))
+        velocity = self._sim.derived_field("cvel")[:, bodies]
+        return velocity[..., 3:] + cross(velocity[..., :3], self._from_tree_com(points, roots))
 
-    def _from_tree_com(self, points: Tensor) -> Tensor:
-        return points - self._sim.derived_field("subtree_com")[:, self._tree_root]
+    def _from_tree_com(self, points: Tensor, roots: Tensor) -> Tensor:
+        """Return the vectors to points from the centres of mass of the kinematic trees with some root bodies."""
+        return points - self._sim.derived_field("subtree_com")[:, roots]
 
     def _body_force(self, name: str) -> Tensor:
         if not self._computes_body_forces:

@@ -22,10 +22,8 @@ def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:
     """
     position = torch.tensor(entity.engine.model.qpos0[entity.qpos_columns.cpu().numpy()], dtype=torch.float32)
     velocity = torch.zeros_like(position)
-    for values, target in (
-        (entity.config.init.joint_pos, position),
-        (entity.config.init.joint_vel, velocity),
-    ):
+    init = entity.config.init
+    for values, target in ((init.joint_pos, position), (init.joint_vel, velocity)):
         for pattern, value in values.items():
             target[match(pattern, entity.joint_names, "joint")] = value
     return position, velocity

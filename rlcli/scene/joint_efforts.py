@@ -43,15 +43,11 @@ class JointEfforts:
             name: torch.tensor(getattr(model, name)[ids][None], dtype=torch.float32, device=device)
             for name in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "actuator_ctrlrange")
         }
-        self._force_limited, self._control_limited = (
-            torch.tensor(values[ids], dtype=torch.bool, device=device)
-            for values in (model.actuator_forcelimited, model.actuator_ctrllimited)
-        )
-        self._joint_limits = torch.full((len(columns),), math.inf, device=device)
-        limited = np.flatnonzero(model.jnt_actfrclimited[entity.joint_ids])
-        for column in limited:
-            high = np.abs(model.jnt_actfrcrange[entity.joint_ids[column]]).max()
-            self._joint_limits[int(column)] = float(high)
+        self._force_limited = torch.tensor(model.actuator_forcelimited[ids], dtype=torch.bool, device=device)
+        self._control_limited = torch.tensor(model.actuator_ctrllimited[ids], dtype=torch.bool, device=device)
+        largest = np.abs(model.jnt_actfrcrange[entity.joint_ids]).max(axis=1)
+        limits = np.where(model.jnt_actfrclimited[entity.joint_ids], largest, math.inf)
+        self._joint_limits = torch.tensor(limits, dtype=torch.float32, device=device)
         self._driven = torch.zeros(len(columns), dtype=torch.bool, device=device)
         self._driven[self._columns] = True
         self._no_range = torch.tensor([-math.inf, math.inf], device=device)

@@ -9,7 +9,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from rlcli.config.schema import EntityConfig, JointConfig
 from rlcli.scene.names import NameProblem, SceneProblem, match
@@ -111,7 +110,7 @@ class SceneJoints:
                 continue
             if change.effort_limit is not None:
                 _limit_effort(actuator, change.effort_limit)
-            kind = _spec_kind(actuator)
+            kind = _actuator_kind(actuator)
             if kind == "position" and change.kp is not None:
                 actuator.gainprm[0], actuator.biasprm[1] = change.kp, -change.kp
             if kind == "velocity" and change.kv is not None:
@@ -121,7 +120,7 @@ class SceneJoints:
 
     def _add_actuator(self, entity: str, joint: str, kind: str) -> None:
         target = f"{entity}/{joint}"
-        if any(a.target == target and _spec_kind(a) == kind for a in self._spec.actuators):
+        if any(a.target == target and _actuator_kind(a) == kind for a in self._spec.actuators):
             return
         settings = joint_settings(self._entities[entity], joint)
         taken = {actuator.name for actuator in self._spec.actuators}
@@ -161,27 +160,22 @@ def joint_settings(entity: EntityConfig, joint: str) -> JointConfig:
 
 def model_actuator_kind(model: mujoco.MjModel, actuator: int) -> str:
     """Return the kind of an actuator of a compiled model: motor, position, velocity or other."""
-    m, a = model, actuator
-    types = m.actuator_trntype[a], m.actuator_dyntype[a], m.actuator_gaintype[a], m.actuator_biastype[a]
-    return _actuator_kind(types, m.actuator_gainprm[a], m.actuator_biasprm[a])
+    return _actuator_kind(model.actuator(actuator))
 
 
-def _spec_kind(a: mujoco.MjsActuator) -> str:
-    types = a.trntype, a.dyntype, a.gaintype, a.biastype
-    return _actuator_kind(types, a.gainprm, a.biasprm)
-
-
-def _actuator_kind(types: tuple[int, int, int, int], gainprm: NDArray[Any], biasprm: NDArray[Any]) -> str:
-    """Return the kind of an actuator, from the types of its transmission, dynamics, gain and bias."""
-    transmission, dynamics, gain, bias = map(int, types)
-    if (transmission, dynamics, gain) != _KNOWN_ACTUATORS:
+def _actuator_kind(actuator: Any) -> str:
+    """Return the kind of an actuator of a specification or of a compiled model."""
+    kinds = (actuator.trntype, actuator.dyntype, actuator.gaintype, actuator.biastype)
+    *known, bias = (int(np.asarray(kind).item()) for kind in kinds)  # arrays of one element in a compiled model
+    gain, biases = actuator.gainprm[0], actuator.biasprm
+    if tuple(known) != _KNOWN_ACTUATORS:
         return "other"
     if bias == int(mujoco.mjtBias.mjBIAS_NONE):
         return "motor"
     if bias == int(mujoco.mjtBias.mjBIAS_AFFINE):
-        if biasprm[1] == -gainprm[0] != 0:
+        if biases[1] == -gain != 0:
             return "position"
-        if biasprm[1] == 0 and biasprm[2] == -gainprm[0] != 0:
+        if biases[1] == 0 and biases[2] == -gain != 0:
             return "velocity"
     return "other"
 

@@ -76,14 +76,14 @@ class SensorBuilder:
 
     def _contacts(self, name: str, config: ContactSensorConfig, path: tuple[str, ...]) -> ContactSensorSpec:
         """Add an MJCF sensor for each pair of a body and a partner, which measures net force and contact count."""
+        prefix = f"{config.entity}/"
         bodies = self._bodies(config.entity, config.bodies, path, "bodies")
         solid = [body for body in self._bodies(config.entity, ".*", path, "bodies") if self._can_touch(body)]
         for body in bodies:
-            if not self._can_touch(body):
-                have = listing([b.removeprefix(f"{config.entity}/") for b in solid]) if solid else "none"
-                short = body.removeprefix(f"{config.entity}/")
-                message = f"body '{short}' has no geom that can touch anything"
-                raise SceneProblem((*path, "bodies"), message, f"bodies with such a geom: {have}")
+            if body not in solid:
+                allowed = listing([b.removeprefix(prefix) for b in solid]) if solid else "none"
+                message = f"body '{body.removeprefix(prefix)}' has no geom that can touch anything"
+                raise SceneProblem((*path, "bodies"), message, f"bodies with such a geom: {allowed}")
         sensors: list[list[str]] = []
         for slot, body in enumerate(bodies):
             sensors.append([])
@@ -95,7 +95,7 @@ class SensorBuilder:
                 sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, body
                 sensor.intprm[:3] = [_FOUND_AND_FORCE, _NET_FORCE, 1]
                 sensors[-1].append(sensor.name)
-        return ContactSensorSpec(config, [body.removeprefix(f"{config.entity}/") for body in bodies], sensors)
+        return ContactSensorSpec(config, [body.removeprefix(prefix) for body in bodies], sensors)
 
     def _contact_partners(
         self, config: ContactSensorConfig, path: tuple[str, ...]

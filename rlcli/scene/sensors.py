@@ -46,13 +46,10 @@ class ContactSensor(TensorState):
         sensors = [engine.model.sensor(name).id for names in spec.sensors for name in names]
         self._columns = as_index(sensor_columns(engine.model, sensors), device)
         engine.field("sensordata")
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(n, *shape, dtype=dtype, device=device)
-
-        self._times, self._flags = zeros(len(_TIMES), k), zeros(len(_FLAGS), k, dtype=torch.bool)
+        self._times = torch.zeros(n, len(_TIMES), k, device=device)
+        self._flags = torch.zeros(n, len(_FLAGS), k, dtype=torch.bool, device=device)
         times, flags = self._times.unbind(1), self._flags.unbind(1)
-        self.force_history = zeros(spec.config.history, k, 3)
+        self.force_history = torch.zeros(n, spec.config.history, k, 3, device=device)
         """Net contact force on each body over the last steps, newest first, world frame. (num_envs, h, k, 3) [N]"""
         self.force = self.force_history[:, 0]
         """Net contact force on each body in the last substep, world frame. (num_envs, k, 3) [N]"""
@@ -130,11 +127,10 @@ class RaySensor(LazySensor):
         self._groups = spec.groups
         self._table = None if spec.ground is None else HeightTable(spec.ground, engine.device)
         self._root = entity.root_qpos if self._body == entity.root_body else None
-        starts, directions = (values.to(engine.device) for values in _pattern(config))
-        self._starts, self._directions = starts, directions
+        self._starts, self._directions = (values.to(engine.device) for values in _pattern(config))
         self._offset = torch.tensor([config.offset], device=engine.device)
         self._unit = torch.eye(3, device=engine.device)
-        n, r = engine.num_envs, len(starts)
+        n, r = engine.num_envs, len(self._starts)
         self.names = [f"ray_{i}" for i in range(r)]
         """Names of the r rays."""
         self._distance = torch.zeros(n, r, device=engine.device)

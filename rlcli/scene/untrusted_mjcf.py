@@ -125,9 +125,8 @@ class _MjcfScan:
 
     def _read_text(self, file: Path) -> None:
         if file.suffix.lower() not in _TEXT:
-            raise BadModel(
-                f"{file}: not MJCF: models are text, {', '.join(_TEXT)}; compiled models (.mjb) are not opened"
-            )
+            allowed = ", ".join(_TEXT)
+            raise BadModel(f"{file}: not MJCF: models are text, {allowed}; compiled models (.mjb) are not opened")
         if len(self._texts) >= _MAX_FILES:
             raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files")
         self._texts.append(file)
@@ -160,13 +159,11 @@ class _MjcfScan:
                 elif key != "filename" or name in ("mesh", "texture"):
                     self._assets.append((file, line, name, value))
 
-        def end(name: str) -> None:
-            copies.pop()
-
         def refuse(*_: Any) -> None:
             raise BadModel(f"{file}:{parser.CurrentLineNumber}: a DOCTYPE is not allowed in a model")
 
-        parser.StartElementHandler, parser.EndElementHandler = start, end
+        parser.StartElementHandler = start
+        parser.EndElementHandler = lambda name: copies.pop()
         parser.StartDoctypeDeclHandler = refuse
         try:
             parser.Parse(data, True)

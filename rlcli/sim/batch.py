@@ -99,11 +99,6 @@ class BatchEngine(BatchState):
         """This engine, whose calls can be stepped again bit for bit."""
         return self
 
-    @property
-    def divergences(self) -> int:
-        """Number of divergences since the start."""
-        return sum(self.divergence_causes.values())
-
     def use_torch_stream(self) -> None:
         """Do nothing: a CPU has no streams."""
 
@@ -177,9 +172,8 @@ class BatchEngine(BatchState):
         """
         self.described_divergences = []
         warned = np.count_nonzero(self._warning_words) > 0
-        finite = False
-        if motion_is_finite and self._only_motion:
-            finite = all([math.isfinite(np.add.reduce(values, axis=None)) for values in self._bound_inputs])
+        finite = motion_is_finite and self._only_motion
+        finite = finite and all([math.isfinite(np.add.reduce(values, axis=None)) for values in self._bound_inputs])
         # the sum of whole rows is faster than a sum without the columns that never change
         finite = finite or math.isfinite(self._state.sum().item()) or bool(self._state.isfinite().all())
         fast = self._max_velocity < STATE_LIMIT and bool((np.abs(self._qvel) > self._max_velocity).any())

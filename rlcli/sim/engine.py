@@ -44,10 +44,6 @@ class Engine(Protocol):
         """The engine itself if its calls can be stepped again bit for bit; None on a GPU."""
 
     @property
-    def divergences(self) -> int:
-        """Number of divergences since the start."""
-
-    @property
     def divergence_causes(self) -> dict[str, int]:
         """Number of divergences since the start, by cause."""
 

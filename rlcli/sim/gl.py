@@ -107,7 +107,6 @@ def candidates() -> list[str]:
 def _unload_opengl() -> None:
     """Remove PyOpenGL from the imported modules: it chooses its platform at import, for one backend only."""
     os.environ.pop("PYOPENGL_PLATFORM", None)
-    for name in [
-        n for n in sys.modules if n.partition(".")[0] == "OpenGL" or n in ("mujoco.egl", "mujoco.osmesa", "mujoco.glfw")
-    ]:
+    backends = ("mujoco.egl", "mujoco.osmesa", "mujoco.glfw")
+    for name in [name for name in sys.modules if name.partition(".")[0] == "OpenGL" or name in backends]:
         del sys.modules[name]

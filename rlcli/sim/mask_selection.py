@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -11,25 +12,31 @@ from torch import Tensor
 
 from rlcli import random
 from rlcli.sim import warp_kernels
-from rlcli.sim.selection import ALL, Columns
+from rlcli.sim.selection import ALL, DEFAULT_STREAM, Columns
 
 
+@dataclass(eq=False)
 class MaskSelection:
     """Selection of the environments where a mask is true.
 
     All rows take part in the arithmetic; only the masked rows are written. The random numbers equal those of
     `IdSelection`.
+
+    Args:
+        mask: the selected environments. (num_envs,) bool
+        seed: seed of the random numbers.
+        counters: number of each environment's random sequence, usually its episode. (num_envs,)
+        stream_key: the stream to draw from, a result of `rlcli.random.stream`.
+        shared_streams: environments i and i % shared_streams draw the same random numbers; 0: every environment has
+            its own stream.
     """
 
-    def __init__(
-        self, mask: Tensor, seed: int, counters: Tensor, stream: np.uint64 | None = None, shared_streams: int = 0
-    ) -> None:
-        self.mask = mask
-        self._shared_streams = shared_streams
-        self._seed = seed
-        self._counters = counters
-        self._stream = np.uint64(0) if stream is None else stream
-        self._drawn = 0
+    mask: Tensor
+    seed: int
+    counters: Tensor
+    stream_key: np.uint64 = DEFAULT_STREAM
+    shared_streams: int = 0
+    _drawn: int = field(default=0, init=False)
 
     @property
     def count(self) -> Tensor:
@@ -85,7 +92,7 @@ class MaskSelection:
 
     def where(self, mask: Tensor) -> MaskSelection:
         """Return a selection of the rows where `mask` (num_envs,) is true too."""
-        return MaskSelection(self.mask & mask, self._seed, self._counters, self._stream, self._shared_streams)
+        return MaskSelection(self.mask & mask, self.seed, self.counters, self.stream_key, self.shared_streams)
 
     def env_ids(self) -> Tensor:
         """Return the numbers of the masked rows; this waits for the device. (rows,) int64"""
@@ -93,11 +100,11 @@ class MaskSelection:
 
     def union(self, other: MaskSelection) -> MaskSelection:
         """Return a selection of the rows that are in one of two selections."""
-        return MaskSelection(self.mask | other.mask, self._seed, self._counters, shared_streams=self._shared_streams)
+        return MaskSelection(self.mask | other.mask, self.seed, self.counters, shared_streams=self.shared_streams)
 
     def stream(self, stream: np.uint64) -> MaskSelection:
         """Return a selection of the same rows that draws from another stream."""
-        return MaskSelection(self.mask, self._seed, self._counters, stream, self._shared_streams)
+        return MaskSelection(self.mask, self.seed, self.counters, stream, self.shared_streams)
 
     def _uniform(self, low: float, high: float, shape: tuple[int, ...]) -> Tensor:
         return self._draw(warp_kernels.draw_uniform, shape, 1, low, high - low)
@@ -108,7 +115,7 @@ class MaskSelection:
         out = torch.empty(num_envs, count, device=device)
         index, self._drawn = self._drawn, self._drawn + words * count
         if count:
-            start, counters = int(random.start(self._seed)[0]), wp.from_torch(self._counters.contiguous())
-            inputs = [start, counters, int(self._stream), index, self._shared_streams or num_envs, *parameters]
+            start, counters = int(random.start(self.seed)[0]), wp.from_torch(self.counters.contiguous())
+            inputs = [start, counters, int(self.stream_key), index, self.shared_streams or num_envs, *parameters]
             wp.launch(kernel, (num_envs, count), inputs, [wp.from_torch(out)], device=wp.device_from_torch(device))
         return out.view(num_envs, *shape)

@@ -12,7 +12,6 @@ import functools
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import mujoco
@@ -124,9 +123,7 @@ class _WithoutProfiler:
                 self._callback.value = None
             self._inside += 1
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         with self._lock:
             self._inside -= 1
             if not self._inside and self._callback.value is None:  # not None: other code has set a callback

@@ -7,6 +7,7 @@ only the methods of `Selection` runs on both.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
@@ -23,6 +24,7 @@ rows, so a term that reads in every step calls it once."""
 Groups: TypeAlias = tuple[int, ...] | None
 """Geom groups; None: all."""
 ALL = slice(None)
+DEFAULT_STREAM = np.uint64(0)
 
 
 def in_place(tensor: Tensor) -> Any:
@@ -94,6 +96,11 @@ def as_array(values: Any) -> Any:
     return values.numpy() if isinstance(values, Tensor) else values
 
 
+def _on_host(value: Tensor | float) -> Any:
+    """Return a tensor on any device as an array; return a number unchanged."""
+    return value.numpy(force=True) if isinstance(value, Tensor) else value
+
+
 def write_rows(field: Field, rows: NDArray[np.int64], values: Tensor | float, columns: Columns = ALL) -> None:
     """Set some rows of a (num_envs, ...) tensor on the CPU."""
     as_array(field)[_index(rows, columns)] = as_array(values)
@@ -112,36 +119,28 @@ def ids_of(selection: Selection) -> NDArray[np.int64]:
     return selection.ids
 
 
+@dataclass(eq=False)
 class IdSelection:
     """Selection as a sorted list of ids, on the CPU.
 
     Args:
         ids: the selected environments, sorted. (rows,)
         seed: seed of the random numbers.
-        counters: number of each row's random stream, usually its episode. (rows,)
-        stream: the stream to draw from; None: 0.
+        counters: number of each row's random sequence, usually its episode. (rows,)
+        stream_key: the stream to draw from, a result of `rlcli.random.stream`.
         device: device of the random numbers; None: the CPU.
         shared_streams: environments i and i % shared_streams draw the same random numbers; 0: every environment has
             its own stream.
     """
 
-    def __init__(
-        self,
-        ids: NDArray[np.int64],
-        seed: int,
-        counters: NDArray[np.int64],
-        stream: np.uint64 | None = None,
-        device: torch.device | None = None,
-        shared_streams: int = 0,
-    ) -> None:
-        self.ids = ids
-        self._shared_streams = shared_streams
-        self._device = device
-        self._seed = seed
-        self._counters = counters
-        self._keys: random.Keys | None = None
-        self._stream = np.uint64(0) if stream is None else stream
-        self._drawn = 0
+    ids: NDArray[np.int64]
+    seed: int
+    counters: NDArray[np.int64]
+    stream_key: np.uint64 = DEFAULT_STREAM
+    device: torch.device | None = None
+    shared_streams: int = 0
+    _keys: random.Keys | None = field(default=None, init=False)
+    _drawn: int = field(default=0, init=False)
 
     @property
     def count(self) -> int:
@@ -150,17 +149,14 @@ class IdSelection:
 
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Draw uniform numbers in [low, high). (rows, *shape)"""
-        lowest = low.numpy(force=True) if isinstance(low, Tensor) else low
-        highest = high.numpy(force=True) if isinstance(high, Tensor) else high
+        lowest, highest = _on_host(low), _on_host(high)
         return self._scaled(random.uniform(*self._next(math.prod(shape))), highest - lowest, lowest, shape)
 
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Draw Gaussian numbers. (rows, *shape)"""
         size = math.prod(shape)
         keys, stream, index, _ = self._next(2 * size)  # two uniform numbers make a Gaussian one
-        scale = std.numpy(force=True) if isinstance(std, Tensor) else std
-        offset = mean.numpy(force=True) if isinstance(mean, Tensor) else mean
-        return self._scaled(random.normal(keys, stream, index, size), scale, offset, shape)
+        return self._scaled(random.normal(keys, stream, index, size), _on_host(std), _on_host(mean), shape)
 
     def choice(self, options: int, shape: tuple[int, ...] = ()) -> Tensor:
         """Draw integers in [0, options) with equal probability. (rows, *shape) int64"""
@@ -191,15 +187,13 @@ class IdSelection:
             return self
         if not chosen.any():
             return None
-        return IdSelection(
-            self.ids[chosen], self._seed, self._counters[chosen], self._stream, self._device, self._shared_streams
-        )
+        return self._with(self.ids[chosen], self.counters[chosen], self.stream_key)
 
     def union(self, other: IdSelection) -> IdSelection:
         """Return a selection of the rows in one of two selections; a row in both has the stream that it has here."""
         ids, first = np.unique(np.concatenate([self.ids, other.ids]), return_index=True)
-        counters = np.concatenate([self._counters, other._counters])[first]
-        return IdSelection(ids, self._seed, counters, self._stream, self._device, self._shared_streams)
+        counters = np.concatenate([self.counters, other.counters])[first]
+        return self._with(ids, counters, self.stream_key)
 
     def env_ids(self) -> Tensor:
         """Return the numbers of the environments. (rows,) int64"""
@@ -207,9 +201,12 @@ class IdSelection:
 
     def stream(self, stream: np.uint64) -> IdSelection:
         """Return a selection of the same rows that draws from another stream."""
-        other = IdSelection(self.ids, self._seed, self._counters, stream, self._device, self._shared_streams)
+        other = self._with(self.ids, self.counters, stream)
         other._keys = self._row_keys()
         return other
+
+    def _with(self, ids: NDArray[np.int64], counters: NDArray[np.int64], stream_key: np.uint64) -> IdSelection:
+        return IdSelection(ids, self.seed, counters, stream_key, self.device, self.shared_streams)
 
     def _scaled(
         self, drawn: NDArray[Any], scale: float | NDArray[Any], offset: float | NDArray[Any], shape: tuple[int, ...]
@@ -225,15 +222,15 @@ class IdSelection:
 
     def _tensor(self, drawn: NDArray[Any]) -> Tensor:
         values = torch.from_numpy(drawn)
-        return values if self._device is None else values.to(self._device)
+        return values if self.device is None else values.to(self.device)
 
     def _row_keys(self) -> random.Keys:
         if self._keys is None:
-            names = self.ids % self._shared_streams if self._shared_streams else self.ids
-            self._keys = random.row_keys(self._seed, names, self._counters)
+            names = self.ids % self.shared_streams if self.shared_streams else self.ids
+            self._keys = random.row_keys(self.seed, names, self.counters)
         return self._keys
 
     def _next(self, count: int) -> tuple[random.Keys, np.uint64, int, int]:
         """Return the arguments of `random.uniform` for the next `count` numbers of each row."""
         index, self._drawn = self._drawn, self._drawn + count
-        return self._row_keys(), self._stream, index, count
+        return self._row_keys(), self.stream_key, index, count

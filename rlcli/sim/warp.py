@@ -68,11 +68,6 @@ class WarpEngine(WarpState):
             self._flags = torch.zeros(16, dtype=torch.int32, device=self.device)
 
     @property
-    def divergences(self) -> int:
-        """Number of divergences since the start; reading it waits for the device."""
-        return int(self._counts.sum())
-
-    @property
     def divergence_causes(self) -> dict[str, int]:
         """Number of divergences since the start, by cause; reading it waits for the device."""
         return {name: count for name, count in zip(warp_kernels.CAUSES, self._counts.tolist(), strict=True) if count}
@@ -131,14 +126,10 @@ class WarpEngine(WarpState):
     def reset(self, selection: Selection) -> None:
         """Put the selected worlds into the default state, including applied forces."""
         assert isinstance(selection, MaskSelection)
+        inputs = [wp.from_torch(tensor) for tensor in (selection.mask, self._default_qpos, self._default_qvel)]
+        state = [self._arrays[name] for name in STATE]
         with self._launching():
-            wp.launch(
-                warp_kernels.reset_worlds,
-                dim=self.num_envs,
-                inputs=[wp.from_torch(t) for t in (selection.mask, self._default_qpos, self._default_qvel)],
-                outputs=[self._arrays[name] for name in STATE],
-                device=self._device,
-            )
+            wp.launch(warp_kernels.reset_worlds, self.num_envs, inputs, state, device=self._device)
         for name, start in self._start_inputs.items():
             selection.write(self._fields[name].view(self.num_envs, -1), start)
         if not self.forces_after_reset:
@@ -156,7 +147,7 @@ class WarpEngine(WarpState):
         return tensor
 
     def select(self, mask: Field, seed: int, counters: Field) -> MaskSelection:
-        """Return a selection of the worlds where `mask` is true; it is never None, as that would wait for the device."""
+        """Return a selection of the worlds where `mask` is true; only the device can find out whether it is empty."""
         assert isinstance(mask, Tensor)
         assert isinstance(counters, Tensor)
         return MaskSelection(mask, seed, counters, shared_streams=self.shared_streams)
@@ -187,9 +178,7 @@ class WarpEngine(WarpState):
             DivergedError: if contacts or constraints exceeded their capacity; the hint has the setting to raise.
         """
         flags = self._flags.tolist()
-        found = 0
-        for bit in OVERFLOW_SETTINGS:
-            found |= int(bit) if bool((self._overflowed & int(bit)).any()) else 0
+        found = sum(int(bit) for bit in OVERFLOW_SETTINGS if bool((self._overflowed & int(bit)).any()))
         if found:
             self._overflowed.zero_()
             raise overflow_error(found, self.capacity)
@@ -214,15 +203,11 @@ class WarpEngine(WarpState):
 
     def _check_bounds(self) -> None:
         """Restore diverged worlds before fields are derived from their state."""
-        last, found = (self._last_qpos, self._last_qvel), (self._diverged, self._counts, self._first, self._overflowed)
-        wp.launch(
-            warp_kernels.check_bounds,
-            dim=self.num_envs,
-            inputs=[self._arrays[name] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "act")]
-            + [self._data.overflow, self._max_velocity],
-            outputs=[wp.from_torch(tensor) for tensor in (*last, *found)],
-            device=self._device,
-        )
+        state = [self._arrays[name] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "act")]
+        inputs = [*state, self._data.overflow, self._max_velocity]
+        results = (self._last_qpos, self._last_qvel, self._diverged, self._counts, self._first, self._overflowed)
+        outputs = [wp.from_torch(tensor) for tensor in results]
+        wp.launch(warp_kernels.check_bounds, self.num_envs, inputs, outputs, device=self._device)
 
     def _forward(self, selection: Selection) -> None:
         if not self._substep_fields and (FORCE not in self._derived or not self.forces_after_reset):

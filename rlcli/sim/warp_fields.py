@@ -40,11 +40,8 @@ class FieldStages:
         self._sensor_stages = {FORCE} if force_columns else set()
         if len(force_columns) < model.nsensordata:
             self._sensor_stages.add(VELOCITY)
-        self._sensors_need_only_motion = _MOTION_SENSORS.issuperset(
-            int(kind)
-            for kind, stage in zip(model.sensor_type, model.sensor_needstage, strict=True)
-            if int(stage) < int(mujoco.mjtStage.mjSTAGE_ACC)
-        )
+        other_sensors = model.sensor_type[model.sensor_needstage < int(mujoco.mjtStage.mjSTAGE_ACC)]
+        self._sensors_need_only_motion = _MOTION_SENSORS.issuperset(other_sensors.tolist())
 
     def stages_of(self, name: str) -> set[int]:
         """Return the groups of derived fields that a field belongs to."""

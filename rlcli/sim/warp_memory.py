@@ -63,8 +63,8 @@ def overflow_error(found: int, capacity: Capacity) -> DivergedError:
     now = {"contacts_per_env": capacity.contacts, "constraints_per_env": capacity.constraints}
     advice = " ".join(f"sim.{setting}={2 * now[setting]}" for setting in sorted(settings))
     return DivergedError(
-        f"the GPU engine ran out of memory for contacts ({kinds}): it has {capacity.contacts} contacts and"
-        f" {capacity.constraints} constraints per environment; the results since the overflow are wrong",
+        f"the GPU engine exceeded its capacity ({kinds}): it has room for {capacity.contacts} contacts and"
+        f" {capacity.constraints} constraints per environment; the results since then are wrong",
         hint=f"raise the capacity: {advice}",
     )
 
@@ -78,10 +78,9 @@ def _memory_error(model: mujoco.MjModel, num_envs: int, device: torch.device, ca
     sample = 64
     each = sum(_byte_count(value) for value in vars(_make_data(model, sample, capacity)).values()) / sample
     free = wp.device_from_torch(device).free_memory if device.type == "cuda" else 0
-    return DeviceError(
-        f"{num_envs} environments need {each * num_envs / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free on {device}",
-        hint=f"--num-envs {max(1, int(0.8 * free / each))} would fit",
-    )
+    needed, fits = each * num_envs / 2**30, max(1, int(0.8 * free / each))
+    message = f"{num_envs} environments need {needed:.1f} GiB, {free / 2**30:.1f} GiB are free on {device}"
+    return DeviceError(message, hint=f"--num-envs {fits} would fit")
 
 
 def _byte_count(value: object) -> int:

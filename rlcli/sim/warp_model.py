@@ -94,19 +94,16 @@ class WarpModel:
         """Return the structure of MuJoCo Warp that has a model field, and the field's name in it."""
         return (self._model.opt, name[4:]) if name.startswith("opt.") else (self._model, name)
 
-    @contextlib.contextmanager
-    def _launching(self) -> Iterator[None]:
-        with wp.ScopedDevice(self._device):
-            yield
+    def _launching(self) -> wp.ScopedDevice:
+        """Return a context in which Warp launches on the engine's device."""
+        return wp.ScopedDevice(self._device)
 
     @contextlib.contextmanager
     def _setting_up(self) -> Iterator[None]:
         """Launch on the engine's device and, on a GPU, on torch's stream."""
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(wp.ScopedDevice(self._device))
-            if self.device.type == "cuda":
-                stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
-                stack.enter_context(wp.ScopedStream(stream))
+        is_gpu = self.device.type == "cuda"
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if is_gpu else None
+        with self._launching(), wp.ScopedStream(stream):
             yield
 
 

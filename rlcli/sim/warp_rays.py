@@ -41,9 +41,6 @@ class RayCaster:
         """Return the excluded body of each ray, and buffers for the geoms and normals at the hits."""
         _, rays = shape
         if (rays, exclude) not in self._buffers:
-            self._buffers[rays, exclude] = (
-                wp.full(rays, exclude, dtype=int),
-                wp.empty(shape, dtype=int),
-                wp.empty(shape, dtype=wp.vec3),
-            )
+            bodies, geoms = wp.full(rays, exclude, dtype=int), wp.empty(shape, dtype=int)
+            self._buffers[rays, exclude] = bodies, geoms, wp.empty(shape, dtype=wp.vec3)
         return self._buffers[rays, exclude]

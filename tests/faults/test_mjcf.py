@@ -81,8 +81,14 @@ NAMED = {
     "a model outside": (model(asset='<model name="m" file="../outside.xml"/>'), "lies outside"),
     "a compiled model as asset": (model(asset='<model name="m" file="bin.mjb"/>'), "compiled models"),
     "a resource of another kind": (model(asset='<mesh name="m" file="http://example.invalid/m.obj"/>'), "not the name"),
-    "a picture of four terapixels": (model(asset='<texture name="t" type="2d" file="huge.png"/>'), "too large: as expensive as"),
-    "a thousand million copies": (model(body='<replicate count="1000000000"><geom size="1"/></replicate>'), "too large: as expensive as"),
+    "a picture of four terapixels": (
+        model(asset='<texture name="t" type="2d" file="huge.png"/>'),
+        "too large: as expensive as",
+    ),
+    "a thousand million copies": (
+        model(body='<replicate count="1000000000"><geom size="1"/></replicate>'),
+        "too large: as expensive as",
+    ),
     "copies of copies of copies": (
         model(body='<replicate count="1000">' * 3 + '<geom size="1"/>' + "</replicate>" * 3),
         "too large: as expensive as",

@@ -316,7 +316,7 @@ def test_where_nothing_can_draw_the_page_says_so_and_has_the_rest(cli, trained, 
     monkeypatch.setenv("MUJOCO_GL", "disable")
     said = cli("report", trained, "--json")
     assert said.code == 0, said.err
-    assert "drawing is switched off by MUJOCO_GL=disable" in said.json["missing"]["video"]
+    assert "rendering is disabled by MUJOCO_GL=disable" in said.json["missing"]["video"]
     assert said.json["evaluation"] == "made"
     (trained / "videos").mkdir(exist_ok=True)
     (trained / "videos" / "000000000000.mp4").write_bytes(MP4)

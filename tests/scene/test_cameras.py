@@ -112,7 +112,8 @@ def test_pictures_agree_with_rays(boxes):
     rows, columns = torch.meshgrid(torch.arange(31) - 15, torch.arange(41) - 20, indexing="ij")
     ways = torch.stack([torch.ones(31, 41), -pixel * columns, -pixel * rows], dim=-1).view(1, -1, 3)
     ways = torch.nn.functional.normalize(ways, dim=2).expand(3, -1, -1)
-    rays = env.engine.rays(torch.tensor([0.0, 0.0, 1.0]).expand(ways.shape), ways).view(3, 31, 41).clamp(min=0.0)
+    points = torch.tensor([0.0, 0.0, 1.0]).expand(ways.shape)
+    rays = env.engine.rays(points, ways, groups=None, exclude=-1, selection=None).view(3, 31, 41).clamp(min=0.0)
     far = torch.nn.functional.max_pool2d(rays[:, None], 3, 1, 1)[:, 0]
     near = -torch.nn.functional.max_pool2d(-rays[:, None], 3, 1, 1)[:, 0]
     plain = (far - near) < 0.05
@@ -307,7 +308,7 @@ def test_what_goes_wrong_in_a_thread_is_raised_where_somebody_looks(boxes):
 
 PROGRAM = """
 import os, sys, torch
-from worlds import build
+from support.worlds import build
 from rlcli.errors import RlcliError
 env = build(sys.argv[1], 2)
 env.reset()
@@ -363,5 +364,5 @@ def test_without_opengl_a_task_with_a_camera_is_refused_as_the_machines_fault(tm
     arguments = [sys.executable, "-m", "rlcli", command, str(folder), *(["--policy", "zero"] * (command == "eval"))]
     done = subprocess.run(arguments, env={**os.environ, "MUJOCO_GL": "disabled"}, capture_output=True, text=True)
     assert done.returncode == 10
-    assert "drawing is switched off by MUJOCO_GL=disabled" in done.stderr
+    assert "rendering is disabled by MUJOCO_GL=disabled" in done.stderr
     assert "Traceback" not in done.stderr

@@ -438,7 +438,9 @@ def test_a_sensor_that_does_not_fit_is_refused_with_its_place(tmp_path, sensor, 
 
 
 def test_a_body_that_nothing_can_touch_is_refused_with_those_that_can_be(tmp_path):
-    with pytest.raises(ConfigError, match=r"scene.sensors.x.bodies: body 'tag' has no geom .*; bodies with such a geom: box$"):
+    with pytest.raises(
+        ConfigError, match=r"scene.sensors.x.bodies: body 'tag' has no geom .*; bodies with such a geom: box$"
+    ):
         boxes(tmp_path, {"x": contact(entity="low", bodies=["box", "tag"])})
 
 

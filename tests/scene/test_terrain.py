@@ -410,7 +410,9 @@ def test_what_lies_under_the_ground_finds_none_in_the_table():
 def test_boxes_are_in_no_table_of_heights(tmp_path):
     down = {"kind": "rays", "pattern": [[0.0, 0.0, -1.0]], "alignment": "world", "lookup": True}
     stairs = generator(sub_terrains={"it": {"kind": "stairs", "boxes": True}})
-    with pytest.raises(ConfigError, match=r"scene.sensors.scan.lookup: heights cannot be looked up: the terrain has boxes"):
+    with pytest.raises(
+        ConfigError, match=r"scene.sensors.scan.lookup: heights cannot be looked up: the terrain has boxes"
+    ):
         on_terrain(tmp_path, stairs, 1, scene={"sensors": {"scan": down}})
 
 
