@@ -1,4 +1,4 @@
-"""What only an NVIDIA GPU can show: nothing on the path of a step waits for it, and recordings replay the same work."""
+"""Tests that need an NVIDIA GPU: steps do not synchronise with it, and CUDA graphs replay the same work."""
 
 import pytest
 import torch
@@ -13,7 +13,7 @@ from rlcli.rl.ppo.trainer import PpoTrainer
 
 pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU, and there is none here"),
-    # torch says so once a process, of the very mode that the tests ask for
+    # torch warns once per process about the mode that these tests use
     pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype feature"),
 ]
 
@@ -25,7 +25,7 @@ def environment(task, **flags):
 
 
 @pytest.mark.parametrize("task", ["cartpole", "ant-direct"])
-def test_a_step_does_not_wait_for_the_device(task):
+def test_step_does_not_synchronize_with_device(task):
     env = environment(task, episode_length_s=0.5)
     action = torch.zeros(256, env.layout.action_size, device="cuda")
     env.reset()
@@ -40,8 +40,8 @@ def test_a_step_does_not_wait_for_the_device(task):
 
 
 @pytest.mark.parametrize("task", ["cartpole", "ant-direct"])
-def test_a_recorded_rollout_goes_on_like_an_eager_one(task):
-    """The physics is not bit-identical on a GPU, so trajectories are compared within what that explains."""
+def test_captured_rollout_equals_eager_rollout(task):
+    """Compare trajectories with a tolerance: physics on a GPU is not bit-identical."""
     finals = []
     for record in (False, True):
         env = environment(task, episode_length_s=0.5)
@@ -53,7 +53,7 @@ def test_a_recorded_rollout_goes_on_like_an_eager_one(task):
                 obs.copy_(env.step(action).obs["policy"])
 
         run = Recording(work, torch.device("cuda"), env.stateful_objects()) if record else work
-        for _ in range(6):  # 48 steps, over an end of all episodes
+        for _ in range(6):  # 48 steps, in which all episodes end
             run()
         assert not record or run.refusal is None
         finals.append(obs.cpu())
@@ -75,7 +75,7 @@ class Counter:
         self.steps = 0
 
 
-def test_what_is_bound_anew_is_carried_from_replay_to_replay():
+def test_rebound_tensors_carry_over_between_replays():
     holder = Counter()
 
     def work():
@@ -88,7 +88,7 @@ def test_what_is_bound_anew_is_carried_from_replay_to_replay():
     assert holder.total.item() == 5.0
 
 
-def test_work_that_waits_for_the_device_is_named_and_runs_as_it_is(caplog):
+def test_synchronizing_work_runs_eagerly_with_warning(caplog):
     holder = Counter()
 
     def work():
@@ -103,11 +103,11 @@ def test_work_that_waits_for_the_device_is_named_and_runs_as_it_is(caplog):
     assert "test_recording.py" in warning
 
 
-def test_work_that_waits_in_its_first_run_alone_is_recorded(caplog):
+def test_work_synchronizing_only_in_first_run_is_captured(caplog):
     holder, made = Counter(), []
 
     def work():
-        if not made:  # as a constant that is made when it is first asked for
+        if not made:  # like a constant that is made at its first use
             made.append(torch.tensor(2.0, device="cuda"))
         holder.total += made[0]
 
@@ -119,7 +119,7 @@ def test_work_that_waits_in_its_first_run_alone_is_recorded(caplog):
     assert run._graph is not None
 
 
-def test_a_number_that_changes_from_step_to_step_is_named(caplog):
+def test_changing_python_number_is_reported(caplog):
     holder = Counter()
 
     def work():
@@ -145,7 +145,7 @@ def trainer_of(**settings):
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-def test_training_records_rollout_and_update(compiled, caplog):
+def test_training_captures_rollout_and_update(compiled, caplog):
     trainer = trainer_of(**{"agent.compile": compiled})
     reports = [trainer.iterate() for _ in range(8)]
     assert not warnings_in(caplog)
@@ -156,7 +156,7 @@ def test_training_records_rollout_and_update(compiled, caplog):
     assert torch.get_float32_matmul_precision() == "highest"
 
 
-def test_a_compiled_minibatch_gives_the_gradient_of_the_plain_one():
+def test_compiled_minibatch_gradient_equals_eager():
     trainer = trainer_of(**{"agent.compile": True, "agent.tf32": False})
     trainer.iterate()
     trainer.collector.collect()
@@ -171,7 +171,7 @@ def test_a_compiled_minibatch_gives_the_gradient_of_the_plain_one():
     torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-5)
 
 
-def test_a_task_with_ids_runs_eagerly_and_says_why(caplog):
+def test_task_with_env_ids_runs_eagerly_with_reason(caplog):
     settings = {"scene.num_envs": 64, "agent.max_iterations": 3}
     resolved = resolve(find_task("cartpole-direct"), agent="ppo", device="cuda", flags=settings)
     env = make_env(resolved, seed=1, device="cuda")

@@ -1,4 +1,4 @@
-"""Cameras of a scene, on boxes whose places, sizes and colours are known."""
+"""Tests of camera sensors on boxes with known positions, sizes and colours."""
 
 import math
 import os
@@ -54,7 +54,7 @@ CART = {"kind": "camera", "data": "depth", "width": 64, "height": 24, "eye": [-3
 
 @pytest.fixture
 def boxes(tmp_path):
-    """Environments with cameras; they are closed behind a test."""
+    """Make environments with cameras, which are closed after the test."""
     made = []
 
     def make(sensors, *overrides, num_envs=3, **changes):
@@ -70,7 +70,7 @@ def boxes(tmp_path):
         env.close()
 
 
-def picture(env, name="camera"):
+def read_image(env, name="camera"):
     return env.sensors[name].image
 
 
@@ -80,11 +80,11 @@ def step(env, count=1):
     return result
 
 
-# --- what is seen ---
+# --- images ---
 
 
-def test_depth_is_metres_along_the_axis_and_nothing_is_0(boxes):
-    depth = picture(boxes({"camera": FRONT}))[0, :, :, 0]
+def test_depth_is_along_camera_axis_and_0_without_hit(boxes):
+    depth = read_image(boxes({"camera": FRONT}))[0, :, :, 0]
     assert depth.shape == (31, 41)
     assert depth[15, 20].item() == pytest.approx(2.0, abs=1e-4)  # the face of the slab
     assert depth[0, 0].item() == 0.0
@@ -94,9 +94,9 @@ def test_depth_is_metres_along_the_axis_and_nothing_is_0(boxes):
     assert slab.any(dim=1).sum() == 5
 
 
-def test_distance_is_that_from_the_camera(boxes):
+def test_distance_is_along_ray_from_camera(boxes):
     env = boxes({"depth": FRONT, "distance": {**FRONT, "data": "distance"}})
-    depth, distance = picture(env, "depth")[0, :, :, 0], picture(env, "distance")[0, :, :, 0]
+    depth, distance = read_image(env, "depth")[0, :, :, 0], read_image(env, "distance")[0, :, :, 0]
     pixel = math.tan(math.radians(30.0)) / 15.5
     rows, columns = torch.meshgrid(torch.arange(31) - 15, torch.arange(41) - 20, indexing="ij")
     along = torch.sqrt(1.0 + (pixel * rows) ** 2 + (pixel * columns) ** 2)
@@ -104,10 +104,10 @@ def test_distance_is_that_from_the_camera(boxes):
     assert distance.max() > depth.max() > 0.0
 
 
-def test_pictures_agree_with_rays(boxes):
-    """Where neighbours are alike, and so no edge runs through the pixel."""
+def test_distance_image_equals_ray_casts(boxes):
+    """Return the pixels whose neighbours have a similar depth: no edge runs through them."""
     env = boxes({"camera": {**FRONT, "data": "distance"}})
-    seen = picture(env)[:, :, :, 0]
+    seen = read_image(env)[:, :, :, 0]
     pixel = math.tan(math.radians(30.0)) / 15.5
     rows, columns = torch.meshgrid(torch.arange(31) - 15, torch.arange(41) - 20, indexing="ij")
     ways = torch.stack([torch.ones(31, 41), -pixel * columns, -pixel * rows], dim=-1).view(1, -1, 3)
@@ -121,8 +121,8 @@ def test_pictures_agree_with_rays(boxes):
     torch.testing.assert_close(seen[plain], rays[plain], rtol=1e-3, atol=1e-3)
 
 
-def test_up_is_up_and_left_is_left(boxes):
-    colours = picture(boxes({"camera": {**FRONT, "data": "rgb", "fov": 80.0}}))[0].int()
+def test_image_has_top_row_and_left_column_first(boxes):
+    colours = read_image(boxes({"camera": {**FRONT, "data": "rgb", "fov": 80.0}}))[0].int()
     assert colours.shape == (31, 41, 3)
     green = (colours[..., 1] > colours[..., 0] + 40).nonzero()
     blue = (colours[..., 2] > colours[..., 0] + 40).nonzero()
@@ -139,8 +139,8 @@ def test_up_is_up_and_left_is_left(boxes):
     ("clip", "seen"),
     [([0.01, 20.0], {2.0, 3.9}), ([0.01, 3.0], {2.0}), ([2.5, 20.0], {3.9}), ([0.5, 1.5], set())],
 )
-def test_what_is_nearer_or_farther_than_the_clip_is_not_seen(boxes, clip, seen):
-    depth = picture(boxes({"camera": {**FRONT, "fov": 80.0, "clip": clip}}))[0]
+def test_clip_planes_hide_near_and_far_geoms(boxes, clip, seen):
+    depth = read_image(boxes({"camera": {**FRONT, "fov": 80.0, "clip": clip}}))[0]
     values = depth[depth > 0.0]
     found = {2.0: ((values - 2.0).abs() < 1e-2).any(), 3.9: ((values - 3.9).abs() < 1e-2).any()}
     assert {metres for metres, there in found.items() if there} == seen
@@ -148,16 +148,16 @@ def test_what_is_nearer_or_farther_than_the_clip_is_not_seen(boxes, clip, seen):
 
 
 @pytest.mark.parametrize("data", ["depth", "rgb"])
-def test_a_pixel_is_the_mean_of_its_samples(boxes, data):
+def test_pixel_is_mean_of_samples(boxes, data):
     soft = {**FRONT, "data": data, "width": 12, "height": 9, "samples": 3}
     fine = {**soft, "width": 36, "height": 27, "samples": 1}
     env = boxes({"soft": soft, "fine": fine})
-    blocks = picture(env, "fine").float().unflatten(2, (12, 3)).unflatten(1, (9, 3)).mean(dim=(2, 4))
+    blocks = read_image(env, "fine").float().unflatten(2, (12, 3)).unflatten(1, (9, 3)).mean(dim=(2, 4))
     assert len(blocks.unique()) > 4  # some edges run through pixels
-    torch.testing.assert_close(picture(env, "soft").float(), blocks, rtol=1e-5, atol=0.51 if data == "rgb" else 1e-5)
+    torch.testing.assert_close(read_image(env, "soft").float(), blocks, rtol=1e-5, atol=0.51 if data == "rgb" else 1e-5)
 
 
-def test_a_camera_may_look_straight_down(boxes):
+def test_camera_looks_straight_down(boxes):
     down = {
         "kind": "camera",
         "data": "depth",
@@ -167,38 +167,38 @@ def test_a_camera_may_look_straight_down(boxes):
         "lookat": [4, 2, 1],
         "fov": 20.0,
     }
-    depth = picture(boxes({"camera": down}))[0, :, :, 0]
+    depth = read_image(boxes({"camera": down}))[0, :, :, 0]
     assert depth[4, 4].item() == pytest.approx(1.9, abs=1e-4)
     assert depth[0, 4].item() == 0.0
 
 
-def test_a_camera_of_the_mjcf_moves_with_its_body(boxes):
-    """The cart's camera slides past the slab's edge, 2 m ahead and 4 m below: one placed by hand sees the same."""
+def test_mjcf_camera_moves_with_body(boxes):
+    """Compare the camera of the cart with a camera that is placed at the same pose in the configuration."""
     own = {"kind": "camera", "data": "depth", "width": 40, "height": 40, "entity": "robot", "camera": "ahead"}
     held = {**own, "camera": None, "body": "cart", "eye": [0, 0, 0], "lookat": [1, 0, 0], "fov": 60.0}
     del held["camera"]
     env = boxes({"own": own, "held": held})
-    pictures = picture(env, "own").clone()
-    torch.testing.assert_close(picture(env, "held"), pictures, rtol=1e-5, atol=1e-5)
+    pictures = read_image(env, "own").clone()
+    torch.testing.assert_close(read_image(env, "held"), pictures, rtol=1e-5, atol=1e-5)
     assert pictures.amax(dim=(1, 2, 3)).min() > 0.0
-    assert not torch.equal(pictures[0], pictures[1])  # the carts are in different places
+    assert not torch.equal(pictures[0], pictures[1])  # the carts have different positions
 
 
-# --- when it is drawn ---
+# --- time of rendering ---
 
 
-def test_each_environment_has_the_picture_of_its_own_state(boxes):
+def test_each_environment_renders_own_state(boxes):
     env = boxes({"camera": CART}, num_envs=5)
     for _ in range(2):
         y = env.entities["robot"].data.joint_pos[:, 0]
-        columns = (picture(env)[..., 0] > 0.0).float().sum(dim=1)
+        columns = (read_image(env)[..., 0] > 0.0).float().sum(dim=1)
         middle = (columns * torch.arange(64)).sum(dim=1) / columns.sum(dim=1)
-        pixel = 24 / (2.0 * 2.9 * math.tan(math.radians(22.5)))  # pixels a metre where the sphere is seen
+        pixel = 24 / (2.0 * 2.9 * math.tan(math.radians(22.5)))  # pixels per metre at the depth of the sphere
         assert (middle - (31.5 - pixel * y)).abs().max() < 0.6
         step(env, 2)
 
 
-def test_the_last_picture_of_an_episode_is_of_its_last_state_and_the_next_of_the_new_one(boxes):
+def test_final_obs_has_last_image_of_episode_and_obs_has_first_of_next(boxes):
     observations = {"policy": {"image": {"func": "image", "sensor": "camera"}, "pos": {"func": "joint_pos"}}}
     env = boxes({"camera": CART}, observations=observations)
     env.reset(seed=4)
@@ -213,52 +213,52 @@ def test_the_last_picture_of_an_episode_is_of_its_last_state_and_the_next_of_the
         qpos = env.engine.field("qpos")
         qpos[:, 0] = seen[:, -1].double()
         env.sensors["camera"].update(0.02)
-        torch.testing.assert_close(seen[:, :-1], picture(env).flatten(1), rtol=0.0, atol=1e-5)
+        torch.testing.assert_close(seen[:, :-1], read_image(env).flatten(1), rtol=0.0, atol=1e-5)
 
 
-def test_an_environment_that_begins_anew_is_drawn_anew_and_the_others_are_not(boxes):
+def test_reset_renders_only_reset_environments(boxes):
     env = boxes({"camera": CART})
-    before = picture(env).clone()
+    before = read_image(env).clone()
     env.engine.field("qpos")[:, 0] = torch.tensor([0.4, 0.4, 0.4]).double()
     begun = env._select(torch.tensor([False, True, False]))
     env.sensors["camera"].reset(begun)
-    after = picture(env)
+    after = read_image(env)
     assert torch.equal(after[[0, 2]], before[[0, 2]])
     assert not torch.equal(after[1], before[1])
     env.sensors["camera"].update(0.02)
-    assert torch.equal(picture(env)[0], picture(env)[1])
+    assert torch.equal(read_image(env)[0], read_image(env)[1])
 
 
-def test_threads_change_nothing(boxes):
+def test_image_is_independent_of_thread_count(boxes):
     sensors = {"camera": CART, "colours": {**FRONT, "data": "rgb", "samples": 2}}
     one, four = (boxes(sensors, f"sim.engine_threads={n}", num_envs=7) for n in (1, 4))
     assert (one.sensors["camera"]._renderers.count, four.sensors["camera"]._renderers.count) == (1, 4)
     for _ in range(4):
         for name in sensors:
-            assert torch.equal(picture(one, name), picture(four, name))
+            assert torch.equal(read_image(one, name), read_image(four, name))
         step(one), step(four)
 
 
-def test_model_fields_of_a_worlds_own_show(boxes):
+def test_expanded_model_fields_are_visible_in_images(boxes):
     env = boxes({"camera": CART})
     sizes = env.engine.expand("geom_size")
     sizes[1, env.engine.model.geom("robot/cart").id] = 0.4
     env.sensors["camera"].update(0.02)
-    seen = (picture(env) > 0.0).sum(dim=(1, 2, 3))
+    seen = (read_image(env) > 0.0).sum(dim=(1, 2, 3))
     assert seen[1] > 3 * seen[0]
     assert abs(int(seen[0]) - int(seen[2])) < 0.5 * int(seen[0])
 
 
-# --- what cannot be ---
+# --- errors ---
 
 
-def test_the_gpu_engine_has_no_cameras(boxes):
+def test_gpu_engine_refuses_cameras(boxes):
     with pytest.raises(ConfigError, match="cameras need the CPU engine; the GPU engine cannot render them"):
         boxes({"camera": CART}, "sim.engine=warp")
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "expected"),
     [
         ({"entity": "robot", "camera": "ahed"}, "no camera 'ahed' in the MJCF of 'robot'; did you mean 'ahead'"),
         ({"entity": "robot", "body": "wing"}, "wing"),
@@ -270,7 +270,7 @@ def test_the_gpu_engine_has_no_cameras(boxes):
         ({"data": "colour"}, "data"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused_by_its_key(boxes, change, said):
+def test_invalid_camera_raises_config_error_with_key(boxes, change, expected):
     camera = {**FRONT, **change}
     if "camera" in change and "entity" in change:
         camera = {key: value for key, value in camera.items() if key not in ("eye", "lookat", "fov")} | change
@@ -278,10 +278,10 @@ def test_a_camera_that_cannot_be_is_refused_by_its_key(boxes, change, said):
         boxes({"camera": camera})
     (problem,) = refused.value.problems
     assert problem.path.startswith("scene.sensors.camera")
-    assert said in f"{problem.message}; {problem.hint} {problem.path}"
+    assert expected in f"{problem.message}; {problem.hint} {problem.path}"
 
 
-def test_closing_ends_the_threads_and_drawing(boxes):
+def test_close_ends_threads_and_rendering(boxes):
     before = threading.active_count()
     env = boxes({"camera": CART}, "sim.engine_threads=2")
     assert threading.active_count() == before + 2
@@ -290,10 +290,10 @@ def test_closing_ends_the_threads_and_drawing(boxes):
     assert threading.active_count() == before
     env.sensors["camera"].update(0.02)
     with pytest.raises(MachineError, match="the environment is closed"):
-        picture(env)
+        read_image(env)
 
 
-def test_what_goes_wrong_in_a_thread_is_raised_where_somebody_looks(boxes):
+def test_error_in_render_thread_is_raised_by_run(boxes):
     env = boxes({"camera": CART})
     renderers = env.sensors["camera"]._renderers
 
@@ -303,7 +303,7 @@ def test_what_goes_wrong_in_a_thread_is_raised_where_somebody_looks(boxes):
     with pytest.raises(ValueError, match="out of paint"):
         renderers.run([fail])
     env.sensors["camera"].update(0.02)
-    assert picture(env).max() > 0.0  # and the threads work on
+    assert read_image(env).max() > 0.0  # the threads still work
 
 
 PROGRAM = """
@@ -344,14 +344,14 @@ def program(tmp_path, way, **variables):
 @pytest.mark.slow
 @pytest.mark.parametrize(("way", "code"), [("end", 0), ("raise", 3)])
 @pytest.mark.parametrize("backend", ["egl", "osmesa"])
-def test_a_process_that_never_closes_its_cameras_ends_in_peace(tmp_path, way, code, backend):
+def test_process_with_open_cameras_exits_without_error(tmp_path, way, code, backend):
     done = program(tmp_path, way, MUJOCO_GL=backend)
     assert (done.returncode, done.stderr) == (code, "")
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
-def test_a_forked_process_is_told_instead_of_waiting_for_ever(tmp_path):
+def test_rendering_in_forked_process_raises_machine_error(tmp_path):
     done = program(tmp_path, "fork")
     assert done.returncode == 0, done.stderr
     assert "MachineError cameras render only in the process that made the environment" in done.stdout
@@ -359,7 +359,7 @@ def test_a_forked_process_is_told_instead_of_waiting_for_ever(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["check", "lint", "eval"])
-def test_without_opengl_a_task_with_a_camera_is_refused_as_the_machines_fault(tmp_path, command):
+def test_camera_without_opengl_exits_with_machine_error(tmp_path, command):
     folder = write(tmp_path / "task", edited(dump(TASK), scene={"sensors": {"camera": CART}}), boxes_xml=BOXES)
     arguments = [sys.executable, "-m", "rlcli", command, str(folder), *(["--policy", "zero"] * (command == "eval"))]
     done = subprocess.run(arguments, env={**os.environ, "MUJOCO_GL": "disabled"}, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""From MJCF files to a model: what the configuration says is what the compiled model has."""
+"""Tests of scenes: the compiled model has the settings of the configuration."""
 
 import math
 import os
@@ -61,7 +61,7 @@ def dof(model, name):
     return int(model.jnt_dofadr[joint(model, name)])
 
 
-def test_joint_overrides_reach_the_model_and_the_rest_keeps_the_mjcf(tmp_path):
+def test_joint_overrides_change_only_named_joints(tmp_path):
     model = model_of(tmp_path, robot={"joints": {
         "elbow": {"damping": 2.0, "stiffness": 3.0, "armature": 0.4, "friction_loss": 0.5},
     }})  # fmt: skip
@@ -75,7 +75,7 @@ def test_joint_overrides_reach_the_model_and_the_rest_keeps_the_mjcf(tmp_path):
     assert np.ravel(model.jnt_stiffness[s])[0] == 0.0
 
 
-def test_of_two_patterns_the_later_wins_key_by_key(tmp_path):
+def test_joint_overrides_merge_keys_and_later_pattern_wins(tmp_path):
     model = model_of(tmp_path, robot={"joints": {".*": {"damping": 1.0, "armature": 0.1}, "elbow": {"damping": 5.0}}})
     assert np.ravel(model.dof_damping[dof(model, "robot/shoulder")])[0] == 1.0
     assert np.ravel(model.dof_damping[dof(model, "robot/elbow")])[0] == 5.0
@@ -83,13 +83,13 @@ def test_of_two_patterns_the_later_wins_key_by_key(tmp_path):
 
 
 @pytest.mark.parametrize("angle", ["degree", "radian"])
-def test_a_joint_range_is_in_rad_whatever_unit_the_mjcf_uses(tmp_path, angle):
+def test_joint_range_is_in_rad_for_any_mjcf_unit(tmp_path, angle):
     xml = ARM.replace("<compiler ", f'<compiler angle="{angle}" ').replace("-90 90", "-1.5 1.5").replace("10", "0.1")
     model = model_of(tmp_path, xml=xml, robot={"joints": {"shoulder": {"range": [-0.5, 0.25]}}})
     assert model.jnt_range[joint(model, "robot/shoulder")].tolist() == pytest.approx([-0.5, 0.25])
 
 
-def test_the_range_of_a_slide_joint_is_in_m(tmp_path):
+def test_slide_joint_range_is_in_m(tmp_path):
     xml = ARM.replace('name="shoulder" axis="0 1 0" range="-90 90"', 'name="shoulder" type="slide" range="-1 1"')
     model = model_of(tmp_path, xml=xml, robot={"joints": {"shoulder": {"range": [-0.5, 0.25]}}})
     assert model.jnt_range[joint(model, "robot/shoulder")].tolist() == [-0.5, 0.25]
@@ -97,7 +97,7 @@ def test_the_range_of_a_slide_joint_is_in_m(tmp_path):
 
 
 def largest_force(env, column):
-    """|joint force| that an absurd effort action produces."""
+    """Return the magnitude of the joint force for a huge effort action."""
     env.reset()
     env.step(torch.full((env.num_envs, 1), 1e6))
     force = env.engine.field("qfrc_actuator")
@@ -105,13 +105,13 @@ def largest_force(env, column):
     return float(force[0, column])
 
 
-def test_an_effort_limit_holds_on_the_joint_through_the_gear_of_an_existing_actuator(tmp_path):
+def test_effort_limit_applies_after_gear_of_existing_actuator(tmp_path):
     xml = ARM.replace(' ctrlrange="-1 1"', "")
     env = build(arm(tmp_path, xml=xml, robot={"joints": {"shoulder": {"effort_limit": 12.0}}}))
     assert largest_force(env, dof(env.engine.model, "robot/shoulder")) == pytest.approx(12.0)
 
 
-def test_an_effort_limit_holds_on_an_added_actuator(tmp_path):
+def test_effort_limit_applies_to_added_actuator(tmp_path):
     xml = ARM.replace('<position joint="elbow" kp="10" kv="1" gear="2"/>', "")
     env = build(arm(tmp_path, xml=xml, robot={"joints": {"elbow": {"effort_limit": 3.0}}},
                     actions={"torque": {"func": "joint_effort", "joints": ["elbow"]}}))  # fmt: skip
@@ -119,7 +119,7 @@ def test_an_effort_limit_holds_on_an_added_actuator(tmp_path):
 
 
 @pytest.mark.parametrize("gear", [1, 50, -4])
-def test_a_joint_effort_is_action_times_scale_whatever_the_gear(tmp_path, gear):
+def test_joint_effort_is_action_times_scale_for_any_gear(tmp_path, gear):
     env = build(arm(tmp_path, xml=ARM.replace('gear="50" ctrlrange="-1 1"', f'gear="{gear}"')))
     env.reset()
     force = env.engine.field("qfrc_actuator")
@@ -128,7 +128,7 @@ def test_a_joint_effort_is_action_times_scale_whatever_the_gear(tmp_path, gear):
     assert force[:, column].tolist() == pytest.approx([6.0, -4.0, 0.0], rel=1e-6)
 
 
-def test_the_mjcfs_own_control_range_still_limits(tmp_path):
+def test_mjcf_control_range_limits_effort(tmp_path):
     env = build(arm(tmp_path))
     env.reset()
     force = env.engine.field("qfrc_actuator")
@@ -136,22 +136,22 @@ def test_the_mjcfs_own_control_range_still_limits(tmp_path):
     assert float(force[0, dof(env.engine.model, "robot/shoulder")]) == pytest.approx(50.0)
 
 
-def test_actuators_are_added_only_where_missing(tmp_path):
+def test_actuators_are_added_only_if_missing(tmp_path):
     both = {"torque": {"func": "joint_effort", "joints": ["shoulder", "elbow"]}}
     model = model_of(tmp_path, actions=both)
     drives = [int(j) for j in model.actuator_trnid[:, 0]]
     s, e = joint(model, "robot/shoulder"), joint(model, "robot/elbow")
-    assert sorted(drives) == sorted([s, e, e])  # the motor of the shoulder, the elbow's servo and its new motor
+    assert sorted(drives) == sorted([s, e, e])  # motor of the shoulder; servo and added motor of the elbow
     assert model_of(tmp_path).nu == 2
 
 
-def test_an_unnamed_actuator_of_the_mjcf_is_used(tmp_path):
+def test_unnamed_mjcf_actuator_is_used(tmp_path):
     env = build(arm(tmp_path, xml=ARM.replace('name="shoulder_motor" ', "")))
     assert env.engine.model.nu == 2
     assert env.layout.actions[0].elements == ("shoulder",)
 
 
-def test_gains_of_added_position_and_velocity_actuators(tmp_path):
+def test_added_actuators_have_configured_gains(tmp_path):
     env = build(arm(tmp_path, robot={"joints": {"shoulder": {"kp": 30.0, "kv": 2.0, "actuator": "position"},
                                                "elbow": {"kv": 4.0, "actuator": "velocity"}}}))  # fmt: skip
     model = env.engine.model
@@ -164,14 +164,14 @@ def test_gains_of_added_position_and_velocity_actuators(tmp_path):
     assert (model.actuator_gainprm[a, 0], *model.actuator_biasprm[a, 1:3]) == (4.0, 0.0, -4.0)
 
 
-def test_gains_of_an_existing_position_actuator_follow_the_task(tmp_path):
+def test_task_overrides_gains_of_existing_actuator(tmp_path):
     env = build(arm(tmp_path, robot={"joints": {"elbow": {"kp": 25.0, "kv": 3.0}}}))
     ((_, a),) = env.entities["robot"].actuators_of("position")
     model = env.engine.model
     assert (model.actuator_gainprm[a, 0], *model.actuator_biasprm[a, 1:3]) == (25.0, -25.0, -3.0)
 
 
-def test_a_position_target_is_the_joints_whatever_the_gear(tmp_path):
+def test_position_target_is_joint_position_for_any_gear(tmp_path):
     env = build(arm(tmp_path, sim={"gravity": [0.0, 0.0, 0.0]}, episode_length_s=100.0,
                     actions={"torque": {"func": "joint_position", "joints": ["elbow"], "use_default_offset": False}},
                     robot={"joints": {".*": {"damping": 1.0}}}))  # fmt: skip
@@ -181,12 +181,12 @@ def test_a_position_target_is_the_joints_whatever_the_gear(tmp_path):
     assert env.entities["robot"].data.joint_pos[:, 1].tolist() == pytest.approx([0.6] * 3, abs=0.01)
 
 
-def test_a_position_actuator_without_a_gain_is_a_problem_of_the_configuration(tmp_path):
+def test_position_actuator_without_gain_raises_config_error(tmp_path):
     with pytest.raises(ConfigError, match=r"scene.entities.robot.joints: joint 'shoulder' needs a position actuator"):
         build(arm(tmp_path, actions={"t": {"func": "joint_position", "joints": ["shoulder"]}}))
 
 
-def test_two_entities_of_one_model_are_apart(tmp_path):
+def test_two_entities_of_one_model_are_independent(tmp_path):
     entities = {
         "left": {"model": "arm.xml", "pos": [0.0, 1.0, 0.0], "init": {"joint_pos": {"elbow": 0.3}}},
         "right": {"model": "arm.xml", "pos": [0.0, -1.0, 0.0], "joints": {"elbow": {"damping": 9.0}}},
@@ -217,8 +217,8 @@ def test_two_entities_of_one_model_are_apart(tmp_path):
     assert left.data.root_pos_w[0].tolist() == [0, 1, 0]
 
 
-def test_joints_around_a_ball_joint_have_their_own_columns(tmp_path):
-    """Columns of qpos are not contiguous there: 0 and 5, with the ball's four between them."""
+def test_columns_of_joints_skip_ball_joint(tmp_path):
+    """Check the columns 0 and 5 of qpos, which enclose the four columns of a ball joint."""
     env = build(arm(tmp_path, robot={"init": {"joint_pos": {"shoulder": 0.2, "elbow": 0.4},
                                               "joint_vel": {"elbow": -0.5}}}))  # fmt: skip
     entity = env.entities["robot"]
@@ -233,16 +233,16 @@ def test_joints_around_a_ball_joint_have_their_own_columns(tmp_path):
     assert torch.equal(entity.data.joint_vel, env.engine.field("qvel").float()[:, [0, 4]])
 
 
-def test_a_joint_starts_at_qpos0_unless_told_otherwise(tmp_path):
+def test_joint_starts_at_qpos0_or_init(tmp_path):
     env = build(arm(tmp_path))
     assert env.entities["robot"].data.default_joint_pos[0].tolist() == pytest.approx([0.0, math.radians(10)])
 
 
-def test_keyframes_of_an_mjcf_do_not_disturb_a_scene(tmp_path):
+def test_mjcf_keyframes_are_dropped(tmp_path):
     assert model_of(tmp_path).nkey == 0
 
 
-def test_options_come_from_the_first_mjcf_unless_the_task_says_otherwise(tmp_path):
+def test_options_come_from_first_mjcf_unless_overridden(tmp_path):
     model = model_of(tmp_path)
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     assert model.opt.iterations == 7
@@ -254,18 +254,18 @@ def test_options_come_from_the_first_mjcf_unless_the_task_says_otherwise(tmp_pat
     assert changed.opt.timestep == 0.002
 
 
-def test_the_memory_that_an_mjcf_asks_for_is_there(tmp_path):
+def test_mjcf_memory_size_is_kept(tmp_path):
     assert model_of(tmp_path).narena == 20 * 1024 * 1024
 
 
-def test_an_entitys_orientation_is_normalised(tmp_path):
+def test_entity_orientation_is_normalised(tmp_path):
     model = model_of(tmp_path, robot={"quat": [2.0, 0.0, 0.0, 2.0], "pos": [1.0, 2.0, 3.0]})
     body = model.body("robot/base")
     assert body.quat.tolist() == pytest.approx([math.sqrt(0.5), 0, 0, math.sqrt(0.5)])
     assert body.pos.tolist() == [1, 2, 3]
 
 
-def test_ground_and_lights(tmp_path):
+def test_scene_has_ground_and_lights(tmp_path):
     model = model_of(tmp_path, scene={
         "entities": {"robot": {"model": "arm.xml"}},
         "ground": {"size": 12.0, "friction": 0.7},
@@ -282,7 +282,7 @@ def test_ground_and_lights(tmp_path):
     assert model_of(tmp_path).ngeom == 4  # ground: null
 
 
-def test_a_floating_root_is_found_also_where_the_mjcf_names_nothing(tmp_path):
+def test_floating_root_is_found_in_unnamed_mjcf(tmp_path):
     xml = CRITTER.replace('<body name="torso" pos', "<body pos").replace('<freejoint name="root"/>', "<freejoint/>")
     xml = xml.replace('name="hip_fl" ', "")
     data = edited(
@@ -296,7 +296,7 @@ def test_a_floating_root_is_found_also_where_the_mjcf_names_nothing(tmp_path):
     assert entity.joint_names[1:] == ["hip_fr", "hip_bl", "hip_br"]
 
 
-def test_an_entity_of_nothing_but_geoms_is_a_fixture(tmp_path):
+def test_entity_without_bodies_is_fixed(tmp_path):
     table = '<mujoco><worldbody><geom type="box" size="1 1 0.1"/></worldbody></mujoco>'
     data = edited(PENDULUM_TASK, scene={"entities": {
         "robot": {"model": "pendulum.xml"}, "table": {"model": "table.xml", "pos": [0.0, 0.0, -3.0]}}})  # fmt: skip
@@ -319,7 +319,7 @@ def test_an_entity_of_nothing_but_geoms_is_a_fixture(tmp_path):
         ({"init": {"joint_pos": {"knee": 1.0}}}, r"scene.entities.robot.init: no joint matches 'knee'"),
     ],
 )  # fmt: skip
-def test_what_the_models_do_not_fit_is_a_problem_at_its_place(tmp_path, robot, message):
+def test_mismatch_with_model_raises_config_error_with_key(tmp_path, robot, message):
     folder = arm(tmp_path, robot=robot)
     (tmp_path / "outside.xml").write_text(ARM)
     (folder / "broken.xml").write_text("<mujoco><worldbody><bdoy/></worldbody></mujoco>")
@@ -328,20 +328,20 @@ def test_what_the_models_do_not_fit_is_a_problem_at_its_place(tmp_path, robot, m
     assert "task.yaml:" in str(caught.value)
 
 
-def test_all_problems_of_a_scene_are_reported_at_once(tmp_path):
+def test_scene_reports_all_problems_at_once(tmp_path):
     with pytest.raises(ConfigError) as caught:
         build(arm(tmp_path, robot={"joints": {"elbo": {"damping": 1.0}, "shuolder": {"armature": 1.0}}}))
     assert len(caught.value.problems) == 2
 
 
-def test_a_model_that_does_not_compile_is_a_configuration_error(tmp_path):
+def test_compile_error_raises_config_error(tmp_path):
     xml = ARM.replace('<geom size="0.03" mass="0.2"', '<geom size="0.03" mass="0"').replace('mass="0.5"', 'mass="0"')
     with pytest.raises(ConfigError, match=r"MuJoCo cannot compile the model: .*mass"):
         build(arm(tmp_path, xml=xml))
 
 
 @pytest.mark.parametrize("number", [1, 2])
-def test_the_total_mass_that_a_model_asks_for_is_kept_for_each_entity(tmp_path, number):
+def test_settotalmass_is_kept_for_each_entity(tmp_path, number):
     xml = ARM.replace('autolimits="true"', 'autolimits="true" settotalmass="14"')
     entities = {f"arm_{i}": {"model": "arm.xml"} for i in range(number)}
     task = edited(PENDULUM_TASK, scene={"entities": {"robot": {"model": "arm.xml"}, **entities}}, actions=ARM_ACTIONS)
@@ -357,12 +357,12 @@ def test_the_total_mass_that_a_model_asks_for_is_kept_for_each_entity(tmp_path, 
     assert model.body_mass.sum() == pytest.approx(14.0 * (number + 1))
 
 
-def test_attaching_a_model_with_options_of_its_own_prints_nothing(tmp_path, capfd):
+def test_attach_with_other_options_prints_nothing(tmp_path, capfd):
     model_of(tmp_path, xml=ARM.replace("<option ", '<option timestep="0.003" '))
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_model_may_lie_in_an_installed_package_that_is_not_imported(tmp_path, monkeypatch):
+def test_model_in_installed_package_is_read_without_import(tmp_path, monkeypatch):
     package = tmp_path / "site" / "armory" / "assets"
     package.mkdir(parents=True)
     (package.parent / "__init__.py").write_text("raise SystemExit('imported')\n")
@@ -380,12 +380,12 @@ def users_folder(tmp_path, monkeypatch):
     return folder
 
 
-def test_a_model_may_lie_in_a_folder_of_the_users(tmp_path, monkeypatch):
+def test_model_in_user_folder_is_read(tmp_path, monkeypatch):
     users_folder(tmp_path, monkeypatch)
     assert joint(model_of(tmp_path / "a", robot={"model": "models:arm/arm.xml"}), "robot/elbow") >= 0
 
 
-def test_what_a_model_of_the_users_loads_lies_in_that_folder_too(tmp_path, monkeypatch):
+def test_model_in_user_folder_may_not_load_files_outside(tmp_path, monkeypatch):
     folder = users_folder(tmp_path, monkeypatch)
     (tmp_path / "secret.xml").write_text("<mujoco/>")
     (folder / "arm" / "arm.xml").write_text(ARM.replace("<worldbody>", '<include file="../../secret.xml"/><worldbody>'))
@@ -394,13 +394,13 @@ def test_what_a_model_of_the_users_loads_lies_in_that_folder_too(tmp_path, monke
 
 
 @pytest.mark.parametrize("first", ["models:leg/leg.xml", "package:no_such_package_here/arm.xml", "absent.xml"])
-def test_of_several_models_the_first_that_is_there_counts(tmp_path, monkeypatch, first):
+def test_first_existing_model_is_used(tmp_path, monkeypatch, first):
     users_folder(tmp_path, monkeypatch)
     model = model_of(tmp_path / "a", robot={"model": f"{first} | models:arm/arm.xml | package:numpy/arm.xml"})
     assert joint(model, "robot/elbow") >= 0
 
 
-def test_a_model_that_the_user_has_not_got_is_no_error_of_the_task(tmp_path, monkeypatch):
+def test_missing_user_model_raises_missing_model_error(tmp_path, monkeypatch):
     monkeypatch.delenv("RLCLI_MODELS", raising=False)
     with pytest.raises(TaskError) as missing:
         model_of(tmp_path, robot={"model": "models:arm/arm.xml | package:no_such_package_here/arm.xml"})
@@ -413,28 +413,28 @@ def test_a_model_that_the_user_has_not_got_is_no_error_of_the_task(tmp_path, mon
 
 
 @pytest.mark.parametrize(
-    ("reference", "error", "said"),
+    ("reference", "error", "expected"),
     [
         ("models:leg/leg.xml", TaskError, "no file 'leg/leg.xml' in"),
         ("models:../secret.xml", ConfigError, "lies outside the folder"),
     ],
 )
-def test_a_model_that_is_in_no_folder_of_the_users_is_refused(tmp_path, monkeypatch, reference, error, said):
+def test_model_outside_user_folders_is_refused(tmp_path, monkeypatch, reference, error, expected):
     users_folder(tmp_path, monkeypatch)
     (tmp_path / "secret.xml").write_text(ARM)
-    with pytest.raises(error, match=re.escape(said)):
+    with pytest.raises(error, match=re.escape(expected)):
         model_of(tmp_path / "a", robot={"model": reference})
 
 
 @pytest.mark.parametrize(
-    ("reference", "said"),
+    ("reference", "expected"),
     [
         ("package:no_such_package_here/arm.xml", "no Python package 'no_such_package_here'"),
         ("package:numpy/arm.xml", "no file 'arm.xml' in the package 'numpy'"),
         ("package:numpy/../arm.xml", "lies outside the package 'numpy'"),
     ],
 )
-def test_a_model_that_is_in_no_package_is_refused(tmp_path, reference, said):
+def test_model_outside_packages_is_refused(tmp_path, reference, expected):
     with pytest.raises(ConfigError) as refused:
         model_of(tmp_path, robot={"model": reference})
-    assert said in str(refused.value)
+    assert expected in str(refused.value)

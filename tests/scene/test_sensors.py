@@ -1,4 +1,4 @@
-"""Contact and ray sensors of a scene, on states whose forces and distances are known."""
+"""Tests of contact and ray sensors in states with known forces and distances."""
 
 import math
 
@@ -44,7 +44,7 @@ MANY_STEPS = pytest.mark.parametrize("engine", ["batch", pytest.param("warp", ma
 
 
 def boxes(tmp_path, sensors, *overrides, num_envs=3, **changes):
-    """Two boxes of 2 and 1 kg, one on the other, on the ground; and a cart out of the way that takes actions."""
+    """Make environments with a box of 1 kg on a box of 2 kg on the ground, and a distant cart for the actions."""
     task = edited(dump(TASK), scene={"sensors": sensors}, **changes)
     folder = write(tmp_path / "boxes", task, low_xml=BOX.format(mass=2), high_xml=BOX.format(mass=1), cart_xml=CART)
     env = build(folder, num_envs, *overrides)
@@ -65,7 +65,7 @@ def contact(**settings):
 
 
 @MANY_STEPS
-def test_the_force_is_that_on_the_body_in_the_world_frame(tmp_path, engine):
+def test_contact_force_acts_on_body_in_world_frame(tmp_path, engine):
     env = boxes(tmp_path, {
         "low": contact(entity="low", bodies="box"),
         "high": contact(entity="high", bodies="box"),
@@ -84,7 +84,7 @@ def test_the_force_is_that_on_the_body_in_the_world_frame(tmp_path, engine):
 
 
 @MANY_STEPS
-def test_a_pushed_box_feels_friction_against_its_motion(tmp_path, engine):
+def test_contact_force_includes_friction(tmp_path, engine):
     env = boxes(tmp_path, {"low": contact(entity="low", bodies="box", against="ground")}, f"sim.engine={engine}")
     rest(env, 5)
     env.engine.field("xfrc_applied").view(3, -1)[:, 6:7] = 4.0  # along x, on the first body after the world
@@ -92,7 +92,7 @@ def test_a_pushed_box_feels_friction_against_its_motion(tmp_path, engine):
     torch.testing.assert_close(env.sensors["low"].force[:, 0, 0], torch.full((3,), -4.0), atol=0.05, rtol=0)
 
 
-def test_slots_stand_in_the_order_written_and_several_others_add_up(tmp_path):
+def test_contact_slots_have_order_of_configuration(tmp_path):
     task = edited(dump(TASK), scene={"entities": {
         "left": {"model": "low.xml", "pos": [-0.12, 0.0, 0.0]},
         "right": {"model": "low.xml", "pos": [0.12, 0.0, 0.0]},
@@ -117,7 +117,7 @@ def test_slots_stand_in_the_order_written_and_several_others_add_up(tmp_path):
     assert float(whole) == pytest.approx(4 * 9.81, abs=0.05)
 
 
-def test_forces_against_several_bodies_are_their_sum(tmp_path):
+def test_contact_forces_of_several_partners_are_summed(tmp_path):
     env = boxes(tmp_path, {
         "all": contact(entity="low", bodies="box", against={"entity": "high", "bodies": ["box", "tag"]}),
         "one": contact(entity="low", bodies="box", against={"entity": "high", "bodies": ["box"]}),
@@ -129,7 +129,7 @@ def test_forces_against_several_bodies_are_their_sum(tmp_path):
 
 @MANY_STEPS
 def test_air_and_contact_times_count_steps(tmp_path, engine):
-    """The box starts 0.2 m above the ground: sqrt(2 h / g) = 0.202 s of fall, steps of 0.02 s."""
+    """Drop a box from 0.2 m: it falls for sqrt(2 h / g) = 0.202 s, in steps of 0.02 s."""
     entities = {"low": {"pos": [0.0, 0.0, 0.2]}, "high": {"pos": [9.0, 0.0, 0.0]}}
     env = boxes(tmp_path, {"box": contact(entity="low", bodies="box", history=3)}, f"sim.engine={engine}",
                 *(f"scene.entities.{n}.pos={e['pos']}" for n, e in entities.items()))  # fmt: skip
@@ -154,7 +154,7 @@ def test_air_and_contact_times_count_steps(tmp_path, engine):
         else:
             assert not sensor.first_contact.any()
             assert sensor.contact_time[0, 0] == pytest.approx(0.02 * (step - landed + 1))
-    assert landed in (11, 12)  # contact is found a substep after it begins
+    assert landed in (11, 12)  # contact is detected one substep after it begins
     assert seen[landed - 1 :] == [True] * (16 - landed)
     env.engine.field("qvel")[:, 2] = 2.0  # thrown up
     env.step(torch.zeros(3, 1))
@@ -165,7 +165,7 @@ def test_air_and_contact_times_count_steps(tmp_path, engine):
 
 
 @ENGINES
-def test_a_new_episode_starts_without_times_and_leaves_the_others_alone(tmp_path, engine):
+def test_reset_clears_contact_times_of_selected_environments(tmp_path, engine):
     env = boxes(tmp_path, {"box": contact(entity="low", bodies="box", history=2)}, f"sim.engine={engine}")
     sensor = env.sensors["box"]
     rest(env, 5)
@@ -181,7 +181,7 @@ def test_a_new_episode_starts_without_times_and_leaves_the_others_alone(tmp_path
     assert torch.equal(sensor.force_history[1, 0], sensor.force[1])
 
 
-def test_a_threshold_decides_what_contact_is(tmp_path):
+def test_force_threshold_defines_contact(tmp_path):
     env = boxes(tmp_path, {
         "light": contact(entity="high", bodies="box", force_threshold=9.0),
         "heavy": contact(entity="high", bodies="box", force_threshold=11.0),
@@ -237,7 +237,7 @@ def rays(**settings):
 
 
 @ENGINES
-def test_distances_hits_and_misses_of_single_rays(tmp_path, engine):
+def test_ray_sensor_returns_distances_hits_and_misses(tmp_path, engine):
     env = tower(tmp_path, {
         "eye": rays(pattern=[[0.0, 0.0, -2.0], [1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, -1.0]], sees="all",
                     offset=[0.0, 0.0, -0.5], max_distance=4.0),
@@ -254,8 +254,8 @@ def test_distances_hits_and_misses_of_single_rays(tmp_path, engine):
 
 
 @ENGINES
-def test_alignment_decides_which_turns_the_pattern_follows(tmp_path, engine):
-    """The body is turned by 90 degrees about z, then rolled by 30 degrees about its own x axis."""
+def test_ray_alignment_selects_rotation_of_pattern(tmp_path, engine):
+    """Turn the body by 90 degrees about z, then roll it by 30 degrees about its own x axis."""
     grid = {"size": [1.0, 0.0], "resolution": 1.0}
     env = tower(tmp_path, {
         name: rays(pattern=grid, offset=[0.0, 0.2, 0.0], alignment=name) for name in ("base", "yaw", "world")
@@ -266,7 +266,7 @@ def test_alignment_decides_which_turns_the_pattern_follows(tmp_path, engine):
     position = {"world": [0.0, 0.2, 1.0], "yaw": [-0.2, 0.0, 1.0], "base": [-0.2 * math.cos(math.pi / 6), 0.0, 1.1]}
     for name, expected in position.items():
         torch.testing.assert_close(env.sensors[name].position[0], torch.tensor(expected), atol=1e-5, rtol=0)
-    # one ray starts half a metre behind, one as far ahead of the sensor
+    # one ray starts 0.5 m behind the sensor, one 0.5 m ahead of it
     world, yaw, base = (env.sensors[name].hits[0] for name in ("world", "yaw", "base"))
     torch.testing.assert_close(world, torch.tensor([[-0.5, 0.2, 0.0], [0.5, 0.2, 0.0]]), atol=1e-5, rtol=0)
     torch.testing.assert_close(yaw, torch.tensor([[-0.2, -0.5, 0.0], [-0.2, 0.5, 0.0]]), atol=1e-5, rtol=0)
@@ -277,7 +277,7 @@ def test_alignment_decides_which_turns_the_pattern_follows(tmp_path, engine):
 
 
 @ENGINES
-def test_a_sensor_on_another_body_follows_its_joint(tmp_path, engine):
+def test_ray_sensor_moves_with_body(tmp_path, engine):
     env = tower(tmp_path, {"eye": rays(body="head", pattern=[[1.0, 0.0, 0.0]], sees="all")}, f"sim.engine={engine}")
     pose(env, [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0])
     torch.testing.assert_close(env.sensors["eye"].distance, torch.full((3, 1), 2.0), atol=1e-5, rtol=0)
@@ -285,7 +285,7 @@ def test_a_sensor_on_another_body_follows_its_joint(tmp_path, engine):
     torch.testing.assert_close(env.sensors["eye"].distance, torch.full((3, 1), 4.0), atol=1e-4, rtol=0)
 
 
-def test_the_grid_runs_along_x_first_and_has_both_ends(tmp_path):
+def test_ray_grid_runs_along_x_first_and_includes_both_ends(tmp_path):
     env = tower(tmp_path, {"scan": rays(pattern={"size": [1.6, 1.0], "resolution": 0.1})})
     hits = env.sensors["scan"].hits[0]
     assert hits.shape == (17 * 11, 3)
@@ -296,8 +296,8 @@ def test_the_grid_runs_along_x_first_and_has_both_ends(tmp_path):
 
 
 @pytest.mark.parametrize(("sees", "distance"), [("ground", 2.0), ("all", 0.48), ([3], 0.48), ([4], 10.0)])
-def test_what_a_ray_sees(tmp_path, sees, distance):
-    """From two metres up, a plate of geom group 3 hangs 0.5 m below, 0.02 m thick on each side."""
+def test_ray_hits_only_selected_geom_groups(tmp_path, sees, distance):
+    """Cast rays down from 2 m; a plate of geom group 3 with a half thickness of 0.02 m is 0.5 m below."""
     plate = WALL.replace('pos="3 0 1"', 'pos="0 0 1.5"').replace('size="0.5 10 1"', 'size="1 1 0.02" group="3"')
     task = edited(dump(TASK), sim={"gravity": [0.0, 0.0, 0.0]}, scene={
         "entities": {"robot": {"model": "tower.xml", "pos": [0.0, 0.0, 2.0]}, "plate": {"model": "plate.xml"}},
@@ -309,7 +309,7 @@ def test_what_a_ray_sees(tmp_path, sees, distance):
 
 
 @ENGINES
-def test_rays_are_cast_once_a_step_and_again_where_an_episode_begins(tmp_path, engine, monkeypatch):
+def test_rays_are_cast_once_per_step_and_after_reset(tmp_path, engine, monkeypatch):
     env = tower(tmp_path, {"eye": rays(pattern=[[0.0, 0.0, -1.0]])}, f"sim.engine={engine}")
     casts = []
     cast = env.engine.rays
@@ -360,34 +360,34 @@ def sensing_critter(tmp_path, num_envs, *overrides, sensors=FEET, grip=None, see
     return build(critter(tmp_path, task, terms_py=TERMS), num_envs, *overrides, seed=seed)
 
 
-def lives(env, steps):
+def rollout(env, steps):
     env.reset()
     return [env.step(a).obs["policy"].clone() for a in actions(steps, env.num_envs, env.layout.action_size)]
 
 
-def test_what_sensors_tell_an_environment_is_the_same_among_many(tmp_path):
-    many = lives(sensing_critter(tmp_path / "a", 19), 50)
-    few = lives(sensing_critter(tmp_path / "b", 3), 50)
+def test_sensor_readings_are_independent_of_num_envs(tmp_path):
+    many = rollout(sensing_critter(tmp_path / "a", 19), 50)
+    few = rollout(sensing_critter(tmp_path / "b", 3), 50)
     assert all(torch.equal(a[:3], b) for a, b in zip(many, few, strict=True))
-    assert torch.stack(few)[..., 6:8].mean() > 0.1  # feet on the ground now and then
+    assert torch.stack(few)[..., 6:8].mean() > 0.1  # the feet touch the ground at times
     assert not torch.equal(few[0][0], few[0][1])
 
 
-def test_both_engines_tell_the_same(tmp_path):
+def test_sensor_readings_agree_between_engines(tmp_path):
     host = sensing_critter(tmp_path / "a", 4)
     device = sensing_critter(tmp_path / "b", 4, "sim.engine=warp")
     for env in (host, device):
         env.reset(seed=1)
-    # contact forces multiply rounding errors: compare the first steps, in which the legs touch down
+    # contact forces amplify rounding errors: compare only the first steps, in which the legs touch down
     for action in actions(4, 4, 4):
         one, other = host.step(0.3 * action).obs["policy"], device.step(0.3 * action).obs["policy"]
         torch.testing.assert_close(one, other, atol=0.2, rtol=0.02)
         torch.testing.assert_close(one[:, 12:], other[:, 12:], atol=1e-3, rtol=0)
 
 
-def test_a_checkpoint_carries_times_and_history(tmp_path):
+def test_state_dict_restores_contact_times_and_history(tmp_path):
     env = sensing_critter(tmp_path / "a", 4)
-    lives(env, 12)
+    rollout(env, 12)
     state = env.state_dict()
     assert {"sensors.feet.air_time", "sensors.feet.force_history"} <= state.keys()
     draws = actions(20, 4, 4, seed=3)
@@ -399,7 +399,7 @@ def test_a_checkpoint_carries_times_and_history(tmp_path):
     assert all(torch.equal(a, b) for a, b in zip(expected, found, strict=True))
 
 
-# --- refusals ---
+# --- errors ---
 
 
 @pytest.mark.parametrize(
@@ -428,7 +428,7 @@ def test_a_checkpoint_carries_times_and_history(tmp_path):
          "lookup: false"),
     ],
 )  # fmt: skip
-def test_a_sensor_that_does_not_fit_is_refused_with_its_place(tmp_path, sensor, message, hint):
+def test_invalid_sensor_raises_config_error_with_key(tmp_path, sensor, message, hint):
     task = edited(CRITTER_TASK, scene={"sensors": {"feet": sensor}})
     with pytest.raises(ConfigError) as error:
         build(critter(tmp_path, task), 2)
@@ -437,14 +437,14 @@ def test_a_sensor_that_does_not_fit_is_refused_with_its_place(tmp_path, sensor, 
     assert hint is None or hint in text
 
 
-def test_a_body_that_nothing_can_touch_is_refused_with_those_that_can_be(tmp_path):
+def test_contact_sensor_on_body_without_contacts_is_refused(tmp_path):
     with pytest.raises(
         ConfigError, match=r"scene.sensors.x.bodies: body 'tag' has no geom .*; bodies with such a geom: box$"
     ):
         boxes(tmp_path, {"x": contact(entity="low", bodies=["box", "tag"])})
 
 
-def test_a_sensor_of_the_ground_without_a_ground_is_refused(tmp_path):
+def test_ground_sensor_without_ground_is_refused(tmp_path):
     with pytest.raises(ConfigError) as error:
         boxes(tmp_path, {"a": contact(entity="low", bodies="box", against="ground"),
                          "b": rays(entity="low", pattern=[[0.0, 0.0, -1.0]])}, "scene.ground=null")  # fmt: skip
@@ -456,7 +456,7 @@ def test_a_sensor_of_the_ground_without_a_ground_is_refused(tmp_path):
     [("feed", "no sensor 'feed' of kind contact in scene.sensors", "did you mean 'feet'"),
      ("body", "sensor 'body' is of kind rays, the term needs one of kind contact", "sensors of this kind: feet")],
 )  # fmt: skip
-def test_a_term_that_names_a_wrong_sensor_is_refused(tmp_path, name, message, hint):
+def test_term_with_unknown_sensor_is_refused(tmp_path, name, message, hint):
     with pytest.raises(ConfigError) as error:
         sensing_critter(tmp_path, 2, grip={"sensor": name})
     text = str(error.value)

@@ -1,4 +1,4 @@
-"""Entities written as shapes: props that stand, objects that fall, and several of a kind."""
+"""Tests of entities that are shapes: static props, falling objects, and several entities of one kind."""
 
 import math
 
@@ -29,7 +29,7 @@ ENGINES = pytest.mark.parametrize("engine", ["batch", pytest.param("warp", marks
 
 
 def scene(tmp_path, entities, *overrides, num_envs=2, **changes):
-    """A cart out of the way, and further entities; the shapes come first."""
+    """Make environments with the given entities first and a distant cart last."""
     task = edited(dump(TASK), scene={"entities": {**entities, **TASK["scene"]["entities"]}}, **changes)
     env = build(write(tmp_path / "shapes", task, cart_xml=CART), num_envs, *overrides)
     env.reset()
@@ -46,7 +46,7 @@ def free(shape, size, pos, **more):
 
 
 @ENGINES
-def test_free_shapes_come_to_rest_at_the_height_their_size_says(tmp_path, engine):
+def test_free_shape_rests_at_height_of_its_size(tmp_path, engine):
     env = scene(tmp_path, {
         "box": free("box", [0.4, 0.3, 0.2], [0.0, 0.0, 0.12], mass=2.0),
         "ball": free("sphere", [0.15], [2.0, 0.0, 0.16], mass=1.0),
@@ -58,7 +58,7 @@ def test_free_shapes_come_to_rest_at_the_height_their_size_says(tmp_path, engine
         assert env.entities[name].data.root_pos_w[:, 2].tolist() == pytest.approx([height] * 2, abs=2e-3), name
 
 
-def test_mass_and_density_reach_the_model(tmp_path):
+def test_mass_and_density_are_written_to_model(tmp_path):
     model = scene(tmp_path, {
         "heavy": free("box", [0.4, 0.3, 0.2], [0.0, 0.0, 1.0], mass=7.0),
         "dense": free("box", [0.4, 0.3, 0.2], [2.0, 0.0, 1.0], density=500.0),
@@ -72,7 +72,7 @@ def test_mass_and_density_reach_the_model(tmp_path):
     assert mass["can"] == pytest.approx(math.pi * 0.1**2 * 0.5 * 1000.0)
 
 
-def test_a_static_shape_carries_what_falls_on_it_and_stays(tmp_path):
+def test_static_shape_supports_falling_object(tmp_path):
     env = scene(tmp_path, {
         "table": {"shape": "box", "size": [1.0, 1.0, 0.1], "pos": [0.0, 0.0, 0.75]},
         "floor": {"shape": "plane", "size": [4.0, 4.0], "pos": [10.0, 0.0, 0.3]},
@@ -86,8 +86,8 @@ def test_a_static_shape_carries_what_falls_on_it_and_stays(tmp_path):
     assert not env.entities["table"].is_floating
 
 
-def test_friction_of_a_shape_decides_whether_it_slides_down(tmp_path):
-    """On a slope of 20 degrees a box holds where friction is above tan 20 = 0.364."""
+def test_shape_friction_determines_sliding(tmp_path):
+    """Place a box on a slope of 20 degrees: it stays if its friction is above tan 20 = 0.364."""
     half = math.radians(10.0)
     turn = [math.cos(half), 0.0, math.sin(half), 0.0]
     normal = torch.tensor([math.sin(2 * half), 0.0, math.cos(2 * half)]) * (0.05 + 0.1)
@@ -101,14 +101,14 @@ def test_friction_of_a_shape_decides_whether_it_slides_down(tmp_path):
     rest(env, 50)
     start = {name: torch.tensor(entities[name]["pos"]) for name in ("slippery", "rough")}
     slid = {name: float((env.entities[name].data.root_pos_w[0] - start[name]).norm()) for name in start}
-    # half of g (sin 20 - 0.2 cos 20) t^2 after half a second
+    # 0.5 g (sin 20 - 0.2 cos 20) t^2 after 0.5 s
     expected = 0.5 * 9.81 * (math.sin(2 * half) - 0.2 * math.cos(2 * half)) * 0.25
     assert slid["slippery"] == pytest.approx(expected, rel=0.05)
     assert slid["rough"] < 0.01
 
 
 @ENGINES
-def test_the_default_velocity_of_a_free_root_is_in_the_world_frame(tmp_path, engine):
+def test_default_root_velocity_is_in_world_frame(tmp_path, engine):
     half = math.sqrt(0.5)
     env = scene(tmp_path, {
         "ball": free("sphere", [0.1], [0.0, 0.0, 5.0], quat=[half, half, 0.0, 0.0],
@@ -125,7 +125,7 @@ def test_the_default_velocity_of_a_free_root_is_in_the_world_frame(tmp_path, eng
 
 
 @ENGINES
-def test_a_mocap_shape_is_moved_by_events_carries_others_and_returns_at_a_reset(tmp_path, engine):
+def test_mocap_shape_moves_objects_and_returns_at_reset(tmp_path, engine):
     env = scene(tmp_path, {
         "lift": {"shape": "box", "size": [1.0, 1.0, 0.2], "pos": [0.0, 0.0, 0.1], "mocap": True},
         "ball": free("box", [0.1, 0.1, 0.1], [0.0, 0.0, 0.25]),
@@ -139,19 +139,19 @@ def test_a_mocap_shape_is_moved_by_events_carries_others_and_returns_at_a_reset(
         lift.write_root_pose(chosen, height, rows)
         rest(env, 1)
     assert lift.data.root_pos_w[:, 2].tolist() == pytest.approx([0.1, 0.298])
-    # the ball starts at rest on the lift; a mocap body pushes without a velocity of its own
+    # the ball starts at rest on the lift; a mocap body has no velocity of its own
     assert env.entities["ball"].data.root_pos_w[:, 2].tolist() == pytest.approx([0.25, 0.25 + 0.198], abs=0.02)
     env._reset_envs(chosen)
     assert lift.data.root_pos_w[:, 2].tolist() == pytest.approx([0.1, 0.1])
 
 
-def test_options_come_from_the_first_mjcf_though_a_shape_stands_before_it(tmp_path):
+def test_options_come_from_first_mjcf_after_shape(tmp_path):
     env = scene(tmp_path, {"box": free("box", [0.2, 0.2, 0.2], [0.0, 0.0, 1.0])})
     assert env.engine.model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
 
 
-def test_one_model_attached_twice_gives_two_robots_of_equal_lives(tmp_path):
-    """Each of two critters, far apart and driven alike, lives as one that is alone."""
+def test_model_attached_twice_gives_equal_trajectories(tmp_path):
+    """Compare two distant critters with equal actions to a critter that is alone."""
     events = {"root": None, "joints": None, "push": None, "shove": None}
     pair = {name: {"model": "critter.xml", "pos": [0.0, y, 0.0], "joints": {".*": {"kp": 20.0, "kv": 0.5}}}
             for name, y in (("robot", 0.0), ("other", 8.0))}  # fmt: skip
@@ -169,7 +169,7 @@ def test_one_model_attached_twice_gives_two_robots_of_equal_lives(tmp_path):
     assert float((robot.joint_pos[0] - robot.joint_pos[1]).abs().max()) > 0.05
 
 
-def test_objects_do_not_make_a_life_depend_on_the_number_of_environments(tmp_path):
+def test_trajectory_with_objects_is_independent_of_num_envs(tmp_path):
     ball = {"ball": free("sphere", [0.1], [0.3, 0.0, 0.6], mass=0.5)}
     task = edited(CRITTER_TASK, scene={"entities": {
         "robot": {"model": "critter.xml", "joints": {".*": {"kp": 20.0, "kv": 0.5}}}, **ball}})  # fmt: skip
@@ -196,7 +196,7 @@ def test_objects_do_not_make_a_life_depend_on_the_number_of_environments(tmp_pat
         ({"shape": "sphere", "size": [1.0], "init": {"lin_vel": [1.0, 0.0, 0.0]}}, "entity 'robot' has no free root"),
     ],
 )
-def test_a_shape_that_does_not_fit_is_refused_with_its_place(tmp_path, entity, message):
+def test_invalid_shape_raises_config_error_with_key(tmp_path, entity, message):
     task = edited(dump(TASK), scene={"entities": {"robot": entity, "cart": {"model": "cart.xml"}}},
                   actions={"push": {"func": "joint_effort", "entity": "cart"}},
                   observations={"policy": {"pos": {"func": "joint_pos", "entity": "cart"}}})  # fmt: skip

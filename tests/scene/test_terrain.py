@@ -1,4 +1,4 @@
-"""Terrains: what the patches look like, where environments start on them, and how they change level."""
+"""Tests of terrains: heights of the patches, start positions of environments, and changes of level."""
 
 import mujoco
 import numpy as np
@@ -28,8 +28,8 @@ def ground(**changes):
     return make_ground(TerrainGeneratorConfig.model_validate(data), None)
 
 
-def one(difficulty, **patch):
-    """The heights of a single patch of 6 m x 6 m, cells of 0.1 m."""
+def patch_heights(difficulty, **patch):
+    """Return the heights of a single patch of 6 m x 6 m with cells of 0.1 m."""
     level = (difficulty, difficulty)
     return ground(rows=1, columns=1, patch=(6.0, 6.0), difficulty=level, sub_terrains={"it": patch}).heights
 
@@ -38,9 +38,11 @@ def one(difficulty, **patch):
 
 
 @pytest.mark.parametrize("inverted", [False, True])
-def test_a_slope_rises_from_the_edges_to_its_platform(inverted):
-    heights = one(0.5, kind="slope", slope=(0.0, 0.4), platform=2.0, inverted=inverted) * (-1 if inverted else 1)
-    # half way between 0 and 0.4: 0.2 m a metre over the two metres to the platform
+def test_slope_rises_from_edges_to_platform(inverted):
+    heights = patch_heights(0.5, kind="slope", slope=(0.0, 0.4), platform=2.0, inverted=inverted) * (
+        -1 if inverted else 1
+    )
+    # slope 0.2, halfway between 0 and 0.4, over the 2 m to the platform
     assert heights[30, 30] == pytest.approx(0.4)
     assert heights[10, 30] == pytest.approx(0.2)
     assert heights[30, 50] == pytest.approx(0.2)
@@ -50,10 +52,10 @@ def test_a_slope_rises_from_the_edges_to_its_platform(inverted):
 
 
 @pytest.mark.parametrize("inverted", [False, True])
-def test_stairs_have_steps_of_the_height_that_the_difficulty_says(inverted):
+def test_stairs_have_step_height_of_difficulty(inverted):
     patch = {"kind": "stairs", "step_height": (0.1, 0.2), "step_width": 0.5, "platform": 2.0, "inverted": inverted}
-    heights = one(1.0, **patch) * (-1 if inverted else 1)
-    # four rings of half a metre: 0, 0.2, 0.4, 0.6, then the platform
+    heights = patch_heights(1.0, **patch) * (-1 if inverted else 1)
+    # four rings of 0.5 m with heights 0, 0.2, 0.4 and 0.6, then the platform
     middles = [heights[30, int(10 * (0.25 + 0.5 * ring))] for ring in range(4)]
     assert middles == pytest.approx([0.0, 0.2, 0.4, 0.6])
     assert heights[30, 30] == pytest.approx(0.8)
@@ -61,38 +63,38 @@ def test_stairs_have_steps_of_the_height_that_the_difficulty_says(inverted):
     assert np.allclose(heights, heights[::-1])
 
 
-def test_waves_have_their_amplitude_and_count():
-    heights = one(1.0, kind="waves", amplitude=(0.0, 0.3), count=3)
+def test_waves_have_configured_amplitude_and_count():
+    heights = patch_heights(1.0, kind="waves", amplitude=(0.0, 0.3), count=3)
     x = np.arange(61) * 0.1
     expected = 0.15 * (np.sin(x)[:, None] * 0 + np.sin(2 * np.pi * 3 * x / 6)[:, None] + np.sin(2 * np.pi * 3 * x / 6))
     assert np.allclose(heights[1:-1, 1:-1], expected[1:-1, 1:-1])
 
 
-def test_noise_is_within_its_bound_and_straight_between_its_points():
-    heights = one(0.5, kind="noise", height=(0.0, 0.2), spacing=0.5)
+def test_noise_is_bounded_and_linear_between_points():
+    heights = patch_heights(0.5, kind="noise", height=(0.0, 0.2), spacing=0.5)
     assert 0.08 < heights.max() <= 0.1
     assert -0.08 > heights.min() >= -0.1
     inner = heights[5:11, 10]
     assert np.allclose(np.diff(inner, 2), 0.0)
 
 
-def test_obstacles_leave_the_platform_free_and_have_the_height_of_the_difficulty():
-    heights = one(1.0, kind="obstacles", height=(0.0, 0.2), width=(0.3, 0.8), count=30, platform=2.0)
+def test_obstacles_have_height_of_difficulty_and_free_platform():
+    heights = patch_heights(1.0, kind="obstacles", height=(0.0, 0.2), width=(0.3, 0.8), count=30, platform=2.0)
     assert np.all(heights[20:41, 20:41] == 0.0)
     assert set(np.unique(np.round(heights, 9))) == {-0.2, -0.1, 0.0, 0.1, 0.2}
 
 
-def test_stones_stand_at_0_over_a_pit_and_gaps_widen():
-    easy = one(0.0, kind="stones", width=(0.4, 1.0), gap=(0.1, 0.5), depth=2.0, platform=1.5)
-    hard = one(1.0, kind="stones", width=(0.4, 1.0), gap=(0.1, 0.5), depth=2.0, platform=1.5)
+def test_stones_have_height_0_and_gaps_grow_with_difficulty():
+    easy = patch_heights(0.0, kind="stones", width=(0.4, 1.0), gap=(0.1, 0.5), depth=2.0, platform=1.5)
+    hard = patch_heights(1.0, kind="stones", width=(0.4, 1.0), gap=(0.1, 0.5), depth=2.0, platform=1.5)
     for heights in (easy, hard):
         assert set(np.unique(heights)) <= {-2.0, 0.0}
         assert np.all(heights[23:38, 23:38] == 0.0)
     assert (hard < 0).mean() > (easy < 0).mean()
 
 
-def test_a_grid_has_cells_of_its_edge_within_its_bound():
-    heights = one(1.0, kind="grid", cell=1.0, height=(0.0, 0.3), platform=1.0)
+def test_grid_has_bounded_cells_of_configured_edge():
+    heights = patch_heights(1.0, kind="grid", cell=1.0, height=(0.0, 0.3), platform=1.0)
     cells = heights[5::10, 5::10]
     assert cells.shape == (6, 6)
     assert len(np.unique(cells)) >= 30
@@ -101,7 +103,7 @@ def test_a_grid_has_cells_of_its_edge_within_its_bound():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_patch_meets_its_neighbours_at_0_and_grows_with_difficulty(kind):
+def test_patch_has_zero_edges_and_grows_with_difficulty(kind):
     heights = ground(sub_terrains={"it": {"kind": kind}}, rows=4, difficulty=[0.1, 1.0]).heights
     assert not heights[::40].any()
     assert not heights[:, ::60].any()
@@ -109,31 +111,31 @@ def test_every_patch_meets_its_neighbours_at_0_and_grows_with_difficulty(kind):
     assert rough[0] < rough[3] or kind == "flat"
 
 
-# --- the whole ---
+# --- whole terrain ---
 
 
-def test_columns_are_shared_out_by_proportion_and_rows_by_difficulty():
+def test_curriculum_assigns_columns_by_proportion_and_rows_by_difficulty():
     made = ground(columns=8, sub_terrains={
         "up": {"kind": "slope", "slope": (0.1, 0.4), "platform": 2.0, "proportion": 3.0},
         "none": {"kind": "flat", "proportion": 0.0},
         "down": {"kind": "slope", "slope": (0.1, 0.4), "platform": 2.0, "inverted": True},
     })  # fmt: skip
     top = made.origins[:, :, 2]
-    # one metre from the edge to the platform, slopes 0.1, 0.25, 0.4
+    # 1 m from the edge to the platform, slopes 0.1, 0.25 and 0.4
     expected = np.outer([0.1, 0.25, 0.4], [1, 1, 1, 1, 1, 1, -1, -1])
     assert np.allclose(top, expected, atol=1e-6)
     assert made.origins[:, 0, 0].tolist() == [-4.0, 0.0, 4.0]
     assert made.origins[0, :, 1].tolist() == [-21.0, -15.0, -9.0, -3.0, 3.0, 9.0, 15.0, 21.0]
 
 
-def test_without_curriculum_kinds_and_difficulties_are_drawn():
+def test_without_curriculum_kinds_and_difficulties_are_random():
     kinds = {"up": {"kind": "slope", "slope": (0.1, 0.4)}, "down": {"kind": "slope", "inverted": True}}
     tops = ground(rows=10, columns=10, curriculum=False, sub_terrains=kinds).origins[:, :, 2]
     assert 30 < (tops > 0).sum() < 70
     assert len(np.unique(tops)) > 80
 
 
-def test_a_terrain_is_the_same_for_the_same_seed_alone():
+def test_terrain_depends_only_on_seed():
     kinds = {kind: {"kind": kind} for kind in KINDS}
     first, again, other = (ground(columns=8, sub_terrains=kinds, seed=seed) for seed in (1, 1, 2))
     assert np.array_equal(first.heights, again.heights)
@@ -161,7 +163,7 @@ def height_at(model, x, y):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_model_has_the_heights_that_were_made(tmp_path, kind):
+def test_model_has_heights_of_ground(tmp_path, kind):
     patch = {"it": {"kind": kind}}
     model = on_terrain(tmp_path, generator(sub_terrains=patch), 1).engine.model
     made = ground(sub_terrains=patch)
@@ -176,7 +178,7 @@ def test_the_model_has_the_heights_that_were_made(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", ["stairs", "grid"])
 @pytest.mark.parametrize("inverted", [False, True])
-def test_boxes_have_the_heights_of_the_height_field_with_upright_faces(tmp_path, kind, inverted):
+def test_boxes_equal_height_field_with_upright_faces(tmp_path, kind, inverted):
     if kind == "grid" and inverted:
         patch = {"it": {"kind": "grid", "cell": 1.0, "height": [0.1, 0.3]}}
     else:
@@ -190,7 +192,7 @@ def test_boxes_have_the_heights_of_the_height_field_with_upright_faces(tmp_path,
     made = ground(sub_terrains={"it": lists}, rows=1, columns=1)
     for i in range(5, 36, 5):
         for j in range(5, 56, 5):
-            x, y = i * 0.1 - 2.0 + 0.21, j * 0.1 - 3.0 + 0.21  # inside of cells and of steps
+            x, y = i * 0.1 - 2.0 + 0.21, j * 0.1 - 3.0 + 0.21  # inside cells and steps
             expected = made.heights[round((x + 2.0) * 10), round((y + 3.0) * 10)]
             assert height_at(model, x, y) == pytest.approx(expected, abs=1e-6), (x, y)
 
@@ -201,7 +203,7 @@ HILLS = generator(rows=4, columns=3, sub_terrains={"hill": {"kind": "slope", "sl
 
 
 @ENGINES
-def test_environments_start_on_their_patches_and_stand_there(tmp_path, engine):
+def test_environments_start_on_their_patches(tmp_path, engine):
     still = {"push": None, "shove": None, "joints": None}
     quiet = {"func": "reset_root_state_uniform", "mode": "reset", "z": [0.0, 0.0]}
     env = on_terrain(tmp_path, HILLS, 6, f"sim.engine={engine}", events={**still, "root": quiet})
@@ -216,7 +218,7 @@ def test_environments_start_on_their_patches_and_stand_there(tmp_path, engine):
     assert ((height > 0.2) & (height < 0.4)).all(), height
 
 
-def test_the_default_state_is_on_the_patch_without_any_event(tmp_path):
+def test_default_state_is_on_patch_without_events(tmp_path):
     none = dict.fromkeys(("root", "joints", "push", "shove"))
     ball = {"robot": {"model": "critter.xml", "joints": {".*": {"kp": 20.0, "kv": 0.5}}},
             "ball": {"shape": "sphere", "size": [0.1], "pos": [0.5, 0.0, 1.0], "free": True},
@@ -228,7 +230,7 @@ def test_the_default_state_is_on_the_patch_without_any_event(tmp_path):
         torch.testing.assert_close(found, torch.tensor([place] * 4), atol=1e-5, rtol=0)
 
 
-def test_reset_scene_to_default_puts_everything_on_the_patch(tmp_path):
+def test_reset_scene_to_default_places_entities_on_patch(tmp_path):
     events = {**dict.fromkeys(("root", "joints", "push", "shove")),
               "all": {"func": "reset_scene_to_default", "mode": "reset"}}  # fmt: skip
     env = on_terrain(tmp_path, HILLS, 4, events=events)
@@ -238,7 +240,7 @@ def test_reset_scene_to_default_puts_everything_on_the_patch(tmp_path):
 
 
 @ENGINES
-def test_levels_rise_and_fall_for_the_selected_and_wrap_to_a_random_one(tmp_path, engine):
+def test_move_changes_levels_of_selected_environments(tmp_path, engine):
     env = on_terrain(tmp_path, HILLS, 5, f"sim.engine={engine}")
     terrain = env.terrain
     terrain.levels.copy_(torch.tensor([0, 1, 3, 3, 2]))
@@ -246,7 +248,7 @@ def test_levels_rise_and_fall_for_the_selected_and_wrap_to_a_random_one(tmp_path
     chosen = env._select(torch.tensor([True, True, True, False, False]))
     up, down = torch.tensor([False, True, True, True, True]), torch.tensor([True, True, False, False, True])
     terrain.move(chosen, chosen.read(up), chosen.read(down))
-    assert terrain.levels[[0, 1, 3, 4]].tolist() == [0, 2, 3, 2]  # of both, up counts
+    assert terrain.levels[[0, 1, 3, 4]].tolist() == [0, 2, 3, 2]  # if both are set, `up` applies
     assert 0 <= int(terrain.levels[2]) < 4
     moved = terrain.origins[terrain.levels, terrain.types]
     assert torch.equal(env.origins[:3], moved[:3])
@@ -256,7 +258,7 @@ def test_levels_rise_and_fall_for_the_selected_and_wrap_to_a_random_one(tmp_path
     assert terrain.levels[[0, 1, 3, 4]].tolist() == [0, 1, 2, 1]
 
 
-def test_who_passes_the_last_level_lands_on_any_level(tmp_path):
+def test_move_above_last_level_draws_random_level(tmp_path):
     env = on_terrain(tmp_path, HILLS, 200)
     env.terrain.levels.fill_(3)
     everyone, yes = env._select_all(), torch.ones(200, dtype=torch.bool)
@@ -265,8 +267,8 @@ def test_who_passes_the_last_level_lands_on_any_level(tmp_path):
     assert (counts > 25).all()
 
 
-def test_the_curriculum_of_levels_goes_by_the_distance_covered(tmp_path):
-    """Half a patch is 2 m; what is asked for is 0.5 m; every step ends an episode."""
+def test_terrain_curriculum_uses_walked_distance(tmp_path):
+    """End an episode in every step; half a patch is 2 m and the required distance is 0.5 m."""
     none = dict.fromkeys(("joints", "push", "shove"))
     terms = {"levels": {"func": "terrain_levels", "least": 0.5}}
     env = on_terrain(tmp_path, HILLS, 4, events={**none, "root": {"func": "reset_scene_to_default", "mode": "reset"}},
@@ -283,7 +285,7 @@ def test_the_curriculum_of_levels_goes_by_the_distance_covered(tmp_path):
 
 
 @ENGINES
-def test_every_episode_may_begin_on_a_random_level_of_the_same_ground(tmp_path, engine):
+def test_scatter_draws_random_level_in_same_column(tmp_path, engine):
     none = dict.fromkeys(("joints", "push", "shove"))
     events = {**none, "root": None, "level": {"func": "randomize_terrain_level", "mode": "reset"},
               "place": {"func": "reset_root_state_uniform", "mode": "reset"}}  # fmt: skip
@@ -302,19 +304,19 @@ def test_every_episode_may_begin_on_a_random_level_of_the_same_ground(tmp_path, 
     torch.testing.assert_close(found, torch.tensor([[0.0, 0.0, 0.35]] * 60), atol=1e-5, rtol=0)
 
 
-def test_random_levels_without_a_terrain_are_refused(tmp_path):
+def test_random_levels_without_terrain_are_refused(tmp_path):
     task = edited(CRITTER_TASK, events={"level": {"func": "randomize_terrain_level", "mode": "reset"}})
     with pytest.raises(ConfigError, match=r"events.level: the scene has no terrain"):
         build(critter(tmp_path, task), 1)
 
 
-def test_a_curriculum_of_levels_without_a_terrain_is_refused(tmp_path):
+def test_terrain_curriculum_without_terrain_is_refused(tmp_path):
     task = edited(CRITTER_TASK, curriculum={"levels": {"func": "terrain_levels"}})
     with pytest.raises(ConfigError, match=r"curriculum.levels: the scene has no terrain"):
         build(critter(tmp_path, task), 1)
 
 
-def test_start_levels_depend_on_the_seed_and_are_bounded(tmp_path):
+def test_start_levels_depend_on_seed_and_are_bounded(tmp_path):
     env = on_terrain(tmp_path, {**HILLS, "max_start_level": 1}, 100)
     first = env.terrain.levels.clone()
     assert set(first.tolist()) == {0, 1}
@@ -326,13 +328,13 @@ def test_start_levels_depend_on_the_seed_and_are_bounded(tmp_path):
     assert torch.equal(env.origins, env.terrain.origins[env.terrain.levels, env.terrain.types])
 
 
-def test_a_life_on_terrain_is_the_same_among_many(tmp_path):
+def test_trajectory_on_terrain_is_independent_of_num_envs(tmp_path):
     hills = generator(sub_terrains={"a": {"kind": "noise"}, "b": {"kind": "stairs"}})
     many, few = (run(on_terrain(tmp_path, hills, n, folder=name), 30) for name, n in (("a", 19), ("b", 3)))
     assert all(same(life(many, env), life(few, env)) for env in range(3))
 
 
-def test_a_checkpoint_carries_levels_and_origins(tmp_path):
+def test_state_dict_restores_levels_and_origins(tmp_path):
     env = on_terrain(tmp_path, HILLS, 4)
     env.reset()
     everyone, yes = env._select_all(), torch.ones(4, dtype=torch.bool)
@@ -349,7 +351,7 @@ def test_a_checkpoint_carries_levels_and_origins(tmp_path):
     assert all(torch.equal(a, other.step(b).obs["policy"]) for a, b in zip(expected, draws, strict=True))
 
 
-def test_sensors_know_the_terrain_as_the_ground(tmp_path):
+def test_sensors_treat_terrain_as_ground(tmp_path):
     grid = {"size": [0.4, 0.4], "resolution": 0.2}
     sensors = {"torso": {"kind": "contact", "bodies": "leg_.*", "against": "ground"},
                "scan": {"kind": "rays", "pattern": grid, "alignment": "yaw"}}  # fmt: skip
@@ -367,7 +369,7 @@ def test_sensors_know_the_terrain_as_the_ground(tmp_path):
 
 
 @ENGINES
-def test_heights_that_are_looked_up_are_those_that_rays_find(tmp_path, engine):
+def test_height_lookup_equals_ray_casts(tmp_path, engine):
     grid = {"size": [1.6, 1.0], "resolution": 0.1}
     scan = {"kind": "rays", "pattern": grid, "alignment": "yaw", "offset": [0.1, 0.0, 5.0], "max_distance": 9.0}
     grounds = {"rubble": {"kind": "noise", "height": [0.1, 0.3], "spacing": 0.1}, "hill": {"kind": "slope"}}
@@ -378,7 +380,7 @@ def test_heights_that_are_looked_up_are_those_that_rays_find(tmp_path, engine):
                      scene={"sensors": {"cast": scan, "table": {**scan, "lookup": True}}})  # fmt: skip
     env.reset()
     draw = torch.Generator().manual_seed(1)
-    # four about their patches, four at the edge between field and border, four at that of the border, and beyond
+    # four on their patches, four at the edge of the height field, four at the edge of the border, and one beyond
     place = env.origins + torch.rand(12, 3, generator=draw) * torch.tensor([2.0, 2.0, 0.5])
     place[4:8, 0], place[8:, 0] = 5.9, 8.0
     turns = torch.nn.functional.normalize(torch.randn(12, 4, generator=draw), dim=1)
@@ -401,13 +403,13 @@ def test_heights_that_are_looked_up_are_those_that_rays_find(tmp_path, engine):
     assert ((table.distance != before).any(dim=1) == (torch.arange(12) == 3)).all()
 
 
-def test_what_lies_under_the_ground_finds_none_in_the_table():
+def test_height_lookup_below_ground_returns_no_hit():
     table = HeightTable(ground(sub_terrains={"flat": {"kind": "flat"}}), torch.device("cpu"))
     found = table.distance(torch.tensor([[0.3, 0.2, 1.5], [0.3, 0.2, -0.1], [7.9, 0.0, 2.0], [8.1, 0.0, 2.0]]))
     assert found.tolist() == [1.5, -1.0, 2.0, -1.0]
 
 
-def test_boxes_are_in_no_table_of_heights(tmp_path):
+def test_height_lookup_is_refused_for_boxes(tmp_path):
     down = {"kind": "rays", "pattern": [[0.0, 0.0, -1.0]], "alignment": "world", "lookup": True}
     stairs = generator(sub_terrains={"it": {"kind": "stairs", "boxes": True}})
     with pytest.raises(
@@ -416,7 +418,7 @@ def test_boxes_are_in_no_table_of_heights(tmp_path):
         on_terrain(tmp_path, stairs, 1, scene={"sensors": {"scan": down}})
 
 
-def test_a_height_field_from_a_file(tmp_path):
+def test_terrain_reads_height_field_from_file(tmp_path):
     x, y = np.meshgrid(np.arange(41) * 0.25 - 5.0, np.arange(21) * 0.25 - 2.5, indexing="ij")
     (tmp_path / "t" / "critter").mkdir(parents=True)
     np.save(tmp_path / "t" / "critter" / "hill.npy", 0.5 + 0.1 * x - 0.05 * y)
@@ -426,13 +428,13 @@ def test_a_height_field_from_a_file(tmp_path):
     assert env.origins.tolist() == [pytest.approx([0.0, 0.0, 0.5])] * 2
 
 
-def test_without_a_terrain_all_origins_are_0(tmp_path):
+def test_origins_without_terrain_are_0(tmp_path):
     env = build(critter(tmp_path), 3)
     assert env.terrain is None
     assert env.origins.tolist() == [[0.0] * 3] * 3
 
 
-# --- refusals ---
+# --- errors ---
 
 
 @pytest.mark.parametrize(
@@ -458,7 +460,7 @@ def test_without_a_terrain_all_origins_are_0(tmp_path):
         ({"rows": 0}, "terrain.rows: expected a whole number >= 1", None),
     ],
 )  # fmt: skip
-def test_a_terrain_that_does_not_fit_is_refused_with_its_place(tmp_path, change, message, hint):
+def test_invalid_terrain_raises_config_error_with_key(tmp_path, change, message, hint):
     with pytest.raises(ConfigError) as error:
         on_terrain(tmp_path, generator(**change), 1)
     assert message in str(error.value)
@@ -485,7 +487,7 @@ def test_a_terrain_that_does_not_fit_is_refused_with_its_place(tmp_path, change,
         (None, "../hill.npy", "lies outside the task's folder"),
     ],
 )
-def test_a_file_of_heights_that_cannot_be_read_is_refused(tmp_path, content, file, message):
+def test_unreadable_height_file_is_refused(tmp_path, content, file, message):
     folder = tmp_path / "t" / "critter"
     folder.mkdir(parents=True)
     if isinstance(content, bytes):

@@ -1,4 +1,4 @@
-"""The CPU engine against MuJoCo itself, one world at a time."""
+"""Tests of the CPU engine: each world equals a simulation in plain MuJoCo."""
 
 import mujoco
 import numpy as np
@@ -28,13 +28,13 @@ def engine_of(model, num_envs, *, device="cpu", **settings):
     return open_engine(model, num_envs, SimConfig(dt=model.opt.timestep, **settings), device=device)
 
 
-def some(*ids):
+def selection_of(*ids):
     ids = np.array(ids, dtype=np.int64)
     return IdSelection(ids, 0, np.zeros_like(ids))
 
 
 def scatter(engine, seed=0):
-    """Different states and controls in every world."""
+    """Set different states and controls in every world."""
     random = np.random.default_rng(seed)
     qpos = engine.field("qpos")
     qpos[:, :3] += torch.from_numpy(random.uniform(-0.1, 0.1, (engine.num_envs, 3)))
@@ -43,19 +43,19 @@ def scatter(engine, seed=0):
     engine.field("ctrl")[:] = torch.from_numpy(random.uniform(-1, 1, (engine.num_envs, 4)))
 
 
-def test_more_worlds_than_memory_holds_are_refused_before_any_is_made(monkeypatch):
+def test_engine_refuses_more_worlds_than_memory_holds(monkeypatch):
     monkeypatch.setattr("rlcli.machine.memory", lambda: 2**30)
     with pytest.raises(DeviceError, match=r"^1000000 environments need at least \d\.\d GiB, 1\.0 GiB are") as no:
         engine_of(model_of(), 1_000_000)
-    assert no.value.hint == "fewer environments: --num-envs"
+    assert no.value.hint == "use fewer environments: --num-envs"
     assert engine_of(model_of(), 1000).num_envs == 1000
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_it_steps_like_a_loop_of_mj_step_bit_for_bit(threads):
+def test_step_equals_mj_step_bit_for_bit(threads):
     model = model_of()
     engine = engine_of(model, N, engine_threads=threads)
-    engine.field("xpos")  # with a stage asked for the last substep, too
+    engine.field("xpos")  # so that the last substep computes a stage too
     scatter(engine)
     worlds = []
     for i in range(N):
@@ -68,10 +68,10 @@ def test_it_steps_like_a_loop_of_mj_step_bit_for_bit(threads):
             mujoco.mj_step(model, data, 3)
             for name in ("qpos", "qvel", "qacc_warmstart"):
                 np.testing.assert_array_equal(engine.field(name)[i].numpy(), getattr(data, name))
-    assert any(data.ncon for data in worlds), "contacts were part of it"
+    assert any(data.ncon for data in worlds), "contacts occurred"
 
 
-def test_fields_are_live_views():
+def test_field_returns_live_view():
     engine = engine_of(model_of(), N)
     qpos, again = engine.field("qpos"), engine.field("qpos")
     qpos[2, 2] = 5.0
@@ -90,7 +90,7 @@ def kinematics(engine, i):
     return data
 
 
-def test_derived_fields_are_those_of_the_state_after_a_step_and_after_a_partial_reset():
+def test_derived_fields_match_state_after_step_and_partial_reset():
     engine = engine_of(model_of(), N)
     fields = {name: engine.field(name) for name in ("xpos", "xquat", "cvel", "site_xpos")}
     scatter(engine)
@@ -99,9 +99,9 @@ def test_derived_fields_are_those_of_the_state_after_a_step_and_after_a_partial_
         for name, value in fields.items():
             np.testing.assert_allclose(value[i], getattr(kinematics(engine, i), name), atol=1e-12, rtol=0)
     kept = {name: value.clone() for name, value in fields.items()}
-    engine.reset(some(1, 4))
+    engine.reset(selection_of(1, 4))
     engine.field("qpos")[4, 0] = 0.7
-    engine.forward(some(1, 4))
+    engine.forward(selection_of(1, 4))
     for i in range(N):
         for name, value in fields.items():
             np.testing.assert_allclose(value[i], getattr(kinematics(engine, i), name), atol=1e-12, rtol=0)
@@ -109,7 +109,7 @@ def test_derived_fields_are_those_of_the_state_after_a_step_and_after_a_partial_
     assert float(fields["xpos"][4, 1, 0]) == 0.7
 
 
-def test_gyro_and_accelerometer_are_the_new_episodes_after_a_partial_reset():
+def test_gyro_and_accelerometer_match_start_state_after_partial_reset():
     engine = engine_of(model_of(), N)
     sensors = engine.field("sensordata")
     scatter(engine)
@@ -117,15 +117,15 @@ def test_gyro_and_accelerometer_are_the_new_episodes_after_a_partial_reset():
     gyro = sensors[0, 3:6].clone()
     np.testing.assert_allclose(gyro, kinematics(engine, 0).sensordata[3:6], atol=1e-12)
     kept = sensors.clone()
-    engine.reset(some(2))
-    engine.field("qpos")[2, 2], engine.field("ctrl")[2] = 0.25, 0.3  # on its feet: the ground pushes
-    engine.forward(some(2))
+    engine.reset(selection_of(2))
+    engine.field("qpos")[2, 2], engine.field("ctrl")[2] = 0.25, 0.3  # on its feet, in contact with the ground
+    engine.forward(selection_of(2))
     assert abs(kinematics(engine, 2).sensordata[2]) > 5.0
     np.testing.assert_allclose(sensors[2], kinematics(engine, 2).sensordata, atol=1e-9)
     assert torch.equal(sensors[[0, 1, 3, 4, 5]], kept[[0, 1, 3, 4, 5]])
 
 
-def test_acceleration_fields_are_those_of_the_last_substep():
+def test_acceleration_fields_have_values_of_last_substep():
     model = model_of()
     engine = engine_of(model, 1)
     qacc, force = engine.field("qacc"), engine.field("actuator_force")
@@ -141,7 +141,7 @@ def test_acceleration_fields_are_those_of_the_last_substep():
     np.testing.assert_array_equal(force[0], data.actuator_force)
 
 
-def test_a_derived_field_that_is_asked_for_late_is_that_of_the_state():
+def test_field_bound_late_matches_state():
     engine = engine_of(model_of(), N)
     qacc = engine.field("qacc")
     scatter(engine)
@@ -150,10 +150,10 @@ def test_a_derived_field_that_is_asked_for_late_is_that_of_the_state():
     for name in ("xpos", "sensordata"):
         for i in range(N):
             np.testing.assert_allclose(engine.field(name)[i], getattr(kinematics(engine, i), name), atol=1e-9)
-    assert torch.equal(qacc, kept), "what was asked for before keeps the values of its substep"
+    assert torch.equal(qacc, kept), "a field bound before keeps the values of its substep"
 
 
-def test_sensors_of_forces_alone_are_those_of_the_last_substep_and_start_again_with_the_world():
+def test_force_sensors_have_values_of_last_substep_until_reset():
     xml = XML.replace('<accelerometer name="acc" site="imu"/><gyro name="gyro" site="imu"/>', '<force site="hip"/>')
     xml = xml.replace('<joint name="hip_fl"', '<site name="hip"/><joint name="hip_fl"')
     model = model_of(xml)
@@ -166,13 +166,13 @@ def test_sensors_of_forces_alone_are_those_of_the_last_substep_and_start_again_w
     mujoco.mj_step(model, data, 3)
     np.testing.assert_array_equal(sensors[1], data.sensordata)
     assert np.abs(kinematics(engine, 1).sensordata - data.sensordata).max() > 1e-3, "another one than the state's"
-    engine.reset(some(2))
-    engine.forward(some(2))
+    engine.reset(selection_of(2))
+    engine.forward(selection_of(2))
     np.testing.assert_allclose(sensors[2], kinematics(engine, 2).sensordata, atol=1e-9)
     np.testing.assert_array_equal(sensors[1], data.sensordata)
 
 
-def test_a_restored_engine_has_the_last_substep_of_fields_not_asked_for_yet():
+def test_load_state_dict_restores_substep_fields_bound_later():
     engine, fresh = engine_of(model_of(), N), engine_of(model_of(), N)
     engine.field("qacc")
     scatter(engine)
@@ -181,16 +181,16 @@ def test_a_restored_engine_has_the_last_substep_of_fields_not_asked_for_yet():
     assert torch.equal(fresh.field("qacc"), engine.field("qacc"))
 
 
-def test_reset_restores_the_whole_row_and_only_the_chosen_ones():
+def test_reset_restores_whole_state_of_selected_worlds():
     engine = engine_of(model_of(), N)
     engine.set_default_state(torch.arange(11, dtype=torch.float64) / 10, torch.full((10,), 0.5, dtype=torch.float64))
-    engine.reset(some(0))
+    engine.reset(selection_of(0))
     default = engine.state_dict()["state"][0]
     scatter(engine)
     engine.field("xfrc_applied")[:] = 3.0
     engine.step(5)
     kept = engine.state_dict()["state"]
-    engine.reset(some(0, 3))
+    engine.reset(selection_of(0, 3))
     state = engine.state_dict()["state"]
     for i in range(N):
         assert torch.equal(state[i], default if i in (0, 3) else kept[i])
@@ -199,7 +199,7 @@ def test_reset_restores_the_whole_row_and_only_the_chosen_ones():
     assert not engine.field("xfrc_applied")[3].any()
 
 
-def test_gravity_of_each_world_is_seen_by_its_dynamics():
+def test_expanded_gravity_changes_dynamics():
     engine = engine_of(
         model_of(PENDULUM.replace("base", "ball").replace('<body name="ball">', '<body name="ball"><freejoint/>')), 3
     )
@@ -207,11 +207,11 @@ def test_gravity_of_each_world_is_seen_by_its_dynamics():
     engine.expand("opt.gravity")[:, 2] = gravity
     engine.step(10)
     t = 10 * engine.model.opt.timestep
-    # nothing but gravity acts: the root falls with v = g t
+    # only gravity acts: the root falls with v = g t
     assert engine.field("qvel")[:, 2].tolist() == pytest.approx((gravity * t).tolist(), abs=1e-12)
 
 
-def test_mass_of_each_world_is_seen_by_its_dynamics():
+def test_expanded_mass_changes_dynamics():
     xml = '<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="s" type="slide" axis="1 0 0"/>'
     xml += '<geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="s"/></actuator></mujoco>'
     engine = engine_of(model_of(xml), 3)
@@ -224,7 +224,7 @@ def test_mass_of_each_world_is_seen_by_its_dynamics():
 
 
 @pytest.mark.parametrize("threads", [1, 4])
-def test_a_restored_engine_goes_on_bit_for_bit_with_any_number_of_threads(threads):
+def test_restored_engine_continues_bit_for_bit_with_any_thread_count(threads):
     model = model_of()
     engine = engine_of(model, N, engine_threads=2)
     derived = engine.field("xpos"), engine.field("qacc"), engine.field("sensordata")
@@ -239,13 +239,13 @@ def test_a_restored_engine_goes_on_bit_for_bit_with_any_number_of_threads(thread
     restored = other.field("xpos"), other.field("qacc"), other.field("sensordata")
     other.load_state_dict(saved)
     for value, expected in zip(restored, at_save, strict=True):
-        assert torch.equal(value, expected), "what a policy would observe now"
+        assert torch.equal(value, expected), "values that a policy observes"
     other.step(25)
     assert torch.equal(other.state_dict()["state"], engine.state_dict()["state"])
     assert torch.equal(other.expand("body_mass"), engine.expand("body_mass"))
 
 
-def test_a_state_dict_is_a_copy():
+def test_state_dict_is_copy():
     engine = engine_of(model_of(), N)
     saved = engine.state_dict()
     kept = saved["state"].clone()
@@ -253,7 +253,7 @@ def test_a_state_dict_is_a_copy():
     assert torch.equal(saved["state"], kept)
 
 
-def test_world_shows_one_world_without_disturbing_it():
+def test_world_returns_one_world_without_changing_engine():
     engine = engine_of(model_of(), N)
     engine.expand("body_mass")[3, 1] = 9.0
     scatter(engine)
@@ -272,7 +272,7 @@ def test_world_shows_one_world_without_disturbing_it():
     assert not torch.equal(before, engine.state_dict()["state"])
 
 
-def test_unknown_fields_are_named_with_the_nearest():
+def test_unknown_field_error_suggests_name():
     engine = engine_of(model_of(), 1)
     with pytest.raises(ValueError, match=r"'qvle' is not an MjData field; did you mean .*'qvel'"):
         engine.field("qvle")
@@ -281,17 +281,17 @@ def test_unknown_fields_are_named_with_the_nearest():
 
 
 @pytest.mark.parametrize("device", ["cuda:99", "tpu", "mps"])
-def test_a_device_that_is_not_there_is_refused(device):
+def test_missing_device_raises_device_error(device):
     with pytest.raises(DeviceError, match=f"device '{device}' is not available"):
         engine_of(model_of(), 1, device=device)
 
 
-def test_the_engine_of_the_cpu_is_refused_on_another_device():
+def test_batch_engine_on_gpu_device_is_refused():
     with pytest.raises(ConfigError, match="'batch' runs on a CPU, not on 'cuda'"):
         engine_of(model_of(), 1, device="cuda", engine="batch")
 
 
-def test_dropped_contacts_are_counted_and_are_no_divergence():
+def test_full_contact_buffer_is_counted_and_no_divergence():
     engine = engine_of(model_of(), 2)
     engine.step(1)
     engine._batch.warning[1, int(mujoco.mjtWarning.mjWARN_CONTACTFULL), 1] = 1
@@ -301,24 +301,24 @@ def test_dropped_contacts_are_counted_and_are_no_divergence():
     assert engine.warnings["contact_full"] == 1
 
 
-def test_positions_and_velocities_are_neighbours_and_copied_as_one():
+def test_sim_data_copies_qpos_and_qvel_at_once():
     engine = engine_of(model_of(), N)
     scatter(engine)
     sim = SimData(engine)
-    assert sim.qpos.untyped_storage().data_ptr() == sim.qvel.untyped_storage().data_ptr(), "one copy, not two"
+    assert sim.qpos.untyped_storage().data_ptr() == sim.qvel.untyped_storage().data_ptr(), "both are views of one copy"
     engine.field("qpos")[2, 0], engine.field("qvel")[N - 1, 9] = 7.0, -3.0
     sim.refresh()
     for name, copied in (("qpos", sim.qpos), ("qvel", sim.qvel)):
         assert torch.equal(copied, engine.field(name).float()), name
     before = sim.qvel.clone()
     engine.field("qvel")[:] = 5.0
-    sim.refresh_rows(some(1, 4))
+    sim.refresh_rows(selection_of(1, 4))
     assert torch.equal(sim.qvel[[1, 4]], torch.full((2, 10), 5.0))
     assert torch.equal(sim.qvel[[0, 2, 3, 5]], before[[0, 2, 3, 5]])
 
 
 @pytest.mark.parametrize("name", ["qpos", "qvel", "ctrl", "qfrc_applied", "xfrc_applied"])
-def test_a_field_of_the_state_is_the_state_itself(name):
+def test_state_field_is_view_of_integration_state(name):
     engine = engine_of(model_of(), N)
     field = engine.field(name)
     field.copy_(torch.arange(field.numel(), dtype=torch.float64).view(field.shape))

@@ -1,4 +1,4 @@
-"""How much room the GPU engine sets aside for contacts and constraints, and what happens when it was too little."""
+"""Tests of the GPU engine's capacity for contacts and constraints, and of its errors if the capacity is exceeded."""
 
 import mujoco
 import numpy as np
@@ -25,12 +25,12 @@ BALL = '<mujoco>{}<worldbody>{}<body pos="0 0 0.1"><freejoint/>{}</body></worldb
 
 
 def ant():
-    """The model of the built-in task, ground and motors included."""
+    """Return the model of the built-in task with ground and motors."""
     return build("ant-direct", 1).engine.model
 
 
-def needed(model, steps, shake=2.0):
-    """The most contacts and rows of a long simulation."""
+def simulated_maximum(model, steps, shake=2.0):
+    """Return the largest numbers of contacts and rows in a long simulation."""
     data, random = mujoco.MjData(model), np.random.default_rng(7)
     contacts = rows = 0
     for trial in range(4):
@@ -43,20 +43,20 @@ def needed(model, steps, shake=2.0):
     return contacts, rows
 
 
-def test_the_estimate_covers_what_a_longer_simulation_of_the_ant_needs():
+def test_capacity_covers_long_simulation_of_ant():
     model = ant()
-    room, (contacts, rows) = required_capacity(model), needed(model, 800)
+    capacity, (contacts, rows) = required_capacity(model), simulated_maximum(model, 800)
     assert contacts >= 4
-    assert room.contacts >= contacts
-    assert room.constraints >= rows
+    assert capacity.contacts >= contacts
+    assert capacity.constraints >= rows
 
 
-def test_the_estimate_covers_a_stack_of_boxes():
+def test_capacity_covers_stack_of_boxes():
     model = mujoco.MjModel.from_xml_string(BOXES)
-    room, (contacts, rows) = required_capacity(model), needed(model, 400, shake=0.5)
+    capacity, (contacts, rows) = required_capacity(model), simulated_maximum(model, 400, shake=0.5)
     assert contacts >= 12
-    assert room.contacts >= contacts
-    assert room.constraints >= rows
+    assert capacity.contacts >= contacts
+    assert capacity.constraints >= rows
 
 
 HILLS = '<asset><hfield name="hills" nrow="20" ncol="20" size="1 1 0.1 0.1" elevation="{}"/></asset>'.format(
@@ -88,39 +88,39 @@ LYING = {
 
 
 @pytest.mark.parametrize("xml", [BALL.format(*parts) for parts in LYING.values()], ids=LYING)
-def test_two_geoms_that_lie_on_each_other_have_room(xml):
+def test_capacity_covers_two_geoms_at_rest(xml):
     model = mujoco.MjModel.from_xml_string(xml)
-    room, (contacts, rows) = required_capacity(model), needed(model, 200, shake=0.2)
+    capacity, (contacts, rows) = required_capacity(model), simulated_maximum(model, 200, shake=0.2)
     assert contacts > 0
-    assert room.contacts >= contacts
-    assert room.constraints >= rows
+    assert capacity.contacts >= contacts
+    assert capacity.constraints >= rows
 
 
-def test_a_model_whose_parents_and_children_may_touch_has_room_for_that():
+def test_capacity_covers_contacts_of_parent_and_child():
     xml = """<mujoco><option><flag filterparent="disable"/></option><worldbody><body><joint/><geom size="0.1"/>
       <body pos="0 0 0.15"><joint axis="0 1 0"/><geom size="0.1"/></body></body></worldbody></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)
-    room, (contacts, rows) = required_capacity(model), needed(model, 20)
+    capacity, (contacts, rows) = required_capacity(model), simulated_maximum(model, 20)
     assert contacts == 1
-    assert room.contacts >= contacts
-    assert room.constraints >= rows
+    assert capacity.contacts >= contacts
+    assert capacity.constraints >= rows
 
 
-def test_settings_replace_the_estimate():
+def test_settings_replace_estimated_capacity():
     model = mujoco.MjModel.from_xml_string(BOXES)
     estimate, found = required_capacity(model), required_capacity(model, contacts=5)
     assert (found.contacts, found.constraints) == (5, estimate.constraints)
     assert required_capacity(model, constraints=9).constraints == 9
 
 
-def test_a_model_without_contacts_gets_little():
-    room = build("cartpole", 2, "sim.engine=warp").engine.capacity
-    assert room.contacts <= 2
-    assert room.constraints <= 4
+def test_capacity_without_contacts_is_small():
+    capacity = build("cartpole", 2, "sim.engine=warp").engine.capacity
+    assert capacity.contacts <= 2
+    assert capacity.constraints <= 4
 
 
 @pytest.mark.parametrize("setting", ["contacts_per_env", "constraints_per_env"])
-def test_too_little_room_is_an_error_of_check_that_names_the_setting(setting):
+def test_check_raises_with_setting_if_capacity_is_exceeded(setting):
     env = build("ant-direct", 3, "sim.engine=warp", f"sim.{setting}=1")
     env.reset()
     for _ in range(60):
@@ -132,7 +132,7 @@ def test_too_little_room_is_an_error_of_check_that_names_the_setting(setting):
     assert "1" in str(error.value)
 
 
-def test_enough_room_is_no_error():
+def test_sufficient_capacity_reports_nothing():
     model = mujoco.MjModel.from_xml_string(BOXES)
     engine = open_engine(model, 2, SimConfig(dt=0.002, engine="warp"))
     for _ in range(40):
@@ -141,8 +141,8 @@ def test_enough_room_is_no_error():
     assert engine.report_nonfinite() == []
 
 
-def test_room_on_a_height_field_is_what_is_needed_anywhere_on_it():
-    """Over the origin gapes a pit, in which nothing touches anything for a long time; 20 feet stand about it."""
+def test_capacity_covers_whole_height_field():
+    """Start 20 feet above a pit, in which they touch nothing; the ground around the pit is higher."""
     heights = np.ones((41, 41))
     heights[16:25, 16:25] = 0.0
     spec = mujoco.MjSpec()
@@ -154,5 +154,5 @@ def test_room_on_a_height_field_is_what_is_needed_anywhere_on_it():
         place = [0.2 * (foot % 5), 0.2 * (foot // 5), 0.0]
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.1, 0.0, 0.0], pos=place)
     model = spec.compile()
-    assert needed(model, 100, shake=0.0)[0] == 0
+    assert simulated_maximum(model, 100, shake=0.0)[0] == 0
     assert required_capacity(model).contacts >= 60

@@ -1,4 +1,4 @@
-"""The history of engine calls and the names of what diverged."""
+"""Tests of the history of engine calls and of the reported causes of divergence."""
 
 import math
 
@@ -35,13 +35,13 @@ def history(envs=2, columns=4, width=3, calls=3):
     return state, StateHistory(state, width, np.array(DEFAULT), calls)
 
 
-def test_a_divergence_says_environment_cause_and_place():
+def test_divergence_text_has_environment_cause_and_element():
     assert str(Divergence(3, "BADQACC", "joint 'swing'")) == "environment 3: BADQACC (joint 'swing')"
     assert str(Divergence(0, "engine error")) == "environment 0: engine error"
     assert Divergence(0, "x").index == -1
 
 
-def test_the_last_calls_are_kept_oldest_first_with_what_nobody_wrote_from_the_default():
+def test_history_returns_last_calls_with_default_columns():
     state, kept = history()
     assert (kept.calls, kept.width) == (3, 3)
     assert kept.calls_of(0) == []
@@ -55,7 +55,7 @@ def test_the_last_calls_are_kept_oldest_first_with_what_nobody_wrote_from_the_de
     assert kept.last_state(0).tolist() == [4.0, 4.0, 4.0, -4.0]
 
 
-def test_an_episode_that_begins_anew_has_no_past_and_the_others_keep_theirs():
+def test_start_episodes_drops_calls_of_selected_environments():
     state, kept = history()
     assert kept.last_state(0).tolist() == DEFAULT
     for number in (1.0, 2.0):
@@ -72,7 +72,7 @@ def test_an_episode_that_begins_anew_has_no_past_and_the_others_keep_theirs():
     assert kept.last_state(1).tolist() == [*[3.0] * 3, -4.0]
 
 
-def test_worlds_that_are_all_put_elsewhere_have_no_past_and_calls_of_before_are_not_given_out():
+def test_clear_drops_all_calls():
     state, kept = history()
     for number in (1.0, 2.0):
         state[:] = number
@@ -86,7 +86,7 @@ def test_worlds_that_are_all_put_elsewhere_have_no_past_and_calls_of_before_are_
     assert [call.state[0] for call in kept.calls_between(0, 0, kept.count)] == [3.0]
 
 
-def test_calls_are_asked_for_by_number_and_those_to_come_are_not_there():
+def test_calls_between_returns_recorded_numbers_only():
     state, kept = history(calls=4)
     for number in range(4):
         state[:] = number
@@ -95,7 +95,7 @@ def test_calls_are_asked_for_by_number_and_those_to_come_are_not_there():
     assert [call.state[0] for call in kept.calls_between(0, 2, 99)] == [2.0, 3.0]
 
 
-def test_calls_are_counted_on_from_where_another_history_ended():
+def test_history_continues_count_of_earlier_history():
     state = np.zeros((1, 2))
     kept = StateHistory(state, 2, np.zeros(2), 5, memory=3 * state.nbytes, count=7)
     assert (kept.count, kept.calls, kept.requested_calls, kept.memory) == (7, 3, 5, 48)
@@ -107,19 +107,19 @@ def test_calls_are_counted_on_from_where_another_history_ended():
 @pytest.mark.parametrize(
     ("envs", "calls", "kept"), [(1, 64, 64), (2**14, 64, 64), (2**15, 64, 32), (2**21, 64, 1), (1, 0, 1)]
 )
-def test_a_history_takes_64_mb_and_always_keeps_a_call(envs, calls, kept, monkeypatch):
+def test_history_is_limited_to_64_mb_and_at_least_one_call(envs, calls, kept, monkeypatch):
     monkeypatch.setattr(divergence_report.np, "empty", lambda shape: np.zeros(1))
     state = np.broadcast_to(np.zeros((1, 8)), (envs, 8))
     assert StateHistory(state, 8, np.zeros(8), calls).calls == kept
 
 
-def test_a_model_without_columns_has_a_history_too():
+def test_history_accepts_state_without_columns():
     kept = StateHistory(np.zeros((2, 0)), 0, np.zeros(0), 4)
     kept.record(1)
     assert [call.state.tolist() for call in kept.calls_of(0)] == [[]]
 
 
-def test_columns_are_those_of_the_layout(layout):
+def test_layout_returns_columns_of_fields(layout):
     assert layout.columns("qpos") == slice(1, 4)
     assert layout.fields() == [
         ("time", slice(0, 1)), ("qpos", slice(1, 4)), ("qvel", slice(4, 6)), ("ctrl", slice(6, 7)),
@@ -127,7 +127,7 @@ def test_columns_are_those_of_the_layout(layout):
     ]  # fmt: skip
 
 
-def test_what_is_written_is_named_before_what_comes_of_it(layout):
+def test_nonfinite_fields_lists_inputs_first(layout):
     row = np.zeros(9)
     assert layout.nonfinite_fields(row) == []
     row[[0, 3, 5, 6, 8]] = np.nan, np.inf, -np.inf, np.nan, np.nan
@@ -158,7 +158,7 @@ def test_what_is_written_is_named_before_what_comes_of_it(layout):
         ("act", 0, "act[0]"),
     ],
 )
-def test_a_place_is_named_by_what_it_belongs_to(layout, name, index, place):
+def test_element_at_returns_joint_or_actuator(layout, name, index, place):
     assert layout.element_at(name, index) == place
 
 
@@ -172,15 +172,15 @@ LIMITED = """
 @pytest.mark.parametrize(
     ("field", "place", "found"),
     [
-        ("ctrl", (1, 0), True),  # MuJoCo clips an infinite one to its range
+        ("ctrl", (1, 0), True),  # MuJoCo clamps an infinite control to its range
         ("qfrc_applied", (1, 0), True),
         ("xfrc_applied", (1, 1, 0), True),
-        ("xfrc_applied", (1, 0, 1), True),  # on the world itself: nobody reads it
+        ("xfrc_applied", (1, 0, 1), True),  # on the world body, where it has no effect
         ("time", (1,), True),
-        ("qacc_warmstart", (1, 0), False),  # the step writes its own
+        ("qacc_warmstart", (1, 0), False),  # the step overwrites it
     ],
 )
-def test_what_is_given_to_a_world_and_is_not_finite_is_found_though_its_positions_are(field, place, found, value):
+def test_diverged_detects_nonfinite_inputs_with_finite_motion(field, place, found, value):
     verdicts = []
     for looked_at in (False, True):
         engine = open_cpu_engine(mujoco.MjModel.from_xml_string(LIMITED), 3, SimConfig(dt=0.002, engine_threads=1))

@@ -1,4 +1,4 @@
-"""Which engine runs, and what is said where it cannot."""
+"""Tests of the choice of the engine, and of the errors if an engine is not available."""
 
 import importlib.util
 import json
@@ -12,11 +12,11 @@ import torch
 from rlcli.sim import capacity as _placed
 
 ROOT = os.path.dirname(os.path.dirname(os.path.dirname(_placed.__file__)))
-no_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has the GPU whose absence is tested")
+no_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="the test needs a machine without a GPU")
 
 
 def python(code, folder):
-    """Run code in a process of its own, with this checkout first on its path."""
+    """Run code in a new process, with this checkout first on its path."""
     path = os.pathsep.join([ROOT, os.path.join(ROOT, "tasks"), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": path, "RLCLI_RUNS_DIR": str(folder / "runs")}
     return subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True)
@@ -41,11 +41,11 @@ sys.meta_path.insert(0, Absent())
 """
 
 
-def test_the_machine_of_these_tests_has_the_gpu_engine():
+def test_gpu_engine_is_installed_for_tests():
     assert importlib.util.find_spec("mujoco_warp") is not None
 
 
-def test_without_the_extra_the_engine_is_a_missing_dependency_with_its_pip_line(tmp_path):
+def test_missing_warp_raises_dependency_error_with_pip_line(tmp_path):
     done = python(WITHOUT + RUN.format(arguments=[*SMALL, "sim.engine=warp"]), tmp_path)
     code, loaded = json.loads(done.stdout.splitlines()[-1])
     assert code == 7, done.stderr
@@ -55,14 +55,14 @@ def test_without_the_extra_the_engine_is_a_missing_dependency_with_its_pip_line(
     assert "mujoco_warp" not in loaded
 
 
-def test_without_the_extra_the_cpu_trains(tmp_path):
+def test_training_on_cpu_runs_without_warp(tmp_path):
     done = python(WITHOUT + RUN.format(arguments=[*SMALL, "--device", "cpu"]), tmp_path)
     assert json.loads(done.stdout.splitlines()[-1])[0] == 0, done.stderr
 
 
 @no_gpu
 @pytest.mark.parametrize("device", ["cuda", "cuda:1"])
-def test_a_gpu_that_is_not_there_is_exit_8_and_says_what_was_looked_for(tmp_path, device):
+def test_missing_gpu_exits_with_8(tmp_path, device):
     done = python(RUN.format(arguments=[*SMALL, "--device", device]), tmp_path)
     assert json.loads(done.stdout.splitlines()[-1])[0] == 8, done.stderr
     assert "no CUDA device" in done.stderr
@@ -71,12 +71,12 @@ def test_a_gpu_that_is_not_there_is_exit_8_and_says_what_was_looked_for(tmp_path
 
 
 @no_gpu
-def test_training_on_a_machine_without_a_gpu_loads_nothing_of_warp(tmp_path):
+def test_training_on_cpu_does_not_import_warp(tmp_path):
     done = python(RUN.format(arguments=SMALL), tmp_path)
     assert json.loads(done.stdout.splitlines()[-1]) == [0, []], done.stderr
 
 
-def test_a_model_that_warp_cannot_run_is_an_invalid_configuration(tmp_path):
+def test_model_unsupported_by_warp_raises_config_error(tmp_path):
     folder = tmp_path / "odd"
     folder.mkdir()
     (folder / "model.xml").write_text(

@@ -1,4 +1,4 @@
-"""Columns of the joint state: the right ones for any index, and the angles of the present step."""
+"""Tests of the cached columns of the joint state, and of joint angles."""
 
 import math
 
@@ -21,24 +21,24 @@ INDICES = [slice(0, 6), slice(0, 6, 2), slice(1, None, 2), slice(None), torch.te
 
 
 @pytest.mark.parametrize("name", ["joint_pos", "joint_vel", "default_joint_pos", "default_joint_vel"])
-def test_columns_are_those_of_the_index(data, name):
-    for index in INDICES:  # on one entity: none may be taken for another
+def test_columns_equal_indexed_tensor(data, name):
+    for index in INDICES:  # on one entity: the cache must not mix them up
         torch.testing.assert_close(getattr(data, f"{name}_of")(index), getattr(data, name)[:, index], rtol=0, atol=0)
 
 
-def test_columns_follow_the_state_and_a_tensor_that_is_replaced(data):
+def test_columns_follow_state_and_replaced_tensor(data):
     names = data._entity.joint_names[:3]
-    asked = [data._entity.select("Joints", names)[0] for _ in range(2)]  # by two terms
-    first = data.joint_pos_of(asked[0])
-    assert data.joint_pos_of(asked[1]) is first
+    indices = [data._entity.select("Joints", names)[0] for _ in range(2)]  # as two terms do
+    first = data.joint_pos_of(indices[0])
+    assert data.joint_pos_of(indices[1]) is first
     data.default_joint_pos_of(slice(0, 3))
     data.default_joint_pos = data.default_joint_pos + 1.0
     assert torch.equal(data.default_joint_pos_of(slice(0, 3)), data.default_joint_pos[:, :3])
 
 
-def test_limits_of_columns_are_those_of_now(data):
+def test_joint_limits_follow_randomization(data):
     engine = data._entity.engine
-    for _ in range(2):  # as configured, and of every environment's own
+    for _ in range(2):  # as configured, and randomised
         for soft in (False, True):
             for index in INDICES:
                 for part, whole in zip(data.joint_limits_of(index, soft), data.joint_limits(soft), strict=True):
@@ -50,7 +50,7 @@ def test_limits_of_columns_are_those_of_now(data):
     assert bool((low[1] > low[0]).any())
 
 
-def test_angles_are_wrapped_and_those_of_the_step(data):
+def test_joint_angle_is_wrapped_and_computed_once_per_step(data):
     turn = 2.0 * math.pi
     for index in INDICES:
         angle, position = data.joint_angle_of(index), data.joint_pos[:, index]
@@ -62,12 +62,12 @@ def test_angles_are_wrapped_and_those_of_the_step(data):
     torch.testing.assert_close(data.joint_angle_of(slice(8, 10)), before + 0.5)
 
 
-def test_angles_of_short_lived_indices_are_not_each_others(data):
+def test_joint_angle_cache_distinguishes_temporary_indices(data):
     found = [data.joint_angle_of(torch.tensor([column])) for column in range(8)]
     assert torch.equal(torch.cat(found, dim=1), data.joint_angle_of(slice(0, 8)))
 
 
-def test_a_slice_with_a_step_writes_its_own_columns(data):
+def test_write_with_stepped_slice_sets_own_columns(data):
     entity = data._entity
     selection = entity.engine.select(torch.ones(2, dtype=torch.bool), 0, torch.zeros(2, dtype=torch.int64))
     entity.write_joint_positions(selection, torch.zeros(2, 6), slice(0, 6))

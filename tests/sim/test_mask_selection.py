@@ -1,4 +1,4 @@
-"""A selection by mask does to the masked rows what a selection by ids does, and nothing to the others."""
+"""Tests of `MaskSelection`: it equals `IdSelection` in the masked rows and does not change the others."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def both(seed=5, mask=MASK, counters=COUNTERS):
 
 
 def close(by_id, by_mask, ulp=1):
-    """To one unit in the last place: a compiler may fuse a product and a sum."""
+    """Compare up to one unit in the last place: a compiler may fuse a product and a sum."""
     np.testing.assert_array_max_ulp(by_id.numpy(), by_mask[IDS].numpy(), ulp)
 
 
@@ -30,11 +30,11 @@ def close(by_id, by_mask, ulp=1):
 @pytest.mark.parametrize("seed", [0, 5, -1, 2**63])
 @pytest.mark.parametrize("name", [None, "events.reset_joints"])
 @pytest.mark.parametrize("shape", [(), (1,), (3,), (2, 4)])
-def test_uniform_draws_are_those_of_ids(seed, name, shape):
+def test_uniform_equals_id_selection(seed, name, shape):
     by_id, by_mask = both(seed)
     if name:
         by_id, by_mask = (s.stream(random.stream(name)) for s in (by_id, by_mask))
-    for low, high in ((0.0, 1.0), (-2.0, 3.0), (0.5, 0.5)):  # one after the other: an index of their own each
+    for low, high in ((0.0, 1.0), (-2.0, 3.0), (0.5, 0.5)):  # consecutive draws use new random words
         drawn = by_mask.uniform(low, high, shape)
         assert drawn.shape == (N, *shape)
         assert drawn.dtype == torch.float32
@@ -53,7 +53,7 @@ def test_uniform_draws_are_those_of_ids(seed, name, shape):
         (torch.tensor([[-1.0], [2.0]]), torch.tensor([[1.0], [5.0]])),
     ],
 )
-def test_uniform_draws_between_bounds_a_column(low, high):
+def test_uniform_accepts_bounds_per_column(low, high):
     by_id, by_mask = both()
     shape = (3,) if torch.broadcast_tensors(torch.as_tensor(low), torch.as_tensor(high))[0].dim() == 1 else (2, 3)
     expected, found = by_id.uniform(low, high, shape), by_mask.uniform(low, high, shape)
@@ -62,17 +62,19 @@ def test_uniform_draws_between_bounds_a_column(low, high):
 
 
 @pytest.mark.parametrize("shape", [(), (2,), (3, 5)])
-def test_normal_draws_are_those_of_ids(shape):
+def test_normal_equals_id_selection(shape):
     by_id, by_mask = both()
     for mean, std in ((0.0, 1.0), (4.0, 0.1), (torch.tensor(2.0), torch.tensor(3.0))):
         expected, found = by_id.normal(mean, std, shape), by_mask.normal(mean, std, shape)
         assert found.shape == (N, *shape)
         torch.testing.assert_close(expected, found[IDS], rtol=1e-6, atol=3e-6)
-    assert torch.equal(by_id.uniform(0.0, 1.0), by_mask.uniform(0.0, 1.0)[IDS]), "as many words were used"
+    assert torch.equal(by_id.uniform(0.0, 1.0), by_mask.uniform(0.0, 1.0)[IDS]), (
+        "both used the same number of random words"
+    )
 
 
 @pytest.mark.parametrize("options", [1, 2, 7, 100_000])
-def test_choices_are_those_of_ids(options):
+def test_choice_equals_id_selection(options):
     by_id, by_mask = both()
     expected, found = by_id.choice(options, (50,)), by_mask.choice(options, (50,))
     assert found.dtype == torch.int64
@@ -81,7 +83,7 @@ def test_choices_are_those_of_ids(options):
     assert int(found.max()) < options
 
 
-def test_normal_draws_have_the_moments_of_a_gaussian():
+def test_normal_has_gaussian_moments():
     everyone = MaskSelection(torch.ones(2000, dtype=torch.bool), 1, torch.zeros(2000, dtype=torch.int64))
     drawn = everyone.normal(0.0, 1.0, (20,))
     assert drawn.isfinite().all()
@@ -98,7 +100,9 @@ def test_draws_depend_on_seed_stream_counter_and_environment():
     other[3] += 1
     moved = both(counters=other)[1].uniform(0.0, 1.0, (4,))
     assert (moved != base).all(dim=1).tolist() == [i == 3 for i in range(N)]
-    assert torch.equal(base, both(mask=~MASK)[1].uniform(0.0, 1.0, (4,))), "who else is selected changes nothing"
+    assert torch.equal(base, both(mask=~MASK)[1].uniform(0.0, 1.0, (4,))), (
+        "draws do not depend on the other selected rows"
+    )
 
 
 # --- reading and writing ---
@@ -122,7 +126,7 @@ def field(dtype):
 
 @pytest.mark.parametrize("columns", COLUMNS.values(), ids=COLUMNS)
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
-def test_writing_rows_sets_what_ids_set_and_leaves_the_rest(dtype, columns):
+def test_write_equals_id_selection(dtype, columns):
     by_id, by_mask = both()
     expected, found = field(dtype), field(dtype)
     width = len(expected[0, columns])
@@ -137,7 +141,7 @@ def test_writing_rows_sets_what_ids_set_and_leaves_the_rest(dtype, columns):
 @pytest.mark.parametrize("columns", COLUMNS.values(), ids=COLUMNS)
 @pytest.mark.parametrize(("dtype", "value"), [(torch.float32, -1.5), (torch.float64, 0.1), (torch.int64, 0),
                                               (torch.int64, 0.0), (torch.bool, True)])  # fmt: skip
-def test_writing_a_number_sets_it_in_the_masked_rows(dtype, value, columns):
+def test_write_number_sets_masked_rows(dtype, value, columns):
     by_id, by_mask = both()
     expected, found = field(dtype), field(dtype)
     by_id.write(expected, value, columns)
@@ -147,7 +151,7 @@ def test_writing_a_number_sets_it_in_the_masked_rows(dtype, value, columns):
 
 
 @pytest.mark.parametrize("columns", COLUMNS.values(), ids=COLUMNS)
-def test_adding_adds_where_masked(columns):
+def test_add_changes_masked_rows(columns):
     by_id, by_mask = both()
     expected, found = field(torch.float32), field(torch.float32)
     width = len(expected[0, columns])
@@ -160,7 +164,7 @@ def test_adding_adds_where_masked(columns):
     assert torch.equal(found[~MASK], field(torch.float32)[~MASK])
 
 
-def test_float32_values_are_cast_to_the_field_that_they_are_written_to():
+def test_write_casts_values_to_field_dtype():
     by_id, by_mask = both()
     values = torch.rand(N, 5)
     for dtype in (torch.float64, torch.float32):
@@ -170,7 +174,7 @@ def test_float32_values_are_cast_to_the_field_that_they_are_written_to():
         assert torch.equal(expected, found)
 
 
-def test_rows_of_a_tensor_of_one_and_of_three_dimensions_are_written():
+def test_write_accepts_one_and_three_dimensions():
     by_id, by_mask = both()
     for shape in ((N,), (N, 2, 3)):
         expected, found = torch.zeros(shape), torch.zeros(shape)
@@ -180,7 +184,7 @@ def test_rows_of_a_tensor_of_one_and_of_three_dimensions_are_written():
         assert torch.equal(expected, found)
 
 
-def test_a_row_for_all_is_broadcast():
+def test_write_broadcasts_one_row():
     by_id, by_mask = both()
     expected, found = field(torch.float32), field(torch.float32)
     by_id.write(expected, torch.tensor([7.0, 8.0, 9.0]), slice(1, 4))
@@ -188,7 +192,7 @@ def test_a_row_for_all_is_broadcast():
     assert torch.equal(expected, found)
 
 
-def test_what_is_not_masked_may_be_nan_in_the_values_and_stays_out():
+def test_write_ignores_nan_in_unmasked_rows():
     _, by_mask = both()
     values = torch.full((N, 5), torch.nan)
     values[MASK] = 1.0
@@ -200,7 +204,7 @@ def test_what_is_not_masked_may_be_nan_in_the_values_and_stays_out():
 
 
 @pytest.mark.parametrize("columns", COLUMNS.values(), ids=COLUMNS)
-def test_reading_gives_a_copy(columns):
+def test_read_returns_copy(columns):
     by_id, by_mask = both()
     source = field(torch.float32)
     read = by_mask.read(source, columns)
@@ -209,7 +213,7 @@ def test_reading_gives_a_copy(columns):
     assert torch.equal(source, field(torch.float32))
 
 
-def test_mean_count_and_ids_are_those_of_the_masked_rows():
+def test_mean_count_and_env_ids_use_masked_rows():
     by_id, by_mask = both()
     values = torch.rand(N)
     torch.testing.assert_close(by_mask.mean(values), by_id.mean(values))
@@ -218,18 +222,18 @@ def test_mean_count_and_ids_are_those_of_the_masked_rows():
     assert torch.equal(by_mask.env_ids(), by_id.env_ids())
 
 
-def test_nobody_selected_is_nothing_done():
-    nobody = MaskSelection(torch.zeros(N, dtype=torch.bool), 5, COUNTERS)
+def test_empty_mask_changes_nothing():
+    empty = MaskSelection(torch.zeros(N, dtype=torch.bool), 5, COUNTERS)
     found = field(torch.float32)
-    nobody.write(found, nobody.uniform(0.0, 1.0, (5,)))
-    nobody.add(found, 3.0)
+    empty.write(found, empty.uniform(0.0, 1.0, (5,)))
+    empty.add(found, 3.0)
     assert torch.equal(found, field(torch.float32))
-    assert float(nobody.mean(torch.ones(N))) == 0.0
-    assert int(nobody.count) == 0
-    assert len(nobody.env_ids()) == 0
+    assert float(empty.mean(torch.ones(N))) == 0.0
+    assert int(empty.count) == 0
+    assert len(empty.env_ids()) == 0
 
 
-def test_joined_selections_hold_the_rows_of_both_and_draw_as_before():
+def test_union_has_rows_of_both_with_same_draws():
     chosen = torch.zeros_like(MASK)
     chosen[[1, 5]] = True
     by_id, by_mask = both()

@@ -1,4 +1,4 @@
-"""Rotations and angles: right, and the same bits for a row whatever the number of rows."""
+"""Tests of rotations and angles: correct values, and the same bits for any number of rows."""
 
 import math
 
@@ -10,7 +10,7 @@ from rlcli.sim.rotations import atan2
 torch.set_num_threads(1)
 
 
-def test_the_angle_of_a_point_is_that_of_the_standard_library_all_around():
+def test_atan2_equals_math_atan2():
     angles = torch.linspace(-math.pi, math.pi, 1441, dtype=torch.float64)
     for radius in (1e-6, 1.0, 1e3):
         x, y = (radius * angles.cos()).float(), (radius * angles.sin()).float()
@@ -23,11 +23,11 @@ def test_the_angle_of_a_point_is_that_of_the_standard_library_all_around():
     [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, math.pi / 2), (1.0, -0.0, math.pi / 2), (-1.0, 0.0, -math.pi / 2),
      (-1.0, -0.0, -math.pi / 2), (0.0, -1.0, math.pi), (-0.0, -1.0, -math.pi)],
 )  # fmt: skip
-def test_the_angle_is_defined_on_the_axes_and_at_the_origin(y, x, angle):
+def test_atan2_is_defined_on_axes_and_at_origin(y, x, angle):
     assert float(atan2(torch.tensor(y), torch.tensor(x))) == pytest.approx(angle, abs=1e-6)
 
 
-def test_an_angle_has_the_same_bits_whatever_the_number_of_rows():
+def test_atan2_has_same_bits_for_any_number_of_rows():
     points = torch.randn(203, 2, generator=torch.Generator().manual_seed(0))
     together = atan2(points[:, 0], points[:, 1])
     for rows in range(1, 40):

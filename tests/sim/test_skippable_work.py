@@ -1,4 +1,4 @@
-"""What steps leave out, and that nothing comes of it."""
+"""Tests of the work that steps skip: it changes no result."""
 
 import _ctypes
 import ctypes
@@ -64,13 +64,13 @@ PAIR = '<geom name="floor" type="plane" size="5 5 1" contype="0" conaffinity="0"
         pytest.param(model_of(slider(), flags="sleep='enable'"), CONTACT, id="sleep"),
     ],
 )
-def test_what_may_be_left_out_of_a_model(model, flags):
+def test_skippable_flags_of_models(model, flags):
     assert skippable_flags(model) == flags
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_geoms_that_may_touch_are_those_that_mujoco_lets_touch(seed):
-    """Balls of which each reaches all others, in random trees with random bits."""
+def test_colliding_pairs_equal_mujoco_contacts(seed):
+    """Make overlapping balls in random kinematic trees with random contact bits."""
     random = np.random.default_rng(seed)
     spec = mujoco.MjSpec()
     if seed % 3 == 2:
@@ -108,12 +108,12 @@ TASKS = [
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_states_are_those_of_a_batch_that_leaves_nothing_out(task):
+def test_states_equal_batch_without_skipped_work(task):
     env = make_env(resolve(find_task(task), flags={"scene.num_envs": 8}), seed=0)
     env.reset(seed=0)
     engine, model = env.engine, env.engine.model
     whole = Batch(model, 8, 2)
-    for name in engine.expanded_fields():  # what was drawn for every world
+    for name in engine.expanded_fields():  # model fields that the task randomises
         whole.expand(name)[:] = engine.expand(name).numpy()
     if engine.own_constants:
         whole.set_const()
@@ -133,8 +133,8 @@ def test_states_are_those_of_a_batch_that_leaves_nothing_out(task):
 
 
 @pytest.fixture
-def looks():
-    """How often MuJoCo has looked at the clock, which is a C function here."""
+def clock_reads():
+    """Count how often MuJoCo reads the clock, which is replaced by a C function."""
     count = [0]
 
     @ctypes.CFUNCTYPE(ctypes.c_double)
@@ -147,20 +147,20 @@ def looks():
     mujoco.set_mjcb_time(None)
 
 
-def test_an_engine_does_not_have_mujoco_look_at_the_clock(looks):
+def test_engine_calls_do_not_read_clock(clock_reads):
     model = model_of(FLOOR + slider())
     engine = engine_of(model)
     engine.field("xpos")
-    before = looks[0]
+    before = clock_reads[0]
     engine.step(2)
-    assert looks[0] == before
+    assert clock_reads[0] == before
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data)
-    assert looks[0] > before, "whoever steps elsewhere is timed as before"
+    assert clock_reads[0] > before, "other simulations read the clock as before"
     assert data.timer[mujoco.mjtTimer.mjTIMER_STEP].duration > 0
 
 
-def test_the_clock_is_back_after_an_error_and_after_threads_that_step_at_once(looks):
+def test_clock_is_restored_after_error_and_parallel_steps(clock_reads):
     with pytest.raises(RuntimeError), without_profiler:
         raise RuntimeError
     model = model_of(slider())
@@ -177,23 +177,23 @@ def test_the_clock_is_back_after_an_error_and_after_threads_that_step_at_once(lo
         thread.start()
     for thread in threads:
         thread.join()
-    before = looks[0]
+    before = clock_reads[0]
     mujoco.mj_step(model, mujoco.MjData(model))
-    assert looks[0] > before
+    assert clock_reads[0] > before
 
 
-def test_a_clock_that_is_set_meanwhile_stays(looks):
+def test_clock_set_during_step_is_kept(clock_reads):
     with without_profiler:
-        mujoco.set_mjcb_time(None)  # the one of the bindings
-    before = looks[0]
+        mujoco.set_mjcb_time(None)  # the clock of the bindings
+    before = clock_reads[0]
     data = mujoco.MjData(model_of(slider()))
     mujoco.mj_step(data.model, data)
-    assert looks[0] == before
+    assert clock_reads[0] == before
     assert data.timer[mujoco.mjtTimer.mjTIMER_STEP].duration > 0
 
 
 @pytest.mark.parametrize("found", [None, b"no library", "another"])
-def test_a_mujoco_whose_library_is_not_as_it_should_be_is_timed(found, tmp_path, monkeypatch, looks):
+def test_profiler_stays_on_for_unknown_library_layout(found, tmp_path, monkeypatch, clock_reads):
     if found == "another":
         (tmp_path / "libmujoco.so").symlink_to(_ctypes.__file__)
     elif found:
@@ -201,17 +201,17 @@ def test_a_mujoco_whose_library_is_not_as_it_should_be_is_timed(found, tmp_path,
     monkeypatch.setattr(mujoco, "__file__", str(tmp_path / "__init__.py"))
     other = type(without_profiler)()
     with other:
-        before = looks[0]
+        before = clock_reads[0]
         mujoco.mj_step(model := model_of(slider()), mujoco.MjData(model))
-        assert looks[0] > before
+        assert clock_reads[0] > before
 
 
-def test_geoms_that_are_given_bits_later_touch_from_then_on():
-    """A ball above a floor of which nothing may touch it, until a world of its own says so."""
+def test_expanded_contact_bits_enable_contacts():
+    """Drop a ball through a floor without contacts, then enable the contacts in one world."""
     model = model_of(FLOOR + f'<body pos="0 0 0.15"><freejoint/>{GHOST}</body>')
     engine = engine_of(model)
     assert engine.step(100) is None
-    assert (engine.field("qpos")[:, 2] < 0.0).all(), "it falls through"
+    assert (engine.field("qpos")[:, 2] < 0.0).all(), "the ball falls through the floor"
     engine.reset(every := engine.select(torch.ones(3, dtype=torch.bool), 0, torch.zeros(3, dtype=torch.int64)))
     assert every is not None
     engine.expand("geom_contype")[1, 1] = engine.expand("body_contype")[1, 1] = 1
@@ -223,7 +223,7 @@ def test_geoms_that_are_given_bits_later_touch_from_then_on():
     assert "model.opt.disableflags" not in engine.state_dict()
 
 
-def test_islands_are_found_for_whoever_reads_them():
+def test_binding_island_fields_enables_islands():
     model = model_of(FLOOR + slider())
     engine = engine_of(model)
     engine.step(1)
@@ -232,7 +232,7 @@ def test_islands_are_found_for_whoever_reads_them():
     assert engine.field("nisland").tolist() == [1] * 3
 
 
-def test_models_that_are_given_away_leave_nothing_out():
+def test_write_own_model_keeps_original_flags():
     model = model_of(slider(), options="gravity='0 0 -5'")
     engine = engine_of(model)
     assert model.opt.disableflags == 0
@@ -248,7 +248,7 @@ def test_models_that_are_given_away_leave_nothing_out():
     assert engine.world(1)[0].opt.disableflags == int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
 
 
-def test_flags_that_are_set_in_the_model_later_count_neither_before_nor_after_something_is_expanded():
+def test_later_changes_of_model_flags_have_no_effect():
     model = model_of(slider())
     engine = engine_of(model)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
@@ -260,7 +260,7 @@ def test_flags_that_are_set_in_the_model_later_count_neither_before_nor_after_so
     assert engine.world(0)[0].opt.disableflags == 0
 
 
-def test_a_model_of_which_several_threads_make_engines_stays_as_it_is():
+def test_engines_made_in_threads_do_not_change_model():
     model = model_of(slider())
 
     def work():
@@ -277,7 +277,7 @@ def test_a_model_of_which_several_threads_make_engines_stays_as_it_is():
 
 
 @pytest.mark.parametrize("engine", ["batch", "warp"])
-def test_distances_are_measured_between_geoms_that_never_touch(engine):
+def test_distance_sensor_works_for_geoms_without_contacts(engine):
     far = slider(
         slider(name="child", geom='<geom name="b" size="0.1" contype="0" conaffinity="0" pos="1 0 0"/>'), geom=GHOST
     )
@@ -288,6 +288,6 @@ def test_distances_are_measured_between_geoms_that_never_touch(engine):
     assert values.flatten().tolist() == pytest.approx([0.8, 0.8], abs=1e-5)
 
 
-def test_the_library_is_found_here():
-    """The engine runs at two thirds of its speed where it is not: nothing else would tell."""
+def test_mujoco_library_is_found():
+    """Check that the library is found: without it the engine is a third slower, and no other test fails."""
     assert list(Path(mujoco.__file__).parent.glob("libmujoco*")), "another layout: see rlcli/sim/mujoco_private.py"

@@ -1,4 +1,4 @@
-"""Derived fields as the last physics step left them, and the forces of contacts on bodies."""
+"""Tests of derived fields with values of the last physics step, and of contact forces on bodies."""
 
 import re
 
@@ -20,7 +20,7 @@ XML = (
     .replace("<worldbody>", f'{RK4}<worldbody><geom type="plane" size="5 5 1"/>')
     .replace("</mujoco>", '<actuator><position joint="hip_fl" kp="20" kv="0.5"/></actuator></mujoco>')
 )
-"""No sensor that would have MuJoCo compute forces on bodies by itself."""
+"""Model without sensors that make MuJoCo compute forces on bodies."""
 POSITION, VELOCITY, FORCE = ("xpos", "xipos", "cinert"), ("cvel",), ("qacc", "qfrc_actuator", "qfrc_constraint")
 FIELDS = (*POSITION, *VELOCITY, *FORCE)
 
@@ -35,8 +35,8 @@ def select(engine, *ids):
     return engine.select(mask, 0, torch.zeros(N, dtype=torch.int64))
 
 
-def drop(engine):
-    """Each world a little higher than the one before; all but the highest stand on the ground."""
+def place_worlds(engine):
+    """Place each world a little higher than the one before; all but the highest touch the ground."""
     everyone = select(engine, *range(N))
     engine.reset(everyone)
     height = torch.tensor([0.26, 0.265, 0.27, 2.0]).to(engine.field("qpos").dtype)
@@ -45,8 +45,8 @@ def drop(engine):
     engine.forward(everyone)
 
 
-def loop(engine):
-    """The same worlds, each an MjData after `mj_forward`."""
+def forwarded_worlds(engine):
+    """Return the worlds as MjData after `mj_forward`."""
     worlds = []
     for i in range(N):
         data = mujoco.MjData(engine.model)
@@ -57,12 +57,12 @@ def loop(engine):
     return worlds
 
 
-def test_the_cpu_engine_reads_what_mj_step_leaves_bit_for_bit():
+def test_substep_fields_equal_mj_step_bit_for_bit():
     engine = engine_of(derived_fields="substep", external_forces=True)
     for name in (*FIELDS, "cfrc_ext"):
         engine.field(name)
-    drop(engine)
-    worlds = loop(engine)
+    place_worlds(engine)
+    worlds = forwarded_worlds(engine)
     felt = np.zeros(N)
     for _ in range(30):
         engine.step(3)
@@ -76,11 +76,11 @@ def test_the_cpu_engine_reads_what_mj_step_leaves_bit_for_bit():
     assert felt[3] == 0
 
 
-def test_fields_of_the_step_are_those_of_the_state_before_it():
+def test_substep_fields_belong_to_state_before_step():
     late, current = engine_of(derived_fields="substep"), engine_of()
     for engine in (late, current):
         engine.field("xpos")
-        drop(engine)
+        place_worlds(engine)
     late.step(1)
     current.step(1)
     np.testing.assert_array_equal(late.field("qpos").numpy(), current.field("qpos").numpy())
@@ -88,14 +88,14 @@ def test_fields_of_the_step_are_those_of_the_state_before_it():
     torch.testing.assert_close(current.field("xpos")[:, 1], current.field("qpos")[:, :3])
 
 
-@pytest.mark.slow  # Warp compiles Runge and Kutta's kernels
-def test_the_gpu_engine_reads_like_the_cpu_engine():
+@pytest.mark.slow  # Warp compiles the Runge-Kutta kernels
+def test_substep_fields_agree_between_engines():
     settings = {"derived_fields": "substep", "external_forces": True}
     host, device = engine_of("batch", **settings), engine_of("warp", **settings)
     for engine in (host, device):
         for name in (*FIELDS, "cfrc_ext"):
             engine.field(name)
-        drop(engine)
+        place_worlds(engine)
     for step in range(4):
         host.step(2)
         device.step(2)
@@ -107,10 +107,10 @@ def test_the_gpu_engine_reads_like_the_cpu_engine():
 
 
 @pytest.mark.parametrize("kind", ["batch", pytest.param("warp", marks=pytest.mark.slow)])
-def test_a_new_episode_has_felt_no_contact_and_the_others_keep_theirs(kind):
+def test_reset_clears_substep_forces_of_selected_worlds(kind):
     engine = engine_of(kind, derived_fields="substep", external_forces=True)
     forces, place = engine.field("cfrc_ext"), engine.field("xpos")
-    drop(engine)
+    place_worlds(engine)
     engine.step(2)
     felt, late = forces.clone(), place.clone()
     assert all(felt[i].abs().sum() > 0 for i in range(3))
@@ -123,23 +123,23 @@ def test_a_new_episode_has_felt_no_contact_and_the_others_keep_theirs(kind):
         assert torch.equal(place[world], late[world])
 
 
-def test_a_force_from_outside_counts_without_a_contact():
+def test_external_force_is_computed_without_contact():
     engine = engine_of(external_forces=True)
     forces, push = engine.field("cfrc_ext"), engine.field("xfrc_applied")
-    drop(engine)
+    place_worlds(engine)
     push[3, 1, 2] = 5.0
     engine.step(1)
     assert float(forces[3, 1, 5]) == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize("kind", ["batch", pytest.param("warp", marks=pytest.mark.slow)])
-def test_a_state_that_is_taken_back_has_its_late_fields(kind):
+def test_load_state_dict_restores_fields_bound_later(kind):
     settings = {"derived_fields": "substep", "external_forces": True}
     engine = engine_of(kind, **settings)
     names = ("xpos", "cvel", "qacc", "cfrc_ext")
     for name in names:
         engine.field(name)
-    drop(engine)
+    place_worlds(engine)
     engine.step(3)
     kept, state = {name: engine.field(name).clone() for name in names}, engine.state_dict()
     other = engine_of(kind, **settings)

@@ -1,4 +1,4 @@
-"""The GPU engine on Warp's CPU device: equal to the CPU engine, untouched where not selected, guarded."""
+"""Tests of the GPU engine on Warp's CPU device: agreement with the CPU engine, selections, divergence."""
 
 import math
 
@@ -35,7 +35,7 @@ def pair(xml=XML, fields=(), **settings):
 
 
 def scatter(engine, height=0.0):
-    """Different states and controls in every world, the same on every engine."""
+    """Set different states and controls in every world, equal on all engines."""
     random = np.random.default_rng(0)
 
     def draw(*shape):
@@ -53,7 +53,7 @@ def scatter(engine, height=0.0):
     put("ctrl", draw(N, 4))
 
 
-def some(engine, *ids):
+def selection_of(engine, *ids):
     mask = torch.tensor([i in ids for i in range(N)])
     return engine.select(mask, 0, torch.zeros(N, dtype=torch.int64))
 
@@ -80,7 +80,7 @@ def assert_rows(before, after, rows):
 
 
 @pytest.mark.parametrize("forces", [True, False])
-def test_derived_fields_are_the_cpu_engines_after_a_step_and_after_a_partial_reset(forces):
+def test_derived_fields_agree_with_cpu_after_step_and_partial_reset(forces):
     host, device = pair(fields=FIELDS, forces_after_reset=forces)
     for engine in (host, device):
         scatter(engine, height=0.5)
@@ -88,9 +88,9 @@ def test_derived_fields_are_the_cpu_engines_after_a_step_and_after_a_partial_res
     assert_equal(host, device, ("qpos", "qvel", *FIELDS), 2e-5, "after a step")
     rest, kept = [0, 2, 3], snapshot(device, ("qpos", "qvel", "time", *FIELDS))
     for engine in (host, device):
-        chosen = some(engine, 1, 4)
+        chosen = selection_of(engine, 1, 4)
         engine.reset(chosen)
-        engine.field("qpos")[4, 2] = 0.25  # on its feet: the ground pushes
+        engine.field("qpos")[4, 2] = 0.25  # on its feet, in contact with the ground
         engine.field("ctrl")[4] = 0.3
         engine.forward(chosen)
     assert_equal(host, device, ("qpos", "qvel", *FIELDS), 2e-5, "after a reset")
@@ -106,14 +106,14 @@ def test_derived_fields_are_the_cpu_engines_after_a_step_and_after_a_partial_res
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_a_field_asked_for_late_is_that_of_the_state(name):
+def test_field_bound_late_matches_state(name):
     host, device = pair()
     for engine in (host, device):
         scatter(engine, height=0.5)
     assert_equal(host, device, [name], 2e-5)
 
 
-def test_fields_are_live_and_unknown_ones_are_named_with_the_nearest():
+def test_field_is_live_and_unknown_field_error_suggests_name():
     _, device = pair()
     qpos = device.field("qpos")
     assert device.field("qpos").data_ptr() == qpos.data_ptr()
@@ -128,7 +128,7 @@ def test_fields_are_live_and_unknown_ones_are_named_with_the_nearest():
 # --- resets ---
 
 
-def test_a_partial_reset_puts_back_the_chosen_worlds_and_leaves_the_others_bit_for_bit():
+def test_partial_reset_changes_only_selected_worlds():
     _, device = pair(fields=("xpos", "xfrc_applied"))
     names = ("qpos", "qvel", "qacc_warmstart", "ctrl", "time", "xfrc_applied", "xpos")
     scatter(device)
@@ -136,8 +136,8 @@ def test_a_partial_reset_puts_back_the_chosen_worlds_and_leaves_the_others_bit_f
     device.step(5)
     kept = snapshot(device, names)
     device.set_default_state(torch.from_numpy(device.model.qpos0) + 0.01, torch.full((10,), 0.5))
-    device.reset(some(device, 0, 3))
-    device.forward(some(device, 0, 3))
+    device.reset(selection_of(device, 0, 3))
+    device.forward(selection_of(device, 0, 3))
     now = snapshot(device, names)
     assert_rows(kept, now, [1, 2, 4])
     for name in ("qacc_warmstart", "ctrl", "time", "xfrc_applied"):
@@ -147,13 +147,13 @@ def test_a_partial_reset_puts_back_the_chosen_worlds_and_leaves_the_others_bit_f
     assert (now["qvel"][[0, 3]] == 0.5).all()
 
 
-def test_worlds_that_were_not_reset_go_on_as_if_nothing_had_happened():
+def test_worlds_without_reset_continue_unchanged():
     engines = [pair()[1] for _ in range(2)]
     for engine in engines:
         scatter(engine)
         engine.step(4)
-    engines[1].reset(some(engines[1], 2))
-    engines[1].forward(some(engines[1], 2))
+    engines[1].reset(selection_of(engines[1], 2))
+    engines[1].forward(selection_of(engines[1], 2))
     for engine in engines:
         engine.step(4)
     here, there = (snapshot(engine, ("qpos", "qvel")) for engine in engines)
@@ -169,14 +169,14 @@ MOCAP = """
 """
 
 
-def test_a_reset_restores_mocap_poses_and_equalities_as_on_the_cpu():
+def test_reset_restores_mocap_poses_and_equalities():
     for engine in pair(MOCAP):
         position, turn, active = (engine.field(name) for name in ("mocap_pos", "mocap_quat", "eq_active"))
         before = [values.clone() for values in (position, turn, active)]
         position += 1.0
         turn.copy_(torch.tensor([0.0, 1.0, 0.0, 0.0]))
         active[:] = False
-        engine.reset(some(engine, 1))
+        engine.reset(selection_of(engine, 1))
         for values, old in zip((position, turn, active), before, strict=True):
             assert torch.equal(values[1], old[1])
             assert not torch.equal(values[0], old[0])
@@ -193,7 +193,7 @@ def test_a_reset_restores_mocap_poses_and_equalities_as_on_the_cpu():
         ("opt.gravity", lambda values: values[2].mul_(0.2)),
     ],
 )
-def test_an_expanded_model_field_changes_that_worlds_dynamics_only(name, change):
+def test_expanded_field_changes_dynamics_of_one_world(name, change):
     host, device = pair()
     _, plain = pair()
     for engine in (host, device, plain):
@@ -211,7 +211,7 @@ def test_an_expanded_model_field_changes_that_worlds_dynamics_only(name, change)
     assert float((device.field("qvel")[2] - plain.field("qvel")[2]).abs().max()) > 1e-3
 
 
-def test_constants_follow_a_mass_that_was_written():
+def test_set_constants_follows_written_mass():
     host, device = pair()
     for engine in (host, device):
         engine.expand("body_mass")[1:] *= torch.arange(2.0, 6.0)[:, None]
@@ -222,7 +222,7 @@ def test_constants_follow_a_mass_that_was_written():
         assert not torch.equal(found[0], found[1])
 
 
-def test_world_shows_the_state_and_the_model_of_one_world():
+def test_world_returns_state_and_model_of_one_world():
     _, device = pair(fields=("xfrc_applied",))
     scatter(device)
     device.expand("body_mass")[3, 1] = 7.0
@@ -244,7 +244,7 @@ def test_world_shows_the_state_and_the_model_of_one_world():
     assert_rows(before, snapshot(device, before), list(range(N)))
 
 
-def test_a_saved_state_continues_equally_in_another_engine():
+def test_restored_engine_continues_equally():
     first, second = pair(fields=("qacc", "sensordata"))[1], pair()[1]
     scatter(first)
     first.expand("body_mass")[1] *= 1.5
@@ -253,7 +253,7 @@ def test_a_saved_state_continues_equally_in_another_engine():
     saved = first.state_dict()
     kept = {name: values.clone() for name, values in saved.items()}
     first.step(3)
-    assert all(torch.equal(values, kept[name]) for name, values in saved.items()), "the state is a copy"
+    assert all(torch.equal(values, kept[name]) for name, values in saved.items()), "state_dict returns copies"
     second.load_state_dict(saved)
     assert torch.equal(second.field("qacc"), saved["substep.qacc"])
     second.step(3)
@@ -263,7 +263,7 @@ def test_a_saved_state_continues_equally_in_another_engine():
 
 
 @pytest.mark.parametrize("task", ["critter", "cartpole-direct"])
-def test_an_environment_continues_equally_from_its_state(tmp_path, task):
+def test_restored_environment_continues_equally(tmp_path, task):
     place = critter(tmp_path) if task == "critter" else task
     first, second = (build(place, 4, "sim.engine=warp", "episode_length_s=0.3") for _ in range(2))
     action = torch.full((4, first.layout.action_size), 0.2)
@@ -284,38 +284,38 @@ def test_an_environment_continues_equally_from_its_state(tmp_path, task):
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "who"), [("qpos", math.nan, 0), ("qvel", math.inf, 3), ("qvel", 1e12, 3), ("qpos", 1e12, 4)]
+    ("field", "value", "world"), [("qpos", math.nan, 0), ("qvel", math.inf, 3), ("qvel", 1e12, 3), ("qpos", 1e12, 4)]
 )
-def test_a_diverged_world_is_terminated_and_put_back_and_the_others_are_untouched(tmp_path, field, value, who):
+def test_diverged_world_is_terminated_and_restored_alone(tmp_path, field, value, world):
     sound, sick = (build(critter(tmp_path), N, "sim.engine=warp", "episode_length_s=9.0") for _ in range(2))
     action = torch.full((N, 4), 0.2)
     for env in (sound, sick):
         env.reset()
         for _ in range(3):
             env.step(action)
-    last = sick.sim.qpos[who].clone(), sick.sim.qvel[who].clone()
-    sick.engine.field(field)[who, -1] = value
-    rest = [i for i in range(N) if i != who]
+    last = sick.sim.qpos[world].clone(), sick.sim.qvel[world].clone()
+    sick.engine.field(field)[world, -1] = value
+    rest = [i for i in range(N) if i != world]
     for i in range(8):
         here, there = sound.step(action), sick.step(action)
         if i == 0:
-            assert there.terminated.tolist() == [env == who for env in range(N)]
+            assert there.terminated.tolist() == [env == world for env in range(N)]
             assert not there.truncated.any()
             episodes = there.episodes.ended()
-            assert episodes.ids.tolist() == [who]
+            assert episodes.ids.tolist() == [world]
             assert episodes.causes["diverged"].tolist() == [True]
-            assert torch.equal(there.final_obs["critic"][who], torch.cat([last[0][7:], last[1][6:]]))
+            assert torch.equal(there.final_obs["critic"][world], torch.cat([last[0][7:], last[1][6:]]))
         for group, values in here.obs.items():
             assert torch.equal(values[rest], there.obs[group][rest])
             assert there.obs[group].isfinite().all()
         assert torch.equal(here.reward[rest], there.reward[rest])
-        assert there.reward.isfinite().all(), "terms of forces and of derived fields are finite as well"
+        assert there.reward.isfinite().all(), "terms that read forces and derived fields are finite too"
     assert sick.divergences == 1
     sick.check()
 
 
 @pytest.mark.parametrize("engine", ["batch", "warp"])
-def test_a_world_that_moves_faster_than_its_task_allows_has_diverged_and_is_judged_by_where_it_was(tmp_path, engine):
+def test_world_beyond_max_velocity_diverges_with_reward_of_last_state(tmp_path, engine):
     quick, slow = (
         build(critter(tmp_path), N, f"sim.engine={engine}", f"sim.max_velocity={most}", "episode_length_s=9.0")
         for most in ("null", 40.0)
@@ -338,11 +338,11 @@ def test_a_world_that_moves_faster_than_its_task_allows_has_diverged_and_is_judg
     assert not slow.step(action).terminated.any()
 
 
-def test_a_world_that_diverges_in_its_first_step_is_judged_by_its_start(tmp_path):
+def test_divergence_in_first_step_uses_start_state(tmp_path):
     envs = [build(pendulum(tmp_path), 3, f"sim.engine={engine}") for engine in ("batch", "warp")]
     for env in envs:
         env.reset()
-        for _ in range(10):  # the time-out begins new episodes, from rest
+        for _ in range(10):  # the time-out starts new episodes at rest
             result = env.step(torch.full((3, 1), 5.0))
         assert result.truncated.all()
         env.engine.field("qvel")[1, 0] = math.nan
@@ -351,7 +351,7 @@ def test_a_world_that_diverges_in_its_first_step_is_judged_by_its_start(tmp_path
         assert result.final_obs["policy"][1].tolist() == [0.0, 0.0]
 
 
-def test_a_world_diverges_again_and_is_counted_again(tmp_path):
+def test_repeated_divergence_is_counted(tmp_path):
     env = build(pendulum(tmp_path), 3, "sim.engine=warp")
     env.reset()
     for count in (1, 2, 3):
@@ -384,7 +384,7 @@ def broken_row(env, *, entity: Entity = "robot"):
         ({"observations": {"policy": {"odd": {"func": "broken_row"}}}}, "observation group 'policy' is not finite"),
     ],
 )
-def test_check_reports_what_is_not_finite_by_name_and_once(tmp_path, changes, named):
+def test_check_reports_nonfinite_values_by_name_once(tmp_path, changes, named):
     task = pendulum(tmp_path, edited(PENDULUM_TASK, episode_length_s=5.0, **changes), terms_py=BROKEN)
     env = build(task, 3, "sim.engine=warp")
     env.reset()
@@ -402,7 +402,7 @@ def test_check_reports_what_is_not_finite_by_name_and_once(tmp_path, changes, na
 
 @pytest.mark.parametrize("task", ["pendulum", "cartpole-direct"])
 @pytest.mark.parametrize("value", [math.nan, -math.inf])
-def test_check_reports_an_action_that_is_not_finite(tmp_path, task, value):
+def test_check_reports_nonfinite_action(tmp_path, task, value):
     env = build(pendulum(tmp_path) if task == "pendulum" else task, 3, "sim.engine=warp")
     env.reset()
     env.step(torch.tensor([[0.0], [value], [0.0]]))
@@ -410,7 +410,7 @@ def test_check_reports_an_action_that_is_not_finite(tmp_path, task, value):
         env.check()
 
 
-def test_any_number_of_things_can_be_watched():
+def test_check_finite_accepts_any_number_of_names():
     _, device = pair()
     for i in range(40):
         device.check_finite(torch.full((N, 2), math.nan if i in (3, 20, 39) else 0.0), f"thing {i}")
@@ -420,10 +420,10 @@ def test_any_number_of_things_can_be_watched():
     assert device.report_nonfinite() == ["thing 20"]
 
 
-# --- models that it cannot run ---
+# --- unsupported models ---
 
 
-def test_a_solver_that_it_lacks_is_refused_by_name_with_the_way_out():
+def test_unsupported_solver_is_refused_with_hint():
     xml = XML.replace("<worldbody>", '<option solver="PGS"/><worldbody>', 1)
     model = mujoco.MjModel.from_xml_string(xml)
     with pytest.raises(ConfigError) as refused:
@@ -433,7 +433,7 @@ def test_a_solver_that_it_lacks_is_refused_by_name_with_the_way_out():
     open_engine(model, 2, SimConfig(dt=0.002, engine="batch")).step(1)
 
 
-def test_the_cpu_engine_is_refused_a_gpu_before_anything_else():
+def test_batch_engine_on_gpu_is_refused_first():
     with pytest.raises(ConfigError, match="batch"):
         open_engine(mujoco.MjModel.from_xml_string(XML), 2, SimConfig(dt=0.002, engine="batch"), device="cuda")
 
@@ -446,8 +446,8 @@ ONLY_MOTION = XML.replace(
 
 
 @pytest.mark.parametrize("also", [(), ("qfrc_bias",), ("actuator_velocity",)])
-def test_motion_is_the_cpu_engines_whatever_else_is_read(also):
-    """What needs neither contacts nor inertias is computed without them, unless something else is bound that does."""
+def test_motion_agrees_with_cpu_for_any_bound_fields(also):
+    """Check fields that need neither contacts nor inertias, alone and with a bound field that needs them."""
     names = ("site_xpos", "cvel", "subtree_com", "sensordata", *also)
     host, device = pair(ONLY_MOTION, names)
     for engine in (host, device):
@@ -455,7 +455,7 @@ def test_motion_is_the_cpu_engines_whatever_else_is_read(also):
         engine.step(3)
     assert_equal(host, device, names, 2e-5, "after a step")
     for engine in (host, device):
-        chosen = some(engine, 1, 3)
+        chosen = selection_of(engine, 1, 3)
         engine.reset(chosen)
         engine.field("qvel")[1] = 0.5
         engine.forward(chosen)
@@ -463,7 +463,7 @@ def test_motion_is_the_cpu_engines_whatever_else_is_read(also):
 
 
 @pytest.mark.parametrize("kind", [0, 1])
-def test_without_forces_after_a_reset_a_forward_pass_leaves_those_of_the_last_substep(kind):
+def test_forward_keeps_substep_forces_without_forces_after_reset(kind):
     names = ("actuator_force", "qacc", "sensordata")
     engine = pair(fields=names, forces_after_reset=False)[kind]
     scatter(engine)
@@ -472,17 +472,17 @@ def test_without_forces_after_a_reset_a_forward_pass_leaves_those_of_the_last_su
     accelerations = engine.field("sensordata")[:, :3].clone()
     assert felt["actuator_force"][2].any()
     engine.field("qvel")[2, :3] += 1.0  # pushed, not reset
-    engine.forward(some(engine, 2))
+    engine.forward(selection_of(engine, 2))
     assert_rows(felt, snapshot(engine, felt), range(N))
     assert torch.equal(engine.field("sensordata")[:, :3], accelerations)
-    engine.reset(some(engine, 2))
-    engine.forward(some(engine, 2))
+    engine.reset(selection_of(engine, 2))
+    engine.forward(selection_of(engine, 2))
     assert not engine.field("actuator_force")[2].any()
     assert not engine.field("sensordata")[2, :3].any()
     assert torch.equal(engine.field("sensordata")[3, :3], accelerations[3])
 
 
-def test_a_world_that_diverges_is_seen_where_it_was_and_the_others_where_they_are():
+def test_derived_fields_of_diverged_world_are_restored():
     names = ("xpos", "cvel", "sensordata")
     _, device = pair(fields=names)
     scatter(device, height=0.5)
@@ -499,19 +499,19 @@ def test_a_world_that_diverges_is_seen_where_it_was_and_the_others_where_they_ar
 
 
 @pytest.mark.parametrize("kind", [0, 1])
-def test_worlds_that_move_twice_are_seen_where_they_are(kind):
+def test_derived_fields_follow_two_moves(kind):
     engine = pair(fields=("xpos",))[kind]
     sim = SimData(engine)
     for world, height in ((1, 2.0), (3, 3.0)):
-        chosen = some(engine, world)
+        chosen = selection_of(engine, world)
         engine.field("qpos")[world, 2] = height
         sim.on_moved(chosen)
     sim.forward_moved()
     start = float(engine.model.qpos0[2])
     torch.testing.assert_close(sim.derived_field("xpos")[:, 1, 2], torch.tensor([start, 2.0, start, 3.0, start]))
     engine.field("qpos")[0, 2] = 4.0
-    sim.on_moved(some(engine, 0))
-    assert float(sim.derived_field("xpos")[0, 1, 2]) == pytest.approx(4.0), "what is read is current without more ado"
+    sim.on_moved(selection_of(engine, 0))
+    assert float(sim.derived_field("xpos")[0, 1, 2]) == pytest.approx(4.0), "reading updates the derived fields"
 
 
 HELD = """
@@ -533,20 +533,20 @@ HELD = """
     "constraint", ['<connect body1="b" body2="free" anchor="0.3 0 0"/>', '<weld body1="b" body2="free"/>']
 )
 @pytest.mark.parametrize("how", ["step", "forward"])
-def test_bodies_that_are_held_together_are_held_by_the_velocities_they_have(constraint, how):
-    """Set to another speed, as by a reset: what they did in the step before counts for nothing."""
+def test_equality_constraints_use_current_velocities(constraint, how):
+    """Set other velocities, as a reset does: those of the step before must have no effect."""
     engines = pair(HELD.format(constraint=constraint), ["qacc"] if how == "forward" else [])
     speeds = 10.0 * torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (N, 9)))
     found = []
     for engine in engines:
         engine.field("qvel").copy_(-speeds)
         engine.step(1)
-        engine.reset(some(engine, *range(N)))
+        engine.reset(selection_of(engine, *range(N)))
         engine.field("qvel").copy_(speeds)
         if how == "step":
             engine.step(1)
             found.append(engine.field("qvel").float())
         else:
-            engine.forward(some(engine, *range(N)))
+            engine.forward(selection_of(engine, *range(N)))
             found.append(engine.field("qacc").float())
     torch.testing.assert_close(found[0], found[1], rtol=2e-4, atol=2e-4 * float(found[0].abs().max()))
