@@ -31,7 +31,7 @@ from rlcli.sim.divergence_report import (
     DivergenceReporter,
 )
 from rlcli.sim.mujoco_private import STATE_FIELDS, forward_of, without_profiler
-from rlcli.sim.selection import Field, Groups, IdSelection, Selection, as_array, ids_of
+from rlcli.sim.selection import Field, Groups, IdSelection, Selection, ids_of
 from rlcli.sim.skippable_work import FIELDS_OF_SKIPPED_WORK
 from rlcli.sim.tensor_state import substate
 
@@ -250,10 +250,10 @@ class BatchEngine(BatchState):
 
     def select(self, mask: Field, seed: int, counters: Field) -> IdSelection | None:
         """Return the worlds where `mask` holds, as ids; None for none."""
-        ids = as_array(mask).nonzero()[0]
+        ids = np.asarray(mask).nonzero()[0]
         if not len(ids):
             return None
-        return IdSelection(ids, seed, as_array(counters)[ids], shared_streams=self.shared_streams)
+        return IdSelection(ids, seed, np.asarray(counters)[ids], shared_streams=self.shared_streams)
 
     def rays(
         self, points: Tensor, directions: Tensor, *, groups: Groups, exclude: int, selection: Selection | None

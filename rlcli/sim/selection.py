@@ -91,7 +91,7 @@ class Selection(Protocol):
         """Return a selection of the same rows that draws from another stream."""
 
 
-def as_array(values: Any) -> Any:
+def _as_array(values: Any) -> Any:
     """Return a CPU tensor as an array of the same memory; return any other value unchanged."""
     return values.numpy() if isinstance(values, Tensor) else values
 
@@ -103,7 +103,7 @@ def _on_host(value: Tensor | float) -> Any:
 
 def write_rows(field: Field, rows: NDArray[np.int64], values: Tensor | float, columns: Columns = ALL) -> None:
     """Set some rows of a (num_envs, ...) tensor on the CPU."""
-    as_array(field)[_index(rows, columns)] = as_array(values)
+    _as_array(field)[_index(rows, columns)] = _as_array(values)
 
 
 def _index(rows: NDArray[np.int64], columns: Columns) -> Any:
@@ -164,7 +164,7 @@ class IdSelection:
 
     def read(self, field: Field, columns: Columns = ALL) -> Tensor:
         """Return a copy of the rows of a (num_envs, ...) tensor."""
-        return torch.from_numpy(as_array(field)[_index(self.ids, columns)])
+        return torch.from_numpy(_as_array(field)[_index(self.ids, columns)])
 
     read_view = read
 
@@ -174,7 +174,7 @@ class IdSelection:
 
     def add(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
         """Add to the rows of a (num_envs, ...) tensor."""
-        as_array(field)[_index(self.ids, columns)] += as_array(values)
+        _as_array(field)[_index(self.ids, columns)] += _as_array(values)
 
     def mean(self, values: Tensor) -> Tensor:
         """Return the mean of a (num_envs,) tensor over the rows. ()"""
@@ -182,7 +182,7 @@ class IdSelection:
 
     def where(self, mask: Field) -> IdSelection | None:
         """Return a selection of the rows where `mask` (num_envs,) is true; None if there are none."""
-        chosen = as_array(mask)[self.ids]
+        chosen = _as_array(mask)[self.ids]
         if chosen.all():
             return self
         if not chosen.any():
