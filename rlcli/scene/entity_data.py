@@ -117,12 +117,12 @@ class EntityData:
         if not isinstance(joints, slice):
             return selection.read_view(position, joints), selection.read_view(velocity, joints)
         key = (joints.start, joints.stop, joints.step)
-        known = self._defaults.get(key)
-        if known is None or known[0] is not position or known[1] is not velocity:
+        cached = self._defaults.get(key)
+        if cached is None or cached[0] is not position or cached[1] is not velocity:
             as_field = self._entity.engine.as_field
-            known = position, velocity, as_field(position[:, joints]), as_field(velocity[:, joints])
-            self._defaults[key] = known
-        return selection.read_view(known[2]), selection.read_view(known[3])
+            cached = position, velocity, as_field(position[:, joints]), as_field(velocity[:, joints])
+            self._defaults[key] = cached
+        return selection.read_view(cached[2]), selection.read_view(cached[3])
 
     def joint_limits_of(self, joints: Columns, soft: bool = False) -> tuple[Tensor, Tensor]:
         """Return `joint_limits` of some joints; the views are made once. (num_envs or 1, k) each"""
@@ -132,9 +132,9 @@ class EntityData:
 
     def joint_angle_of(self, joints: Columns) -> Tensor:
         """Return `joint_pos[:, joints]` wrapped to [-pi, pi], computed once per step. (num_envs, k) [rad]"""
-        stamp, known = self._sim.stamp, self._angles.get(id(joints))
-        if known is not None and known[0] is joints and known[1] == stamp:
-            return known[2]
+        stamp, cached = self._sim.stamp, self._angles.get(id(joints))
+        if cached is not None and cached[0] is joints and cached[1] == stamp:
+            return cached[2]
         angle = wrap_to_pi(self.joint_pos_of(joints))
         if len(self._angles) >= MAX_CACHED_VIEWS:
             self._angles.clear()

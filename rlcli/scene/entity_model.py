@@ -45,14 +45,14 @@ def name_all(child: mujoco.MjSpec) -> None:
         ("tendon", child.tendons),
         ("pair", child.pairs),
     ):
-        taken = {element.name for element in elements}
+        used = {element.name for element in elements}
         for number, element in enumerate(elements):
             if not element.name:
-                wanted = element.target if kind == "actuator" and element.target not in taken else f"{kind}_{number}"
-                while wanted in taken:
-                    wanted += "_"
-                element.name = wanted
-                taken.add(wanted)
+                new_name = element.target if kind == "actuator" and element.target not in used else f"{kind}_{number}"
+                while new_name in used:
+                    new_name += "_"
+                element.name = new_name
+                used.add(new_name)
 
 
 def write_masses(child: mujoco.MjSpec) -> None:
@@ -82,8 +82,8 @@ def _load_mjcf(entity: EntityConfig, path: tuple[str, ...], root: Path, installe
     if ":" not in entity.model and not file.is_relative_to(root):
         raise SceneProblem(path, f"'{entity.model}' lies outside the task's folder {root}")
     if not file.is_file():
-        have = sorted(str(p.relative_to(root)) for p in root.rglob("*.xml"))
-        hint = f"MJCF files there: {', '.join(have) or 'none'}"
+        files = sorted(str(p.relative_to(root)) for p in root.rglob("*.xml"))
+        hint = f"MJCF files there: {', '.join(files) or 'none'}"
         raise SceneProblem(path, f"no file '{entity.model}' in {root}", hint)
     try:
         installed = installed or ":" in entity.model

@@ -123,8 +123,8 @@ class SceneJoints:
         if any(a.target == target and _actuator_kind(a) == kind for a in self._spec.actuators):
             return
         settings = joint_settings(self._entities[entity], joint)
-        taken = {actuator.name for actuator in self._spec.actuators}
-        name = target if target not in taken else f"{target}_{kind}"
+        used_names = {actuator.name for actuator in self._spec.actuators}
+        name = target if target not in used_names else f"{target}_{kind}"
         actuator = self._spec.add_actuator(name=name, target=target, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         if kind == "motor":
             actuator.set_to_motor()

@@ -105,9 +105,10 @@ def model_rows(engine: Engine, name: str) -> np.ndarray:
         ValueError: for a field that cannot differ between worlds.
     """
     if name not in FIELDS:
-        near = did_you_mean(name, FIELDS)
+        suggestion = did_you_mean(name, FIELDS)
         allowed = f"fields that can: {listing(sorted(FIELDS), 60)}"
-        raise NameProblem(f"'{name}' cannot differ between environments", f"{near}; {allowed}" if near else allowed)
+        hint = f"{suggestion}; {allowed}" if suggestion else allowed
+        raise NameProblem(f"'{name}' cannot differ between environments", hint)
     owner, attribute = (engine.model.opt, name[4:]) if name.startswith("opt.") else (engine.model, name)
     value = np.asarray(getattr(owner, attribute), dtype=np.float64)
     return value.reshape(1, -1) if name.startswith("opt.") else value.reshape(len(value), -1)

@@ -57,12 +57,12 @@ def match_values(values: Mapping[str, Value], names: Sequence[str], what: str) -
         NameProblem: under the conditions of `match`.
     """
     found: list[Value | None] = [None] * len(names)
-    taken: dict[int, str] = {}
+    owner: dict[int, str] = {}
     for pattern, value in values.items():
         for position in match(pattern, names, what):
-            if position in taken:
-                raise NameProblem(f"{what} '{names[position]}' is matched by '{taken[position]}' and by '{pattern}'")
-            taken[position] = pattern
+            if position in owner:
+                raise NameProblem(f"{what} '{names[position]}' is matched by '{owner[position]}' and by '{pattern}'")
+            owner[position] = pattern
             found[position] = value
     return found
 
@@ -74,7 +74,7 @@ def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
         raise NameProblem(f"'{pattern}' is neither a {what} nor a regular expression ({error})") from None
     found = [position for position, name in enumerate(names) if regex.fullmatch(name)]
     if not found:
-        near = did_you_mean(pattern, names)
-        have = f"{'bodies' if what == 'body' else f'{what}s'}: {listing(names)}"
-        raise NameProblem(f"no {what} matches '{pattern}'", f"{near} {have}" if near else have)
+        suggestion = did_you_mean(pattern, names)
+        existing = f"{'bodies' if what == 'body' else f'{what}s'}: {listing(names)}"
+        raise NameProblem(f"no {what} matches '{pattern}'", f"{suggestion} {existing}" if suggestion else existing)
     return found

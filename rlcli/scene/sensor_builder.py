@@ -17,7 +17,7 @@ from rlcli.scene.terrain import TERRAIN_BODY, Ground
 _CONTACT_DATA = mujoco.mjtConDataField
 _FOUND_AND_FORCE = (1 << int(_CONTACT_DATA.mjCONDATA_FOUND)) | (1 << int(_CONTACT_DATA.mjCONDATA_FORCE))
 _NET_FORCE = 3
-"""Reduction of a contact sensor that adds up all contacts in the world frame (mjCONREDUCE_NETFORCE)."""
+"""Reduction `netforce` of a contact sensor, which adds up all contacts in the world frame."""
 _DRAWN_GROUPS = (0, 1, 2)
 """Geom groups that viewers draw by default."""
 
@@ -143,8 +143,8 @@ class SensorBuilder:
         prefix = f"{config.entity}/"
         names = [c.name.removeprefix(prefix) for c in self._spec.cameras if c.name.startswith(prefix)]
         if config.camera not in names:
-            near = did_you_mean(config.camera, names) or f"cameras: {listing(names) if names else 'none'}"
-            raise SceneProblem((*path, "camera"), f"no camera '{config.camera}' in the MJCF of '{config.entity}'", near)
+            hint = did_you_mean(config.camera, names) or f"cameras: {listing(names) if names else 'none'}"
+            raise SceneProblem((*path, "camera"), f"no camera '{config.camera}' in the MJCF of '{config.entity}'", hint)
         return CameraSensorSpec(config, prefix + config.camera)
 
     def _body(self, entity: str, pattern: str | None, path: tuple[str, ...]) -> str:
@@ -158,8 +158,8 @@ class SensorBuilder:
     def _bodies(self, entity: str, patterns: str | list[str], path: tuple[str, ...], key: str) -> list[str]:
         """Return the full names of the matching bodies of an entity."""
         if entity not in self._entities:
-            near = did_you_mean(entity, self._entities) or f"entities: {listing(self._entities)}"
-            raise SceneProblem((*path, "entity"), f"no entity '{entity}' in the scene", near)
+            hint = did_you_mean(entity, self._entities) or f"entities: {listing(self._entities)}"
+            raise SceneProblem((*path, "entity"), f"no entity '{entity}' in the scene", hint)
         prefix = f"{entity}/"
         names = [body.name.removeprefix(prefix) for body in self._spec.bodies if body.name.startswith(prefix)]
         try:
@@ -184,14 +184,14 @@ class SensorBuilder:
         if not ground:
             raise SceneProblem(path, "the scene has no ground", "add scene.ground or scene.terrain, or write sees: all")
         names = {geom.name for geom in ground}
-        taken = {int(geom.group) for geom in self._spec.geoms if geom.name not in names}
-        free = [group for group in _DRAWN_GROUPS if group not in taken]
-        if not free:
+        used_groups = {int(geom.group) for geom in self._spec.geoms if geom.name not in names}
+        free_groups = [group for group in _DRAWN_GROUPS if group not in used_groups]
+        if not free_groups:
             message = f"the entities have geoms in all groups that are drawn: {listing(map(str, _DRAWN_GROUPS))}"
             raise SceneProblem(path, message, "leave one group free for the ground in the MJCF, or write sees: all")
         for geom in ground:
-            geom.group = free[0]
-        return free[0]
+            geom.group = free_groups[0]
+        return free_groups[0]
 
 
 def _look_rotation(ray: NDArray[np.float64]) -> NDArray[np.float64]:

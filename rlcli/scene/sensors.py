@@ -175,8 +175,7 @@ class RaySensor(LazySensor):
     def _cast(self) -> None:
         if not self._current:
             self._current = True
-            found = self._rays(*self._pose())
-            for buffer, values in zip(self._buffers, found, strict=True):
+            for buffer, values in zip(self._buffers, self._rays(*self._pose()), strict=True):
                 buffer.copy_(values)
 
     def _rays(self, position: Tensor, quat: Tensor, selection: Selection | None = None) -> tuple[Tensor, ...]:
@@ -190,9 +189,9 @@ class RaySensor(LazySensor):
             found = self._table.distance(points)
         else:
             found = self._engine.rays(points, directions, groups=self._groups, exclude=self._body, selection=selection)
-        reach = self._config.max_distance
-        missed = (found < 0.0) | (found > reach)
-        distance = found.masked_fill_(missed, reach)
+        max_distance = self._config.max_distance
+        missed = (found < 0.0) | (found > max_distance)
+        distance = found.masked_fill_(missed, max_distance)
         return distance, missed, points + directions * distance[..., None], position
 
     def _pose(self) -> tuple[Tensor, Tensor]:
@@ -223,17 +222,17 @@ Sensor = ContactSensor | RaySensor | CameraSensor
 def make_sensors(specs: Mapping[str, SensorSpec], sim: SimData, entities: Mapping[str, Entity]) -> dict[str, Sensor]:
     """Make the sensors of a compiled scene, in the order of `specs`."""
     cameras = {name: spec for name, spec in specs.items() if isinstance(spec, CameraSensorSpec)}
-    made: dict[str, Sensor] = dict(make_cameras(cameras, sim.engine))
+    sensors: dict[str, Sensor] = dict(make_cameras(cameras, sim.engine))
     for name, spec in specs.items():
         if isinstance(spec, ContactSensorSpec):
-            made[name] = ContactSensor(spec, sim)
+            sensors[name] = ContactSensor(spec, sim)
         elif isinstance(spec, RaySensorSpec):
-            made[name] = RaySensor(spec, sim, entities[spec.config.entity])
-    return {name: made[name] for name in specs}
+            sensors[name] = RaySensor(spec, sim, entities[spec.config.entity])
+    return {name: sensors[name] for name in specs}
 
 
 def _pattern(config: RaySensorConfig) -> tuple[Tensor, Tensor]:
-    """Return the start points of the rays relative to the sensor, and their unit directions. (r, 3) each [m]"""
+    """Return the start points of the rays relative to the sensor [m], and their unit directions. (r, 3) each"""
     if not isinstance(config.pattern, GridPatternConfig):
         directions = torch.tensor(config.pattern)
         return torch.zeros_like(directions), torch.nn.functional.normalize(directions, dim=1)

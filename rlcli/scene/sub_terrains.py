@@ -68,13 +68,13 @@ class Patch:
 
 def make_patch(config: schema.PatchConfig, site: PatchSite) -> Patch:
     """Make a sub-terrain of the site's difficulty."""
-    made = _MAKERS[type(config)](config, site)
-    if isinstance(made, np.ndarray):
-        return Patch(_with_zero_edges(made))
+    heights_or_blocks = _MAKERS[type(config)](config, site)
+    if isinstance(heights_or_blocks, np.ndarray):
+        return Patch(_with_zero_edges(heights_or_blocks))
     heights = site.flat()
-    for block in made:
+    for block in heights_or_blocks:
         _raise_to_block(heights, site, block)
-    return Patch(_with_zero_edges(heights), tuple(made) if config.boxes else ())  # type: ignore[attr-defined]
+    return Patch(_with_zero_edges(heights), tuple(heights_or_blocks) if config.boxes else ())  # type: ignore[attr-defined]
 
 
 def ring(outer: Block, inner: Block) -> list[Block]:

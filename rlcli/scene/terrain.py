@@ -296,8 +296,8 @@ def _file_problems(config: schema.TerrainHeightsConfig, root: Path) -> Iterator[
         yield ("file",), f"'{config.file}' lies outside the task's folder {root}", None
         return
     if not file.is_file():
-        have = ", ".join(sorted(str(p.relative_to(root)) for p in root.rglob("*.npy"))) or "none"
-        yield ("file",), f"no file '{config.file}' in {root}", f"NumPy files there: {have}"
+        files = ", ".join(sorted(str(p.relative_to(root)) for p in root.rglob("*.npy"))) or "none"
+        yield ("file",), f"no file '{config.file}' in {root}", f"NumPy files there: {files}"
         return
     try:
         heights = _read_heights(file)

@@ -114,7 +114,7 @@ class Engine(Protocol):
         Args:
             mask: the worlds. (num_envs,) bool
             seed: seed of the selection's random numbers.
-            counters: number of each world's random stream. (num_envs,) int64
+            counters: number of each world's random sequence, usually its episode. (num_envs,) int64
         """
 
     def rays(

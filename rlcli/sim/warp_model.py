@@ -63,8 +63,8 @@ class WarpModel:
         if name not in self._expanded:
             owner, attribute = self._owner(name)
             if not self.can_expand(name):
-                near = did_you_mean(attribute, _batched_fields(owner))
-                raise ValueError(f"'{name}' cannot differ between worlds; {near or ''}")
+                suggestion = did_you_mean(attribute, _batched_fields(owner))
+                raise ValueError(f"'{name}' cannot differ between worlds; {suggestion or ''}")
             array = getattr(owner, attribute)
             values = np.repeat(array.numpy()[:1], self.num_envs, axis=0)
             wide = wp.array(values, dtype=array.dtype, device=self._device)

@@ -53,8 +53,8 @@ class WarpState(WarpModel):
         if name not in self._fields:
             array = getattr(self._data, name, None)
             if not isinstance(array, wp.array) or array.ndim == 0 or array.shape[0] != self.num_envs:
-                known = [f.name for f in dataclasses.fields(self._data)]
-                raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {did_you_mean(name, known) or ''}")
+                names = [f.name for f in dataclasses.fields(self._data)]
+                raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {did_you_mean(name, names) or ''}")
             saved = self._substep_values()
             self._fields[name] = wp.to_torch(array)
             if name in INPUTS:  # it still has the model's value
@@ -163,7 +163,7 @@ class WarpState(WarpModel):
     def _of_substep(self) -> list[str]:
         """Return the bound fields that have values of the last substep, which the state does not determine."""
         stages = {name: self._stages.stages_of(name) for name in self._fields}
-        return [name for name, of in stages.items() if FORCE in of or (self._substep_fields and of)]
+        return [name for name, groups in stages.items() if FORCE in groups or (self._substep_fields and groups)]
 
     def _substep_values(self) -> dict[str, Tensor]:
         """Return copies of the values of the last substep, which a forward pass would overwrite."""
