@@ -9,14 +9,14 @@ from typing import TypeVar
 import mujoco
 import numpy as np
 
-from rlcli.config.schema import EntityConfig, SceneConfig, SimConfig
+from rlcli.config.schema import EntityConfig, SceneConfig, SimConfig, TerrainConfig
 from rlcli.errors import ConfigError, Problem, one_line
 from rlcli.scene.entity_model import entity_model, name_all, write_masses
 from rlcli.scene.ground_and_lights import add_ground_plane, add_lights, add_materials
 from rlcli.scene.joint_setup import SceneJoints
 from rlcli.scene.names import SceneProblem
 from rlcli.scene.sensor_builder import SensorBuilder, SensorSpec
-from rlcli.scene.terrain import Ground, TerrainConfig, add_ground, make_ground, terrain_problems
+from rlcli.scene.terrain import Ground, add_ground, make_ground, terrain_problems
 from rlcli.sim.mujoco_log import quiet_mujoco
 
 _OPTIONS = (
