@@ -72,7 +72,7 @@ RUN_BY = {
     "first-task.md: Scenes": f"{OF_PAGES}::test_the_scenes_of_the_page_build_and_run",
     "first-task.md: Events and randomisation": f"{HERE}::test_randomised_models_of_the_page_differ",
     **dict.fromkeys(
-        (f"first-task.md: {part}" for part in ("What the policy sees", "Commands", "Actuators", "Curriculum")),
+        (f"first-task.md: {part}" for part in ("Observations", "Commands", "Actuators", "Curriculum")),
         f"{OF_PAGES}::test_the_sections_on_what_is_seen_asked_driven_and_changed_work_together",
     ),
     "write-a-trainer.md": f"{OF_WHEELS}::test_the_trainer_of_the_page_works_as_written",
@@ -224,7 +224,7 @@ def test_the_mistake_of_the_readme_is_answered_as_it_says(capsys):
 
 def test_randomised_models_of_the_page_differ(tmp_path):
     """first-task.md"""
-    (block,) = blocks(DOCS / "tutorials" / "first-task.md", "## Events and randomisation", "## What the policy sees")
+    (block,) = blocks(DOCS / "tutorials" / "first-task.md", "## Events and randomisation", "## Observations")
     part = yaml.safe_load(block.text.replace("foot_.*", "geom_.*"))
     env = build_env(write(tmp_path / "task", edited(CRITTER_TASK, **part), critter_xml=CRITTER), 3)
     env.reset()

@@ -93,7 +93,7 @@ def test_the_scenes_of_the_page_build_and_run(number, tmp_path):
 
 
 def test_the_sections_on_what_is_seen_asked_driven_and_changed_work_together(tmp_path):
-    found = blocks(DOCS / "tutorials" / "first-task.md", "## What the policy sees", "## Check it")
+    found = blocks(DOCS / "tutorials" / "first-task.md", "## Observations", "## Check it")
     parts = [yaml.safe_load(block.text) for block in found if block.language == "yaml"]
     (terms,) = [block.text for block in found if block.language == "python"]
     assert [list(part) for part in parts] == [
