@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 RUNS ?= runs
-# of `make learn-TASK`: cpu or cuda (else the device that docs/zoo/zoo.yaml names), and the seed
+# of `make learn-TASK`: cpu or cuda (else the device that docs/reference/zoo/zoo.yaml names), and the seed
 DEVICE ?=
 SEED ?= 1
 # of `make bench`: which tables; all, if empty
@@ -21,6 +21,13 @@ $(VENV)/.demo: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) install -c constraints.txt torch
 	$(PIP) install -c constraints.txt -e '.[video,tensorboard]'
+	touch $@
+
+# What `make docs` needs, where the developer's installation is not there.
+$(VENV)/.docs: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) install -c constraints.txt torch
+	$(PIP) install -c constraints.txt -e '.[docs]'
 	touch $@
 
 $(VENV)/.dev: $(VENV)/.demo
@@ -63,7 +70,7 @@ check: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Trains a built-in task with its default agent, evaluates it, and compares with its bar in docs/zoo/zoo.yaml.
+# Trains a built-in task with its default agent, evaluates it, and compares with its bar in docs/reference/zoo/zoo.yaml.
 learn-%: $(VENV)/.demo
 	$(BIN)/python benchmarks/zoo.py learn $* --device "$(DEVICE)" --seed $(SEED) --runs-dir $(RUNS)
 
@@ -71,11 +78,11 @@ learn-%: $(VENV)/.demo
 zoo-pages: $(VENV)/.demo
 	$(BIN)/python benchmarks/zoo.py pages
 
-docs: $(VENV)/.dev
+docs: $(if $(wildcard $(VENV)/.dev),,$(VENV)/.docs)
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
 	@echo "docs/_build/html/index.html"
 
-# Every table of the CPU in docs/benchmarks.md, and the figures of the README: about half an hour on an idle machine.
+# Every table of the CPU in docs/explanation/benchmarks.md, and the figures of the README: about half an hour on an idle machine.
 # The libraries that it compares with are installed below .bench. TABLES=envpool: one of them.
 bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/bench.py $(TABLES)

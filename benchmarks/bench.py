@@ -1,4 +1,4 @@
-"""Every table of the CPU in `docs/benchmarks.md`: `make bench`, or `python benchmarks/bench.py [TABLE...]`.
+"""Every table of the CPU in `docs/explanation/benchmarks.md`: `make bench`, or `python benchmarks/bench.py [TABLE...]`.
 
 Each table runs in a process of its own, one after the other, and keeps its result in `results.json`; then the generated
 parts of the pages are written from that. `--pages` only writes the pages; `--quick` tries everything out and keeps
@@ -73,23 +73,13 @@ def printed(result: dict[str, Any]) -> str:
 
 
 def readme(kept: dict[str, Any]) -> str:
-    """The figures in the README's sentences."""
-    rows = kept["env_step"]["rows"]
-    ratio = next(row["ratio"] for row in rows if (row["task"], row["num_envs"]) == ("cartpole", 4096))
-    said = [f"The environment step runs at {ratio:.3f} of the bare physics at 4,096 cartpoles"]
-    if "ratio" in kept.get("mjlab", {}):
-        said.append(f"takes 1/{kept['mjlab']['ratio']:.1f} of mjlab's time on a CPU at 1,024")
-    means = kept.get("envpool", {}).get("means")
-    if means:
-        said.append(f"is {means['1024']:.2f} times as fast as EnvPool's over Gymnasium's eleven tasks")
-    times = {
-        row["name"]: row["times"]["ppo"]["ratio"] for row in kept.get("trainers", {}).get("rows", []) if row["times"]
-    }
-    if "dummy" in times:
-        said.append(f"training is {times['dummy']:.1f} times as fast as SB3's on a plain Gymnasium cartpole")
-    if len(said) > 1:
-        said[-1] = f"and {said[-1]}"
-    return f"{', '.join(said)}\n([figures](docs/benchmarks.md))."
+    """Return the README's figure of the training speed."""
+    rows = kept["trainers"]["rows"]
+    times = next(row["times"]["ppo"]["ratio"] for row in rows if row["name"] == "dummy")
+    return (
+        f"- **{times:.1f} times** the training speed of Stable-Baselines3 on a plain Gymnasium cartpole, on the same two"
+        " cores."
+    )
 
 
 def texts(kept: dict[str, Any]) -> dict[str, str]:
@@ -97,7 +87,7 @@ def texts(kept: dict[str, Any]) -> dict[str, str]:
     makers: dict[str, Callable[[dict[str, Any]], str]] = dict.fromkeys(SCRIPTS, printed)
     makers |= {name: importlib.import_module(module).markdown for name, module in MODULES.items() if name in kept}
     found = {name: makers[name](kept[name]) for name in TABLES if name in kept}
-    return {**found, **({"readme": readme(kept)} if "env_step" in kept else {})}
+    return {**found, **({"readme": readme(kept)} if "trainers" in kept else {})}
 
 
 def write_pages() -> None:

@@ -170,7 +170,9 @@ def main() -> None:
     parser.add_argument("--runs-dir", type=Path, default=Path("runs/gym_scores"))
     parser.add_argument("--label", default="", help="Added to the names of the runs: for trials with overrides.")
     parser.add_argument("--output", type=Path, help="JSON file to write.")
-    parser.add_argument("--page", type=Path, help="Markdown file to write the tables into, as docs/zoo/peers.md.")
+    parser.add_argument(
+        "--page", type=Path, help="Markdown file to write the tables into, as docs/reference/zoo/peers.md."
+    )
     parser.add_argument("overrides", nargs="*", help="agent.gamma=0.98 and the like, for every training.")
     options = parser.parse_intermixed_args()
     todo = [(task, seed) for seed in options.seeds for task in options.tasks]

@@ -1,6 +1,6 @@
 """Learning curves of runs as one small CSV and one SVG: `python benchmarks/learning_curves.py NAME RUN ...`.
 
-Writes docs/curves/NAME.csv and docs/curves/NAME.svg: the success rate of each run over its environment steps, in
+Writes docs/reference/curves/NAME.csv and docs/reference/curves/NAME.svg: the success rate of each run over its environment steps, in
 training, exploration included. A run is called by the seed that it was trained with.
 """
 
@@ -55,7 +55,7 @@ def drawing(curves):
 
 def main(name, *runs):
     curves = sorted(curve(Path(run)) for run in runs)
-    folder = Path(__file__).parents[1] / "docs" / "curves"
+    folder = Path(__file__).parents[1] / "docs" / "reference" / "curves"
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / f"{name}.csv").open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(table(curves))

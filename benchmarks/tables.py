@@ -1,4 +1,4 @@
-"""The tables of `docs/benchmarks.md`: what was measured is kept in `results.json`, and the pages are written from that.
+"""The tables of `docs/explanation/benchmarks.md`: what was measured is kept in `results.json`, and the pages are written from that.
 
 A table is a module with `NAME`, `measure(quick)`, which gives a JSON object, and `markdown(result)`. Run as a program
 it measures, keeps the result and writes it into the pages; `--quick` only tries it out and prints.
@@ -20,7 +20,7 @@ from machine import describe
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).with_name("results.json")
-PAGES = [ROOT / "docs" / "benchmarks.md", ROOT / "README.md"]
+PAGES = [ROOT / "docs" / "explanation" / "benchmarks.md", ROOT / "README.md"]
 _MARKED = re.compile(
     r"^(?P<indent> *)<!-- bench: (?P<name>[\w-]+) -->\n(?P<text>.*?)^ *<!-- end bench -->", re.DOTALL | re.MULTILINE
 )

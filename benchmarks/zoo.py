@@ -1,4 +1,4 @@
-"""The built-in tasks: trained, judged and shown. What each is held to stands in docs/zoo/zoo.yaml.
+"""The built-in tasks: trained, judged and shown. What each is held to stands in docs/reference/zoo/zoo.yaml.
 
     python benchmarks/zoo.py learn TASK            train the default agent here, evaluate, compare with the bar
     python benchmarks/zoo.py collect TASK RUN ...  finished runs, from this or another machine, become results and
@@ -7,7 +7,7 @@
                                                    documents of `rlcli eval --json` that lie there are taken
     python benchmarks/zoo.py adopt TASK OTHER      ship the policy of the task's other form, judged in this one
     python benchmarks/zoo.py picture TASK          a strip of pictures of the shipped policy
-    python benchmarks/zoo.py pages                 fill the generated parts of docs/zoo/*.md, and write its index
+    python benchmarks/zoo.py pages                 fill the generated parts of docs/reference/zoo/*.md, and write its index
 
 `learn` exits with 9 where the bar or the minutes are missed, and appends a line to RUNS/learn.jsonl.
 """
@@ -34,7 +34,7 @@ import zoo_pages
 
 from rlcli.registry import find_task
 
-ZOO = Path(__file__).resolve().parents[1] / "docs" / "zoo"
+ZOO = Path(__file__).resolve().parents[1] / "docs" / "reference" / "zoo"
 _LARGEST_PICTURE = 80_000
 _FRAMES = 5
 _NOT_THE_TRAINING = ("--runs-dir", "--name", "--logger", "--video-every")

@@ -1,4 +1,4 @@
-"""The generated parts of docs/zoo/*.md: what a task is, what came of its trainings, and how they went."""
+"""The generated parts of docs/reference/zoo/*.md: what a task is, what came of its trainings, and how they went."""
 
 from __future__ import annotations
 
@@ -149,30 +149,43 @@ def curves(zoo: Path, entry: Any) -> str:
 
 
 def index(zoo: Path, found: list[Any]) -> str:
-    """The table of all tasks."""
+    """Return the page with the table of all tasks."""
     lines = [
-        "# The built-in tasks",
+        "# Built-in tasks",
         "",
-        "Each has a page with its numbers and where they come from, a policy that ships with it (`rlcli play TASK`",
-        "right after the installation), learning curves, and a bar that `make learn-TASK` checks: tier A over three",
-        "seeds within its minutes, tier B a stated level of one seed. `cpu` is two cores, `cuda` one H200. What a task",
-        "is held to stands in [zoo.yaml](zoo.yaml); `python benchmarks/zoo.py pages` writes this table and the",
-        "generated parts of the pages.",
+        "After reading this page you can choose a task to start from. `rlcli play TASK` shows the policy that comes with a",
+        "task, and `rlcli train TASK` trains a new one. A task's page has its model, numbers, learning curves and results.",
         "",
-        "| | task | workflow | obs | act | tier | device | minutes | bar | result |",
-        "| --- | --- | --- | ---: | ---: | --- | --- | ---: | --- | --- |",
+        "```{toctree}",
+        ":hidden:",
+        "",
+        *(entry.name for entry in found),
+        "peers",
+        "```",
+        "",
+        "| task | what the policy does | observations, actions | trained on | result (bar) |",
+        "| --- | --- | --- | --- | --- |",
     ]
     shipped = _index_json()
     for entry in found:
         known = shipped.get(entry.name, {})
         rows = rows_of(zoo, entry.name)
-        image = f"![](pictures/{entry.name}.jpg)" if (zoo / "pictures" / f"{entry.name}.jpg").is_file() else ""
-        page = f"[{entry.name}]({entry.name}.md)" if (zoo / f"{entry.name}.md").is_file() else entry.name
-        lines.append(
-            f"| {image} | {page}: {known.get('summary', '')} | {known.get('workflow', '?')} |"
-            f" {known.get('observation_size', '?')} | {known.get('action_size', '?')} | {entry.tier} | {entry.device} |"
-            f" {_minutes(rows, entry)} | {bars(entry)} | {_outcome(rows, entry)} |"
+        image = (
+            f"![{entry.name}](pictures/{entry.name}.jpg)" if (zoo / "pictures" / f"{entry.name}.jpg").is_file() else ""
         )
+        page = f"[{entry.name}]({entry.name}.md)" if (zoo / f"{entry.name}.md").is_file() else entry.name
+        machine = "one H200" if entry.device == "cuda" else "two CPU cores"
+        lines.append(
+            f"| {page} {image} | {known.get('summary', '')} |"
+            f" {known.get('observation_size', '?')}, {known.get('action_size', '?')} |"
+            f" {machine}, {_minutes(rows, entry)} min | {_outcome(rows, entry)} ({bars(entry)}), tier {entry.tier} |"
+        )
+    lines += [
+        "",
+        "- Tier A: three seeds reach the bar within the given minutes. Tier B: one seed reaches it.",
+        "- `make learn-TASK` trains a task and compares the result with its bar. The bars are in [zoo.yaml](zoo.yaml).",
+        "- [Scores of other libraries](peers.md) compares results on Gymnasium's tasks.",
+    ]
     return "\n".join(lines) + "\n"
 
 

@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-PAGE = Path(__file__).parent / "licences.md"
+PAGE = Path(__file__).parent / "reference" / "licences.md"
 LICENCES = {
     "build": ("MIT", "builds wheels and source archives"),
     "filelock": ("MIT", "one writer a run; one process at a time begins a sweep's trial"),
     "furo": ("MIT", "the look of these pages"),
     "gitpython": ("BSD-3-Clause", "RSL-RL or rl_games imports it; the trainer plugins are tested"),
+    "griffelib": ("ISC", "reads docstrings and signatures for the generated Python reference"),
     "gymnasium": ("MIT", "the interface that other libraries know environments by"),
+    "hatch-fancy-pypi-readme": ("MIT", "writes the README for package indexes"),
     "hatchling": ("MIT", "the build backend"),
     "hypothesis": ("MPL-2.0", "tests with drawn cases"),
     "imageio": ("BSD-2-Clause", "writes videos and GIFs"),

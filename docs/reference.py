@@ -1,164 +1,198 @@
-"""The pages that are written from the code: configuration, terms, command line, Python."""
+"""Generator of the reference pages: task schema, agents, terms, commands and the Python API.
+
+`python docs/reference.py` writes the pages into `docs/reference/`, where they are committed, and the two lists of public
+names. `tests/docs/test_reference_pages.py` fails while a page differs from the code.
+"""
 
 from __future__ import annotations
 
 import importlib
 import inspect
-import json
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-PUBLIC = Path(__file__).parent / "public-names.txt"
-"""What others may rely on, a name a line; tests/docs compares it with the code."""
-WORDS = Path(__file__).parent / "public-words.txt"
-"""Likewise what task files and command lines may say; tests/packaging compares it with the code."""
-MODULES = (
-    "rlcli.task",
-    "rlcli.trainers",
-    "rlcli.formats",
-    "rlcli.errors",
-    "rlcli.gym",
-    "rlcli.random",
-    "rlcli.registry",
-    "rlcli.config.load",
-    "rlcli.config.schema",
-    "rlcli.reporting.task_card",
-    "rlcli.envs.vec_env",
-    "rlcli.envs.make",
-    "rlcli.envs.build",
-    "rlcli.envs.direct",
-    "rlcli.envs.articulation",
-    "rlcli.envs.step",
-    "rlcli.envs.observers",
-    "rlcli.sim.markers",
-    "rlcli.sim.selection",
-    "rlcli.sim.rotations",
-    "rlcli.rl.trainer",
-    "rlcli.rl.policy",
-    "rlcli.rl.statistics",
-    "rlcli.rl.optimizers",
-    "rlcli.rl.rng",
-    "rlcli.adapters.gymnasium",
-    "rlcli.adapters.sb3",
-    "rlcli.adapters.rsl_rl",
-    "rlcli.testing",
-)
-"""Modules whose public names are the Python interface."""
-TRAINERS = ("ppo", "sb3")
-"""The trainers that come with rlcli, whose agents' settings are part of the configuration."""
-TERMS = (
-    "observations",
-    "actions",
-    "rewards",
-    "terminations",
-    "events",
-    "commands",
-    "curriculum",
-    "success",
-    "randomization",
-)
+import griffe
+
+from rlcli.config.term_reference import TermEntry, term_entries, type_text, yaml_text
+
+DOCS = Path(__file__).resolve().parent
+PUBLIC = DOCS / "public-names.txt"
+"""Public Python names, one a line; tests/docs compares them with the code."""
+WORDS = DOCS / "public-words.txt"
+"""Public words of task files and command lines; tests/packaging compares them with the code."""
+MODULES = {
+    "rlcli.task": "Task plugins and type aliases of terms",
+    "rlcli.trainers": "Trainer plugins",
+    "rlcli.formats": "Plugins that read other task formats",
+    "rlcli.errors": "Exceptions",
+    "rlcli.gym": "Gymnasium registration",
+    "rlcli.random": "Seeds",
+    "rlcli.registry": "Find tasks and trainers",
+    "rlcli.config.load": "Resolve a configuration",
+    "rlcli.config.schema": "Configuration models",
+    "rlcli.reporting.task_card": "Task cards",
+    "rlcli.envs.vec_env": "Vectorized environments",
+    "rlcli.envs.make": "Make an environment",
+    "rlcli.envs.build": "Build a simulation",
+    "rlcli.envs.direct": "Direct tasks",
+    "rlcli.envs.articulation": "Articulations of direct tasks",
+    "rlcli.envs.step": "Step results",
+    "rlcli.envs.observers": "Observers of the step",
+    "rlcli.sim.markers": "Markers in viewers",
+    "rlcli.sim.selection": "Selections of environments",
+    "rlcli.sim.rotations": "Rotations",
+    "rlcli.rl.trainer": "Trainers",
+    "rlcli.rl.policy": "Policies",
+    "rlcli.rl.statistics": "Episode statistics",
+    "rlcli.rl.optimizers": "Optimizers",
+    "rlcli.rl.rng": "Random generators",
+    "rlcli.adapters.gymnasium": "Gymnasium environments",
+    "rlcli.adapters.sb3": "Stable-Baselines3 environments",
+    "rlcli.adapters.rsl_rl": "RSL-RL environments",
+    "rlcli.testing": "Contract checks",
+}
+"""Modules with public names -> titles of their pages."""
+TRAINERS = {"ppo": "rlcli.rl.ppo.config", "sb3": "rlcli.rl.sb3.config"}
+"""Built-in trainers -> the modules with their `SPEC`."""
+SECTIONS = {
+    "observations": "Values that the policy or the critic receives, one row per environment.",
+    "actions": "Conversions of raw policy outputs into actuator targets.",
+    "rewards": "Values of which the weighted sum is the reward; each is scaled by the length of a step.",
+    "terminations": "Conditions that end an episode.",
+    "events": "Changes at startup, at resets or at intervals.",
+    "randomization": "Events that sample properties of the model.",
+    "commands": "Goals that the policy follows, sampled again at intervals.",
+    "curriculum": "Changes of the task during the training.",
+    "success": "Conditions that count an episode as successful.",
+}
+"""Section of the terms -> what its terms are."""
 
 
 def public_names(module_name: str) -> list[str]:
-    """What a module defines, or says it offers, without an underscore."""
+    """Return the public names of a module: its `__all__`, else the classes and functions that it defines."""
     module = importlib.import_module(module_name)
-    offered = getattr(module, "__all__", None)
-    if offered is not None:
-        return sorted(offered)
-    found = []
-    for name, value in vars(module).items():
-        own = _defined_in(value, module_name)
-        if not name.startswith("_") and own and (inspect.isclass(value) or inspect.isfunction(value)):
-            found.append(name)
-    return sorted(found)
+    listed = getattr(module, "__all__", None)
+    if listed is not None:
+        return sorted(listed)
+    return sorted(
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_")
+        and _defined_in(value, module_name)
+        and (inspect.isclass(value) or inspect.isfunction(value))
+    )
 
 
 def _defined_in(value: Any, module_name: str) -> bool:
-    """Whether a module, or a module of this package, defines the value."""
-    place = str(getattr(value, "__module__", ""))
-    return place == module_name or place.startswith(f"{module_name}.")
+    """Return whether a module, or a module of this package, defines the value."""
+    module = str(getattr(value, "__module__", ""))
+    return module == module_name or module.startswith(f"{module_name}.")
 
 
 def public_words() -> list[str]:
-    """Terms, configuration keys, commands and their options: renaming one breaks somebody's files or scripts."""
-    import typer
-
-    from rlcli.cli.app import build
+    """Return the terms, configuration keys, commands and options: users' files and scripts contain them."""
     from rlcli.config.schema import TaskConfig
-    from rlcli.rl.ppo.config import SPEC as PPO
-    from rlcli.rl.sb3.config import SPEC as SB3
 
-    words = [f"term {section}.{name}" for section in TERMS for name, _ in _terms_of(section)]
-    models: dict[str, Any] = {"Task": TaskConfig}
-    for trainer, spec in (("ppo", PPO), ("sb3", SB3)):
-        for algorithm, place in spec.algorithms.items():
-            module, _, name = place.partition(":")
-            models[f"{trainer}.{algorithm}"] = getattr(importlib.import_module(module), name)
-    for model, value in models.items():
-        schema = value.model_json_schema()
+    words = [f"term {section}.{entry.name}" for section, entry in _terms()]
+    for model, schema in {"Task": TaskConfig.model_json_schema(), **agent_schemas("{}.{}")}.items():
         for name, fields in {model: schema, **schema.get("$defs", {})}.items():
             words += [f"key {name}.{key}" for key in fields.get("properties", {})]
-    pending = [("rlcli", typer.main.get_command(build()))]
-    while pending:
-        path, command = pending.pop()
-        inner = getattr(command, "commands", {})
-        pending += [(f"{path} {name}", each) for name, each in inner.items()]
-        if not inner:
-            options = [option for parameter in command.params for option in parameter.opts if option[0] == "-"]
-            words += [f"command {path}", *(f"option {path} {option}" for option in options)]
+    for path, command in commands():
+        options = [option for parameter in command.params for option in parameter.opts if option[0] == "-"]
+        words += [f"command {path}", *(f"option {path} {option}" for option in options)]
     return sorted(set(words))
 
 
-def write(folder: Path) -> None:
-    """All of the pages."""
-    folder.mkdir(exist_ok=True)
-    pages = {
-        "index": _index,
-        "configuration": _configuration,
-        "terms": _terms,
-        "command-line": _command_line,
-        "python": _python,
+def agent_schemas(title: str = "{}, {}") -> dict[str, Any]:
+    """Return the JSON schemas of the built-in trainers' algorithms, by title."""
+    schemas = {}
+    for trainer, module_name in TRAINERS.items():
+        for algorithm, reference in importlib.import_module(module_name).SPEC.algorithms.items():
+            module, _, name = reference.partition(":")
+            model = getattr(importlib.import_module(module), name)
+            schemas[title.format(trainer, algorithm)] = model.model_json_schema()
+    return schemas
+
+
+def commands() -> Iterator[tuple[str, Any]]:
+    """Yield every command with its words, `rlcli import sb3`, in the order of `--help`."""
+    import typer
+
+    from rlcli.cli.app import build
+
+    def walk(path: str, command: Any) -> Iterator[tuple[str, Any]]:
+        inner = getattr(command, "commands", None)
+        if inner is None:
+            yield path, command
+        else:
+            for name, each in inner.items():
+                yield from walk(f"{path} {name}", each)
+
+    return walk("rlcli", typer.main.get_command(build()))
+
+
+def pages() -> dict[str, str]:
+    """Return the text of every generated page, by its path in `docs/reference/`."""
+    written: dict[str, Iterable[str]] = {
+        "task-schema.md": _task_schema(),
+        "agents.md": _agents(),
+        "commands.md": _commands(),
+        "terms/index.md": _terms_index(),
+        "python/index.md": _python_index(),
     }
-    for name, page in pages.items():
-        text = "\n".join(page()) + "\n"
-        file = folder / f"{name}.md"
-        if not file.is_file() or file.read_text(encoding="utf-8") != text:
-            file.write_text(text, encoding="utf-8")
+    written |= {f"terms/{section}.md": _terms_page(section) for section in SECTIONS}
+    package = griffe.load("rlcli", search_paths=[DOCS.parent], docstring_parser="google")
+    written |= {f"python/{_file_name(module)}": _python_page(package, module) for module in MODULES}
+    return {path: "\n".join(parts).rstrip("\n") + "\n" for path, parts in written.items()}
 
 
-def _index() -> Iterator[str]:
-    yield "# Reference\n"
-    yield "Written from the code of this version.\n"
-    yield "```{toctree}\n:maxdepth: 1\n\nconfiguration\nterms\ncommand-line\npython\n```"
+def write() -> None:
+    """Write every page that has changed, and remove pages of modules that are gone."""
+    folder, now = DOCS / "reference", pages()
+    for path, text in now.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text, encoding="utf-8")
+    for file in [*folder.glob("terms/*.md"), *folder.glob("python/*.md")]:
+        if file.relative_to(folder).as_posix() not in now:
+            file.unlink()
+    names = [f"{module}.{name}\n" for module in MODULES for name in public_names(module)]
+    PUBLIC.write_text("".join(names), encoding="utf-8")
+    WORDS.write_text("".join(f"{word}\n" for word in public_words()), encoding="utf-8")
 
 
-def _configuration() -> Iterator[str]:
+# Task schema and agents
+
+
+def _task_schema() -> Iterator[str]:
     from rlcli.config.schema import TaskConfig
-    from rlcli.trainers import TrainerSpec
 
-    schema = TaskConfig.model_json_schema()
-    yield "# Configuration\n"
-    yield "Every key of a `task.yaml`, with its type, default, unit and range; for editors: `show TASK --schema`."
-    yield "A number may be a fraction, `1/120`. Mappings of terms (`rewards:`, `events:`, ...) have names that you"
-    yield "choose, and what `func` names has [further keys](terms.md).\n"
-    yield from _models("Task", schema)
-    yield "## Agents\n"
-    yield "What stands in `agents.NAME`, by `trainer` and `algorithm`; `agent.KEY=VALUE` on the command line.\n"
-    for trainer in TRAINERS:
-        spec: TrainerSpec = importlib.import_module(f"rlcli.rl.{trainer}_config").SPEC
-        for algorithm, place in spec.algorithms.items():
-            module, _, name = place.partition(":")
-            settings = getattr(importlib.import_module(module), name).model_json_schema()
-            yield from _models(f"{trainer}, {algorithm}", settings, within=f"{trainer}, {algorithm}: ", level="###")
+    yield "# Task schema\n"
+    yield "After reading this page you can look up every key of a `task.yaml`: its type, default, unit and range."
+    yield "`rlcli show TASK --schema` prints the same as a JSON Schema for editors.\n"
+    yield "- A number may be written as a fraction: `dt: 1/120`."
+    yield "- Sections of terms (`rewards`, `events`, ...) are mappings. You choose the names; each entry has a `func`"
+    yield "  and the [keys of that term](terms/index.md)."
+    yield "- Units are SI: m, s, kg, N, rad. Quaternions are (w, x, y, z).\n"
+    yield from _models("Task", TaskConfig.model_json_schema())
 
 
-def _models(title: str, schema: dict[str, Any], within: str = "", level: str = "##") -> Iterator[str]:
-    """A model, and those that it has inside."""
-    yield from _model(f"{level} {title}", schema)
+def _agents() -> Iterator[str]:
+    yield "# Agent settings\n"
+    yield "After reading this page you can set every parameter of a trainer: in the task file under `agents.NAME`, or"
+    yield "on the command line as `agent.KEY=VALUE`, for example `rlcli train cartpole agent.learning_rate=1e-3`."
+    yield "[The ppo trainer](ppo.md) explains the settings of `ppo`.\n"
+    for title, schema in agent_schemas().items():
+        yield from _models(title, schema, prefix=f"{title}: ")
+
+
+def _models(title: str, schema: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    """Yield the table of a model and those of the models inside it."""
+    yield from _model(f"## {title}", schema)
     for name, model in sorted(schema.get("$defs", {}).items()):
         if "properties" in model:
-            yield from _model(f"{level} {within}{name}", model)
+            yield from _model(f"## {prefix}{name}", model)
 
 
 def _model(heading: str, model: dict[str, Any]) -> Iterator[str]:
@@ -167,133 +201,121 @@ def _model(heading: str, model: dict[str, Any]) -> Iterator[str]:
         yield _one_line(model["description"]) + "\n"
     if not model.get("properties"):
         return
-    yield "| key | type | default | |\n| --- | --- | --- | --- |"
+    yield "| key | type | default | meaning |\n| --- | --- | --- | --- |"
     for key, field in model["properties"].items():
-        default = "required" if key in model.get("required", ()) else f"`{_cell(_default(field.get('default')))}`"
-        yield f"| `{key}` | {_cell(_type(field))} | {default} | {_cell(_one_line(field.get('description', '')))} |"
+        default = "required" if key in model.get("required", ()) else f"`{_cell(yaml_text(field.get('default')))}`"
+        yield f"| `{key}` | {_cell(type_text(field))} | {default} | {_cell(_one_line(field.get('description', '')))} |"
     yield ""
 
 
-_BOUNDS = (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("exclusiveMaximum", "<"))
+# Terms
 
 
-def _default(value: Any) -> str:
-    """As a YAML has it."""
-    return value if isinstance(value, str) and value else json.dumps(value)
+def _terms() -> Iterator[tuple[str, TermEntry]]:
+    """Yield every built-in term with its section; randomization terms are a section of their own here."""
+    for entry in term_entries():
+        yield ("randomization" if ".randomization" in entry.signature.module else entry.section), entry
 
 
-def _type(field: dict[str, Any]) -> str:
-    """The type with its range: `number > 0`, `[number >= 0, number] or null`."""
-    if "$ref" in field:
-        return field["$ref"].rsplit("/", 1)[-1]
-    for several in ("anyOf", "oneOf", "allOf"):
-        if several in field:
-            written = [each for each in field[several] if not ("pattern" in each and len(field[several]) > 1)]
-            return " or ".join(dict.fromkeys(_type(each) for each in written))
-    if "enum" in field or "const" in field:
-        return ", ".join(map(str, field.get("enum", [field.get("const")])))
-    if field.get("type") == "array":
-        items = field.get("prefixItems") or field.get("items")
-        if isinstance(items, list):
-            return "[" + ", ".join(_type(item) for item in items) + "]"
-        return f"list of {_type(items)}" if isinstance(items, dict) else "list"
-    if field.get("type") == "object":
-        inner = field.get("additionalProperties")
-        return f"mapping to {_type(inner)}" if isinstance(inner, dict) and inner else "mapping"
-    bounds = [f"{sign} {field[word]}" for word, sign in _BOUNDS if word in field]
-    return " ".join([str(field.get("type", "any")), " and ".join(bounds)]).strip()
+def _terms_index() -> Iterator[str]:
+    from rlcli.config.term_signatures import SECTIONS as MODELS
 
-
-def _terms() -> Iterator[str]:
     yield "# Terms\n"
-    yield "What `func:` may name in each section of a task. A term's keyword parameters are its YAML keys.\n"
-    for section in TERMS:
-        yield f"## {section.capitalize()}\n"
-        for name, value in _terms_of(section):
-            yield from _term(name, value)
+    yield "After reading this page you can find every term that a task file may name in `func`, and what it computes."
+    yield "`rlcli terms PATTERN` prints the same in the terminal; `rlcli terms --task TASK` adds a task's own terms.\n"
+    yield "```{toctree}\n:hidden:\n\n" + "\n".join(SECTIONS) + "\n```\n"
+    yield "| section | terms | contents |\n| --- | ---: | --- |"
+    counts: dict[str, int] = {}
+    for section, _ in _terms():
+        counts[section] = counts.get(section, 0) + 1
+    for section, contents in SECTIONS.items():
+        yield f"| [{section}]({section}.md) | {counts[section]} | {contents} |"
+    yield "\n## Keys of every term of a section\n"
+    for section, model in MODELS.items():
+        yield from _model(f"### {section.capitalize()}", {"properties": model.model_json_schema()["properties"]})
+    yield "## All terms\n"
+    for section in SECTIONS:
+        names = sorted(entry.name for where, entry in _terms() if where == section)
+        yield f"- {section}: " + ", ".join(f"[{name}]({section}.md#{name})" for name in names)
 
 
-def _terms_of(section: str) -> Iterator[tuple[str, Any]]:
-    """The terms of a section, by the names that `func:` knows them by."""
-    from rlcli.config.term_signatures import snake_case
-
-    module = importlib.import_module(f"rlcli.mdp.{section}")
-    for name, value in vars(module).items():
-        if name.startswith("_") or not _defined_in(value, module.__name__):
-            continue
-        if inspect.isclass(value) or inspect.isfunction(value):
-            yield snake_case(name) if inspect.isclass(value) else name, value
+def _terms_page(section: str) -> Iterator[str]:
+    yield f"# {section.capitalize()}\n"
+    yield SECTIONS[section] + "\n"
+    for where, entry in _terms():
+        if where == section:
+            yield from _term(entry)
 
 
-def _term(name: str, value: Any) -> Iterator[str]:
-    yield f"### {name}\n"
-    parameters = [
-        f"`{parameter.name}`" + ("" if parameter.default is parameter.empty else f" = `{parameter.default!r}`")
-        for parameter in inspect.signature(value).parameters.values()
-        if parameter.kind is parameter.KEYWORD_ONLY
-    ]
-    yield inspect.cleandoc(value.__doc__ or "").replace("\n\n", "\n\n") + "\n"
-    if parameters:
-        yield "Keys: " + ", ".join(parameters) + "\n"
+def _term(entry: TermEntry) -> Iterator[str]:
+    yield f"## {entry.name}\n"
+    term = griffe.Docstring(_docstring(entry), parser="google")
+    yield from _docstring_parts(term)
+    if entry.keys:
+        yield "| key | type | default | meaning |\n| --- | --- | --- | --- |"
+    for key in entry.keys:
+        default = "required" if key.required else f"`{_cell(yaml_text(key.default))}`"
+        yield f"| `{key.name}` | {_cell(key.type)} | {default} | {_cell(key.description)} |"
+    yield f"\n```yaml\n{entry.example}\n```\n"
 
 
-def _command_line() -> Iterator[str]:
-    import typer
-
-    from rlcli.cli.app import build
-
-    command = typer.main.get_command(build())
-    yield "# Command line\n"
-    yield "Data goes to stdout, messages to stderr; `--json` prints one document. `KEY=VALUE` are overrides of the"
-    yield "[configuration](configuration.md). `--debug`, on every command, adds the traceback to an error.\n"
-    yield "## Exit codes\n"
-    yield "| code | kind | |\n| --- | --- | --- |\n| 0 | | It worked. |\n| 1 | bug | A mistake of rlcli's. |"
-    for error in sorted(_errors(), key=lambda error: error.exit_code):
-        yield f"| {error.exit_code} | {error.kind} | {_cell(_one_line(error.__doc__ or ''))} |"
-    yield "| 75, 130 | stopped | It was asked to stop, by a signal or by Ctrl-C; a training can be resumed. |\n"
-    yield "What one sees of each, and what to do: [when something goes wrong](../exit-codes.md).\n"
-    yield from _commands(command, "rlcli")
+def _docstring(entry: TermEntry) -> str:
+    module = importlib.import_module(entry.signature.module)
+    return inspect.getdoc(getattr(module, entry.signature.attribute)) or ""
 
 
-def _errors() -> list[Any]:
-    from rlcli import errors
-
-    kinds = [e for e in vars(errors).values() if inspect.isclass(e) and issubclass(e, errors.RlcliError)]
-    return [e for e in kinds if e.kind not in ("error", "stopped") and "kind" in vars(e)]
+# Commands
 
 
-def _commands(command: Any, path: str) -> Iterator[str]:
-    for name, inner in sorted(getattr(command, "commands", {}).items()):
-        yield f"## {path} {name}\n"
-        yield inspect.cleandoc(inner.help or "") + "\n"
-        if hasattr(inner, "commands"):
-            yield from _commands(inner, f"{path} {name}")
-            continue
-        yield "| | default | |\n| --- | --- | --- |"
-        for parameter in inner.params:
+def _commands() -> Iterator[str]:
+    yield "# Commands\n"
+    yield "After reading this page you can look up every command and option of the command line."
+    yield "Results are printed to stdout and messages to stderr. `--json` prints one JSON document. `KEY=VALUE`"
+    yield "arguments are overrides of the [task file](task-schema.md) or, as `agent.KEY=VALUE`, of the"
+    yield "[agent](agents.md). [Exit codes](exit-codes.md) are the same for all commands.\n"
+    for path, command in commands():
+        yield f"## {path}\n"
+        yield _help_text(command) + "\n"
+        yield "| option | default | meaning |\n| --- | --- | --- |"
+        for parameter in command.params:
             if getattr(parameter, "hidden", False) or parameter.name == "help":
                 continue
-            yield f"| {_cell(_names(parameter))} | {_cell(_given(parameter))} | {_cell(_help(parameter))} |"
+            yield f"| {_cell(_spellings(parameter))} | {_cell(_default_text(parameter))} | {_cell(_help(parameter))} |"
         yield ""
 
 
-def _names(parameter: Any) -> str:
-    """The spellings of an option, and what it takes; of an argument, its name."""
+def _help_text(command: Any) -> str:
+    """Return the help of a command; its examples as a block of commands."""
+    text, _, examples = inspect.cleandoc(command.help or "").replace("\b", "").partition("Examples:")
+    lines = [line.strip() for line in [*examples.splitlines(), *(getattr(command, "epilog", None) or "").splitlines()]]
+    shown = [line for line in lines if line and line != "Examples:"]
+    text = text.strip()
+    return text + (
+        "\n\n<!-- not run: the names of runs and files are yours -->\n```sh\n" + "\n".join(shown) + "\n```"
+        if shown
+        else ""
+    )
+
+
+def _spellings(parameter: Any) -> str:
+    """Return the spellings of an option with its metavar, or the name of an argument."""
     if not parameter.opts[0].startswith("-"):
         return f"`{(parameter.metavar or parameter.name).upper()}`"
-    kind = getattr(parameter, "metavar", None) or _METAVARS.get(parameter.type_descriptor.annotation, "TEXT")
-    takes = "" if parameter.is_flag else f" {kind}"
-    return ", ".join(f"`{option}{takes}`" for option in (*parameter.opts, *parameter.secondary_opts))
+    metavar = parameter.metavar or _METAVARS.get(parameter.type_descriptor.annotation, "TEXT")
+    value = "" if parameter.is_flag else f" {metavar}"
+    return ", ".join(f"`{option}{value}`" for option in (*parameter.opts, *parameter.secondary_opts))
 
 
-_METAVARS: dict[Any, str] = {int: "N", float: "X", Path: "PATH"}
+_METAVARS: dict[Any, str] = {int: "INTEGER", float: "FLOAT", Path: "PATH"}
 
 
-def _given(parameter: Any) -> str:
-    """The default, where there is one that says something."""
+def _default_text(parameter: Any) -> str:
+    """Return the default of a parameter, empty where there is none."""
     value = parameter.default
     if parameter.required:
         return "required"
+    if isinstance(parameter.show_default, str):
+        return parameter.show_default
     return f"`{value}`" if isinstance(value, (str, int, float)) and not isinstance(value, bool) and value != "" else ""
 
 
@@ -301,19 +323,122 @@ def _help(parameter: Any) -> str:
     return _one_line(getattr(parameter, "help", None) or "")
 
 
-def _python() -> Iterator[str]:
-    yield "# Python\n"
-    yield "What plugins and scripts may rely on. Before 1.0 a minor version may change one: see the changelog.\n"
-    for module_name in MODULES:
-        yield f"## {module_name}\n"
-        yield "```{eval-rst}"
-        yield f".. automodule:: {module_name}\n   :no-index:\n"
-        for name in public_names(module_name):
-            value = getattr(importlib.import_module(module_name), name)
-            kind = "autoclass" if inspect.isclass(value) else "autofunction" if callable(value) else "py:data"
-            yield f".. {kind}:: {module_name}.{name}"
-            yield "   :no-index:\n" if kind != "autoclass" else "   :members:\n   :no-index:\n"
-        yield "```\n"
+# Python
+
+
+def _file_name(module: str) -> str:
+    return f"{module.removeprefix('rlcli.')}.md"
+
+
+def _python_index() -> Iterator[str]:
+    yield "# Python API\n"
+    yield "After reading this page you can find every public class and function."
+    yield "[Use rlcli from Python](../../guides/python-api.md) shows how they work together. Before version 1.0 a minor"
+    yield "version may change a public name; the changelog lists such changes.\n"
+    yield (
+        "```{toctree}\n:hidden:\n\n"
+        + "\n".join(_file_name(module).removesuffix(".md") for module in MODULES)
+        + "\n```\n"
+    )
+    yield "| module | contents | names |\n| --- | --- | --- |"
+    for module, title in MODULES.items():
+        names = ", ".join(f"`{name}`" for name in public_names(module))
+        yield f"| [`{module}`]({_file_name(module)}) | {title} | {names} |"
+
+
+def _python_page(package: griffe.Object | griffe.Alias, module_name: str) -> Iterator[str]:
+    module = package[module_name.removeprefix("rlcli.")]
+    yield f"# {MODULES[module_name]}\n"
+    yield f"Module `{module_name}`.\n"
+    yield from _docstring_parts(module.docstring)
+    for name in public_names(module_name):
+        member = module.all_members[name]
+        yield from _member(member.final_target if member.is_alias else member, name, "##")
+
+
+def _member(member: Any, name: str, level: str) -> Iterator[str]:
+    yield f"{level} {name}\n"
+    if member.is_function:
+        yield f"```python\n{_signature(member, name)}\n```\n"
+        yield from _docstring_parts(member.docstring)
+    elif member.is_class:
+        constructor = member.all_members.get("__init__")
+        if constructor is not None and constructor.is_function and not constructor.inherited:
+            yield f"```python\n{_signature(constructor, name)}\n```\n"
+        yield from _docstring_parts(member.docstring)
+        yield from _attributes(member)
+        for inner_name, inner in member.members.items():
+            if not inner_name.startswith("_") and inner.is_function:
+                yield from _member(inner, f"{name}.{inner_name}", "###")
+    else:
+        if member.value is not None:
+            yield f"```python\n{name} = {member.value}\n```\n"
+        yield from _docstring_parts(member.docstring)
+
+
+def _attributes(member: Any) -> Iterator[str]:
+    """Yield the table of the public attributes and properties of a class that have a docstring."""
+    rows = [
+        f"| `{name}` | {_cell(_code(attribute.annotation))} | {_cell(_one_line(attribute.docstring.value))} |"
+        for name, attribute in member.members.items()
+        if not name.startswith("_") and attribute.is_attribute and attribute.docstring
+    ]
+    if rows:
+        yield "\n".join(["| attribute | type | meaning |", "| --- | --- | --- |", *rows]) + "\n"
+
+
+def _signature(function: Any, name: str) -> str:
+    """Return the signature of a function, one parameter a line where it is long."""
+    parts, keyword_only = [], False
+    for parameter in function.parameters:
+        if parameter.name in ("self", "cls"):
+            continue
+        kind = parameter.kind.value
+        if kind == "keyword-only" and not keyword_only:
+            keyword_only = True
+            parts.append("*")
+        stars = {"variadic positional": "*", "variadic keyword": "**"}.get(kind, "")
+        keyword_only |= stars == "*"
+        text = f"{stars}{parameter.name}" + (f": {parameter.annotation}" if parameter.annotation else "")
+        parts.append(text + (f" = {parameter.default}" if parameter.default is not None and not stars else ""))
+    returns = f" -> {function.returns}" if function.returns and function.name != "__init__" else ""
+    line = f"{name}({', '.join(parts)}){returns}"
+    return line if len(line) <= 100 else f"{name}(\n    " + ",\n    ".join(parts) + f",\n){returns}"
+
+
+def _docstring_parts(docstring: griffe.Docstring | None) -> Iterator[str]:
+    """Yield the sections of a Google-style docstring as Markdown."""
+    if docstring is None:
+        return
+    for section in docstring.parse("google", warnings=False):
+        kind = section.kind.value
+        if kind == "text":
+            yield _escaped(section.value) + "\n"
+        elif kind in ("parameters", "attributes"):
+            yield (
+                "\n".join(f"- `{item.name}`: {_escaped(_one_line(item.description))}" for item in section.value) + "\n"
+            )
+        elif kind == "raises":
+            lines = (f"- `{item.annotation}`: {_escaped(_one_line(item.description))}" for item in section.value)
+            yield "Raises:\n\n" + "\n".join(lines) + "\n"
+        elif kind in ("returns", "yields"):
+            text = " ".join(_escaped(_one_line(item.description)) for item in section.value)
+            yield f"{kind.capitalize()}: {text}\n"
+        elif kind == "admonition":
+            yield f"{section.title}: {_escaped(section.value.description)}\n"
+        else:
+            yield "\n".join(f"```python\n{text}\n```" for _, text in section.value) + "\n"
+
+
+def _escaped(text: str) -> str:
+    """Return text of a docstring as Markdown: `<` and stars outside of code stay what they are."""
+    parts = re.split(r"(```.*?```|`[^`]*`)", text, flags=re.DOTALL)
+    parts[::2] = [part.replace("<", "&lt;").replace("*", "\\*").replace("|", "\\|") for part in parts[::2]]
+    return "".join(parts)
+
+
+def _code(value: Any) -> str:
+    return f"`{value}`" if value is not None else ""
 
 
 def _one_line(text: str) -> str:
@@ -321,9 +446,8 @@ def _one_line(text: str) -> str:
 
 
 def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("<", "&lt;")
+    return re.sub(r"(?<!\\)\|", r"\\|", text).replace("<", "&lt;")
 
 
 if __name__ == "__main__":
-    PUBLIC.write_text("".join(f"{m}.{n}\n" for m in MODULES for n in public_names(m)), encoding="utf-8")
-    WORDS.write_text("".join(f"{word}\n" for word in public_words()), encoding="utf-8")
+    write()

@@ -15,7 +15,7 @@ REPOSITORY = PACKAGE.parent
 LAYERS = """
     errors task trainers formats random machine settings safe_text
     registry  config  sim  scene  managers  envs  mdp  rl  runs  replay  evaluation  deploy  viewer  reporting  testing
-    training  adapters  tuning  doctor  scaffold  cli  gym  pytest_plugin
+    training  adapters  tuning  doctor  scaffold  api  cli  gym  pytest_plugin
 """
 """Lowest first. The names of the first line stand side by side; each later name is a layer of its own."""
 INNER = ["rl < rl.ppo rl.sb3", "mdp < mdp.rewards mdp.randomization", "cli.ui < cli.commands < cli.app"]

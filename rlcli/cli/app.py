@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 COMMANDS = (
-    "list-tasks", "show", "validate", "train", "sweep", "bench", "play", "eval", "stress", "export", "replay",
+    "list-tasks", "terms", "show", "validate", "train", "sweep", "bench", "play", "eval", "stress", "export", "replay",
     "autopsy", "runs", "watch", "plot", "report", "diff", "reproduce", "check", "lint", "new", "doctor",
 )  # fmt: skip
 """Commands, in the order of `--help`; each has a module of `rlcli.cli.commands` of its name with `command`."""

@@ -5,7 +5,7 @@ it carries from one run to the next must keep their addresses. Tensors that a ta
 to their first address at the end of the recording. Work that cannot be recorded is named in a warning and runs eagerly.
 
 All work is recorded in one stream: once a process holds a single recording with parallel branches, each launch of
-every recording takes about a third of a microsecond longer (docs/gpu.md).
+every recording takes about a third of a microsecond longer (docs/tutorials/train-on-a-gpu.md).
 """
 
 from __future__ import annotations

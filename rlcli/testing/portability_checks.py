@@ -332,7 +332,7 @@ def captured(subject: TaskUnderTest) -> Iterator[Finding]:
             for _ in range(EPISODE + 1):
                 env.step(action)
     except HostSyncError as error:
-        hint = "compute with torch.where and masks over all rows: docs/gpu.md; else it runs several times slower there"
+        hint = "compute with torch.where and masks over all rows: docs/tutorials/train-on-a-gpu.md; else it runs several times slower there"
         yield warning_at(subject.place(error), f"{error}, in a step", hint)
 
 

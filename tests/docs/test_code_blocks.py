@@ -22,7 +22,13 @@ from rlcli.config.load import resolve
 from rlcli.registry import find_task
 
 DOCS = REPOSITORY / "docs"
-PAGES = [*sorted(DOCS.glob("*.md")), *sorted((DOCS / "zoo").glob("*.md"))]
+GENERATED = ("commands.md", "task-schema.md", "agents.md", "terms", "python")
+"""Pages in `docs/reference/` that `docs/reference.py` writes; tests/docs/test_reference_pages.py checks their examples."""
+PAGES = [
+    page
+    for page in sorted(DOCS.rglob("*.md"))
+    if "_build" not in page.parts and not {*page.relative_to(DOCS).parts[1:]} & {*GENERATED}
+]
 PAGES += [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"]
 PAGES += sorted((REPOSITORY / "plugins").glob("*/README.md"))
 
@@ -31,40 +37,42 @@ OF_PAGES = "tests/packaging/test_pages.py"
 OF_WHEELS = "tests/packaging/test_wheels.py"
 RUN_BY = {
     "README.md": f"{OF_PAGES}::test_the_readmes_task_of_your_own_works_as_written",
-    "README.md: What it is": f"{HERE}::test_the_mistake_of_the_readme_is_answered_as_it_says",
-    "adapters.md": f"{OF_PAGES}::test_the_scripts_for_other_libraries_run_as_written",
+    "README.md: What rlcli offers": f"{HERE}::test_the_mistake_of_the_readme_is_answered_as_it_says",
+    "external-environments.md": f"{OF_PAGES}::test_the_scripts_for_other_libraries_run_as_written",
     "check-and-lint.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
-    "autopsy.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
-    "checkpoints.md": f"{HERE}::test_a_foreign_policy_is_brought_over_as_the_page_says",
-    "coming-from-gymnasium-and-sb3.md": "tests/docs/test_port_from_gymnasium.py::"
+    "analyse-failures.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
+    "import-policies.md": f"{HERE}::test_a_foreign_policy_is_brought_over_as_the_page_says",
+    "gymnasium-and-sb3.md": "tests/docs/test_port_from_gymnasium.py::"
     "test_the_ported_task_trains_and_lives_the_life_of_the_gymnasium_class",
     "determinism.md": f"{OF_PAGES}::test_the_page_on_determinism_works_as_written",
-    "evaluation.md": f"{OF_PAGES}::test_the_page_on_evaluation_works_as_written",
+    "evaluate.md": f"{OF_PAGES}::test_the_page_on_evaluation_works_as_written",
     "exit-codes.md": "tests/docs/test_exit_codes_page.py::test_what_one_sees_is_what_the_page_says",
     "export.md": f"{HERE}::test_an_exported_file_is_used_as_the_page_says",
-    "from-isaac-lab.md": f"{OF_PAGES}::test_the_examples_for_isaac_labs_users_train_as_written",
-    "from-omniisaacgymenvs.md": "plugins/rlcli-oige/tests/test_oige_page.py::"
+    "isaac-lab.md": f"{OF_PAGES}::test_the_examples_for_isaac_labs_users_train_as_written",
+    "omniisaacgymenvs.md": "plugins/rlcli-oige/tests/test_oige_page.py::"
     "test_the_example_validates_and_a_push_towards_the_middle_earns_more_than_none",
-    "gpu.md: On a cluster": f"{HERE}::test_the_script_for_a_cluster_trains_and_goes_on_when_it_is_begun_again",
-    "on-a-robot.md": "tests/docs/test_robot_page.py::test_the_loop_of_the_page_balances_the_pole_in_time",
+    "train-on-a-gpu.md: On a cluster": f"{HERE}::test_the_script_for_a_cluster_trains_and_goes_on_when_it_is_begun_again",
+    "python-api.md": f"{HERE}::test_the_scripts_of_the_python_page_run_as_written",
+    "put-a-policy-on-a-robot.md": "tests/docs/test_robot_page.py::test_the_loop_of_the_page_balances_the_pole_in_time",
     "play.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
     "plots-and-reports.md": f"{OF_PAGES}::test_the_page_on_plots_and_reports_works_as_written",
     "plots-and-reports.md: The card of a task": f"{OF_PAGES}::test_the_card_of_the_page_is_printed",
     "ppo.md": f"{HERE}::test_the_agent_of_the_page_is_valid",
     "quickstart.md": "tests/docs/test_quickstart.py::test_every_command_of_the_quickstart_prints_what_the_page_shows",
-    "recording.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
-    "resuming.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
+    "record-episodes.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
+    "resume.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
     "security.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
-    "sweeps.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
-    "trainers.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
-    "watching.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
-    "write-a-direct-task.md": f"{OF_PAGES}::test_the_task_of_a_page_checks_trains_and_learns",
-    "write-a-plugin.md": f"{OF_WHEELS}::test_the_plugins_of_the_page_are_made_installed_and_learned_as_written",
-    "write-a-task.md": f"{OF_PAGES}::test_the_task_of_a_page_checks_trains_and_learns",
-    "write-a-task.md: Scenes": f"{OF_PAGES}::test_the_scenes_of_the_page_build_and_run",
-    "write-a-task.md: Events and randomisation": f"{HERE}::test_randomised_models_of_the_page_differ",
+    "seeds-and-sweeps.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
+    "choose-a-trainer.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
+    "monitor-training.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
+    "direct-task.md": f"{OF_PAGES}::test_the_task_of_a_page_checks_trains_and_learns",
+    "first-plugin.md": f"{OF_WHEELS}::test_the_plugins_of_the_page_are_made_installed_and_learned_as_written",
+    "first-task.md": f"{OF_PAGES}::test_the_task_of_a_page_checks_trains_and_learns",
+    "training-does-not-learn.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
+    "first-task.md: Scenes": f"{OF_PAGES}::test_the_scenes_of_the_page_build_and_run",
+    "first-task.md: Events and randomisation": f"{HERE}::test_randomised_models_of_the_page_differ",
     **dict.fromkeys(
-        (f"write-a-task.md: {part}" for part in ("What the policy sees", "Commands", "Actuators", "Curriculum")),
+        (f"first-task.md: {part}" for part in ("Observations", "Commands", "Actuators", "Curriculum")),
         f"{OF_PAGES}::test_the_sections_on_what_is_seen_asked_driven_and_changed_work_together",
     ),
     "write-a-trainer.md": f"{OF_WHEELS}::test_the_trainer_of_the_page_works_as_written",
@@ -76,11 +84,17 @@ RUN_BY = {
 }
 """Page, or page and heading -> the test that runs what stands there; a plugin's README has the plugin's name."""
 
-NEED_A_RUN = {"autopsy.md": 12, "play.md": 2, "security.md": 2, "watching.md": 2}
+NEED_A_RUN = {"analyse-failures.md": 12, "play.md": 2, "security.md": 2, "monitor-training.md": 2}
 """Pages that speak of a run that is there already -> its iterations."""
 NEED_A_TASK = ("check-and-lint.md", "security.md")
-LANGUAGES = {"recording.md": ("sh", "python"), "check-and-lint.md": ("sh", "python")}
-PLUGINS = {"trainers.md": "rlcli_rsl_rl"}
+LANGUAGES = {"record-episodes.md": ("sh", "python"), "check-and-lint.md": ("sh", "python")}
+PLUGINS = {"choose-a-trainer.md": "rlcli_rsl_rl"}
+
+
+def page_path(name):
+    """Return the page with a file name, on whichever shelf it is."""
+    (page,) = [page for page in PAGES if page.name == name]
+    return page
 
 
 def is_code(block):
@@ -125,11 +139,11 @@ SHELL_PAGES = sorted(
 def test_the_commands_of_a_page_run_as_written(page, tmp_path):
     if page in PLUGINS:
         pytest.importorskip(PLUGINS[page], reason="a plugin that this page is about is not installed")
-    found, run = [shortened(block) for block in blocks(DOCS / page)], None
+    found, run = [shortened(block) for block in blocks(page_path(page))], None
     task = "cartpole"
     if page in NEED_A_TASK:
         task = "./my_task"
-        write_files(blocks(DOCS / "write-a-task.md"), tmp_path)
+        write_files(blocks(DOCS / "tutorials" / "first-task.md"), tmp_path)
     if page in NEED_A_RUN:
         train = f"rlcli train {task} --max-iterations {NEED_A_RUN[page]} --logger none\n"
         run = run_commands([Block("sh", None, train)], tmp_path).strip()
@@ -137,10 +151,18 @@ def test_the_commands_of_a_page_run_as_written(page, tmp_path):
 
 
 @pytest.mark.slow
+def test_the_scripts_of_the_python_page_run_as_written(tmp_path):
+    """python-api.md"""
+    for block in blocks(DOCS / "guides" / "python-api.md"):
+        (tmp_path / block.file).write_text(block.text)
+        subprocess.run([sys.executable, block.file], cwd=tmp_path, check=True, capture_output=True, timeout=300)
+
+
+@pytest.mark.slow
 def test_an_exported_file_is_used_as_the_page_says(tmp_path):
     train = Block("sh", None, "rlcli train cartpole --max-iterations 2 --logger none agent.save_interval=1\n")
     run = run_commands([train], tmp_path).strip()
-    commands, *scripts = [b for b in blocks(DOCS / "export.md") if "pip install" not in b.text]
+    commands, *scripts = [b for b in blocks(DOCS / "guides" / "export.md") if "pip install" not in b.text]
     output = run_commands([commands], tmp_path, run=run)
     exports = tmp_path / run / "exports"
     for name in ("policy.onnx", "policy.pt2", "policy.py", "policy"):
@@ -174,7 +196,7 @@ model = PPO("MlpPolicy", env, n_steps=8, batch_size=32, device="cpu").learn(32)
 model.save("model.zip"), env.save("vecnormalize.pkl")
 """
     train = Block("python", None, script)
-    found = blocks(DOCS / "checkpoints.md")
+    found = blocks(DOCS / "guides" / "import-policies.md")
     run_commands([train, *found], tmp_path, languages=("sh", "python"))
     with_statistics = "rlcli import sb3 model.zip --task cartpole --normalizer normalizer.safetensors\n"
     output = run_commands([Block("sh", None, with_statistics)], tmp_path)
@@ -183,7 +205,7 @@ model.save("model.zip"), env.save("vecnormalize.pkl")
 
 
 def test_the_agent_of_the_page_is_valid():
-    (block,) = [b for b in blocks(DOCS / "ppo.md") if b.language == "yaml"]
+    (block,) = [b for b in blocks(DOCS / "reference" / "ppo.md") if b.language == "yaml"]
     (agent,) = yaml.safe_load(block.text)["agents"].values()
     chosen = resolve(
         find_task("cartpole"),
@@ -201,8 +223,8 @@ def test_the_mistake_of_the_readme_is_answered_as_it_says(capsys):
 
 
 def test_randomised_models_of_the_page_differ(tmp_path):
-    """write-a-task.md"""
-    (block,) = blocks(DOCS / "write-a-task.md", "## Events and randomisation", "## What the policy sees")
+    """first-task.md"""
+    (block,) = blocks(DOCS / "tutorials" / "first-task.md", "## Events and randomisation", "## Observations")
     part = yaml.safe_load(block.text.replace("foot_.*", "geom_.*"))
     env = build_env(write(tmp_path / "task", edited(CRITTER_TASK, **part), critter_xml=CRITTER), 3)
     env.reset()
@@ -262,7 +284,7 @@ STUBS = {
 
 @pytest.mark.slow
 def test_the_script_for_a_cluster_trains_and_goes_on_when_it_is_begun_again(tmp_path):
-    (script,) = [b for b in all_blocks(DOCS / "gpu.md") if b.file == "train.sbatch"]
+    (script,) = [b for b in all_blocks(DOCS / "tutorials" / "train-on-a-gpu.md") if b.file == "train.sbatch"]
     (tmp_path / "train.sbatch").write_text(script.text)
     for name, text in STUBS.items():
         (tmp_path / name).write_text(f"#!/bin/bash\n{text}\n")
@@ -283,8 +305,8 @@ def test_the_script_for_a_cluster_trains_and_goes_on_when_it_is_begun_again(tmp_
 
 
 def test_the_script_for_a_cluster_can_be_read_and_its_commands_exist():
-    """gpu.md"""
-    (script,) = [b for b in all_blocks(DOCS / "gpu.md") if b.file == "train.sbatch"]
+    """train-on-a-gpu.md"""
+    (script,) = [b for b in all_blocks(DOCS / "tutorials" / "train-on-a-gpu.md") if b.file == "train.sbatch"]
     done = subprocess.run(["bash", "-n"], input=script.text, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     options = set(re.findall(r"(?<=[ (])--[a-z-]+", script.text.partition("-m rlcli train")[2])) | {

@@ -1,4 +1,4 @@
-"""docs/exit-codes.md: each message is what one sees, with the code of its heading."""
+"""docs/reference/exit-codes.md: each message is what one sees, with the code of its heading."""
 
 import shlex
 
@@ -10,7 +10,7 @@ from rlcli.cli.app import main
 
 CASES = [
     pytest.param(int(block.section.partition(":")[0]), command, id=command.text)
-    for block in blocks(REPOSITORY / "docs" / "exit-codes.md")
+    for block in blocks(REPOSITORY / "docs" / "reference" / "exit-codes.md")
     for command in commands(block.text)
 ]
 

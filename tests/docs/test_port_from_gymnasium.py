@@ -1,11 +1,11 @@
-"""The port of docs/coming-from-gymnasium-and-sb3.md: both sides run, and are the same environment."""
+"""The port of docs/guides/gymnasium-and-sb3.md: both sides run, and are the same environment."""
 
 import re
 
 import pytest
 from support.fenced import REPOSITORY, Block, blocks, run_commands, success_rate, write_files
 
-PAGE = REPOSITORY / "docs" / "coming-from-gymnasium-and-sb3.md"
+PAGE = REPOSITORY / "docs" / "guides" / "gymnasium-and-sb3.md"
 
 
 def script(file):

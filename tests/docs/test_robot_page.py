@@ -1,4 +1,4 @@
-"""docs/on-a-robot.md: the loop drives the exported model, and stops when it must."""
+"""docs/tutorials/put-a-policy-on-a-robot.md: the loop drives the exported model, and stops when it must."""
 
 import re
 import shutil
@@ -6,7 +6,7 @@ import shutil
 import pytest
 from support.fenced import REPOSITORY, Block, blocks, run_commands, write_files
 
-PAGE = REPOSITORY / "docs" / "on-a-robot.md"
+PAGE = REPOSITORY / "docs" / "tutorials" / "put-a-policy-on-a-robot.md"
 
 
 @pytest.fixture(scope="module")

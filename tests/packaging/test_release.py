@@ -46,13 +46,13 @@ def test_no_term_key_command_or_option_has_gone_or_come_unnoticed():
 
 def test_a_name_that_is_removed_is_noticed(monkeypatch):
     import rlcli.errors
-    import rlcli.mdp.rewards
     from rlcli.cli import app
 
     reference = script("reference")
     names, words = reference.public_names("rlcli.errors"), set(reference.public_words())
     monkeypatch.delattr(rlcli.errors, "listing")
-    monkeypatch.delattr(rlcli.mdp.rewards, "is_alive")
+    entries = [entry for entry in reference.term_entries() if entry.name != "is_alive"]
+    monkeypatch.setattr(reference, "term_entries", lambda: entries)
     assert set(names) - set(reference.public_names("rlcli.errors")) == {"listing"}
     assert words - set(reference.public_words()) == {"term rewards.is_alive"}
     assert {f"command rlcli {name}" for name in app.COMMANDS} <= words
@@ -74,7 +74,7 @@ def test_licences_are_what_the_packages_say():
             said = said_of(name)
         except importlib.metadata.PackageNotFoundError:
             continue  # the trackers, which nobody installs all of
-        family = re.match(r"MIT|BSD|Apache|PSF|MPL|LGPL", licence)[0]
+        family = re.match(r"MIT|BSD|Apache|PSF|MPL|LGPL|ISC", licence)[0]
         family = {"PSF": "PSF|Python Software", "MPL": "MPL|Mozilla"}.get(family, family)
         assert re.search(family, said), f"{name}: {said}"
         checked += 1
@@ -155,7 +155,9 @@ def test_the_metadata_say_what_it_is(archives):
     assert metadata["License-Expression"] == "Apache-2.0"
     assert metadata["Requires-Python"] == ">=3.11"
     assert metadata["Description-Content-Type"] == "text/markdown"
-    assert metadata.get_payload().strip() == (REPOSITORY / "README.md").read_text(encoding="utf-8").strip()
+    description = metadata.get_payload()
+    assert "rlcli train cartpole" in description
+    assert re.findall(r"\]\((?!https?:)[^)]+\)", description) == [], "links that a package index cannot resolve"
     for minor in (11, 12, 13):
         assert f"Programming Language :: Python :: 3.{minor}" in metadata.get_all("Classifier")
 

@@ -151,7 +151,7 @@ def test_every_command_of_the_plugins_readme_runs(site, tmp_path):
 def test_the_plugins_of_the_page_are_made_installed_and_learned_as_written(site, tmp_path):
     own = tmp_path / "site"
     shutil.copytree(site, own)
-    found = blocks(REPOSITORY / "docs" / "write-a-plugin.md")
+    found = blocks(REPOSITORY / "docs" / "tutorials" / "first-plugin.md")
     output = run_commands(found, tmp_path, site=own)
     for name in ("my-arm", "my-direct-arm"):
         assert f"{name}: 0 errors, 0 warnings" in output
@@ -253,7 +253,7 @@ def test_the_commands_of_menageries_readme_run_on_a_stand_in(site, tmp_path):
 def test_the_trainer_of_the_page_works_as_written(site, tmp_path):
     own = tmp_path / "site"
     shutil.copytree(site, own)
-    found = blocks(REPOSITORY / "docs" / "write-a-trainer.md")
+    found = blocks(REPOSITORY / "docs" / "guides" / "write-a-trainer.md")
     write_files(found, tmp_path)
     output = run_commands(found, tmp_path, site=own)
     assert 0.0 <= success_rate(output) <= 1.0

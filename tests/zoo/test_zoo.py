@@ -184,10 +184,10 @@ def test_the_thick_line_is_the_median_of_the_seeds():
 @pytest.mark.slow
 def test_learning_is_judged_and_logged_and_becomes_results_curves_and_a_policy(tmp_path):
     copy = tmp_path / "repository"
-    for part in ("benchmarks", "docs/zoo", "tasks"):
+    for part in ("benchmarks", "docs/reference/zoo", "tasks"):
         shutil.copytree(REPOSITORY / part, copy / part, ignore=shutil.ignore_patterns("__pycache__"))
     for folder in ("results", "curves", "pictures"):
-        shutil.rmtree(copy / "docs" / "zoo" / folder)
+        shutil.rmtree(copy / "docs" / "reference" / "zoo" / folder)
     shutil.rmtree(copy / "tasks" / "rlcli_tasks" / "cartpole" / "policies")
 
     def run(*arguments):
@@ -195,7 +195,7 @@ def test_learning_is_judged_and_logged_and_becomes_results_curves_and_a_policy(t
         command = [sys.executable, str(copy / "benchmarks" / "zoo.py"), *arguments]
         return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=280)
 
-    held = copy / "docs" / "zoo" / "zoo.yaml"
+    held = copy / "docs" / "reference" / "zoo" / "zoo.yaml"
     text = held.read_text()
     short, before = "minutes: 90, episodes: 16, ", "minutes: 1, bar: {success: 0.95}"
     assert before in text
@@ -219,12 +219,12 @@ def test_learning_is_judged_and_logged_and_becomes_results_curves_and_a_policy(t
     collected = run("collect", "--all", "runs", "--ship")
     assert collected.returncode == 0, collected.stderr
     assert "cartpole, seed 5: within its bar" in collected.stdout
-    assert (copy / "docs" / "zoo" / "pictures" / "cartpole.jpg").stat().st_size < 80_000
-    (row,) = json.loads((copy / "docs" / "zoo" / "results" / "cartpole.json").read_text())
+    assert (copy / "docs" / "reference" / "zoo" / "pictures" / "cartpole.jpg").stat().st_size < 80_000
+    (row,) = json.loads((copy / "docs" / "reference" / "zoo" / "results" / "cartpole.json").read_text())
     assert (row["seed"], row["agent"], row["evaluation"]["episodes"]) == (5, "sb3-ppo", 16)
     assert row["evaluation"]["return"] == json.loads(said.stdout)["return"]
     shipped = copy / "tasks" / "rlcli_tasks" / "cartpole" / "policies" / "cartpole"
     assert open_bundle(shipped).manifest["evaluation"]["return"] == row["evaluation"]["return"]
-    page = (copy / "docs" / "zoo" / "cartpole.md").read_text()
+    page = (copy / "docs" / "reference" / "zoo" / "cartpole.md").read_text()
     assert "| 5 | `sb3-ppo` |" in page
     assert "curves/cartpole.svg" in page

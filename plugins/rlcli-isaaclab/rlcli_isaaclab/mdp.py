@@ -132,7 +132,7 @@ def __getattr__(name: str) -> Any:
     if not _known(name):
         near = did_you_mean(name, _names())
         raise AttributeError(
-            f"rlcli_isaaclab.mdp has no '{name}'; {near or 'docs/isaaclab-terms.md says which there are'}"
+            f"rlcli_isaaclab.mdp has no '{name}'; {near or 'docs/reference/isaac-lab-terms.md says which there are'}"
         )
     return _function(name)
 

@@ -1,6 +1,6 @@
 """What stands in a scene and how it is simulated. Names as in `isaaclab.sim`, usually imported as `sim_utils`.
 
-Settings that only Isaac Sim knows are accepted and reported; those in use are in docs/from-isaac-lab.md.
+Settings that only Isaac Sim knows are accepted and reported; those in use are in docs/guides/isaac-lab.md.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import pytest
 import rlcli
 from rlcli.config.term_signatures import SECTIONS, builtin_terms
 
-PAGE = Path(rlcli.__path__[0]).parent / "docs" / "isaaclab-terms.md"
+PAGE = Path(rlcli.__path__[0]).parent / "docs" / "reference" / "isaac-lab-terms.md"
 ROW = re.compile(r"^\| `([^`]+)` \| (same|not possible|not offered|`[a-z0-9_]+`) \| (.*) \|$")
 
 

@@ -39,7 +39,7 @@ from rlcli_isaaclab.randomization import EVENTS
 
 torch.set_num_threads(1)
 
-PAGE = Path(rlcli.__path__[0]).parent / "docs" / "isaaclab-terms.md"
+PAGE = Path(rlcli.__path__[0]).parent / "docs" / "reference" / "isaac-lab-terms.md"
 LEGS = {"asset_cfg": Pick("robot", joint_names=["hip_.*"])}
 TORSO = {"asset_cfg": Pick("robot", body_names="torso")}
 FEET = {"asset_cfg": Pick("robot", body_names="leg_.*"), "sensor_cfg": Pick("contact_forces", body_names="leg_.*")}

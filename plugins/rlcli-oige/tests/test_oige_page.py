@@ -1,4 +1,4 @@
-"""The example of docs/from-omniisaacgymenvs.md works as it stands there."""
+"""The example of docs/guides/omniisaacgymenvs.md works as it stands there."""
 
 import re
 from pathlib import Path
@@ -12,7 +12,7 @@ from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.registry import find_task
 
-PAGE = Path(rlcli.__file__).parents[1] / "docs" / "from-omniisaacgymenvs.md"
+PAGE = Path(rlcli.__file__).parents[1] / "docs" / "guides" / "omniisaacgymenvs.md"
 FILE = re.compile(r"```\w+ file=(\S+)\n(.*?)```", re.DOTALL)
 
 torch.set_num_threads(1)

@@ -12,7 +12,7 @@ from rlcli.rl.ppo.config import PpoConfig
 from rlcli.rl.trainer_base import agent_error
 
 _WORTH_COMPILING = 40_000
-"""Minibatches of a run from which compiling saves time on a GPU (docs/benchmarks.md)."""
+"""Minibatches of a run from which compiling saves time on a GPU (docs/explanation/benchmarks.md)."""
 
 
 def policy_spec(env: VecEnv, config: PpoConfig) -> PolicySpec:

@@ -1,4 +1,4 @@
-"""Ant: a four-legged walker runs towards a far target. Numbers and their sources: docs/zoo/ant-direct.md."""
+"""Ant: a four-legged walker runs towards a far target. Numbers and their sources: docs/reference/zoo/ant-direct.md."""
 
 from rlcli.task import TaskSpec
 

@@ -1,4 +1,4 @@
-"""Ant in the direct workflow: four legs run towards a far target. docs/zoo/ant-direct.md lists its 60 columns."""
+"""Ant in the direct workflow: four legs run towards a far target. docs/reference/zoo/ant-direct.md lists its 60 columns."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ JOINTS = tuple(f"{joint}_{leg}" for leg in LEGS for joint in ("hip", "ankle"))
 
 
 class AntTask(LocomotionTask):
-    """Run towards the target on four legs. Observations: docs/zoo/ant-direct.md lists the 60 columns."""
+    """Run towards the target on four legs. Observations: docs/reference/zoo/ant-direct.md lists the 60 columns."""
 
     num_observations = 60
     num_actions = 8

@@ -1,1 +1,1 @@
-"""The arm of several tasks: seven joints and a gripper with two fingers. Numbers: docs/zoo/reach.md."""
+"""The arm of several tasks: seven joints and a gripper with two fingers. Numbers: docs/reference/zoo/reach.md."""

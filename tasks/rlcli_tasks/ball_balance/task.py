@@ -26,7 +26,7 @@ BALL_POS, BALL_VEL = slice(6, 9), slice(9, 12)
 
 
 class BallBalanceTask(DirectTask):
-    """Hold the ball in the middle. Observations: docs/zoo/ball-balance.md lists the 24 columns."""
+    """Hold the ball in the middle. Observations: docs/reference/zoo/ball-balance.md lists the 24 columns."""
 
     num_observations = 24
     num_actions = 3

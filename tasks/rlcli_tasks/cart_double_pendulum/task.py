@@ -23,7 +23,7 @@ CART, POLE, PENDULUM = JOINTS = ("slider_to_cart", "cart_to_pole", "pole_to_pend
 
 
 class CartDoublePendulumTask(DirectTask):
-    """Balance both links. Observations: docs/zoo/cart-double-pendulum.md lists the 7 columns."""
+    """Balance both links. Observations: docs/reference/zoo/cart-double-pendulum.md lists the 7 columns."""
 
     num_observations = 7
     num_actions = 2

@@ -14,7 +14,7 @@ MOTORS = ("m1", "m2", "m3", "m4")
 
 
 class CrazyflieTask(FlightTask):
-    """Hover at the target. Observations: docs/zoo/crazyflie.md lists the 18 columns."""
+    """Hover at the target. Observations: docs/reference/zoo/crazyflie.md lists the 18 columns."""
 
     num_observations = 18
     num_actions = 4

@@ -1,4 +1,4 @@
-"""Humanoid in the direct workflow: a human figure runs towards a far target. docs/zoo/humanoid-direct.md."""
+"""Humanoid in the direct workflow: a human figure runs towards a far target. docs/reference/zoo/humanoid-direct.md."""
 
 from __future__ import annotations
 

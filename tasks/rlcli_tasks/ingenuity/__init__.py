@@ -1,4 +1,4 @@
-"""Ingenuity: fly from point to point on Mars with two coaxial rotors. Numbers, sources: docs/zoo/ingenuity.md."""
+"""Ingenuity: fly from point to point on Mars with two coaxial rotors. Numbers, sources: docs/reference/zoo/ingenuity.md."""
 
 from rlcli.task import TaskSpec
 

@@ -26,7 +26,7 @@ FULLY_OPEN = 0.04
 
 
 class DrawerTask(DirectTask):
-    """Pull the drawer open. Observations: docs/zoo/open-drawer.md lists the 23 columns."""
+    """Pull the drawer open. Observations: docs/reference/zoo/open-drawer.md lists the 23 columns."""
 
     num_observations = 23
     num_actions = 9

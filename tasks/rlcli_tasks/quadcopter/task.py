@@ -23,7 +23,7 @@ THRUSTS = tuple(f"thrust_{rotor}" for rotor in ROTORS)
 
 
 class QuadcopterTask(DirectTask):
-    """Hover at the target. Observations: docs/zoo/quadcopter.md lists the 21 columns."""
+    """Hover at the target. Observations: docs/reference/zoo/quadcopter.md lists the 21 columns."""
 
     num_observations = 21
     num_actions = 12

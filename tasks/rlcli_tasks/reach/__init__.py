@@ -1,4 +1,4 @@
-"""Reach: an arm brings its hand to poses. Numbers and their sources: docs/zoo/reach.md."""
+"""Reach: an arm brings its hand to poses. Numbers and their sources: docs/reference/zoo/reach.md."""
 
 from rlcli.task import TaskSpec
 

@@ -1,0 +1,213 @@
+"""Python interface: make an environment, train, evaluate, act with a trained policy, and export it.
+
+Each function does what the command of the same name does, and returns objects instead of printing. Errors are the
+exceptions of `rlcli.errors`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from rlcli.config.layers import flags
+from rlcli.config.load import resolve
+from rlcli.deploy.export import Exported, check_target
+from rlcli.deploy.export import export as write_export
+from rlcli.envs.make import make_env
+from rlcli.envs.vec_env import VecEnv
+from rlcli.evaluation.session import PolicyRequest, open_session, run_episodes
+from rlcli.registry.find import find_task
+from rlcli.rl.acting import acting
+from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.runs.policy_ref import choose
+from rlcli.runs.restore import policy_of, require_fit
+from rlcli.runs.run_ref import default_runs_dir
+from rlcli.training.job import Job, TrainingResult
+from rlcli.training.launch import TrainingRequest, broadcast_job, setup_job
+from rlcli.training.runner import run_training
+from rlcli.training.signals import StopRequest
+
+if TYPE_CHECKING:
+    from rlcli.training.progress import Progress
+
+
+def make(
+    task: str, *, num_envs: int | None = None, seed: int = 42, device: str = "cpu", overrides: Sequence[str] = ()
+) -> VecEnv:
+    """Return the vectorized environment of a task.
+
+    Args:
+        task: name of an installed task, or the path of a task folder.
+        num_envs: number of environments; None takes the task's own.
+        seed: seed of every random draw.
+        device: `cpu`, or `cuda` for MuJoCo Warp.
+        overrides: `key.path=value`, as on the command line.
+
+    Raises:
+        TaskError: if the task is not found.
+        ConfigError: if an override or the task is wrong.
+    """
+    resolved = resolve(find_task(task), overrides=list(overrides), flags=flags(scene__num_envs=num_envs))
+    return make_env(resolved, seed=seed, device=device)
+
+
+def train(
+    task: str | None = None,
+    *,
+    agent: str | None = None,
+    num_envs: int | None = None,
+    max_iterations: int | None = None,
+    seed: int = 42,
+    device: str = "auto",
+    overrides: Sequence[str] = (),
+    runs_dir: Path | str | None = None,
+    name: str | None = None,
+    resume: Path | str | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> TrainingResult:
+    """Train a policy and return the finished run.
+
+    Call it from the main thread: SIGINT and SIGTERM stop the training after a checkpoint is written.
+
+    Args:
+        task: name of an installed task, or the path of a task folder; not needed with `resume`.
+        agent: name of an agent of the task; None takes the default agent.
+        num_envs: number of environments; None takes the task's own.
+        max_iterations: iterations to train; None takes the agent's own.
+        seed: seed of the training.
+        device: `auto`, `cpu` or `cuda`.
+        overrides: `key.path=value`; `agent.key=value` changes the agent.
+        runs_dir: folder of the runs; None takes the setting, or `runs`.
+        name: part of the name of the run's folder.
+        resume: run to resume.
+        on_progress: receives the progress after each iteration.
+
+    Raises:
+        RlcliError: as the command `rlcli train` ends with.
+    """
+    request = TrainingRequest(
+        Path(runs_dir or default_runs_dir()),
+        source=None if task is None else find_task(task),
+        resume=None if resume is None else str(resume),
+        agent=agent,
+        device=device,
+        overrides=list(overrides),
+        flags=flags(scene__num_envs=num_envs),
+        budget={} if max_iterations is None else {"agent.max_iterations": max_iterations, "agent.max_steps": None},
+        seed=seed,
+        name=name,
+    )
+    stop = StopRequest()
+    with stop:
+        resolved, process_device = request.resolve() if resume is None else (None, device)
+        result = broadcast_job(request, resolved, process_device)
+        if isinstance(result, Job):
+            trainer, env = setup_job(result, process_device, stop)
+            result = run_training(result, trainer, env, stop, _ProgressCallback(on_progress))
+    assert result is not None  # None is returned on ranks other than 0, and there is one rank
+    return result
+
+
+def evaluate(
+    checkpoint: Path | str | None = None,
+    *,
+    task: str | None = None,
+    episodes: int = 1000,
+    num_envs: int | None = None,
+    seed: int = 42,
+    stochastic: bool = False,
+    overrides: Sequence[str] = (),
+    runs_dir: Path | str | None = None,
+) -> dict[str, Any]:
+    """Evaluate a policy and return the summary that `rlcli eval --json` prints.
+
+    Args:
+        checkpoint: run or checkpoint; None takes the newest run of the task, else the policy that comes with it.
+        task: task to evaluate in; None takes the task of the run.
+        episodes: number of episodes.
+        num_envs: number of environments; None takes the task's own.
+        seed: seed of the episodes.
+        stochastic: sample actions instead of taking the mean.
+        overrides: `key.path=value`.
+        runs_dir: folder of the runs.
+
+    Raises:
+        CheckpointError: if there is no such checkpoint.
+    """
+    reference = None if checkpoint is None else str(checkpoint)
+    folder = None if runs_dir is None else Path(runs_dir)
+    request = PolicyRequest(
+        task, overrides, reference, stochastic=stochastic, num_envs=num_envs, seed=seed, runs_dir=folder
+    )
+    session = open_session(request)
+    try:
+        summary, _ = run_episodes(session, episodes)
+    finally:
+        session.env.close()
+    return summary
+
+
+def load_policy(
+    env: VecEnv, checkpoint: Path | str | None = None, *, stochastic: bool = False, runs_dir: Path | str | None = None
+) -> Callable[[Tensor], Tensor]:
+    """Return a function from observations (num_envs, d) to actions (num_envs, a), in an environment.
+
+    The function keeps the hidden state of a recurrent policy and resets it with the episodes of `env`.
+
+    Args:
+        env: environment in which the policy acts.
+        checkpoint: run or checkpoint; None takes the newest run of the task, else the policy that comes with it.
+        stochastic: sample actions instead of taking the mean.
+        runs_dir: folder of the runs.
+
+    Raises:
+        CheckpointError: if there is no such checkpoint, or it does not fit the environment.
+    """
+    saved = open_checkpoint(_find(checkpoint, env.resolved.source.name, runs_dir))
+    require_fit(saved, env.layout)
+    return acting(env, policy_of(saved), stochastic=stochastic)
+
+
+def export(
+    checkpoint: Path | str, file: Path | str, *, format: str = "onnx", runs_dir: Path | str | None = None
+) -> Exported:
+    """Write a policy to one file and check that the file computes the same actions.
+
+    Args:
+        checkpoint: run or checkpoint.
+        file: path to write; its folder exists.
+        format: `onnx`, `torch` or `numpy`.
+        runs_dir: folder of the runs.
+
+    Raises:
+        UsageError: for an unknown format or a wrong suffix.
+        DependencyError: if the library that writes the format is not installed.
+        VerdictError: if the file computes other actions; it is not kept.
+    """
+    check_target(format, Path(file))
+    return write_export(open_checkpoint(_find(checkpoint, None, runs_dir)), Path(file), format)
+
+
+def _find(checkpoint: Path | str | None, task: str | None, runs_dir: Path | str | None) -> Path:
+    source = None if task is None else find_task(task)
+    return choose(None if checkpoint is None else str(checkpoint), Path(runs_dir or default_runs_dir()), source).folder
+
+
+class _ProgressCallback:
+    """View of a training that passes the progress to a function."""
+
+    def __init__(self, function: Callable[[Progress], None] | None) -> None:
+        self._function = function
+
+    def show(self, progress: Progress) -> None:
+        """Pass the progress of one iteration on."""
+        if self._function is not None:
+            self._function(progress)
+
+    def __enter__(self) -> _ProgressCallback:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...

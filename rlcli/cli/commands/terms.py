@@ -1,0 +1,66 @@
+"""`rlcli terms [PATTERN]`: the terms that a task may name, with their keys, types and defaults."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rlcli.cli.ui.console import console
+
+if TYPE_CHECKING:
+    from rlcli.config.term_reference import TermEntry
+
+
+def command(
+    pattern: Annotated[str, typer.Argument(help="Show only terms whose name, section or summary contains this.")] = "",
+    task: Annotated[str | None, typer.Option("--task", help="Include the own terms of this task.")] = None,
+) -> None:
+    """List the terms for the sections of a task file: names, keys, types and defaults.
+
+    An exact name prints the meaning of each key, with its unit, and an example.
+    """
+    from rlcli.config.term_reference import term_entries
+    from rlcli.errors import did_you_mean
+    from rlcli.registry import find_task
+
+    term_files = find_task(task).term_files if task else ()
+    entries = term_entries(pattern, term_files)
+    exact = [entry for entry in entries if entry.name == pattern]
+    for entry in exact:
+        _print_details(entry)
+    if not exact:
+        _print_lines(entries)
+    if not entries:
+        near = did_you_mean(pattern, [entry.name for entry in term_entries("", term_files)])
+        console.info(f"no term's name or summary contains '{pattern}'; {near or 'rlcli terms lists all'}")
+    console.document("terms", terms=[entry.document() for entry in exact or entries])
+
+
+def _print_lines(entries: list[TermEntry]) -> None:
+    section = ""
+    for entry in entries:
+        if entry.section != section:
+            section = entry.section
+            console.data(f"{section}:")
+        keys = ", ".join(_signature(entry))
+        console.data(f"  {entry.name}({keys})")
+
+
+def _signature(entry: TermEntry) -> list[str]:
+    from rlcli.config.term_reference import yaml_text
+
+    return [f"{key.name}: {key.type}" + ("" if key.required else f" = {yaml_text(key.default)}") for key in entry.keys]
+
+
+def _print_details(entry: TermEntry) -> None:
+    from rlcli.config.term_reference import yaml_text
+
+    console.data(f"{entry.name} ({entry.section})\n{entry.summary}\n")
+    rows = [
+        [key.name, key.type, "required" if key.required else yaml_text(key.default), key.description]
+        for key in entry.keys
+    ]
+    if rows:
+        console.table(["key", "type", "default", "meaning"], rows)
+    console.data(f"\nexample: {entry.example}")
