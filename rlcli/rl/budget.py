@@ -1,4 +1,4 @@
-"""How long to train: a limit of iterations, of environment steps, or both."""
+"""Budget of a training: a limit of iterations, of environment steps, or both."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from rlcli.rl.trainer import Trainer
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Limits of a training in total: a resumed run trains what is left of them."""
+    """Limits of a whole training, at least one of them. A resumed run trains the rest."""
 
     max_iterations: int | None
     max_steps: int | None
+    """Environment steps over all environments."""
 
     def spent(self, trainer: Trainer) -> bool:
         """Return whether the trainer has reached a limit."""
-        return (self.max_iterations is not None and trainer.iteration >= self.max_iterations) or (
-            self.max_steps is not None and trainer.env_steps >= self.max_steps
-        )
+        return trainer.iteration >= self.iterations(trainer)
 
     def share(self, trainer: Trainer) -> float:
-        """Return the share of the budget that is spent, 0 to 1; within an iteration, that at its beginning."""
+        """Return the spent share of the budget, 0 to 1. It does not change during an iteration."""
         shares = [0.0]
         if self.max_iterations is not None:
             shares.append(trainer.iteration / self.max_iterations)
@@ -30,7 +29,7 @@ class Budget:
         return min(1.0, max(shares))
 
     def iterations(self, trainer: Trainer) -> int:
-        """Return the iterations in all."""
+        """Return the number of iterations of the whole training."""
         limits = []
         if self.max_iterations is not None:
             limits.append(self.max_iterations)

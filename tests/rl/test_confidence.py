@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rlcli.rl.confidence import difference, improvement, mean, proportion, student
+from rlcli.rl.confidence import difference, improvement, mean, proportion, student_quantile
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def test_the_interval_of_certainty_ends_at_one():
     [(1, 12.706), (2, 4.303), (3, 3.182), (10, 2.228), (30, 2.042), (120, 1.980), (499, 1.965), (501, 1.965)],
 )
 def test_students_quantiles_are_those_of_the_tables(freedom, quantile):
-    assert student(freedom) == pytest.approx(quantile, abs=6e-4)
+    assert student_quantile(freedom) == pytest.approx(quantile, abs=6e-4)
 
 
 def test_the_interval_of_a_mean_is_students():

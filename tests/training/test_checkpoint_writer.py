@@ -5,7 +5,7 @@ import threading
 
 import pytest
 import torch
-from test_checkpoints import state_of
+from support.saved_states import state_of
 
 from rlcli.errors import MachineError
 from rlcli.rl.trainer import Rows
@@ -39,9 +39,9 @@ def save_all(folder, keep, iterations, best=None):
         (Keep(last=1), 4, [0, 4, 12]),
         (Keep(last=2, every=5), None, [0, 5, 10, 11, 12]),
         (Keep(last=20), None, list(range(0, 13))),
-        (Keep.of(None, None, None), None, [0, *range(3, 13)]),
-        (Keep.of(None, None, 1), None, list(range(0, 13))),
-        (Keep.of(3, None, 1), None, [0, 10, 11, 12]),
+        (Keep.from_settings(None, None, None), None, [0, *range(3, 13)]),
+        (Keep.from_settings(None, None, 1), None, list(range(0, 13))),
+        (Keep.from_settings(3, None, 1), None, [0, 10, 11, 12]),
     ],
 )
 def test_the_first_the_best_and_the_newest_stay(folder, keep, best, left):

@@ -12,7 +12,7 @@ from rlcli.registry import find_task
 from rlcli.rl.ppo.compile import tf32_matmul
 from rlcli.rl.ppo.config import PpoConfig
 from rlcli.rl.ppo.loss import UpdateFunctions
-from rlcli.rl.ppo.setup import compilation
+from rlcli.rl.ppo.setup import compile_mode
 from rlcli.rl.ppo.trainer import PpoTrainer
 
 AGENTS = """
@@ -74,7 +74,7 @@ def test_without_a_compiler_the_update_runs_as_it_is_and_one_warning_says_so(tra
     assert trainer.learner.functions == UpdateFunctions()
     (warning,) = [record for record in caplog.records if record.name.startswith("rlcli")]
     assert warning.levelname == "WARNING"
-    assert "cannot be compiled and runs as it is" in warning.message
+    assert "cannot be compiled and runs uncompiled" in warning.message
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_without_a_compiler_the_update_runs_as_it_is_and_one_warning_says_so(tra
 )
 def test_an_update_is_compiled_if_asked_for_and_on_a_gpu_if_the_run_is_long(settings, device, expected):
     config = PpoConfig(trainer="ppo", **settings)
-    assert compilation(config, torch.device(device), 65536) == expected
+    assert compile_mode(config, torch.device(device), 65536) == expected
 
 
 @pytest.mark.parametrize("allowed", [True, False])

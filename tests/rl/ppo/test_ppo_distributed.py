@@ -201,7 +201,7 @@ def test_torchrun_makes_one_run_that_one_process_or_two_go_on_with(tmp_path):
     assert torch.equal(weights(again), weights(whole))
 
     alone, err = run(tmp_path, "-m", "rlcli", "train", "--resume", done["run"], "--max-iterations", "6", "--json")
-    assert "saved by 2 processes, going on in 1: every environment begins a new episode" in err
+    assert "saved by 2 processes, continued by 1: every environment starts a new episode" in err
     assert alone["run"] == done["run"]
     assert [line["step"] for line in lines(alone)] == [512, 1024, 1536, 2048, 2304, 2560]
     single, _ = run(tmp_path, "-m", "rlcli", *TRAIN, "--max-iterations", "2", "--name", "single")
@@ -232,7 +232,7 @@ def test_a_signal_stops_all_processes_at_the_same_boundary(tmp_path):
     [
         (("agent.learning_rate=1e30", "agent.learning_rate_range=[1e-5, 1e30]"), 6, "not finite"),
         (("agent.num_stepz=3",), 3, "num_stepz"),
-        (("--agent", "sb3-ppo", "agent.desired_kl=0.01"), 2, "trains in one process"),
+        (("--agent", "sb3-ppo", "agent.desired_kl=0.01"), 2, "trains in one process only"),
     ],
 )
 def test_the_launcher_passes_on_why_the_processes_failed(tmp_path, changes, code, said):

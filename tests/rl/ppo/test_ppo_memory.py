@@ -11,7 +11,7 @@ from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError
 from rlcli.registry import find_task
-from rlcli.rl.acting import acting
+from rlcli.rl.acting import trained_policy
 from rlcli.rl.policy import Lstm
 from rlcli.rl.ppo.trainer import PpoTrainer
 
@@ -140,7 +140,7 @@ def test_a_deployed_policy_remembers_in_an_environment_as_the_learner_does(remem
     trainer.collector.collect()
     means = trainer.collector.rollout.samples.mean.clone()
     env = make_env(resolve(find_task(remembering), agent="ppo"), seed=3)
-    act, obs = acting(env, trainer.policy()), env.reset(seed=3)["policy"]
+    act, obs = trained_policy(env, trainer.policy()), env.reset(seed=3)["policy"]
     for t in range(8):
         action = act(obs)
         torch.testing.assert_close(action, means[t].clamp(-1.0, 1.0), rtol=1e-4, atol=1e-5)

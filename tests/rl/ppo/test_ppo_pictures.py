@@ -235,11 +235,11 @@ def test_it_learns_what_only_the_picture_says(trainer_of):
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["agent.cnn.kernels=[9,2]"], "windows of 9 x 9 for 8 x 16 pixels"),
-        (["agent.cnn.kernels=[8,2]"], "layer 1 has windows of 2 x 2 for 1 x 5 pixels"),
-        (["agent.cnn.channels=[4]"], "have a number for each layer"),
-        (["agent.rnn={hidden: 4}"], "cnn and rnn cannot be had together"),
-        (["observations.policy.image=null"], "no term of the observation group 'policy' is a picture"),
+        (["agent.cnn.kernels=[9,2]"], "a kernel of 9 x 9 for an input of 8 x 16 pixels"),
+        (["agent.cnn.kernels=[8,2]"], "layer 1 has a kernel of 2 x 2 for an input of 1 x 5 pixels"),
+        (["agent.cnn.channels=[4]"], "must have one number for each layer"),
+        (["agent.rnn={hidden: 4}"], "cnn and rnn cannot be combined"),
+        (["observations.policy.image=null"], "no term of the observation group 'policy' is an image"),
     ],
 )
 def test_eyes_that_cannot_be_are_refused(trainer_of, overrides, said):
