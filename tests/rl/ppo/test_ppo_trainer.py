@@ -263,7 +263,7 @@ def test_settings_that_do_not_fit_the_env_are_config_errors(ppo_task, overrides,
     [
         (["agent.schedule=adaptive"], "desired_kl"),
         (["agent.desired_kl=0.01"], "desired_kl"),
-        (["agent.kl_from=last_pass"], "shuffle update or none"),
+        (["agent.kl_from=last_pass"], "set shuffle to update or none"),
         (["agent.learning_rate_range=[1e-2, 1e-5]"], "is above"),
         (["agent.dialect=rslrl"], "dialect"),
         (["agent.dialect=sb3", "agent.critic={hiden: [3]}"], "hiden"),
