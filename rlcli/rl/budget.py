@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from rlcli.config.schema import AgentConfig
 from rlcli.rl.trainer import Trainer
 
 
@@ -19,15 +20,6 @@ class Budget:
         """Return whether the trainer has reached a limit."""
         return trainer.iteration >= self.iterations(trainer)
 
-    def share(self, trainer: Trainer) -> float:
-        """Return the spent share of the budget, 0 to 1. It does not change during an iteration."""
-        shares = [0.0]
-        if self.max_iterations is not None:
-            shares.append(trainer.iteration / self.max_iterations)
-        if self.max_steps is not None:
-            shares.append(trainer.iteration * trainer.steps_per_iteration / self.max_steps)
-        return min(1.0, max(shares))
-
     def iterations(self, trainer: Trainer) -> int:
         """Return the number of iterations of the whole training."""
         limits = []
@@ -37,3 +29,13 @@ class Budget:
             left = max(0, self.max_steps - trainer.env_steps)
             limits.append(trainer.iteration + -(-left // trainer.steps_per_iteration))
         return min(limits)
+
+
+def remaining_budget(config: AgentConfig, trainer: Trainer) -> float:
+    """Return the share of an agent's budget that is left, 1 to 0. It does not change during an iteration."""
+    spent = [0.0]
+    if config.max_iterations is not None:
+        spent.append(trainer.iteration / config.max_iterations)
+    if config.max_steps is not None:
+        spent.append(trainer.iteration * trainer.steps_per_iteration / config.max_steps)
+    return 1.0 - min(1.0, max(spent))

@@ -10,10 +10,8 @@ from importlib import metadata
 import torch
 from torch import Tensor
 
-from rlcli.config.schema import AgentConfig
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DependencyError
-from rlcli.rl.budget import Budget
 from rlcli.rl.policy import Policy, PolicySpec
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.trainer import Report
@@ -64,10 +62,6 @@ class BaseTrainer(ABC):
         """
         physics, step = (self.env.seconds[name] - before[name] for name in ("physics", "step"))
         return {"physics": physics, "task": step - physics, "policy": rollout - step, "update": update}
-
-    def _remaining_budget(self, config: AgentConfig) -> float:
-        """Return the share of the budget that is left, 1 to 0. It does not change during an iteration."""
-        return 1.0 - Budget(config.max_iterations, config.max_steps).share(self)
 
     def _report(self, losses: Mapping[str, float], seconds: dict[str, float]) -> Report:
         """Return the report of an iteration: episode statistics, metrics of the task and losses."""

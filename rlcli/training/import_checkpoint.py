@@ -249,7 +249,7 @@ def _mlp_policy(
         "activation": activation,
         "action_bound": action_bound,
     }
-    actor = {}
+    actor: dict[str, Tensor] = {}
     for number, (weight, bias) in enumerate(layers):  # activations have the odd numbers
         actor |= {f"actor.{2 * number}.weight": weight, f"actor.{2 * number}.bias": bias}
     return spec, actor

@@ -229,7 +229,7 @@ class MLflow:
         agent = (config.get("agents") or {}).get(run.record.get("agent"))
         values = {
             "seed": run.record["seed"],
-            **{".".join(("agent", *path)): value for path, value in leaves(agent) if value != {}},
+            **{".".join(("agent", *map(str, path))): value for path, value in leaves(agent) if value != {}},
         }
         # MLflow's limits: 100 parameters in a batch, 500 characters in a value
         params = [self._entities.Param(_mlflow_name(key), str(value)[:500]) for key, value in values.items()]

@@ -16,6 +16,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import DivergedError
 from rlcli.random import derive
 from rlcli.rl import distributed
+from rlcli.rl.budget import remaining_budget
 from rlcli.rl.cuda_graph import capture_on_gpu
 from rlcli.rl.nan_check import require_finite
 from rlcli.rl.optimizers import below
@@ -90,7 +91,7 @@ class PpoTrainer(BaseTrainer):
         self._keep_recent_obs(self.collector.obs["policy"])
         collected = self._timestamp()
         torch.set_num_threads(self.learner.torch_threads)
-        self.learner.decay_learning_rate(self._remaining_budget(self.config))  # before the iteration is counted
+        self.learner.decay_learning_rate(remaining_budget(self.config, self))  # before the iteration is counted
         self.collector.iteration += 1
         self.env_steps += self.steps_per_iteration
         self._update()
@@ -185,7 +186,7 @@ class PpoTrainer(BaseTrainer):
 
     def _learner_tensors(self) -> dict[str, Tensor]:
         """Return the tensors of the learner, not copied, by their names in a checkpoint; without the policy."""
-        tensors = {
+        tensors: dict[str, Tensor] = {
             name: value
             for name, value in self.networks.named_parameters()
             if not name.startswith(("actor.", "memory.", "vision."))

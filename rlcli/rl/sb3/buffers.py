@@ -64,7 +64,7 @@ class TorchRolloutBuffer(RolloutBuffer):
         storage = (self.obs, self.action, self.value, self.log_prob, self.advantage, self.target)
         columns = [tensor.view(total, *tensor.shape[2:]) for tensor in storage]
         order, parts = torch.randperm(total), self.num_minibatches
-        for rows in order.split(batch_size or total) if parts is None else order.tensor_split(parts):
+        for rows in torch.split(order, batch_size or total) if parts is None else order.tensor_split(parts):
             yield RolloutBufferSamples(*(column.index_select(0, rows) for column in columns))
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import DivergedError
 from rlcli.random import derive
+from rlcli.rl.budget import remaining_budget
 from rlcli.rl.nan_check import LEARNER_HINT, GradientWatch, moments, require_finite, require_finite_learner
 from rlcli.rl.optimizers import below, load_optimizer, optimizer_tensors
 from rlcli.rl.policy import Normalizer
@@ -118,7 +119,7 @@ class Sb3Trainer(BaseTrainer):
         collected = time.perf_counter()
         torch.set_num_threads(self.torch_threads)
         if self.config.schedule == "linear":
-            self._learning_rate = self.config.learning_rate * self._remaining_budget(self.config)
+            self._learning_rate = self.config.learning_rate * remaining_budget(self.config, self)
         self.iteration += 1
         self._require_finite_rollout()
         if not isinstance(self.config, OffPolicyConfig):
