@@ -87,7 +87,7 @@ def broadcast_job(request: TrainingRequest, resolved: Resolved | None, device: s
     """Create or resume the run on rank 0 and broadcast the job to the other ranks.
 
     Args:
-        request: the training.
+        request: task and settings of the training, or the run to resume.
         resolved: configuration of a new run; None resumes a run.
         device: device of this process.
 
@@ -227,7 +227,7 @@ def setup_job(
     """Build the trainer and its environment, with all heavy imports; remove a new run if that fails.
 
     Args:
-        job: the job.
+        job: run and settings of the training.
         device: device of the training.
         stop: stop request; a signal ends the setup.
         check_model: called with the environment; it raises an error if training must not start.

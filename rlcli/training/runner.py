@@ -53,7 +53,7 @@ def run_training(
     """Train a job until its budget is spent; record an error of the loop in the run and raise it.
 
     Args:
-        job: the job; its run is unlocked at the end.
+        job: run and settings of the training; the run is unlocked at the end.
         trainer: the trainer, in the state in which training starts.
         env: the trainer's environment; it is closed at the end.
         stop: stop request of a signal.
@@ -178,7 +178,7 @@ def _make_play_env(job: Job, purpose: str, flags: dict[str, Any]) -> VecEnv:
     """Make an environment of the job's task in play mode, with its own seed.
 
     Args:
-        job: the job.
+        job: run and settings of the training.
         purpose: name from which the seed is derived.
         flags: dotted key -> value of further settings.
     """
