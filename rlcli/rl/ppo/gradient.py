@@ -168,9 +168,8 @@ class _Objective:
         # dr/dlog pi = r, so dL_clip/dlog pi = r A = `plain` where the minimum is not the clipped product
         share = torch.where(clipped, _share_of_minimum(plain, bounded), 1.0)
         log_prob_gradient = share.mul_(plain).neg_()
-        log_std_gradient = (
-            torch.mv(square.t(), log_prob_gradient) - log_prob_gradient.sum()
-        )  # sum of (z^2 - 1) dL/dlog pi
+        # dlog pi/dlog std = z^2 - 1, summed over the samples
+        log_std_gradient = torch.mv(square.t(), log_prob_gradient) - log_prob_gradient.sum()
         return -torch.min(plain, bounded).sum(), clipped.sum(), log_prob_gradient, log_std_gradient
 
 
