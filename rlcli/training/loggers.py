@@ -9,12 +9,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import DependencyError, require_known
 from rlcli.registry import load_object
 from rlcli.runs.atomic_io import disk_error, write_atomic
 from rlcli.runs.run import Run
+
+if TYPE_CHECKING:
+    from rlcli.training.trackers import Logger
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,18 +41,6 @@ LOGGERS = {
 """Name for `--logger` -> logger; `none` means no logger."""
 _LONGEST_LINE = 1024**2
 """Longest line of `metrics.jsonl`, which has the metrics of one iteration [bytes]."""
-
-
-class Logger(Protocol):
-    """Logger of the metrics of every iteration."""
-
-    def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
-        """Record one iteration."""
-        ...
-
-    def close(self, state: str) -> None:
-        """Flush and close, with the state of the run: finished, stopped, diverged or failed."""
-        ...
 
 
 class JsonLines:

@@ -17,12 +17,12 @@ from rlcli.rl.trainer import Report, Trainer
 from rlcli.runs import checkpoint
 from rlcli.runs.run import Run
 from rlcli.training.checkpoint_writer import CheckpointWriter
-from rlcli.training.loggers import Logger
 from rlcli.training.periodic_eval import PeriodicEval
 from rlcli.training.progress import Progress
 from rlcli.training.signals import Interrupted, StopRequest
 
 if TYPE_CHECKING:
+    from rlcli.training.trackers import Logger
     from rlcli.viewer.training_videos import TrainingVideos
 
 _log = logging.getLogger(__name__)

@@ -22,7 +22,7 @@ from rlcli.runs.provenance import built_record, differences, environment_record
 from rlcli.runs.restore import resolve_run
 from rlcli.training.checkpoint_writer import CheckpointWriter, Keep, manifest_entries
 from rlcli.training.job import Job, TrainingResult
-from rlcli.training.loggers import Logger, open_loggers, read_metrics
+from rlcli.training.loggers import open_loggers, read_metrics
 from rlcli.training.loop import TrainLoop
 from rlcli.training.periodic_eval import PeriodicEval
 from rlcli.training.progress import Progress
@@ -30,6 +30,7 @@ from rlcli.training.signals import StopRequest
 
 if TYPE_CHECKING:
     from rlcli.rl.trainer import Trainer
+    from rlcli.training.trackers import Logger
     from rlcli.viewer.training_videos import TrainingVideos
 
 _log = logging.getLogger(__name__)

@@ -28,7 +28,6 @@ from rlcli.errors import MachineError, one_line
 from rlcli.rl.rng import undisturbed
 from rlcli.runs.run import Run
 from rlcli.runs.safe_io import FileModel
-from rlcli.training.loggers import Logger
 
 _log = logging.getLogger(__name__)
 
@@ -36,6 +35,18 @@ _MAX_ROWS = 100_000
 """Longest queue of iterations; a tracker with a longer queue has failed."""
 _TIMEOUT_S = 60.0
 """Longest time that the end of a training waits for a tracker [s]."""
+
+
+class Logger(Protocol):
+    """Logger of the metrics of every iteration."""
+
+    def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
+        """Record one iteration."""
+        ...
+
+    def close(self, state: str) -> None:
+        """Flush and close, with the state of the run: finished, stopped, diverged or failed."""
+        ...
 
 
 class Tracker(Logger, Protocol):
