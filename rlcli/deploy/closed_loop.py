@@ -34,7 +34,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, UsageError
 from rlcli.evaluation.evaluate import Evaluation, evaluate
 from rlcli.random import derive
-from rlcli.rl.acting import acting
+from rlcli.rl.acting import trained_policy
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators
 from rlcli.runs.checkpoint_manifest import deployment_differences
@@ -188,7 +188,7 @@ def verify(reference: ReferenceEnv, checkpoint: Checkpoint, file: Path, format_:
     controller, policy = space["Controller"](file), policy_of(checkpoint)
     initial = env.state_dict()
     seed_generators(derive(_SEED, "task"))
-    evaluated = evaluate(env, acting(env, policy), episodes)
+    evaluated = evaluate(env, trained_policy(env, policy), episodes)
 
     def drive(synchronize: bool) -> tuple[_Driver, Evaluation]:
         env.load_state_dict(initial)  # a curriculum, too, is where it was
@@ -242,7 +242,7 @@ class _Driver:
         """Largest difference of each."""
         self._require_same_shape(model)
         n = env.num_envs
-        self._expected: Callable[[Tensor], Tensor] = acting(env, policy)
+        self._expected: Callable[[Tensor], Tensor] = trained_policy(env, policy)
         self._controllers = [copy.copy(controller) for _ in range(n)]
         self._models = [copy.deepcopy(model) if env.engine.expanded_fields() else model for _ in range(n)]
         self._datas = [mujoco.MjData(own) for own in self._models]

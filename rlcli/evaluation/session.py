@@ -205,7 +205,7 @@ def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
     import torch
 
     from rlcli.random import derive
-    from rlcli.rl.acting import acting, random_policy, zero_policy
+    from rlcli.rl.acting import random_policy, trained_policy, zero_policy
     from rlcli.runs.checkpoint import open_checkpoint
     from rlcli.runs.restore import policy_of, require_fit
 
@@ -227,7 +227,7 @@ def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
     def make(env: VecEnv) -> Act:
         require_fit(checkpoint, env.layout)
         generator = torch.Generator().manual_seed(seed)
-        return acting(env, trained, stochastic=policy.stochastic, generator=generator)
+        return trained_policy(env, trained, stochastic=policy.stochastic, generator=generator)
 
     return make
 

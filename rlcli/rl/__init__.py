@@ -1,1 +1,1 @@
-"""Training: the trainer protocol, runs and checkpoints, rollouts and evaluation."""
+"""Policies, networks and trainers."""

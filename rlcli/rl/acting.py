@@ -1,4 +1,4 @@
-"""Acting in an environment: a trained policy with its hidden state, the zero policy, a random policy."""
+"""Action functions for an environment: a trained policy with its hidden state, zero actions, random actions."""
 
 from __future__ import annotations
 
@@ -11,34 +11,31 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.rl.policy import Policy
 
 Act = Callable[[Tensor], Tensor]
+"""Observations (num_envs, d) -> actions (num_envs, a)."""
 PATIENCE = 10
-"""Episode lengths after which an evaluation gives an episode up."""
+"""Number of episode lengths after which an evaluation stops an episode that does not end."""
 
 
-def acting(env: VecEnv, policy: Policy, *, stochastic: bool = False, generator: torch.Generator | None = None) -> Act:
-    """Return a policy's action function; its hidden state is reset with each episode, equal streams get equal noise."""
-    memory: Tensor | None = None
-    groups = env.num_envs // (env.engine.shared_streams or env.num_envs) if stochastic and generator is not None else 1
+def trained_policy(
+    env: VecEnv, policy: Policy, *, stochastic: bool = False, generator: torch.Generator | None = None
+) -> Act:
+    """Return the action function of a policy. It resets the hidden state of an environment at each episode start.
+
+    Args:
+        env: the environment.
+        policy: the policy.
+        stochastic: sample actions instead of taking the mean.
+        generator: source of the noise. Environments that share a random stream then get the same noise.
+    """
+    hidden: Tensor | None = None
+    repeats = env.num_envs // (env.engine.shared_streams or env.num_envs) if generator is not None else 1
 
     def act(obs: Tensor) -> Tensor:
-        nonlocal memory
-        if memory is not None:
-            memory = memory * (env.episode_length_buf > 0)[:, None]
-        if groups == 1:
-            action, memory = policy.step(obs, memory, stochastic=stochastic, generator=generator)
-            return action
-        assert generator is not None
-        state = generator.get_state()
-        actions: list[Tensor] = []
-        memories: list[Tensor] = []
-        for number, seen in enumerate(obs.chunk(groups)):
-            generator.set_state(state)
-            before = None if memory is None else memory.chunk(groups)[number]
-            action, after = policy.step(seen, before, stochastic=True, generator=generator)
-            actions.append(action)
-            memories += [] if after is None else [after]
-        memory = torch.cat(memories) if memories else None
-        return torch.cat(actions)
+        nonlocal hidden
+        if hidden is not None:
+            hidden = hidden * (env.episode_length_buf > 0)[:, None]
+        action, hidden = policy.step(obs, hidden, stochastic=stochastic, generator=generator, noise_repeats=repeats)
+        return action
 
     return act
 
@@ -50,10 +47,13 @@ def zero_policy(env: VecEnv) -> Act:
 
 
 def random_policy(env: VecEnv, bound: float | None, seed: int) -> Act:
-    """Return uniform actions within the bound, else standard Gaussian ones; environments of one stream get the same."""
+    """Return a function that samples uniform actions in [-bound, bound], or standard Gaussian ones without a bound.
+
+    Environments that share a random stream get the same actions.
+    """
     generator = torch.Generator().manual_seed(seed)
     streams = env.engine.shared_streams or env.num_envs
-    shape, groups = (streams, env.layout.action_size), env.num_envs // streams
+    shape, repeats = (streams, env.layout.action_size), env.num_envs // streams
     if bound is None:
-        return lambda obs: torch.randn(shape, generator=generator).repeat(groups, 1)
-    return lambda obs: ((torch.rand(shape, generator=generator) * 2.0 - 1.0) * bound).repeat(groups, 1)
+        return lambda obs: torch.randn(shape, generator=generator).repeat(repeats, 1)
+    return lambda obs: ((torch.rand(shape, generator=generator) * 2.0 - 1.0) * bound).repeat(repeats, 1)

@@ -1,4 +1,4 @@
-"""CNN over the images in an observation; its features replace the columns of the images."""
+"""CNN over the images of an observation. Its features replace the columns of the images."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ _Size = Annotated[int, Field(ge=1, le=4096)]
 
 
 class PictureSpec(BaseModel):
-    """Columns of an image in an observation: row by row, channel after channel."""
+    """Columns of one image in an observation, in the order (channels, rows, columns)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     start: Annotated[int, Field(ge=0, le=2**24)]
-    """Its first column."""
+    """First column of the image."""
     shape: tuple[_Size, _Size, _Size]
     """Channels (with a history, the oldest step first), rows, columns."""
     steps: Annotated[int, Field(ge=1, le=4096)] = 1
-    """Number of images whose channels these are: the length of the history."""
+    """Length of the history: number of images that the channels consist of."""
 
     @property
     def stop(self) -> int:
-        """The column after the image."""
+        """First column after the image."""
         return self.start + math.prod(self.shape)
 
 
 class VisionSpec(BaseModel):
-    """Convolutions without padding: the same layers for every image, with separate weights."""
+    """Structure of a CNN without padding. All images have the same layers, with separate weights."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     pictures: Annotated[list[PictureSpec], Field(min_length=1, max_length=16)]
-    """Images in the order of their columns, which do not overlap."""
+    """Images in the order of their columns, without overlap."""
     channels: Annotated[list[_Size], Field(min_length=1, max_length=16)]
     """Output channels of each layer."""
     kernels: list[_Size]
@@ -44,56 +44,57 @@ class VisionSpec(BaseModel):
     strides: list[_Size]
     """Stride of each layer [pixels]."""
     motion: PositiveFloat | None = None
-    """Older images of a history are replaced by the newest minus them, times this; null: they are kept."""
+    """Each older image of a history becomes (newest - older) times this factor; null: images are not changed."""
 
     @model_validator(mode="after")
     def _fits(self) -> VisionSpec:
         if not len(self.channels) == len(self.kernels) == len(self.strides):
-            raise ValueError("channels, kernels and strides have a number for each layer")
+            raise ValueError("channels, kernels and strides must have one number for each layer")
         end = 0
         for picture in self.pictures:
             if picture.start < end:
-                raise ValueError("pictures overlap, or are not in the order of their columns")
+                raise ValueError("images overlap, or are not in the order of their columns")
             if picture.shape[0] % picture.steps:
-                raise ValueError(f"{picture.shape[0]} channels are not those of {picture.steps} steps")
+                raise ValueError(f"{picture.shape[0]} channels cannot be divided into {picture.steps} steps")
             end = picture.stop
             self.sizes(picture)
         return self
 
     @property
     def stop(self) -> int:
-        """The column after the last image."""
+        """First column after the last image."""
         return self.pictures[-1].stop
 
     def sizes(self, picture: PictureSpec) -> list[tuple[int, int, int]]:
-        """Return (channels, rows, columns) of an image before the first layer and after each.
+        """Return (channels, rows, columns) of an image before the first layer and after each layer.
 
         Raises:
             ValueError: if a kernel is larger than its input.
         """
         sizes: list[tuple[int, int, int]] = [picture.shape]
-        for number, (channels, kernel, stride) in enumerate(
-            zip(self.channels, self.kernels, self.strides, strict=True)
-        ):
+        layers = zip(self.channels, self.kernels, self.strides, strict=True)
+        for number, (channels, kernel, stride) in enumerate(layers):
             _, rows, columns = sizes[-1]
             if min(rows, columns) < kernel:
-                raise ValueError(f"layer {number} has windows of {kernel} x {kernel} for {rows} x {columns} pixels")
+                raise ValueError(
+                    f"layer {number} has a kernel of {kernel} x {kernel} for an input of {rows} x {columns} pixels"
+                )
             sizes.append((channels, (rows - kernel) // stride + 1, (columns - kernel) // stride + 1))
         return sizes
 
     def features(self, columns: int) -> int:
-        """Return the number of features of an observation with this number of columns."""
+        """Return the number of features of an observation with `columns` columns."""
         kept = columns - sum(math.prod(picture.shape) for picture in self.pictures)
         return kept + sum(math.prod(self.sizes(picture)[-1]) for picture in self.pictures)
 
 
 class Vision(nn.Module):
-    """CNN of an observation. Its outputs are the features of all images, then the columns outside of images.
+    """CNN of an observation. Its outputs are the features of all images, then the other columns.
 
     Args:
         spec: the images and the layers.
         activation: activation after each layer.
-        wide: compute in float64 by matrix products, as `WideLinear` does; ONNX runtimes have no float64 convolution.
+        wide: compute in float64, as `WideLinear` does, with `WideConv`.
     """
 
     def __init__(self, spec: VisionSpec, activation: type[nn.Module], *, wide: bool = False) -> None:
@@ -103,11 +104,10 @@ class Vision(nn.Module):
         self.pictures = nn.ModuleList()
         for picture in spec.pictures:
             layers: list[nn.Module] = []
-            sizes = spec.sizes(picture)
-            for (inputs, *_), outputs, kernel, stride in zip(
-                sizes, spec.channels, spec.kernels, spec.strides, strict=False
-            ):
-                layers += [kind(inputs, outputs, kernel, stride), activation()]
+            inputs = [channels for channels, _, _ in spec.sizes(picture)[:-1]]
+            settings = zip(inputs, spec.channels, spec.kernels, spec.strides, strict=True)
+            for channels, outputs, kernel, stride in settings:
+                layers += [kind(channels, outputs, kernel, stride), activation()]
             self.pictures.append(nn.Sequential(*layers))
 
     def forward(self, obs: Tensor) -> Tensor:
@@ -125,26 +125,30 @@ class Vision(nn.Module):
 
 
 def motion_channels(pixels: Tensor, steps: int, factor: float) -> Tensor:
-    """Replace all images but the newest by the newest minus them, times `factor`. (n, steps x c, h, w), oldest first"""
+    """Replace each older image of a history by (newest - older) * factor. Oldest first. (n, steps x c, h, w)"""
     frames = torch.unflatten(pixels, 1, (steps, -1))
     newest = frames[:, -1:]
     return torch.cat([factor * (newest - frames[:, :-1]), newest], dim=1).flatten(1, 2)
 
 
 class WideConv(nn.Conv2d):
-    """Convolution with float32 weights that computes in float64, as a matrix product."""
+    """Convolution with float32 weights that computes in float64, as a matrix product.
+
+    ONNX runtimes have no float64 convolution.
+    """
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the convolution. (n, c, h, w) -> (n, k, rows, columns) float64"""
         _, channels, height, width = x.shape
         edge, step = self.kernel_size[0], self.stride[0]
         rows, columns = (height - edge) // step + 1, (width - edge) // step + 1
-        along = torch.arange(edge, device=x.device)
+        offset = torch.arange(edge, device=x.device)
         channel = torch.arange(channels, device=x.device)
-        window = (channel[:, None, None] * height + along[:, None]) * width + along  # of the first position
+        # flat indices of the pixels below the kernel at its first position: (c, row, column) -> (c h + row) w + column
+        window = (channel[:, None, None] * height + offset[:, None]) * width + offset
         down, right = (step * torch.arange(count, device=x.device) for count in (rows, columns))
-        first = (down[:, None] * width + right).flatten()
-        patches = x.double().flatten(1)[:, first[:, None] + window.flatten()]  # (n, rows * columns, c * edge * edge)
+        corner = (down[:, None] * width + right).flatten()
+        patches = x.double().flatten(1)[:, corner[:, None] + window.flatten()]  # (n, rows * columns, c * edge * edge)
         assert self.bias is not None
         outputs = nn.functional.linear(patches, self.weight.double().flatten(1), self.bias.double())
         return torch.unflatten(outputs.transpose(1, 2), 2, (rows, columns))

@@ -1,11 +1,12 @@
-"""Repeated work as a CUDA graph: recorded once on a GPU, and then replayed.
+"""Recording of repeated work as a CUDA graph, and its replay.
 
-A graph records kernel launches on fixed addresses. The work may not read a value back from the device, and tensors that
-it carries from one run to the next must keep their addresses. Tensors that a task rebinds in every step are copied back
-to their first address at the end of the recording. Work that cannot be recorded is named in a warning and runs eagerly.
+A graph records kernel launches on fixed memory addresses. The work must not read a value back from the device. Tensors
+that the work keeps from one run to the next must keep their addresses. Tensors that a task rebinds in every step are
+copied back to their first address at the end of the recording. Work that cannot be recorded runs eagerly, after a
+warning.
 
-All work is recorded in one stream: once a process holds a single recording with parallel branches, each launch of
-every recording takes about a third of a microsecond longer (docs/tutorials/train-on-a-gpu.md).
+All work is recorded in one stream: once a process holds one recording with parallel branches, each launch of every
+recording takes about a third of a microsecond longer (docs/tutorials/train-on-a-gpu.md).
 """
 
 from __future__ import annotations
@@ -21,35 +22,35 @@ from torch import Tensor
 
 Work = Callable[[], None]
 
-_NUMBERS = (bool, int, float)
 _log = logging.getLogger(__name__)
 
 
-def captured(work: Work, device: torch.device, holders: Iterable[Any] = ()) -> Work:
-    """Return `work` itself on a CPU, and a recording of it on a GPU.
+def capture_on_gpu(work: Work, device: torch.device, holders: Iterable[Any] = ()) -> Work:
+    """Return a `Recording` of `work` on a GPU, and `work` itself on a CPU.
 
     Args:
         work: the function.
-        device: where it runs.
-        holders: objects whose attributes the work carries from one run to the next: a task, terms with a state.
+        device: device of the work.
+        holders: objects with attributes that the work keeps from one run to the next: a task, terms with a state.
     """
     return Recording(work, device, list(holders)) if device.type == "cuda" else work
 
 
 class Recording:
-    """Work that runs eagerly until a run shows no obstacle, is recorded in the next run, and replayed from then on.
+    """Work that runs eagerly at first, is recorded as a CUDA graph, and is then replayed.
 
-    The first run may allocate what later runs use, and synchronise with the device for it; a second run may not.
+    The first run may allocate memory and synchronise with the device. If a later run does not synchronise and changes
+    no Python number, the run after it is recorded.
     """
 
     def __init__(self, work: Work, device: torch.device, holders: list[Any]) -> None:
         self._work, self._holders = work, holders
         self._device = torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._warp_capture: Any = None  # holds the memory that Warp allocated while recording
+        self._warp_capture: Any = None  # keeps the memory alive that Warp allocated during the recording
         self._eager_runs, self._ready = 0, False
         self.refusal: str | None = None
-        """Why the work is not recorded."""
+        """Reason why the work cannot be recorded."""
 
     def __call__(self) -> None:
         """Run the work."""
@@ -63,7 +64,7 @@ class Recording:
             self._run_eagerly()
 
     def _run_eagerly(self) -> None:
-        """Run without recording: kernels compile, buffers are allocated, synchronising calls are detected."""
+        """Run without recording. Kernels compile, buffers are allocated, and synchronising calls are detected."""
         self._eager_runs += 1
         before = torch.cuda.get_sync_debug_mode()
         numbers = self._numbers()
@@ -76,17 +77,18 @@ class Recording:
                 torch.cuda.set_sync_debug_mode(before)
         waits = [w for w in caught if "synchronizing CUDA operation" in str(w.message)]
         if waits and self._eager_runs > 1:
-            where = sorted({f"{w.filename}:{w.lineno}" for w in waits})
-            self._refuse(f"{where[0]} waits for the GPU{f' (and {len(where) - 1} more places)' if where[1:] else ''}")
+            first, *others = sorted({f"{w.filename}:{w.lineno}" for w in waits})
+            more = f" (and {len(others)} more lines)" if others else ""
+            self._refuse(f"{first} waits for the GPU{more}")
         changed = [name for name, value in self._numbers().items() if numbers.get(name, value) != value]
         if changed and not waits:
-            self._refuse(f"{changed[0]} is a number that changes from step to step; keep it in a tensor")
+            self._refuse(f"{changed[0]} is a Python number that changes between steps; keep it in a tensor")
         self._ready = not waits and not changed
 
     def _record(self) -> None:
         import warp as wp
 
-        places = [(holder, name, value) for holder, name, value in self._tensors()]
+        tensors = [(h, n, v) for h in self._holders for n, v in vars(h).items() if isinstance(v, Tensor)]
         graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(self._device)  # type: ignore[no-untyped-call]  # torch has no type here
         try:
             torch.cuda.synchronize(self._device)
@@ -96,14 +98,15 @@ class Recording:
                 wp.capture_begin(stream=on, external=True)
                 try:
                     self._work()
-                    _copy_back(places)
+                    _copy_back(tensors)
                 finally:
                     self._warp_capture = wp.capture_end(stream=on), on
         except RuntimeError as error:
-            for holder, name, value in places:
+            for holder, name, value in tensors:  # the failed recording may have rebound them
                 setattr(holder, name, value)
-            place = next(f for f in reversed(traceback.extract_tb(error.__traceback__)) if "torch" not in f.filename)
-            self._refuse(f"{place.filename}:{place.lineno} ({' '.join(str(error).split())[:120]})")
+            frames = reversed(traceback.extract_tb(error.__traceback__))
+            culprit = next(frame for frame in frames if "torch" not in frame.filename)
+            self._refuse(f"{culprit.filename}:{culprit.lineno} ({' '.join(str(error).split())[:120]})")
             self._work()
             return
         self._graph = graph
@@ -113,21 +116,18 @@ class Recording:
         self.refusal = reason
         _log.warning(f"the step cannot be recorded as a CUDA graph and runs several times slower: {reason}")
 
-    def _tensors(self) -> list[tuple[Any, str, Tensor]]:
-        return [(h, n, v) for h in self._holders for n, v in vars(h).items() if isinstance(v, Tensor)]
-
     def _numbers(self) -> dict[str, Any]:
         return {
             f"{type(holder).__name__}.{name}": value
             for holder in self._holders
             for name, value in vars(holder).items()
-            if isinstance(value, _NUMBERS)
+            if isinstance(value, bool | int | float)
         }
 
 
-def _copy_back(places: list[tuple[Any, str, Tensor]]) -> None:
-    """Copy tensors that were rebound to the addresses that the next replay reads."""
-    for holder, name, old in places:
+def _copy_back(tensors: list[tuple[Any, str, Tensor]]) -> None:
+    """Copy the tensors that the work has rebound to their old addresses, which the next replay reads."""
+    for holder, name, old in tensors:
         new = getattr(holder, name)
         if new is not old and isinstance(new, Tensor) and new.shape == old.shape and new.dtype == old.dtype:
             old.copy_(new)

@@ -1,7 +1,7 @@
-"""Data-parallel training of one policy in several processes, started by PyTorch's launcher.
+"""Data-parallel training of one policy in several processes, which PyTorch's launcher starts.
 
-Every process has its own environments and the same networks. Gradients, divergences, statistics of observations and
-metrics are means over all processes. Rank 0 alone writes the run and prints.
+Every process has its own environments and a copy of the networks. Gradients, KL divergences, observation statistics and
+metrics are averaged over all processes. Only rank 0 writes the run and prints.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import TYPE_CHECKING, Any
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _TIMEOUT = timedelta(minutes=10)
-"""Longest wait for the other processes: kernels may be compiling."""
+"""Longest wait for the other processes, which may be compiling kernels."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessGroup:
-    """The processes of a run, from the view of one of them; with one process, every method does nothing."""
+    """Processes of a run and the rank of this one. With a world size of 1 no method communicates."""
 
     rank: int = 0
     world_size: int = 1
@@ -37,7 +37,7 @@ class ProcessGroup:
         return self.rank == 0
 
     def seed(self, seed: int, purpose: str) -> int:
-        """Return the seed of this process: rank 0 uses `seed` itself, the others derive theirs from it."""
+        """Return the seed of this process: `seed` on rank 0, a derived seed on the other ranks."""
         if self.is_rank_zero:
             return seed
         from rlcli.random import derive
@@ -47,20 +47,14 @@ class ProcessGroup:
     def average_(self, values: Tensor) -> Tensor:
         """Replace values by their mean over all processes, in place."""
         if self.world_size > 1:
-            import torch.distributed as dist
-
-            with _lost_process_as_error():
-                dist.all_reduce(values)
+            _communicate("all_reduce", values)
             values /= self.world_size
         return values
 
     def broadcast_(self, values: Tensor) -> None:
         """Replace values by those of rank 0, in place."""
         if self.world_size > 1:
-            import torch.distributed as dist
-
-            with _lost_process_as_error():
-                dist.broadcast(values, 0)
+            _communicate("broadcast", values, 0)
 
     def sum(self, *numbers: float) -> tuple[float, ...]:
         """Return each number summed over all processes."""
@@ -73,24 +67,17 @@ class ProcessGroup:
 
     def broadcast_object(self, value: object = None) -> Any:
         """Return the value of rank 0 in every process."""
-        if self.world_size == 1:
-            return value
-        import torch.distributed as dist
-
         values = [value]
-        with _lost_process_as_error():
-            dist.broadcast_object_list(values, 0)
+        if self.world_size > 1:
+            _communicate("broadcast_object_list", values, 0)
         return values[0]
 
     def gather_object(self, value: object) -> list[Any]:
         """Return the values of all processes by rank, on rank 0; an empty list elsewhere."""
         if self.world_size == 1:
             return [value]
-        import torch.distributed as dist
-
         values: list[Any] | None = [None] * self.world_size if self.is_rank_zero else None
-        with _lost_process_as_error():
-            dist.gather_object(value, values, 0)
+        _communicate("gather_object", value, values, 0)
         return values or []
 
 
@@ -98,7 +85,7 @@ _current = ProcessGroup()
 
 
 def current() -> ProcessGroup:
-    """Return the processes of this run."""
+    """Return the process group of this run."""
     return _current
 
 
@@ -120,7 +107,7 @@ def local_rank_and_size() -> tuple[int, int]:
 
 
 def join(device: str) -> ProcessGroup:
-    """Join the process group; NCCL carries tensors on a GPU, gloo all others.
+    """Join the process group, with NCCL for GPU tensors and gloo for all others.
 
     Raises:
         MachineError: if the other processes cannot be reached.
@@ -130,7 +117,7 @@ def join(device: str) -> ProcessGroup:
         return _current
     import torch
     import torch.distributed as dist
-    import torch.distributed.nn  # imported later, defaults of its functions would keep the group and its threads alive
+    import torch.distributed.nn  # before the group exists: default arguments of its functions would keep it alive
 
     on_gpu = device.startswith("cuda")
     if on_gpu:
@@ -152,7 +139,7 @@ def leave() -> None:
         import torch.distributed as dist
 
         _current = ProcessGroup()
-        gc.collect()  # NCCL blocks for ever while a captured graph uses it
+        gc.collect()  # destroys captured graphs: NCCL blocks for ever while one uses the group
         with contextlib.suppress(RuntimeError):
             dist.destroy_process_group()
 
@@ -161,7 +148,7 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     """Run `rlcli ARGUMENTS` in several processes of this machine.
 
     Returns:
-        Exit code 0, or that of a process that failed by itself and not because another one failed.
+        Exit code 0, or the exit code of a process that failed by itself and not because of another process.
     """
     import logging
     import sys
@@ -170,8 +157,8 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     from torch.distributed.elastic.multiprocessing.api import SignalException
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch_threads decides; the launcher would only warn
-    logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)  # each process prints its own error
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # else the launcher warns; torch_threads sets the threads
+    logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)  # each process prints its own error already
     options = ["--standalone", f"--nproc-per-node={processes}"]
     try:
         run.run(run.parse_args([*options, "--no-python", sys.executable, "-m", "rlcli", *arguments]))  # type: ignore[no-untyped-call]  # torch has no type here
@@ -183,16 +170,24 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
 
 
 def _exit_code(codes: Sequence[int]) -> int:
-    """Return the exit code of the run: a process killed by the launcher, or one that lost another, did not fail."""
+    """Return the exit code of the run.
+
+    Ignore processes that the launcher killed (negative codes) and those that lost another process (`MachineError`).
+    """
     own = [code for code in codes if code > 0 and code != MachineError.exit_code]
     return next(iter(own), MachineError.exit_code)
 
 
-@contextlib.contextmanager
-def _lost_process_as_error() -> Iterator[None]:
-    """Turn a failed collective operation into a `MachineError`."""
+def _communicate(operation: str, *arguments: Any) -> None:
+    """Call a collective operation of `torch.distributed`.
+
+    Raises:
+        MachineError: if another process is gone.
+    """
+    import torch.distributed as dist
+
     try:
-        yield
+        getattr(dist, operation)(*arguments)
     except RuntimeError as error:
-        hint = "its own message says why; --resume goes on from the last checkpoint"
+        hint = "read the message of that process; --resume continues from the last checkpoint"
         raise MachineError("another process of this run is gone", hint=hint) from error

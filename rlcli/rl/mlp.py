@@ -1,7 +1,7 @@
-"""Multilayer perceptrons on a CPU, with the fastest operations of the libraries inside torch and numpy.
+"""Multilayer perceptrons on a CPU, with the fastest operations that torch, its libraries and numpy offer.
 
-torch uses MKL for matrix products. MKL has AVX-512 on Intel's processors alone: on AMD's oneDNN is twice as fast, on
-Intel's slower. numpy's expm1 and tanh are three and ten times as fast as torch's.
+torch uses MKL for matrix products. MKL uses AVX-512 only on Intel processors: on AMD processors oneDNN is twice as
+fast, on Intel processors it is slower. numpy's expm1 is three times as fast as torch's, and its tanh ten times.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ _aten = torch.ops.aten
 _AVX512 = torch.backends.cpu.get_cpu_capability() == "AVX512"
 """Without AVX-512, numpy's expm1 is not vectorised."""
 _WORTH, _LARGE = 2**20, 64 * 64
-"""Multiplications from which oneDNN's product is faster; and, for sums over samples, elements of the result."""
+"""Number of multiplications from which oneDNN's product is faster. A sum over samples must also have a result with
+so many elements."""
 
 
 def _onednn() -> Callable[..., Tensor] | None:
-    """Return oneDNN's `x @ weight.T + bias` where it is faster; it is a private operator that torch may remove."""
+    """Return oneDNN's `x @ weight.T + bias` where it is faster, else None; torch may remove the private operator."""
     if not _AVX512 or "AMD" not in processor()["model"] or not has_onednn():
         return None
     operator: Any = getattr(torch.ops.mkldnn, "_linear_pointwise", None)
@@ -34,14 +35,14 @@ _linear = _onednn()
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor, out: Tensor | None = None) -> Tensor:
-    """Return `x @ weight.T + bias`, in new memory or in `out`. (n, i), (o, i), (o,) -> (n, o)"""
+    """Return `x @ weight.T + bias`, in `out` or in new memory. (n, i), (o, i), (o,) -> (n, o)"""
     if _linear is not None and len(x) * weight.numel() >= _WORTH:
         return _linear(x, weight, bias)
     return torch.addmm(bias, x, weight.t(), out=out)
 
 
 def input_gradient(gradient: Tensor, weight: Tensor, out: Tensor) -> Tensor:
-    """Return the gradient of a layer's inputs, in new memory or in `out`. (n, o), (o, i) -> (n, i)"""
+    """Return the gradient of a layer's inputs, in `out` or in new memory. (n, o), (o, i) -> (n, i)"""
     if _linear is not None and len(gradient) * weight.numel() >= _WORTH:
         return _linear(gradient, weight.t())
     return torch.mm(gradient, weight, out=out)
@@ -56,12 +57,12 @@ def weight_gradient(inputs: Tensor, gradient: Tensor, out: Tensor) -> None:
 
 
 class Activation(NamedTuple):
-    """An activation and its gradient, both on preallocated tensors."""
+    """Activation and its gradient on preallocated tensors."""
 
     forward: Callable[[Tensor, Tensor], object]
     """forward(inputs, out)"""
     backward: Callable[[Tensor, Tensor, Tensor], object]
-    """backward(gradient, inputs, outputs) turns the gradient of the outputs into that of the inputs, in place."""
+    """backward(gradient, inputs, outputs) replaces the gradient of the outputs by the gradient of the inputs."""
 
 
 def _elu(inputs: Tensor, out: Tensor) -> None:
@@ -70,7 +71,7 @@ def _elu(inputs: Tensor, out: Tensor) -> None:
         return
     torch.clamp(inputs, max=0.0, out=out)
     np.expm1(out.numpy(), out=out.numpy())
-    torch.maximum(inputs, out, out=out)  # expm1(x) is above x below 0, and 0 at it
+    torch.maximum(inputs, out, out=out)  # expm1(x) > x for x < 0; for x >= 0 `out` is 0 before
 
 
 FAST_ACTIVATIONS: dict[type[nn.Module], Activation] = {
@@ -91,7 +92,7 @@ FAST_ACTIVATIONS: dict[type[nn.Module], Activation] = {
 
 
 def is_plain(layers: Iterable[nn.Module]) -> bool:
-    """Return whether these are linear layers on a CPU with the same known activation between each two."""
+    """Return whether the layers are linear layers on a CPU with one known activation between them."""
     linears, activations = list(layers)[::2], list(layers)[1::2]
     return (
         all(isinstance(layer, nn.Linear) and layer.bias is not None for layer in linears)
@@ -102,9 +103,9 @@ def is_plain(layers: Iterable[nn.Module]) -> bool:
 
 
 class Mlp(nn.Sequential):
-    """Layers that use the fast operations of this module where autograd is off, and torch's own where it is on.
+    """Multilayer perceptron that uses the fast operations of this module while autograd is off.
 
-    The fast path calls no hooks of its layers.
+    While autograd is on it uses torch's operations. The fast path calls no hooks of the layers.
     """
 
     def __init__(self, *layers: Any) -> None:

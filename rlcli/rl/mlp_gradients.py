@@ -1,8 +1,12 @@
-"""Gradients of multilayer perceptrons on a CPU in closed form, instead of by autograd.
+"""Gradients of multilayer perceptrons on a CPU in closed form, without autograd.
 
 Autograd computes each operation on a whole minibatch, with threads that synchronise at its end. Here a minibatch is cut
-into parts whose intermediate results stay in the cache, and one thread computes all operations of one network on a
-part. Each part has its own gradient, so that the sum does not depend on which thread computed which part.
+into parts whose intermediate results stay in the cache. One thread computes all operations of one network on a part.
+Each part has its own gradient, so the sum does not depend on which thread computed which part.
+
+For a layer y = x W^T + b with the gradient G of its outputs, (n, o):
+
+    dL/dW = G^T x        dL/db = sum of the rows of G        dL/dx = G W
 """
 
 from __future__ import annotations
@@ -18,24 +22,24 @@ from torch import Tensor, nn
 from rlcli.rl.mlp import FAST_ACTIVATIONS, affine, input_gradient, weight_gradient
 
 _ROWS, _WIDE = 8192, 64
-"""Most samples of a part, if no layer is wider than the second number; beyond, results leave the cache."""
+"""Most samples of a part whose widest layer has `_WIDE` columns: with more, results leave the cache."""
 _PARTS = 2
-"""Parts of a large enough minibatch: with two networks, work for the default number of threads. More parts would mean
-more and shorter operations, and between any two of them a thread waits for Python's lock."""
+"""Parts of a large minibatch. With two networks they occupy the default number of threads, four. More parts mean
+shorter operations, and a thread waits for Python's lock between two operations."""
 OutputGradient = Callable[[slice, Tensor], tuple[Tensor, Tensor]]
-"""Rows of a minibatch and a network's outputs for them, (n, a) -> gradient of the loss with respect to the outputs,
-(n, a), and numbers that are summed over the parts, (m,)"""
+"""Function of the rows of a part and of a network's outputs for them, (n, a). It returns the gradient of the loss with
+respect to the outputs, (n, a), and numbers that are summed over the parts, (m,)."""
 
 
 class MlpGradients:
     """Gradients of an actor and a critic on the same samples.
 
     Args:
-        actor: its layers.
-        critic: its layers.
-        gradients: outputs for the gradients of the actor's parameters, layer by layer, then of the critic's.
-        rows: samples of the largest minibatch.
-        threads: threads that share the work; torch must be set to one thread meanwhile.
+        actor: layers of the actor.
+        critic: layers of the critic.
+        gradients: tensors to write to: gradients of the actor's parameters, layer by layer, then of the critic's.
+        rows: number of samples of the largest minibatch.
+        threads: number of threads that share the work; torch itself must use one thread meanwhile.
     """
 
     def __init__(
@@ -50,7 +54,7 @@ class MlpGradients:
         self._max_rows = max(1, _ROWS * _WIDE // max(_WIDE, *(layer.out_features for layer in linears)))
         self._gradients = gradients
         parts = len(self._split(rows))
-        # transposed, (inputs, outputs): products with few inputs are then several times faster
+        # transposed, (inputs, outputs): products with few inputs are several times faster so
         shapes = [parameter.t().shape for layer in linears for parameter in (layer.weight, layer.bias)]
         self._part_gradients = torch.zeros(parts, sum(shape.numel() for shape in shapes))
         self._part_views = [_views(row, shapes) for row in self._part_gradients]
@@ -66,7 +70,7 @@ class MlpGradients:
     def __call__(
         self, obs: Tensor, critic_obs: Tensor, actor_loss: OutputGradient, critic_loss: OutputGradient
     ) -> tuple[Tensor, Tensor]:
-        """Write the gradients of a minibatch; return the summed numbers of each `OutputGradient`. (n, d), (n, c)"""
+        """Write the gradients of a minibatch; return the summed numbers of both losses. (n, d), (n, c)"""
         cuts = self._split(len(obs))
         numbers = [[torch.empty(0)] * len(cuts) for _ in range(2)]
         tasks = deque(itertools.product(range(2), enumerate(cuts)))
@@ -91,11 +95,11 @@ class MlpGradients:
             torch.sum(self._part_gradients[: len(cuts)], dim=0, out=self._sum)
             for gradient, transposed in zip(self._gradients, self._sum_views, strict=True):
                 gradient.copy_(transposed.t())
-            one, two = (torch.stack(values).sum(dim=0) for values in numbers)
-            return one, two
+            actor_numbers, critic_numbers = (torch.stack(values).sum(dim=0) for values in numbers)
+            return actor_numbers, critic_numbers
 
     def _split(self, rows: int) -> list[slice]:
-        """Return the parts of a minibatch, as even as possible."""
+        """Return the rows of each part of a minibatch; the parts are as even as possible."""
         parts = max(1, -(-rows // self._max_rows), min(_PARTS, 2 * rows // self._max_rows))
         ends = [rows * number // parts for number in range(parts + 1)]
         return [slice(start, end) for start, end in itertools.pairwise(ends)]
@@ -117,13 +121,12 @@ class _Passes:
         """Number of parameters."""
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return the outputs, valid until the next call. (n, d) -> (n, outputs)"""
+        """Return the outputs in memory that the next call overwrites. (n, d) -> (n, outputs)"""
         self._inputs, rows = [inputs], len(inputs)
         *hidden, last = self._weights
         self._outputs = []
-        for (weight, bias), linear, activation in zip(
-            hidden, self._linear_buffers, self._activation_buffers, strict=False
-        ):
+        buffers = zip(hidden, self._linear_buffers[:-1], self._activation_buffers[:-1], strict=True)
+        for (weight, bias), linear, activation in buffers:
             self._outputs.append(affine(inputs, weight, bias, out=linear[:rows]))
             inputs = activation[:rows]
             self._activation.forward(self._outputs[-1], inputs)
@@ -131,7 +134,7 @@ class _Passes:
         return affine(inputs, *last, out=self._linear_buffers[-1][:rows])
 
     def backward(self, gradient: Tensor, gradients: Sequence[Tensor]) -> None:
-        """Write the gradients of weights and biases from that of the outputs. (n, outputs)"""
+        """Write the gradients of weights and biases, given the gradient of the outputs. (n, outputs)"""
         for number in reversed(range(len(self._weights))):
             inputs = self._inputs[number]
             weight_gradient(inputs, gradient, gradients[2 * number])

@@ -1,4 +1,4 @@
-"""Checks of a learner for NaN and infinity: the first tensor in causal order that is not finite is named."""
+"""Checks of a learner for NaN and infinity. The error names the first tensor in causal order that is not finite."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ def require_finite(tensors: Iterable[tuple[str, Tensor]], iteration: int, axes: 
     """Check that all tensors are finite.
 
     Args:
-        tensors: name and values of each, in causal order.
+        tensors: names and values in causal order: each tensor after those that it is computed from.
         iteration: number of the iteration, for the message.
         axes: names of the leading axes, such as `("step", "environment")`.
 
     Raises:
-        DivergedError: with the first tensor that is not finite and the position of its first such value.
+        DivergedError: with the first tensor that is not finite and the index of its first such value.
     """
     for name, values in tensors:
         if is_finite(values):
             continue
         bad = ~values.isfinite()
-        place = bad.nonzero()[0].tolist() if bad.dim() else []
-        where = ", ".join(f"{axis} {index}" for axis, index in zip(axes, place, strict=False))
-        where = where or (f"first at [{', '.join(map(str, place))}]" if place else "")
+        index = bad.nonzero()[0].tolist() if bad.dim() else []
+        where = ", ".join(f"{axis} {number}" for axis, number in zip(axes, index, strict=False))
+        where = where or (f"first at [{', '.join(map(str, index))}]" if index else "")
         count = f" in {int(bad.sum())} of {bad.numel()} values" if bad.numel() > 1 else ""
         raise DivergedError(
-            f"{name} is not finite{count}{f' ({where})' if where else ''}, in iteration {iteration}; what comes before"
-            " it is",
+            f"{name} is not finite{count}{f' ({where})' if where else ''}, in iteration {iteration}; the tensors before"
+            " it are finite",
             hint=LEARNER_HINT,
         )
 
 
 def moments(normalizers: Iterable[tuple[str, Normalizer | None]]) -> list[tuple[str, Tensor]]:
-    """Return the running statistics of normalisers with their names."""
+    """Return the running statistics of normalisers with their names, for `require_finite`."""
     return [
         (f"the {name} normaliser's {moment}", getattr(normalizer, moment))
         for name, normalizer in normalizers
@@ -55,31 +55,29 @@ def moments(normalizers: Iterable[tuple[str, Normalizer | None]]) -> list[tuple[
 def require_finite_learner(
     metrics: Mapping[str, float], modules: Mapping[str, nn.Module], iteration: int, hint: str = LEARNER_HINT
 ) -> None:
-    """Check the metrics of an update, then all weights.
+    """Check that the metrics of an update and all weights are finite.
 
     Raises:
-        DivergedError: with the first that is not finite.
+        DivergedError: with the first metric or weight that is not finite.
     """
-    for name, value in metrics.items():
-        if not math.isfinite(value):
-            raise DivergedError(f"{name} is not finite in iteration {iteration}", hint=hint)
+    bad = [name for name, value in metrics.items() if not math.isfinite(value)]
     for part, module in modules.items():
-        for name, parameter in module.named_parameters():
-            if not is_finite(parameter):
-                raise DivergedError(f"weight '{part}.{name}' is not finite in iteration {iteration}", hint=hint)
+        bad += [f"weight '{part}.{name}'" for name, value in module.named_parameters() if not is_finite(value)]
+    if bad:
+        raise DivergedError(f"{bad[0]} is not finite in iteration {iteration}", hint=hint)
 
 
 class GradientWatch:
-    """Finds the first gradient that is not finite, and keeps it from the weights.
+    """Watch that finds the first gradient that is not finite, and does not let it change the weights.
 
     Args:
         module: the module whose gradients are checked.
-        optimizers: the optimisers of its parameters.
+        optimizers: optimisers of the parameters.
     """
 
     def __init__(self, module: nn.Module, optimizers: Iterable[torch.optim.Optimizer]) -> None:
         self.first: str | None = None
-        """Name of the parameter with that gradient; gradients are computed from the outputs backwards."""
+        """Name of the first parameter with such a gradient, in the order of the backward pass; None: all are finite."""
         for name, parameter in module.named_parameters():
             if parameter.requires_grad:
                 hook = functools.partial(self._check, name)
@@ -93,4 +91,4 @@ class GradientWatch:
 
     def _before_step(self, optimizer: torch.optim.Optimizer, args: object, kwargs: object) -> None:
         if self.first is not None:
-            optimizer.zero_grad(set_to_none=True)  # the run ends with the weights that gave this gradient
+            optimizer.zero_grad(set_to_none=True)  # without gradients the step changes no weight

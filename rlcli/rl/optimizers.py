@@ -1,4 +1,4 @@
-"""The state of optimisers as the flat tensors of a checkpoint; for authors of trainers."""
+"""State of optimisers as flat tensors for a checkpoint."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-_SLOTS = {
+_SLOTS = {  # tensors that each optimiser needs for a parameter
     "Adam": {"step", "exp_avg", "exp_avg_sq"},
     "AdamW": {"step", "exp_avg", "exp_avg_sq"},
     "RMSprop": {"step", "square_avg"},
@@ -17,10 +17,10 @@ _SLOTS = {
 
 
 class Adam(torch.optim.Adam):
-    """torch's Adam with the same results, which does not import torch's compiler.
+    """torch's Adam, with the same results, that does not import torch's compiler.
 
-    The first instance of torch's own class imports the compiler, which takes as long as importing torch, to keep it out
-    of four methods and to break its graphs around the step. rlcli compiles none of them.
+    The first instance of torch's own class imports the compiler to exclude five methods from compilation. That import
+    takes as long as importing torch. rlcli never compiles these methods, so here they are not wrapped.
     """
 
     step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))
@@ -31,12 +31,12 @@ class Adam(torch.optim.Adam):
 
 
 def below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Return the tensors whose names start with `prefix`, under their names without it."""
+    """Return the tensors whose names start with `prefix`, by their names without the prefix."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
-    """Return a copy of an optimiser's state, as PREFIX + index of the parameter + "." + slot."""
+    """Return a copy of an optimiser's state; the keys are PREFIX + index of the parameter + "." + slot."""
     return {
         f"{prefix}{number}.{slot}": torch.as_tensor(value).clone()
         for number, slots in optimizer.state_dict()["state"].items()
@@ -46,10 +46,10 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], prefix: str) -> None:
-    """Restore an optimiser's state from the tensors of a checkpoint; its settings stay.
+    """Restore an optimiser's state from the tensors of a checkpoint; settings such as the learning rate do not change.
 
     Raises:
-        ValueError: with the first value that is missing or of another shape.
+        ValueError: with the first tensor that is missing or has another shape.
     """
     state: dict[int, dict[str, Tensor]] = {}
     for name, value in below(tensors, prefix).items():
@@ -60,11 +60,11 @@ def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tenso
 
 
 def _require_slots(optimizer: torch.optim.Optimizer, state: Mapping[int, Mapping[str, Tensor]]) -> None:
-    """Check the shapes of an optimiser's state, which torch itself checks only in the next step."""
+    """Check the shapes of an optimiser's state; torch checks them only in the next step."""
     owned = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     for number, slots in state.items():
         if not 0 <= number < len(owned):
-            raise ValueError(f"trainer: the optimiser has no parameter {number}")
+            raise ValueError(f"trainer: the optimiser has no parameter {number}; it has {len(owned)}")
         parameter = owned[number]
         missing = _SLOTS.get(type(optimizer).__name__, set()) - set(slots)
         if missing:

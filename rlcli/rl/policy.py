@@ -1,4 +1,4 @@
-"""The policy as it is saved, played and exported: from raw observations to the actions that `env.step` takes."""
+"""Policy as it is saved, played and exported: it maps raw observations to the actions of `env.step`."""
 
 from __future__ import annotations
 
@@ -14,19 +14,23 @@ from rlcli.rl.cnn import Vision, VisionSpec
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 _LOG_STD_RANGE = (-20.0, 2.0)
-_MOST_BYTES = 2**31
+_MAX_BYTES = 2**31
 Width = Annotated[int, Field(ge=1, le=2**24)]
-"""Columns of a layer."""
+"""Number of columns of a layer."""
 Layers = Annotated[list[Width], Field(max_length=100)]
-"""Widths of layers."""
+"""Width of each layer."""
 
 
 class PolicySpec(BaseModel):
     """Structure of a policy: everything but its weights.
 
-    Kinds: `gaussian-mlp`, a mean with a state-independent deviation, clipped to the bound; `gaussian-lstm`, the same
-    behind a memory; `gaussian-cnn`, the same behind convolutions over pictures; `squashed-gaussian-mlp`, mean and
-    deviation from the state, tanh times the bound; `deterministic-mlp`, tanh times the bound.
+    The kinds are:
+
+    - `gaussian-mlp`: a mean and a state-independent standard deviation; actions are clipped to the bound;
+    - `gaussian-lstm`: `gaussian-mlp` behind an LSTM;
+    - `gaussian-cnn`: `gaussian-mlp` behind a CNN over the images of the observation;
+    - `squashed-gaussian-mlp`: mean and standard deviation depend on the state; actions are tanh times the bound;
+    - `deterministic-mlp`: actions are tanh times the bound.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -42,39 +46,40 @@ class PolicySpec(BaseModel):
     action_bound: PositiveFloat | None
     normalize: bool = False
     normalize_clip: PositiveFloat | None = 10.0
-    """Normalised observations are clipped to +-this; null: they are not."""
+    """Normalised observations are clipped to +-this value; null: no clipping."""
     log_std_range: tuple[float, float] | None = None
-    """Of a squashed-gaussian-mlp: tanh maps the logarithm of the deviation into this; null: it is clamped."""
+    """For a squashed-gaussian-mlp: tanh maps the log standard deviation into this range; null: it is clamped to
+    [-20, 2]."""
     memory: Layers = []
-    """Cells of each layer of the memory."""
+    """Number of cells of each LSTM layer; empty: no LSTM."""
     vision: VisionSpec | None = None
-    """Convolutions, and the pictures that they see."""
+    """CNN and the images that it reads; null: no CNN."""
 
     @model_validator(mode="after")
     def _bounded(self) -> PolicySpec:
         if not self.kind.startswith("gaussian-") and self.action_bound is None:
-            raise ValueError(f"a {self.kind} needs an action_bound")
+            raise ValueError(f"kind {self.kind} needs an action_bound")
         if (self.kind == "gaussian-lstm") != bool(self.memory):
-            raise ValueError("memory belongs to a gaussian-lstm, and a gaussian-lstm needs it")
+            raise ValueError("memory must be given for kind gaussian-lstm, and only for it")
         if (self.kind == "gaussian-cnn") != (self.vision is not None):
-            raise ValueError("vision belongs to a gaussian-cnn, and a gaussian-cnn needs it")
+            raise ValueError("vision must be given for kind gaussian-cnn, and only for it")
         if self.vision is not None and self.vision.stop > self.observation_size:
-            raise ValueError("a picture lies outside of the observation")
+            raise ValueError("an image lies outside of the observation")
         return self
 
 
 class Normalizer(nn.Module):
     """Running mean and variance of observations, merged batch by batch (Chan, Golub and LeVeque 1979).
 
-    It is part of the policy: frozen outside of training, and exported with it.
+    It is a part of the policy: it is exported with the policy, and changes only in training.
 
     Args:
-        size: columns.
-        clip: normalised observations are clipped to +-this; None: they are not.
+        size: number of columns.
+        clip: normalised observations are clipped to +-this value; None: no clipping.
     """
 
     EPSILON = 1e-8
-    """Added to the variance."""
+    """Number added to the variance before the square root."""
 
     mean: Tensor
     var: Tensor
@@ -102,6 +107,7 @@ class Normalizer(nn.Module):
         """Update the statistics with the mean and the variance of `count` samples. (d,)"""
         total = self.count + count
         delta = mean - self.mean
+        # Chan, Golub and LeVeque 1979, equation 2.1b: sums of squares add up, plus delta^2 n_a n_b / (n_a + n_b)
         spread = self.var * self.count + var * count + delta.square() * self.count * count / total
         self.mean += delta * count / total
         self.var.copy_(spread / total)
@@ -109,14 +115,14 @@ class Normalizer(nn.Module):
 
 
 class WideLinear(nn.Linear):
-    """A linear layer with float32 weights that computes in float64.
+    """Linear layer with float32 weights that computes in float64.
 
-    The order in which a runtime adds up then does not show in a float32 action, however far an observation lies from
-    those of training: batches of any size and exported graphs agree.
+    Runtimes add products in different orders. In float64 the difference is too small to change a float32 action, also
+    for observations far from those of training. So batches of any size and exported graphs agree.
     """
 
     def forward(self, x: Tensor) -> Tensor:
-        """(n, in) -> (n, out) float64"""
+        """Return the outputs. (n, in) -> (n, out) float64"""
         return nn.functional.linear(x.double(), self.weight.double(), self.bias.double())
 
 
@@ -124,7 +130,7 @@ class Lstm(nn.Module):
     """Long short-term memory (Hochreiter and Schmidhuber 1997), one step at a time.
 
     Args:
-        inputs: columns of the input.
+        inputs: number of input columns.
         cells: number of cells of each layer.
         wide: compute in float64, as `WideLinear` does.
     """
@@ -136,7 +142,7 @@ class Lstm(nn.Module):
         self.cells, self.dtype = list(cells), torch.float64 if wide else torch.float32
 
     def blank(self, rows: int) -> Tensor:
-        """Return zero hidden states: output and cell state of each layer. (rows, 2 x cells of all layers)"""
+        """Return zero hidden states: for each layer the output, then the cell state. (rows, 2 x cells of all layers)"""
         return torch.zeros(rows, 2 * sum(self.cells), dtype=self.dtype, device=next(self.parameters()).device)
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
@@ -151,10 +157,10 @@ class Lstm(nn.Module):
 
 
 class Policy(nn.Module):
-    """Multilayer perceptron with observation normaliser, LSTM or CNN, and action bound.
+    """Multilayer perceptron with optional observation normaliser, LSTM or CNN, and action bound.
 
     Args:
-        spec: its structure.
+        spec: structure of the policy.
     """
 
     def __init__(self, spec: PolicySpec) -> None:
@@ -174,14 +180,14 @@ class Policy(nn.Module):
             self.log_std_head = WideLinear(spec.hidden[-1] if spec.hidden else spec.observation_size, spec.action_size)
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Return the deterministic action; with an LSTM, that of an episode's first step.
+        """Return the deterministic action; a policy with an LSTM acts as in the first step of an episode.
 
         (n, observation_size) -> (n, action_size)
         """
         return self.step(obs, None)[0]
 
     def sample(self, obs: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return a sampled action; that of a deterministic policy is its only one.
+        """Return a sampled action; a deterministic policy returns its deterministic action.
 
         (n, observation_size) -> (n, action_size)
         """
@@ -194,9 +200,18 @@ class Policy(nn.Module):
         *,
         stochastic: bool = False,
         generator: torch.Generator | None = None,
+        noise_repeats: int = 1,
     ) -> tuple[Tensor, Tensor | None]:
-        """Return the action and the next hidden state. (n, observation_size) -> (n, action_size)"""
-        inputs = self._normalized(obs)
+        """Return the action, (n, action_size), and the next hidden state, (n, m) or None.
+
+        Args:
+            obs: raw observations. (n, observation_size)
+            memory: hidden state, or None at the start of an episode. (n, m)
+            stochastic: sample the action instead of taking the mean.
+            generator: source of the noise; None: torch's global generator.
+            noise_repeats: sample noise for the first n / noise_repeats rows and repeat it for the others.
+        """
+        inputs = obs if self.normalizer is None else self.normalizer(obs)
         if self.memory is not None:
             inputs, memory = self.memory(inputs, self.memory.blank(len(obs)) if memory is None else memory)
         if self.vision is not None:
@@ -205,11 +220,10 @@ class Policy(nn.Module):
         mean = self.actor[-1](features).float()
         if not stochastic or self.spec.kind == "deterministic-mlp":
             return self._bounded(mean), memory
-        noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+        rows, columns = mean.shape
+        noise = torch.randn(rows // noise_repeats, columns, generator=generator, device=mean.device)
+        noise = noise.repeat(noise_repeats, 1)
         return self._bounded(mean + self._log_std(features).exp() * noise), memory
-
-    def _normalized(self, obs: Tensor) -> Tensor:
-        return obs if self.normalizer is None else self.normalizer(obs)
 
     def _log_std(self, features: Tensor) -> Tensor:
         if self.spec.kind.startswith("gaussian-"):
@@ -224,12 +238,12 @@ class Policy(nn.Module):
         bound = self.spec.action_bound
         if not self.spec.kind.startswith("gaussian-"):
             assert bound is not None
-            action = torch.tanh(action) * bound  # some runtimes' tanh exceeds 1 by a rounding error
+            action = torch.tanh(action) * bound  # clamped below: in some runtimes tanh exceeds 1 by a rounding error
         return action if bound is None else action.clamp(-bound, bound)
 
 
 def mlp(inputs: int, hidden: list[int], outputs: int, activation: str) -> nn.Sequential:
-    """Return linear layers with activations between them, in float64."""
+    """Return linear layers that compute in float64, with activations between them."""
     layers: list[nn.Module] = []
     for width in hidden:
         layers += [WideLinear(inputs, width), ACTIVATIONS[activation]()]
@@ -238,16 +252,16 @@ def mlp(inputs: int, hidden: list[int], outputs: int, activation: str) -> nn.Seq
 
 
 def load_policy(spec: Mapping[str, object], weights: Mapping[str, Tensor]) -> Policy:
-    """Return a policy from a checkpoint's `policy.json` and `policy.safetensors`, ready to act.
+    """Return a policy in evaluation mode from the content of `policy.json` and `policy.safetensors`.
 
     Raises:
-        CheckpointError: if the weights do not fit the structure, or a weight is not finite.
+        CheckpointError: if the specification is not valid, the weights do not fit it, or a weight is not finite.
     """
     return filled(blank_policy(spec), weights)
 
 
 def blank_policy(spec: Mapping[str, object]) -> Policy:
-    """Return a policy without weights, so that a file cannot cause an allocation larger than itself.
+    """Return a policy without weights, on the meta device: a small untrusted file cannot cause a large allocation.
 
     Raises:
         CheckpointError: if the specification is not valid.
@@ -256,13 +270,13 @@ def blank_policy(spec: Mapping[str, object]) -> Policy:
         checked = PolicySpec.model_validate(spec)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
-        place = ".".join(map(str, first["loc"])) or "all"
-        raise CheckpointError(f"policy.json does not describe a policy: {place[:80]}: {first['msg']}") from None
+        key = ".".join(map(str, first["loc"])) or "all"
+        raise CheckpointError(f"policy.json does not describe a policy: {key[:80]}: {first['msg']}") from None
     with torch.device("meta"):
         policy = Policy(checked)
-    if size_of(policy) > _MOST_BYTES:
+    if size_of(policy) > _MAX_BYTES:
         raise CheckpointError(
-            f"policy.json describes a policy of {size_of(policy):,} bytes; {_MOST_BYTES:,} are allowed"
+            f"policy.json describes a policy of {size_of(policy):,} bytes; at most {_MAX_BYTES:,} are allowed"
         )
     return policy
 
@@ -273,28 +287,25 @@ def size_of(policy: Policy) -> int:
 
 
 def filled(policy: Policy, weights: Mapping[str, Tensor]) -> Policy:
-    """Load weights into a policy without weights; return it ready to act.
+    """Load weights into the result of `blank_policy`; return the policy in evaluation mode.
 
     Raises:
-        CheckpointError: if they do not fit, or a weight is not finite.
+        CheckpointError: if the weights do not fit, or a weight is not finite.
     """
-    expected = {name: tuple(value.shape) for name, value in policy.state_dict().items()}
-    found = {name: tuple(value.shape) for name, value in weights.items()}
+    expected, found = _types_and_shapes(policy.state_dict()), _types_and_shapes(weights)
     if expected != found:
         differs = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
-        raise CheckpointError(
-            "policy.safetensors does not fit policy.json: "
-            + ", ".join(
-                f"{n[:80]} is {found.get(n, 'missing')}, expected {expected.get(n, 'nothing')}" for n in differs[:4]
-            )
-        )
-    kinds = {name: value.dtype for name, value in policy.state_dict().items()}
+        rows = [f"{n[:80]} is {found.get(n, 'missing')}, expected {expected.get(n, 'nothing')}" for n in differs[:4]]
+        raise CheckpointError(f"policy.safetensors does not fit policy.json: {', '.join(rows)}")
     for name, value in weights.items():
-        if value.dtype != kinds[name]:
-            raise CheckpointError(f"policy.safetensors: '{name}' is {value.dtype}, expected {kinds[name]}")
         if not bool(value.isfinite().all()):
-            raise CheckpointError(f"policy.safetensors: '{name}' holds values that are not finite")
+            raise CheckpointError(f"policy.safetensors: '{name}' has values that are not finite")
         if name in ("normalizer.var", "normalizer.count") and bool((value < 0).any()):
             raise CheckpointError(f"policy.safetensors: '{name}' is negative")
     policy.load_state_dict(dict(weights), assign=True)
     return policy.eval().requires_grad_(False)
+
+
+def _types_and_shapes(tensors: Mapping[str, Tensor]) -> dict[str, str]:
+    """Return the type and the shape of each tensor as text, such as `float32 (64, 4)`."""
+    return {name: f"{str(t.dtype).removeprefix('torch.')} {tuple(t.shape)}" for name, t in tensors.items()}

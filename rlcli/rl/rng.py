@@ -1,4 +1,4 @@
-"""The global random generators of torch, numpy and Python: seeded together, and saved as tensors of a checkpoint."""
+"""Seeds and states of the global random generators of torch, numpy and Python."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from rlcli.sim.tensor_state import require_in_range, require_matching_tensors
 
 
 def seed_generators(seed: int) -> None:
-    """Seed all three: a task may use any of them, and torch's networks use torch's."""
+    """Seed the global generators of torch, numpy and Python."""
     torch.manual_seed(seed)
     np.random.seed(seed % 2**32)
     random.seed(seed)
 
 
 def rng_state() -> dict[str, Tensor]:
-    """Return the states of the global generators of torch, numpy and Python."""
+    """Return the states of the global generators of torch, numpy and Python as tensors of a checkpoint."""
     kind, keys, position, has_gauss, gauss = np.random.get_state()
     assert kind == "MT19937"
     version, words, next_gauss = random.getstate()
@@ -38,7 +38,7 @@ def rng_state() -> dict[str, Tensor]:
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """Run with one torch thread; restore the generators and the number of threads at the end."""
+    """Run the block with one torch thread; then restore the generators and the number of threads."""
     rng, threads = rng_state(), torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -56,16 +56,14 @@ def load_rng_state(state: Mapping[str, Tensor]) -> None:
         ValueError: if a tensor is not the state of a generator.
     """
     require_matching_tensors(state, rng_state(), "rng")
-    require_in_range(
-        state["numpy.position"][:1], 0, len(state["numpy.keys"]), "numpy.position"
-    )  # numpy does not check it
-    require_in_range(state["numpy.position"][1:], 0, 1, "numpy.position")
+    position, has_gauss = state["numpy.position"]
+    require_in_range(position, 0, len(state["numpy.keys"]), "numpy.position")  # numpy does not check it
+    require_in_range(has_gauss, 0, 1, "numpy.position")
     for name in ("numpy.keys", "python.words"):
         require_in_range(state[name], 0, 2**32 - 1, name)
     torch.set_rng_state(state["torch"])
-    position, has_gauss = state["numpy.position"].tolist()
     keys = state["numpy.keys"].numpy().astype(np.uint32)
-    np.random.set_state(("MT19937", keys, position, has_gauss, float(state["numpy.gauss"])))
+    np.random.set_state(("MT19937", keys, int(position), int(has_gauss), float(state["numpy.gauss"])))
     version, *words = state["python.words"].tolist()
     gauss = float(state["python.gauss"])
     random.setstate((version, tuple(words), None if math.isnan(gauss) else gauss))

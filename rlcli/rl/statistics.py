@@ -1,4 +1,4 @@
-"""Statistics of finished episodes, under RSL-RL's metric names, so that its dashboards can be used."""
+"""Statistics of finished episodes, with the metric names of RSL-RL, so that its dashboards can be used."""
 
 from __future__ import annotations
 
@@ -13,15 +13,21 @@ from rlcli.rl.distributed import ProcessGroup
 
 
 class EpisodeStatistics:
-    """Statistics of an iteration's episodes; returns and lengths are means over the last iterations with 100 episodes.
+    """Statistics of the finished episodes of an iteration.
 
-    `Episode_Reward/<term>` is the mean episodic sum over the episode's full length in seconds (Isaac Lab's
-    definition); `Episode_Termination/<term>` the share of episodes at whose end the term had fired;
-    `Metrics/<command>/<metric>` the mean of episodes' means. Sums stay on the device of the episodes, so that adding
-    to them never synchronises with it.
+    `Train/*` are means over the last iterations that together have at least `WINDOW` episodes. The other metrics are
+    of one iteration:
+
+    - `Episode_Reward/<term>`: mean sum of the term over an episode, divided by the full episode length [s] (Isaac
+      Lab's definition);
+    - `Episode_Termination/<term>`: share of the episodes that the term ended;
+    - `Metrics/<command>/<metric>`: mean of the means of the episodes.
+
+    Sums stay on the device of the episodes, so that adding to them forces no host sync.
     """
 
     WINDOW = 100
+    """Smallest number of episodes of `Train/*`."""
 
     def __init__(self, episode_length_s: float) -> None:
         self._episode_length_s = episode_length_s
@@ -30,7 +36,7 @@ class EpisodeStatistics:
         self.total = 0
 
     def add(self, episodes: Episodes | None) -> None:
-        """Add the episodes that a step finished."""
+        """Add the episodes that ended in a step."""
         if episodes is None:
             return
         values = {"return": episodes.returns, **{f"term.{k}": v for k, v in episodes.reward_terms.items()}}
@@ -39,30 +45,25 @@ class EpisodeStatistics:
         if episodes.success is not None:
             flags["success"] = episodes.success
         flags["count"] = torch.ones_like(episodes.truncated) if episodes.mask is None else episodes.mask
-        matrix = torch.cat(
-            [
-                torch.stack(list(values.values())),
-                torch.stack(list(flags.values())).float(),
-                episodes.lengths.float()[None],
-            ]
-        )
+        parts = [torch.stack(list(values.values())), torch.stack(list(flags.values())).float()]
+        matrix = torch.cat([*parts, episodes.lengths.float()[None]])  # (statistics, episodes)
         weight = torch.ones(matrix.shape[1]) if episodes.mask is None else episodes.mask.float()
         names = ",".join([*values, *flags, "length"])
         if names not in self._sums:
-            with torch.inference_mode(False):  # `flush` writes to it where there is no such mode
+            with torch.inference_mode(False):  # `flush` may write to it outside of inference mode
                 self._sums[names] = torch.zeros(len(matrix), dtype=torch.float32, device=matrix.device)
         self._sums[names].addmv_(matrix, weight)
 
     def all_reduce(self, process_group: ProcessGroup) -> None:
-        """Sum the episodes of all processes, once an episode has ended in each of them."""
+        """Sum the statistics over all processes, once an episode has ended in each of them."""
         own = len(self._sums)
-        (everywhere,) = process_group.sum(own)
-        if own and everywhere == own * process_group.world_size:
+        (total,) = process_group.sum(own)
+        if own and total == own * process_group.world_size:
             for values in self._sums.values():
                 process_group.average_(values).mul_(process_group.world_size)
 
     def flush(self) -> dict[str, float]:
-        """Return the metrics of the iteration and reset its sums; a mean over no episode is left out."""
+        """Return the metrics of the iteration and reset its sums; without an episode a mean is left out."""
         sums: dict[str, float] = {}
         for names, values in self._sums.items():
             for name, value in zip(names.split(","), values.tolist(), strict=True):
@@ -77,13 +78,13 @@ class EpisodeStatistics:
         return {**self._means(), **self._episode_means(sums, count)}
 
     def state(self) -> dict[str, Any]:
-        """Return the recent iterations as plain JSON; between iterations there is no other state."""
+        """Return the sums of the recent iterations as plain JSON; between iterations there is no other state."""
         return {"recent": [list(row) for row in self._recent], "total": self.total}
 
     def load(self, state: dict[str, Any]) -> None:
         """Restore the state returned by `state()`."""
         for pending in self._sums.values():
-            pending.zero_()  # in place: a captured graph adds to these tensors
+            pending.zero_()  # in place: a CUDA graph adds to these tensors
         self._recent = deque(list(row) for row in state["recent"])
         self.total = state["total"]
 

@@ -1,4 +1,4 @@
-"""The protocol between the training loop and a trainer, and the data that they exchange."""
+"""Protocol between the training loop and a trainer, and the data that they exchange."""
 
 from __future__ import annotations
 
@@ -14,71 +14,77 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """The newest rows of data that only grows, such as a replay buffer; each row is written to the disk once."""
+    """Newest rows of data that only grows, such as a replay buffer. Each row is written to the disk once."""
 
     first: int
-    """The oldest row that is still needed, counted from the first row ever stored."""
+    """Index of the oldest row that is still needed. Row 0 is the first row ever stored."""
     stop: int
-    """One after the newest."""
+    """Index after the newest row."""
     read: Callable[[int, int], dict[str, Tensor]]
-    """read(start, stop) returns copies of rows by column, as they were at the boundary. (stop - start, ...)"""
+    """read(start, stop) returns copies of the rows, as they were when the state was taken, by column name.
+    (stop - start, ...) each"""
 
 
 @dataclass(slots=True)
 class TrainerState:
-    """State from which training continues exactly: tensors by file, plain JSON, and rows by the name of their log."""
+    """State of a trainer, from which training continues exactly."""
 
     tensors: dict[str, dict[str, Tensor]] = field(default_factory=dict)
+    """File of the checkpoint, without its suffix -> name -> tensor."""
     values: dict[str, Any] = field(default_factory=dict)
+    """Plain JSON."""
     logs: dict[str, Rows] = field(default_factory=dict)
+    """Name of a log -> its rows."""
 
 
 @dataclass(slots=True)
 class Report:
-    """Results of one iteration: metrics by name, and the seconds it took by part."""
+    """Results of one iteration."""
 
     metrics: dict[str, float]
+    """Name -> value."""
     seconds: dict[str, float]
+    """Part of the iteration, such as physics or update -> duration [s]."""
 
 
 class Trainer(Protocol):
-    """Learner in a `VecEnv`; between two iterations its state can be saved and restored exactly."""
+    """Learner in a `VecEnv`. Between two iterations its state can be saved and restored exactly."""
 
     @property
     def iteration(self) -> int:
-        """Iterations done."""
+        """Number of finished iterations."""
         ...
 
     @property
     def steps_per_iteration(self) -> int:
-        """Environment steps of an iteration, over all environments."""
+        """Environment steps of an iteration, over all environments and processes."""
         ...
 
     @property
     def env_steps(self) -> int:
-        """Environment steps taken, over all environments."""
+        """Environment steps so far, over all environments and processes."""
         ...
 
     def start(self) -> None:
-        """Reset the environment; called once, before the first iteration of a run that is not resumed."""
+        """Reset the environment. It is called once, before the first iteration of a run that is not resumed."""
         ...
 
     def iterate(self) -> Report:
-        """Collect experience and update once."""
+        """Do one iteration: collect experience, then update."""
         ...
 
     def policy(self) -> Policy:
-        """Return the policy as it is now, with weights of its own."""
+        """Return the current policy, with a copy of the weights."""
         ...
 
     def state(self) -> TrainerState:
-        """Return a copy of the state; the rows of its logs may be read until the end of the next iteration."""
+        """Return a copy of the state; the rows of its logs can be read until the end of the next iteration."""
         ...
 
     def load(self, state: TrainerState) -> None:
-        """Restore a state."""
+        """Restore the state returned by `state()`."""
         ...
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load only the policy's weights (`--init-from`)."""
+        """Load the weights of a policy and nothing else (`--init-from`)."""
         ...

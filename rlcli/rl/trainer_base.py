@@ -1,4 +1,4 @@
-"""Base class of trainers: what every trainer does in the same way, whichever library learns."""
+"""Base class of trainers, and helpers that trainers of all libraries share."""
 
 from __future__ import annotations
 
@@ -17,18 +17,20 @@ from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.trainer import Report
 
 _RECENT_OBS = 256
-"""Recent observations that a checkpoint keeps, for comparing an exported policy with the trained one."""
+"""Number of observations in a checkpoint, on which an exported policy is compared with the trained one."""
 
 
 class BaseTrainer(ABC):
-    """Environment, episode statistics, recent observations and report of a trainer.
+    """Trainer with an environment, episode statistics, recent observations and a report.
 
     Args:
         env: the environment.
-        torch_threads: threads of the update; the rollout runs torch on one thread, since two thread pools compete.
+        torch_threads: threads of torch in the update. In the rollout torch has one thread, so that its thread pool does
+            not compete with the engine's.
     """
 
     spec: PolicySpec
+    """Structure of the policy."""
 
     def __init__(self, env: VecEnv, torch_threads: int) -> None:
         self.env, self.torch_threads = env, torch_threads
@@ -41,28 +43,28 @@ class BaseTrainer(ABC):
         """Return copies of the policy's weights, by their names in a saved policy."""
 
     def policy(self) -> Policy:
-        """Return the deployable policy as it is now, with weights of its own."""
+        """Return the current policy, ready to be deployed, with a copy of the weights."""
         policy = Policy(self.spec)
         policy.load_state_dict(self._policy_tensors())
         return policy.eval().requires_grad_(False)
 
     def _keep_recent_obs(self, obs: Tensor) -> None:
-        """Put the newest observations of the policy before the recent ones. (num_envs, d)"""
+        """Keep the newest observations of the policy. (num_envs, d)"""
         self._recent_obs = torch.cat([obs[:_RECENT_OBS], self._recent_obs])[:_RECENT_OBS]
 
     def _split_seconds(self, before: Mapping[str, float], rollout: float, update: float) -> dict[str, float]:
-        """Return the seconds of an iteration by part.
+        """Return the duration of each part of an iteration [s].
 
         Args:
             before: `env.seconds` at the beginning of the iteration.
-            rollout: seconds of the rollout.
-            update: seconds of the update.
+            rollout: duration of the rollout [s].
+            update: duration of the update [s].
         """
         physics, step = (self.env.seconds[name] - before[name] for name in ("physics", "step"))
         return {"physics": physics, "task": step - physics, "policy": rollout - step, "update": update}
 
     def _report(self, losses: Mapping[str, float], seconds: dict[str, float]) -> Report:
-        """Return the report of an iteration: episode statistics, the task's own numbers and the losses."""
+        """Return the report of an iteration: episode statistics, metrics of the task and losses."""
         return Report({**self.statistics.flush(), **finite_values(self.env.extras()), **losses}, seconds)
 
 
@@ -81,9 +83,9 @@ def require_library(trainer: str, needed: str, at_least: tuple[int, int], below:
 
     Args:
         trainer: name of the trainer.
-        needed: the requirement, as pip reads it.
-        at_least: lowest version, major and minor.
-        below: lowest version that is too new.
+        needed: the requirement in pip's form.
+        at_least: lowest allowed version (major, minor).
+        below: lowest version (major, minor) that is too new.
 
     Raises:
         DependencyError: if the library is missing or has another version.

@@ -1,1 +1,1 @@
-"""Training: from a configuration or a saved run to finished checkpoints."""
+"""One training, from a configuration or a saved run to the last checkpoint."""

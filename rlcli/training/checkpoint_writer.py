@@ -1,9 +1,8 @@
-"""Writer of checkpoints: in the background, each one complete or absent, and old ones removed."""
+"""Writer of checkpoints: it works in the background, writes each checkpoint completely or not at all, and prunes."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import secrets
 import shutil
@@ -11,7 +10,7 @@ import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import safetensors.torch
 from torch import Tensor
@@ -23,35 +22,40 @@ from rlcli.rl.trainer import Rows, TrainerState
 from rlcli.runs.atomic_io import disk_error, sync_folder, to_json, write_atomic, write_synced
 from rlcli.runs.checkpoint import FORMAT, LOG_FOLDER, Checkpoint, Shard, open_checkpoint, sha256, steps
 
+if TYPE_CHECKING:
+    from rlcli.envs.layout import Layout
+    from rlcli.runs.run import Run
+
 _SHARD_BYTES = 64 << 20
-_CLOCKED = 10
-"""Checkpoints kept by default if the time decides when to save."""
+"""Largest size of a file with rows of a log [bytes]."""
+_DEFAULT_LAST = 10
+"""Number of newest checkpoints to keep by default if the time decides when to save."""
 
 
 @dataclass(frozen=True, slots=True)
 class Keep:
-    """Which checkpoints stay: the first, the best and the newest always do."""
+    """Rule for the checkpoints to keep; the first, the best and the newest are always kept."""
 
     last: int | None = None
-    """How many of the newest; None: all."""
+    """Number of newest checkpoints to keep; None: all."""
     every: int | None = None
-    """Those of every k-th iteration as well."""
+    """Keep also the checkpoint of every `every`-th iteration; None: no others."""
 
     @staticmethod
-    def of(last: int | None, every: int | None, save_interval: int | None) -> Keep:
-        """Return the agent's choice: without a number, all checkpoints at `save_interval` stay, else the newest few."""
-        return Keep(_CLOCKED if last is None and save_interval is None else last, every)
+    def from_settings(last: int | None, every: int | None, save_interval: int | None) -> Keep:
+        """Return the rule for the agent's settings; without `last` all checkpoints of a `save_interval` are kept."""
+        return Keep(_DEFAULT_LAST if last is None and save_interval is None else last, every)
 
 
 class CheckpointWriter:
-    """Writer of a run's checkpoints in a background thread: training waits only for the copies in memory.
+    """Writer of a run's checkpoints in a background thread. Training waits only for the copies in memory.
 
     Args:
         checkpoints: the run's folder of checkpoints.
-        keep: which of them stay.
-        manifest: further JSON-able entries of every manifest.
-        resumed: the checkpoint that training goes on from; rows of logs that it has are not written again.
-        cases: keeps ends of episodes, which are written with each checkpoint.
+        keep: rule for the checkpoints to keep.
+        manifest: further JSON entries of every manifest.
+        resumed: checkpoint from which training continues; the rows of its logs are not written again.
+        cases: recorder of failed episodes, which are written with each checkpoint.
     """
 
     def __init__(
@@ -65,9 +69,9 @@ class CheckpointWriter:
     ) -> None:
         self.checkpoints, self.cases = checkpoints, cases
         self.best: int | None = None
-        """Environment steps of the checkpoint with the best evaluation."""
+        """Environment steps of the checkpoint with the best evaluation; None: no evaluation yet."""
         self.newest: tuple[int, int] | None = None if resumed is None else (resumed.iteration, resumed.step)
-        """Iteration and environment steps of the newest checkpoint, which may still be being written."""
+        """Iteration and environment steps of the newest checkpoint. Its writing may not be finished."""
         self.written = self.newest
         """Iteration and environment steps of the newest checkpoint on the disk."""
         self._keep, self._manifest = keep, dict(manifest)
@@ -81,12 +85,12 @@ class CheckpointWriter:
         return any(every and iteration % every == 0 for every in (save_interval, self._keep.every))
 
     def save(self, state: TrainerState, iteration: int, step: int) -> None:
-        """Copy the new rows, and write the checkpoint in the background after the one that is being written.
+        """Wait for the previous checkpoint, copy the new rows of logs, and write the checkpoint in the background.
 
         Raises:
-            MachineError: if the disk refused the checkpoint before, or the folder is gone.
+            MachineError: if the previous checkpoint could not be written.
         """
-        self.wait()  # the thread notes which rows are written
+        self.wait()  # first: the thread changes the list of written rows
         fresh = {name: self._copy_new(name, rows) for name, rows in state.logs.items()}
         self.newest = (iteration, step)
         arguments = (state, fresh, iteration, step, None if self.cases is None else self.cases.take(step))
@@ -94,7 +98,7 @@ class CheckpointWriter:
         self._thread.start()
 
     def save_cases(self, iteration: int, step: int) -> None:
-        """Write the recorded episodes of an iteration that failed: no checkpoint comes after it."""
+        """Write the recorded episodes of a failed iteration, after which there is no checkpoint."""
         if self.cases is not None:
             self.cases.commit(iteration, step)
             batch = self.cases.take(step)
@@ -105,7 +109,7 @@ class CheckpointWriter:
         """Block until everything is on the disk.
 
         Raises:
-            MachineError: if the disk refused.
+            MachineError: if the checkpoint could not be written.
         """
         if self._thread is not None:
             self._thread.join()
@@ -115,17 +119,18 @@ class CheckpointWriter:
             raise failure
 
     def check(self) -> None:
-        """Raise the error of the background thread, if there was one."""
+        """Raise the error of the background thread, if it had one."""
         if self._failure is not None:
             self.wait()
 
     def _copy_new(self, name: str, rows: Rows) -> list[tuple[int, int, dict[str, Tensor]]]:
+        """Return copies of the rows that are in no file yet, one (start, stop, columns) for each new file."""
         start = max(rows.first, self._copied.get(name, 0))
         if start >= rows.stop:
             return []
         self._copied[name] = rows.stop
-        one = rows.read(start, start + 1)
-        count = max(1, _SHARD_BYTES // max(1, sum(value.nbytes for value in one.values())))
+        row = rows.read(start, start + 1)
+        count = max(1, _SHARD_BYTES // max(1, sum(value.nbytes for value in row.values())))
         parts = [(at, min(at + count, rows.stop)) for at in range(start, rows.stop, count)]
         return [(*part, rows.read(*part)) for part in parts]
 
@@ -139,7 +144,7 @@ class CheckpointWriter:
     ) -> None:
         try:
             if self.cases is not None and batch is not None:
-                self.cases.write(batch)  # before the checkpoint: what is there too early is removed on resuming
+                self.cases.write(batch)  # before the checkpoint: a resumed run removes episodes without one
             logs = {name: self._write_rows(name, state.logs[name], parts) for name, parts in fresh.items()}
             extra = {**self._manifest, "iteration": iteration, **({"logs": logs} if logs else {})}
             write_checkpoint(self.checkpoints, step, state, extra)
@@ -157,8 +162,8 @@ class CheckpointWriter:
             data = safetensors.torch.save({column: value.contiguous() for column, value in columns.items()})
             shard = Shard(start=start, stop=stop, size=len(data), sha256=sha256(data))
             try:
-                for own in (folder.parent, folder):  # not what they lie in: a run that has vanished is not made again
-                    own.mkdir(exist_ok=True)
+                for path in (folder.parent, folder):  # not `parents=True`: a deleted run must not be created again
+                    path.mkdir(exist_ok=True)
             except OSError as error:
                 raise disk_error(folder, error) from error
             write_atomic(folder / shard.file, data)
@@ -169,22 +174,42 @@ class CheckpointWriter:
         return {"first": rows.first, "stop": rows.stop, "shards": [shard.model_dump() for shard in shards]}
 
 
+def manifest_entries(run: Run, trainer: str, layout: Layout, deployment: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries of a manifest that all checkpoints of a run share.
+
+    Args:
+        run: the run.
+        trainer: name of the trainer, or of the format of an imported policy.
+        layout: layout of observations and actions.
+        deployment: description of the environment for deployment (`rlcli.deploy.env_description`).
+    """
+    return {
+        **{key: run.record[key] for key in ("task", "agent", "seed")},
+        "trainer": trainer,
+        "layout": layout.record(),
+        "deployment": deployment,
+        "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
+    }
+
+
 def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: Mapping[str, Any]) -> Path:
-    """Write one checkpoint: into a temporary folder, every file synced, the manifest last, then one rename.
+    """Write one checkpoint atomically and return its folder.
+
+    All files are written and synced in a temporary folder, the manifest last. Then the folder is renamed.
 
     Args:
         checkpoints: the run's folder of checkpoints.
         step: environment steps.
-        state: the trainer's state.
-        extra: further JSON-able entries of the manifest.
+        state: state of the trainer.
+        extra: further JSON entries of the manifest.
 
     Raises:
-        MachineError: if the disk refuses or the folder is gone; nothing half-written is left.
+        MachineError: if the checkpoint cannot be written; no part of it is left.
     """
     target = checkpoints / f"{step:012d}"
     if target.exists():
         return target
-    temporary = checkpoints / f".tmp-{os.getpid()}-{secrets.token_hex(4)}"
+    temporary = _temporary_folder(checkpoints)
     files: dict[str, dict[str, Any]] = {}
 
     def put(name: str, data: bytes) -> None:
@@ -195,9 +220,9 @@ def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: M
         temporary.mkdir()
         put("policy.json", to_json(state.values["policy"]).encode())
         put("state.json", to_json(state.values).encode())
-        for part, values_of in state.tensors.items():
-            tensors = {name: value.detach().contiguous() for name, value in values_of.items()}
-            put(f"{part}.safetensors", safetensors.torch.save(tensors))
+        for part, tensors in state.tensors.items():
+            contiguous = {name: value.detach().contiguous() for name, value in tensors.items()}
+            put(f"{part}.safetensors", safetensors.torch.save(contiguous))
         manifest = {"format": FORMAT, "step": step, **extra, "files": files}
         write_synced(temporary / "manifest.json", to_json(manifest).encode())
         sync_folder(temporary)
@@ -213,14 +238,14 @@ def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: M
 
 
 def prune(checkpoints: Path, keep: Keep, best: int | None) -> None:
-    """Remove the checkpoints that need not be kept, and rows of logs that no other checkpoint needs.
+    """Remove the checkpoints that need not be kept, and the rows of logs that no other checkpoint needs.
 
-    A checkpoint is removed by one rename. Checkpoints that cannot be removed stay.
+    A checkpoint is removed by one rename. If a checkpoint cannot be removed, it stays.
     """
-    have = steps(checkpoints)
-    if keep.last is None or len(have) <= keep.last + 1:
+    saved = steps(checkpoints)
+    if keep.last is None or len(saved) <= keep.last + 1:
         return
-    for step in have[1 : -keep.last]:
+    for step in saved[1 : -keep.last]:
         folder = checkpoints / f"{step:012d}"
         if step == best or (keep.every and _iteration(folder) % keep.every == 0):
             continue
@@ -229,15 +254,14 @@ def prune(checkpoints: Path, keep: Keep, best: int | None) -> None:
 
 
 def drop_after(checkpoints: Path, step: int) -> list[int]:
-    """Remove the checkpoints after the step from which training is resumed; return their steps."""
-    later = [have for have in steps(checkpoints) if have > step]
-    for have in reversed(later):
-        _remove(checkpoints / f"{have:012d}")
-    latest = checkpoints / "latest"
-    if (
-        later or not latest.is_file() or latest.read_bytes() != f"{step:012d}\n".encode()
-    ):  # or the run was killed before it wrote the file
-        write_atomic(latest, f"{step:012d}\n")
+    """Remove the checkpoints after the step at which training is resumed; return their steps."""
+    later = [saved for saved in steps(checkpoints) if saved > step]
+    for saved in reversed(later):
+        _remove(checkpoints / f"{saved:012d}")
+    latest, content = checkpoints / "latest", f"{step:012d}\n"
+    # without a later checkpoint the file may still be wrong: the run was killed before it wrote the file
+    if not latest.is_file() or latest.read_bytes() != content.encode():
+        write_atomic(latest, content)
     drop_rows(checkpoints)
     return later
 
@@ -252,14 +276,14 @@ def drop_rows(checkpoints: Path) -> None:
             for name, shards in open_checkpoint(checkpoints / f"{step:012d}").shards().items():
                 files -= {checkpoints / LOG_FOLDER / name / shard.file for shard in shards}
     except CheckpointError:
-        return  # the rows that a damaged checkpoint needs are unknown
+        return  # a damaged checkpoint: which rows it needs is unknown
     for file in files:
         with contextlib.suppress(OSError):
             file.unlink(missing_ok=True)
 
 
 def remove_temporary_files(checkpoints: Path) -> None:
-    """Remove the temporary files of killed writers."""
+    """Remove the temporary files of killed processes."""
     for leftover in checkpoints.glob(".tmp-*"):
         shutil.rmtree(leftover, ignore_errors=True)
     run = checkpoints.parent
@@ -269,17 +293,23 @@ def remove_temporary_files(checkpoints: Path) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Rename a checkpoint to a temporary folder, then delete that."""
-    aside = folder.with_name(f".tmp-{os.getpid()}-{secrets.token_hex(4)}")
+    """Rename a checkpoint to a temporary folder, then delete that folder."""
+    temporary = _temporary_folder(folder.parent)
     try:
-        folder.rename(aside)
+        folder.rename(temporary)
     except OSError:
         return
-    shutil.rmtree(aside, ignore_errors=True)
+    shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _temporary_folder(parent: Path) -> Path:
+    """Return a new name for a folder that `remove_temporary_files` removes."""
+    return parent / f".tmp-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 def _iteration(folder: Path) -> int:
+    """Return the iteration of a checkpoint; 0 if it cannot be read."""
     try:
-        return int(json.loads((folder / "manifest.json").read_bytes())["iteration"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return 0  # a multiple of every interval: the checkpoint stays
+        return open_checkpoint(folder).iteration
+    except (OSError, CheckpointError):
+        return 0  # a multiple of every interval: the checkpoint is kept

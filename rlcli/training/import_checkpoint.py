@@ -1,11 +1,10 @@
-"""Import of policies that other libraries saved: their weights alone, as a run with one checkpoint."""
+"""Import of policies that other libraries have saved: their weights become a run with one checkpoint."""
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,26 +24,29 @@ from rlcli.rl.trainer import TrainerState
 from rlcli.runs.provenance import environment_record
 from rlcli.runs.run import create_run
 from rlcli.runs.torch_archive import VEC_NORMALIZE_HINT, read_archive_file, read_member, read_tensors
-from rlcli.training.checkpoint_writer import write_checkpoint
+from rlcli.training.checkpoint_writer import manifest_entries, write_checkpoint
 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
 
 _NORMALIZER_EPS = 1e-2
-"""RSL-RL adds this to the standard deviation."""
+"""Number that RSL-RL adds to the standard deviation of observations."""
 _MIN_STD = 1e-6
+"""Smallest standard deviation of actions."""
 
 
 @dataclass(slots=True)
 class ImportedPolicy:
-    """Policy of another library: its description and its weights, under the names of a saved policy."""
+    """Policy of another library in the form of a saved policy."""
 
     spec: dict[str, Any]
+    """Content of `policy.json`."""
     weights: dict[str, Tensor]
-    critic: dict[str, Tensor] = field(default_factory=dict)
-    """Weights of the critics, under their original names."""
-    algorithm: str = ""
-    """The algorithm that trained it, by the names of the weights."""
+    """Weights by their names in a saved policy."""
+    critic: dict[str, Tensor]
+    """Weights of the critics by their original names."""
+    algorithm: str
+    """Algorithm of the training, as the names of the weights show it."""
 
 
 def read_sb3(
@@ -53,13 +55,13 @@ def read_sb3(
     """Read a policy from a zip of Stable-Baselines3: PPO, A2C, SAC, TD3 or DDPG with an MlpPolicy.
 
     Args:
-        file: the file of `model.save`; only `policy.pth` in it is read.
-        activation: of the hidden layers, which the file does not hold; None: the library's default.
-        action_bound: the actions that it was trained with lie within +-this.
-        normalizer: `mean` and `var` of its VecNormalize, as safetensors.
+        file: file that `model.save` has written; only its member `policy.pth` is read.
+        activation: activation of the hidden layers, which the file does not contain; None: the library's default.
+        action_bound: actions of the training were within +-action_bound.
+        normalizer: safetensors file with `mean` and `var` of VecNormalize.
 
     Raises:
-        CheckpointError: if it is not such a file, holds something else than tensors, or another kind of policy.
+        CheckpointError: if the file has another format, contains anything but tensors, or another kind of policy.
     """
     where = f"{file}: policy.pth"
     weights = _named_tensors(read_tensors(read_member(file, "policy.pth"), where), where)
@@ -70,85 +72,80 @@ def read_sb3(
     }
     prefix = next((p for p in kinds if any(name.startswith(p) for name in weights)), None)
     if prefix is None or ("action_net.weight" in weights and "log_std" not in weights):
-        raise CheckpointError(
-            f"{file} holds no policy of PPO, A2C, SAC, TD3 or DDPG with continuous actions; {_some(weights)}"
-        )
+        message = "has no policy of PPO, A2C, SAC, TD3 or DDPG with continuous actions"
+        raise CheckpointError(f"{file} {message}; {_some_names(weights)}")
     if any(name.startswith(("features_extractor.", "pi_features_extractor.", "actor.features")) for name in weights):
-        raise CheckpointError(f"{file} holds a policy with a features extractor of its own; MlpPolicy alone is read")
-    kind, algorithm, hidden, output, usual = kinds[prefix]
-    layers = _layers(weights, hidden, file, step=2)
+        raise CheckpointError(f"{file} has a policy with a custom features extractor; only MlpPolicy can be imported")
+    kind, algorithm, hidden, output, default = kinds[prefix]
+    layers = _layers(weights, hidden, file)
     if output is not None:
         layers.append(_layer(weights, output.removesuffix("."), file))
-    taken = _as_actor(layers, file)
+    spec, actor = _mlp_policy(kind, layers, activation or default, action_bound, file)
     if kind == "gaussian-mlp":
-        taken["log_std"] = weights["log_std"]
+        actor["log_std"] = weights["log_std"]
     elif kind == "squashed-gaussian-mlp":
-        weight, bias = _layer(weights, "actor.log_std", file)
-        taken |= {"log_std_head.weight": weight, "log_std_head.bias": bias}
-    spec = _spec(kind, layers, activation or usual, action_bound)
+        actor["log_std_head.weight"], actor["log_std_head.bias"] = _layer(weights, "actor.log_std", file)
     if normalizer is not None:
-        taken |= _vec_normalize(normalizer)
+        actor |= _vec_normalize(normalizer)
         spec["normalize"] = True
     critics = ("mlp_extractor.value_net.", "value_net.", "critic.", "critic_target.")
-    return _whole(file, spec, taken, {n: v for n, v in weights.items() if n.startswith(critics)}, algorithm)
+    critic = {name: value for name, value in weights.items() if name.startswith(critics)}
+    return _checked_policy(file, spec, actor, critic, algorithm)
 
 
 def read_rsl_rl(file: Path, *, activation: str | None = None, action_bound: float | None = None) -> ImportedPolicy:
-    """Read a policy from a checkpoint of RSL-RL, with its LSTM and its empirical normalisation if it has them.
+    """Read a policy from a checkpoint of RSL-RL, with its LSTM and its observation normaliser if it has them.
 
     Args:
-        file: `model_N.pt` of version 2 and later.
-        activation: of the hidden layers, which the file does not hold; None: elu.
-        action_bound: the value of `clip_actions`; None: actions were not clipped.
+        file: `model_N.pt` of RSL-RL 2 or later.
+        activation: activation of the hidden layers, which the file does not contain; None: elu.
+        action_bound: value of `clip_actions`; None: actions were not clipped.
 
     Raises:
-        CheckpointError: if it is not such a file, holds something else than tensors, or another kind of policy.
+        CheckpointError: if the file has another format, contains anything but tensors, or another kind of policy.
     """
     where = str(file)
     saved = read_tensors(read_archive_file(file), where)
-    actor = saved.get("actor_state_dict")
-    if actor is not None:  # version 5
-        weights, critic = _named_tensors(actor, where), _named_tensors(saved.get("critic_state_dict", {}), where)
-        hidden, memory_of, stats = "mlp.", "rnn.rnn.", below(weights, "obs_normalizer.")
+    if saved.get("actor_state_dict") is not None:  # version 5
+        weights = _named_tensors(saved["actor_state_dict"], where)
+        critic = _named_tensors(saved.get("critic_state_dict", {}), where)
+        hidden, lstm, stats = "mlp.", "rnn.rnn.", below(weights, "obs_normalizer.")
         std = {"std": "distribution.std_param", "log_std": "distribution.log_std_param"}
     else:  # versions 2 to 4
         weights = _named_tensors(saved.get("model_state_dict"), where)
         critic = {name: value for name, value in weights.items() if name.startswith(("critic", "memory_c"))}
-        hidden, memory_of = "actor.", "memory_a.rnn."
-        stats = below(weights, "actor_obs_normalizer.")
+        hidden, lstm, stats = "actor.", "memory_a.rnn.", below(weights, "actor_obs_normalizer.")
         if not stats and "obs_norm_state_dict" in saved:
             stats = _named_tensors(saved["obs_norm_state_dict"], where)
         std = {"std": "std", "log_std": "log_std"}
     if not any(name.startswith(hidden) for name in weights):
-        raise CheckpointError(f"{file} holds no actor of RSL-RL; {_some(weights)}")
-    layers = _layers(weights, hidden, file, step=2)
-    taken = _as_actor(layers, file)
-    taken["log_std"] = _log_std(weights, std, file)
-    cells, inputs = _lstm(weights, memory_of, taken, file)
-    spec = _spec("gaussian-lstm" if cells else "gaussian-mlp", layers, activation or "elu", action_bound)
-    if cells:
-        spec |= {"memory": cells, "observation_size": inputs}
+        raise CheckpointError(f"{file} has no actor of RSL-RL; {_some_names(weights)}")
+    layers = _layers(weights, hidden, file)
+    spec, actor = _mlp_policy("gaussian-mlp", layers, activation or "elu", action_bound, file)
+    actor["log_std"] = _log_std(weights, std, file)
+    memory_spec, memory_weights = _lstm(weights, lstm, file)
+    spec, actor = spec | memory_spec, actor | memory_weights
     if stats:
-        taken |= _empirical(stats, file)
+        actor |= _empirical_normalizer(stats, file)
         spec |= {"normalize": True, "normalize_clip": None}
-    return _whole(file, spec, taken, critic, "ppo")
+    return _checked_policy(file, spec, actor, critic, "ppo")
 
 
-def as_run(
+def create_imported_run(
     imported: ImportedPolicy, resolved: Resolved, record: Mapping[str, Any], runs_dir: Path, name: str | None
 ) -> Path:
-    """Create a run with one checkpoint: the policy, for the task and the agent of a configuration.
+    """Create a run with one checkpoint that contains an imported policy; return its folder.
 
     Args:
-        imported: what was read.
-        resolved: the task and the agent.
+        imported: the policy.
+        resolved: configuration of the task and the agent.
         record: further entries of run.json.
         runs_dir: the folder of runs.
-        name: part of the run folder's name.
+        name: part of the name of the run's folder.
 
     Raises:
-        CheckpointError: if the policy is not one for this task, with a table of what differs.
-        MachineError: if the disk refuses.
+        CheckpointError: if the policy does not fit the task, with a table of the differences.
+        MachineError: if the run cannot be written.
     """
     task = resolved.task
     one = task.model_copy(update={"scene": task.scene.model_copy(update={"num_envs": 1})})
@@ -161,8 +158,8 @@ def as_run(
         rows = [("field", "in the file", f"of {resolved.source.name}"), *differing]
         table = "\n".join(f"  {a:<18}{b:<14}{c}" for a, b, c in rows)
         raise CheckpointError(
-            f"{record['imported']['file']} holds no policy for {resolved.source.name}:\n{table}",
-            hint="columns must be the same, in the same order; rlcli show TASK says which the task has",
+            f"the policy in {record['imported']['file']} does not fit {resolved.source.name}:\n{table}",
+            hint="observations and actions must have the same columns in the same order; see rlcli show TASK",
         )
     assert resolved.agent is not None
     entries = {
@@ -176,14 +173,7 @@ def as_run(
         **environment_record(resolved, 1, 1),
     }
     run = create_run(runs_dir, resolved.source.name, name, to_yaml(to_data(resolved)), entries)
-    manifest = {
-        **{key: run.record[key] for key in ("task", "agent", "seed")},
-        "iteration": 0,
-        "trainer": record["imported"]["form"],
-        "layout": layout.record(),
-        "deployment": deployment,
-        "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
-    }
+    manifest = {"iteration": 0, **manifest_entries(run, record["imported"]["form"], layout, deployment)}
     values = {"policy": imported.spec, "iteration": 0, "env_steps": 0}
     tensors = {"policy": imported.weights, "trainer": {f"critic.{n}": value for n, value in imported.critic.items()}}
     try:
@@ -197,64 +187,61 @@ def as_run(
 
 
 def _named_tensors(saved: object, where: str) -> dict[str, Tensor]:
-    """Return float32 copies of named tensors; check that none has more numbers than the file."""
+    """Return float32 copies of untrusted tensors; check that they are plain, finite and not larger than the file."""
     if not isinstance(saved, Mapping):
-        raise CheckpointError(f"{where} holds no weights where they should be")
+        raise CheckpointError(f"{where} has no mapping of weights where it is expected")
     named: dict[str, Tensor] = {}
-    total, most = 0, memory() // 4
+    total, limit = 0, memory() // 4  # bytes
     for name, value in saved.items():
         if not isinstance(name, str) or type(value) not in (Tensor, torch.nn.Parameter):
-            raise CheckpointError(f"{where}: '{str(name)[:60]}' is no tensor")
+            raise CheckpointError(f"{where}: '{str(name)[:60]}' is not a tensor")
         if value.layout != torch.strided or value.device.type != "cpu" or value.is_complex() or value.is_quantized:
-            raise CheckpointError(f"{where}: '{name[:60]}' is a tensor of an uncommon kind")
+            raise CheckpointError(f"{where}: '{name[:60]}' is not a plain tensor on the CPU")
+        # a stride of 0 makes a large tensor of few numbers: its copy would fill the memory
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
-            raise CheckpointError(f"{where}: '{name[:60]}' claims {value.numel():,} numbers, and the file has fewer")
-        total += 4 * value.numel()  # several may share what the file holds
-        if total > most:
-            raise CheckpointError(f"{where} holds tensors of more than {most:,} bytes")
+            raise CheckpointError(f"{where}: '{name[:60]}' claims {value.numel():,} numbers, but the file has fewer")
+        total += 4 * value.numel()  # several tensors may share the numbers of the file
+        if total > limit:
+            raise CheckpointError(f"{where} has tensors of more than {limit:,} bytes in total")
         named[name] = value.detach().to(torch.float32).clone(memory_format=torch.contiguous_format)
         if not bool(named[name].isfinite().all()):
-            raise CheckpointError(f"{where}: '{name[:60]}' holds values that are not finite")
+            raise CheckpointError(f"{where}: '{name[:60]}' has values that are not finite")
     return named
 
 
 _Layer = tuple[Tensor, Tensor]
+"""Weight (outputs, inputs) and bias (outputs,) of a linear layer."""
 
 
-def _layers(weights: Mapping[str, Tensor], prefix: str, file: Path, *, step: int) -> list[_Layer]:
-    """Return the linear layers below a prefix, in the order of their numbers."""
+def _layers(weights: Mapping[str, Tensor], prefix: str, file: Path) -> list[_Layer]:
+    """Return the linear layers of an `nn.Sequential` with activations between them, in the order of their numbers."""
     numbers = {n.removeprefix(prefix).partition(".")[0] for n in weights if n.startswith(prefix)}
     if not all(number.isdecimal() and number.isascii() and len(number) < 4 for number in numbers):
-        raise CheckpointError(
-            f"{file}: {prefix}* are no layers one after the other: {', '.join(sorted(numbers))[:200]}"
-        )
-    if sorted(map(int, numbers)) != list(range(0, step * len(numbers), step)):
-        raise CheckpointError(f"{file}: layers of {prefix}* are missing, or are no linear ones")
+        found = ", ".join(sorted(numbers))[:200]
+        raise CheckpointError(f"{file}: {prefix}* is not a sequence of numbered layers: {found}")
+    if sorted(map(int, numbers)) != list(range(0, 2 * len(numbers), 2)):
+        raise CheckpointError(f"{file}: layers of {prefix}* are missing, or are not linear layers")
     return [_layer(weights, f"{prefix}{number}", file) for number in sorted(numbers, key=int)]
 
 
 def _layer(weights: Mapping[str, Tensor], name: str, file: Path) -> _Layer:
+    """Return a linear layer of untrusted weights."""
     weight, bias = weights.get(f"{name}.weight"), weights.get(f"{name}.bias")
     if weight is None or bias is None or weight.dim() != 2 or bias.shape != weight.shape[:1] or not weight.numel():
-        raise CheckpointError(f"{file}: {name} is no linear layer with a bias")
+        raise CheckpointError(f"{file}: {name} is not a linear layer with a bias")
     return weight, bias
 
 
-def _as_actor(layers: Sequence[_Layer], file: Path) -> dict[str, Tensor]:
+def _mlp_policy(
+    kind: str, layers: Sequence[_Layer], activation: str, action_bound: float | None, file: Path
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return the specification of a policy with these layers, and the weights of its actor."""
+    if not layers:
+        raise CheckpointError(f"{file} has no layers")
     for (before, _), (after, _) in itertools.pairwise(layers):
         if after.shape[1] != len(before):
-            raise CheckpointError(f"{file}: a layer gives {len(before)} numbers, and the next takes {after.shape[1]}")
-    if not layers:
-        raise CheckpointError(f"{file} holds no layers")
-    return {
-        f"actor.{2 * number}.{name}": value
-        for number, layer in enumerate(layers)
-        for name, value in zip(("weight", "bias"), layer, strict=True)
-    }
-
-
-def _spec(kind: str, layers: Sequence[_Layer], activation: str, action_bound: float | None) -> dict[str, Any]:
-    return {
+            raise CheckpointError(f"{file}: a layer has {len(before)} outputs, the next has {after.shape[1]} inputs")
+    spec = {
         "kind": kind,
         "observation_size": layers[0][0].shape[1],
         "action_size": len(layers[-1][0]),
@@ -262,44 +249,49 @@ def _spec(kind: str, layers: Sequence[_Layer], activation: str, action_bound: fl
         "activation": activation,
         "action_bound": action_bound,
     }
+    actor: dict[str, Tensor] = {}
+    for number, (weight, bias) in enumerate(layers):  # activations have the odd numbers
+        actor |= {f"actor.{2 * number}.weight": weight, f"actor.{2 * number}.bias": bias}
+    return spec, actor
 
 
 def _log_std(weights: Mapping[str, Tensor], names: Mapping[str, str], file: Path) -> Tensor:
+    """Return the log standard deviation of the actions, whichever of both parameters the file has."""
     if names["log_std"] in weights:
         return weights[names["log_std"]]
     if names["std"] not in weights:
-        raise CheckpointError(f"{file}: the deviation of its actions depends on the state; that is not read")
+        raise CheckpointError(
+            f"{file}: the standard deviation of actions depends on the state; such a policy cannot be imported"
+        )
     return weights[names["std"]].clamp(min=_MIN_STD).log()
 
 
-def _lstm(
-    weights: Mapping[str, Tensor], prefix: str, taken: dict[str, Tensor], file: Path
-) -> tuple[list[int], int | None]:
-    """Put the cells of an LSTM into `taken`; return their sizes and the number of inputs of the first layer."""
-    cells: list[int] = []
-    inputs: int | None = None
-    for name, value in weights.items():
-        if not name.startswith(prefix):
-            continue
-        kind, _, layer = name.removeprefix(prefix).rpartition("_l")
+def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return the specification and the weights of the LSTM below a prefix; both are empty without an LSTM."""
+    lstm: dict[str, Tensor] = {}
+    for name, value in below(weights, prefix).items():
+        kind, _, layer = name.rpartition("_l")
         if kind not in ("weight_ih", "weight_hh", "bias_ih", "bias_hh") or not (layer.isdecimal() and len(layer) < 3):
-            raise CheckpointError(f"{file}: {name[:60]} is nothing that a memory has")
-        taken[f"memory.layers.{layer}.{kind}"] = value
-    while (recurrent := taken.get(f"memory.layers.{len(cells)}.weight_hh")) is not None:
+            raise CheckpointError(f"{file}: {prefix}{name[:60]} is not a parameter of an LSTM")
+        lstm[f"memory.layers.{layer}.{kind}"] = value
+    cells: list[int] = []
+    while (recurrent := lstm.get(f"memory.layers.{len(cells)}.weight_hh")) is not None:
+        # an LSTM has four gates: weight_hh is (4 x cells, cells)
         if recurrent.dim() != 2 or len(recurrent) != 4 * recurrent.shape[1] or not recurrent.numel():
-            raise CheckpointError(f"{file}: its memory is no LSTM; others are not read")
+            raise CheckpointError(f"{file}: its RNN is not an LSTM; other RNNs cannot be imported")
         cells.append(recurrent.shape[1])
-    if cells:
-        first = taken.get("memory.layers.0.weight_ih")
-        inputs = None if first is None or first.dim() != 2 else first.shape[1]
-    return cells, inputs
+    if not cells:
+        return {}, lstm
+    first = lstm.get("memory.layers.0.weight_ih")
+    inputs = None if first is None or first.dim() != 2 else first.shape[1]
+    return {"kind": "gaussian-lstm", "memory": cells, "observation_size": inputs}, lstm
 
 
-def _empirical(stats: Mapping[str, Tensor], file: Path) -> dict[str, Tensor]:
-    """Convert the normalizer: RSL-RL divides by std + 1e-2, a saved policy by sqrt(var + 1e-8)."""
+def _empirical_normalizer(stats: Mapping[str, Tensor], file: Path) -> dict[str, Tensor]:
+    """Convert the normaliser: RSL-RL divides by std + 1e-2, a saved policy by sqrt(var + 1e-8)."""
     mean, std = stats.get("_mean"), stats.get("_std")
     if mean is None or std is None or mean.shape != std.shape or mean.dim() != 2 or len(mean) != 1:
-        raise CheckpointError(f"{file}: its normaliser has no mean and deviation of each observation")
+        raise CheckpointError(f"{file}: its normaliser has no mean and standard deviation of each observation")
     deviation = std[0].double() + _NORMALIZER_EPS
     return _normalizer(mean[0], (deviation.square() - 1e-8).clamp(min=0.0), stats)
 
@@ -310,34 +302,33 @@ def _normalizer(mean: Tensor, var: Tensor, stats: Mapping[str, Tensor]) -> dict[
 
 
 def _vec_normalize(file: Path) -> dict[str, Tensor]:
+    """Read the normaliser of SB3's VecNormalize from a safetensors file."""
     data = read_archive_file(file)
     if data[:1] == b"\x80" or file.suffix == ".pkl":
         raise CheckpointError(f"{file} is a pickle; it is not opened", hint=VEC_NORMALIZE_HINT)
     try:
         stats = safetensors.torch.load(data)
     except (SafetensorError, RuntimeError, ValueError, KeyError) as error:
-        raise CheckpointError(
-            f"{file} is corrupt, or no safetensors file: {one_line(error)}", hint=VEC_NORMALIZE_HINT
-        ) from None
+        message = f"{file} is corrupt or not a safetensors file: {one_line(error)}"
+        raise CheckpointError(message, hint=VEC_NORMALIZE_HINT) from None
     mean, var = stats.get("mean"), stats.get("var")
     if mean is None or var is None or mean.dim() != 1 or mean.shape != var.shape:
         raise CheckpointError(f"{file} has no 'mean' and 'var' of each observation", hint=VEC_NORMALIZE_HINT)
     return _normalizer(mean, var, stats)
 
 
-def _whole(
+def _checked_policy(
     file: Path, spec: dict[str, Any], weights: dict[str, Tensor], critic: dict[str, Tensor], algorithm: str
 ) -> ImportedPolicy:
-    """Return the policy; check that it can be built."""
+    """Return the imported policy after a check that it can be built."""
     try:
-        if math.isnan(spec["action_bound"] or 0.0):
-            raise CheckpointError("the action bound is no number")
         policy = filled(blank_policy(spec), weights)
     except CheckpointError as error:
-        raise CheckpointError(f"{file} holds no policy that can be taken over: {error.message}") from None
+        raise CheckpointError(f"the policy in {file} cannot be imported: {error.message}") from None
     return ImportedPolicy(policy.spec.model_dump(), weights, critic, algorithm)
 
 
-def _some(weights: Mapping[str, Tensor]) -> str:
+def _some_names(weights: Mapping[str, Tensor]) -> str:
+    """Return the first names of the weights, for a message."""
     names = [name[:40] for name in list(weights)[:6]]
     return f"its weights: {', '.join(names)}" if names else "it has no weights"

@@ -1,4 +1,4 @@
-"""Job of a training: an open run, its configuration and where to begin; imports nothing heavy."""
+"""Job of a training: an open run, its configuration and its start. The module imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -17,29 +17,32 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Job:
-    """A locked run and what to train in it."""
+    """Locked run with the settings of its training."""
 
     run: Run
     resolved: Resolved
     loggers: list[str]
+    """Names of the loggers besides `metrics.jsonl`."""
     resume_from: Checkpoint | None = None
-    """The checkpoint to resume from."""
+    """Checkpoint to resume from; None: training starts at iteration 0."""
     created: bool = True
-    """Whether the run's folder was made for this job; without a checkpoint a run that is resumed begins again."""
+    """Whether the run's folder was created for this job. A resumed run without a checkpoint starts again."""
     init_from: Path | None = None
-    """The checkpoint folder to take weights from."""
+    """Folder of the checkpoint whose weights the policy starts with."""
     stages: list[int] = field(default_factory=list)
-    """Iterations to save at, the last one to end at; they replace the agent's budget and which checkpoints it keeps."""
+    """Iterations after which a checkpoint is saved; training ends at the last. They replace the agent's budget and its
+    rule for the checkpoints to keep."""
     config: str | None = None
-    """The configuration of a resumed run, if its budget changes."""
+    """New content of a resumed run's `config.yaml`, if its budget changes."""
     video_every: int = 0
     """Iterations between videos; 0: none."""
     writes: bool = True
     """Whether this process writes the run."""
     begin: float = field(default_factory=time.monotonic)
+    """Time at which the job was made, by the monotonic clock [s]."""
 
     def message(self) -> dict[str, Any]:
-        """Return what rank 0 broadcasts to the other ranks."""
+        """Return the message that rank 0 broadcasts to the other ranks."""
         return {
             "run": str(self.run.folder),
             "record": self.run.record,
@@ -51,20 +54,23 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class TrainingResult:
-    """A finished run, as the command prints it."""
+    """Result of a finished training, which the command prints."""
 
     run: Path
+    """Folder of the run."""
     checkpoint: Path
-    """The newest checkpoint."""
+    """Newest checkpoint."""
     step: int
+    """Environment steps of the whole run."""
     iteration: int | None = None
-    """This and the rest are None if nothing was left to train."""
+    """Iterations of the whole run; this and the following fields are None if the run was already finished."""
     elapsed_s: float | None = None
+    """Duration of this training [s]."""
     seed: int | None = None
 
 
 def threads(resolved: Resolved) -> tuple[int, int]:
-    """Return the threads of the engine and of torch's update."""
+    """Return the number of threads of the engine, and of torch in the update."""
     assert resolved.agent is not None
     cores = available_cores()
     return resolved.task.sim.engine_threads or cores, resolved.agent.torch_threads or min(4, cores)

@@ -1,4 +1,4 @@
-"""Start of a training: make a new run or resume one on rank 0, and broadcast the job to all ranks."""
+"""Start of a training: create or resume a run on rank 0, and broadcast the job to all ranks."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ _log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class TrainingRequest:
-    """What the command line asks for: a task and all changes to it, or a run to resume."""
+    """Training that the command line describes: a task with all changes, or a run to resume."""
 
     runs: Path
-    """Folder of runs."""
+    """Folder of all runs."""
     source: TaskSource | None = None
-    """The task; of a run that is resumed it may be left out."""
+    """The task; it may be None for a run to resume."""
     resume: str | None = None
     """Reference of the run to resume."""
     agent: str | None = None
     device: str = "auto"
     gpus: int | None = None
-    """Processes to start on this machine, a GPU each."""
+    """Number of processes to start on this machine, with one GPU each."""
     config: Path | None = None
     overrides: list[str] = field(default_factory=list)
     flags: dict[str, Any] = field(default_factory=dict)
@@ -52,22 +52,22 @@ class TrainingRequest:
     seed: int = 42
     loggers: list[str] | None = None
     init_from: str | None = None
-    """Reference of the checkpoint whose weights a new run begins with."""
+    """Reference of the checkpoint whose weights a new run starts with."""
     video_every: int | None = None
     """Iterations between videos; 0: none."""
     name: str | None = None
-    """Part of a new run's folder name."""
+    """Part of the name of a new run's folder."""
 
     def resolve(self, changes: Sequence[str] = ()) -> tuple[Resolved, str]:
-        """Return the configuration of a new run and its device.
+        """Return the configuration and the device of a new run.
 
         Args:
-            changes: overrides besides those of the request.
+            changes: overrides in addition to those of the request.
 
         Raises:
-            ConfigError: if the configuration is wrong.
-            DeviceError: if the device is not there.
-            UsageError: if the trainer does not work on the device, or not in several processes.
+            ConfigError: if the configuration is not valid.
+            DeviceError: if the device is not available.
+            UsageError: if the trainer does not support the device, or several processes.
         """
         assert self.source is not None
         device = process_device(self.device, self.gpus)
@@ -84,15 +84,15 @@ class TrainingRequest:
 
 
 def broadcast_job(request: TrainingRequest, resolved: Resolved | None, device: str) -> Job | TrainingResult | None:
-    """Make or resume the run on rank 0 and broadcast the job to the other ranks.
+    """Create or resume the run on rank 0 and broadcast the job to the other ranks.
 
     Args:
-        request: what to train.
-        resolved: the configuration of a new run; None resumes a run.
-        device: the device of this process.
+        request: task and settings of the training, or the run to resume.
+        resolved: configuration of a new run; None resumes a run.
+        device: device of this process.
 
     Returns:
-        The job; without one the result of a run that is finished already, or None on the other ranks.
+        The job. If the run is already finished: its result on rank 0, None on the other ranks.
     """
     if not distributed.is_rank_zero():
         message = distributed.join(device).broadcast_object()
@@ -118,7 +118,7 @@ def broadcast_job(request: TrainingRequest, resolved: Resolved | None, device: s
 
 
 def new_run(request: TrainingRequest, resolved: Resolved, device: str) -> Job:
-    """Create a run: its folder is written before anything heavy is imported."""
+    """Create a run and write its folder, before anything heavy is imported; return the job."""
     record = run_record(request, resolved, device)
     config = to_yaml(to_data(resolved))
     run = create_run(request.runs, resolved.source.name, request.name, config, record)
@@ -128,20 +128,19 @@ def new_run(request: TrainingRequest, resolved: Resolved, device: str) -> Job:
 
 
 def prepare_run(folder: Path, request: TrainingRequest, changes: Sequence[str] = ()) -> str:
-    """Create a run that waits for its training in a given folder, unless it exists; return its device.
+    """Create a run in the state `waiting` in a given folder, unless it exists; return its device.
 
     Raises:
-        UsageError: if the folder holds a run with other settings.
+        UsageError: if the folder contains a run with other settings.
     """
     resolved, device = request.resolve(changes)
     if (folder / RECORD).is_file():
-        known = open_run(folder).record.get("given")
-        if known is not None and _overrides_in(known) != _overrides_in(given(resolved)):
-            raise UsageError(
-                f"{folder} is the run of other settings: its sweep was another", hint="another --name begins anew"
-            )
+        recorded = open_run(folder).record.get("given")
+        if recorded is not None and _overrides_in(recorded) != _overrides_in(given(resolved)):
+            message = f"{folder} is a run of another sweep, with other settings"
+            raise UsageError(message, hint="start a new sweep with another --name")
         return device
-    for file in ("config.yaml", "checkpoints"):  # left by a process that was killed while it created the run
+    for file in ("config.yaml", "checkpoints"):  # left by a process that was killed while creating the run
         path = folder / file
         shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
     record = run_record(request, resolved, device)
@@ -153,7 +152,7 @@ def run_record(request: TrainingRequest, resolved: Resolved, device: str) -> dic
     """Return the content of a new run's run.json.
 
     Raises:
-        CheckpointError: if there is no checkpoint to take weights from.
+        CheckpointError: if the checkpoint of `init_from` does not exist.
         DependencyError: if a logger or the video encoder is not installed.
     """
     loggers = check_loggers(request.loggers or setting("loggers"))
@@ -180,13 +179,13 @@ def run_record(request: TrainingRequest, resolved: Resolved, device: str) -> dic
 
 
 def resume_run(request: TrainingRequest) -> Job | TrainingResult:
-    """Open and lock a run to train on; return its result if it is finished and has no new budget."""
+    """Open and lock a run to continue it; if it is finished and has no new budget, return its result instead."""
     from rlcli.runs.checkpoint import open_checkpoint
     from rlcli.runs.restore import resolve_run
 
     run, folder, why = _find_checkpoint(request)
     if run.record.get("state") == "finished" and not request.budget and folder is not None:
-        _log.info("%s (%s) is finished; --max-iterations N trains on", run.folder, why)
+        _log.info("%s (%s) is finished; --max-iterations N continues it", run.folder, why)
         return TrainingResult(run.folder, folder, open_checkpoint(folder).step)
     resolved = resolve_run(run, play=False, flags=request.budget, named=request.source)
     _require_parallel(resolved)
@@ -206,7 +205,7 @@ def resume_run(request: TrainingRequest) -> Job | TrainingResult:
     if run.record.get("state") == WAITING:
         _log.info("run %s", run.folder)
     elif folder is None:
-        _log.info("%s (%s) ended before its first checkpoint: it begins again", run.folder, why)
+        _log.info("%s (%s) ended before its first checkpoint: it starts again", run.folder, why)
     else:
         _log.info("resuming %s (%s)", folder, why)
     initial = run.record.get("init_from") if folder is None else None
@@ -225,13 +224,13 @@ def resume_run(request: TrainingRequest) -> Job | TrainingResult:
 def setup_job(
     job: Job, device: str, stop: StopRequest, check_model: Callable[[VecEnv], None] = lambda _: None
 ) -> tuple[Trainer, VecEnv]:
-    """Import everything heavy and build the trainer and its environment; remove a new run if that fails.
+    """Build the trainer and its environment, with all heavy imports; remove a new run if that fails.
 
     Args:
-        job: what to train.
-        device: where to train.
-        stop: a signal ends the setup.
-        check_model: receives the environment, and raises if training must not begin.
+        job: run and settings of the training.
+        device: device of the training.
+        stop: stop request; a signal ends the setup.
+        check_model: called with the environment; it raises an error if training must not start.
     """
     try:
         with stop.before_training(interruptible=not distributed.launched()):
@@ -248,17 +247,17 @@ def setup_job(
 
 
 def _job_of_other_rank(message: dict[str, Any], request: TrainingRequest, resolved: Resolved | None) -> Job:
-    """Return the job that rank 0 broadcast; other ranks write nothing into the run."""
+    """Return the job of another rank for the message of rank 0; other ranks do not write the run."""
     from rlcli.runs.checkpoint import open_checkpoint
     from rlcli.runs.restore import resolve_run
 
-    folder, initial = Path(message["run"]), message["init_from"]
-    if resolved is not None:
-        return Job(Run(folder, message["record"]), resolved, [], init_from=initial, writes=False)
-    run = open_run(folder)
-    resolved = resolve_run(run, play=False, flags=request.budget, named=request.source)
+    folder = Path(message["run"])
+    run = open_run(folder) if resolved is None else Run(folder, message["record"])
+    if resolved is None:
+        resolved = resolve_run(run, play=False, flags=request.budget, named=request.source)
     saved = None if message["resume_from"] is None else open_checkpoint(Path(message["resume_from"]))
-    return Job(run, resolved, [], resume_from=saved, created=message["created"], init_from=initial, writes=False)
+    settings = {"created": message["created"], "init_from": message["init_from"], "writes": False}
+    return Job(run, resolved, [], resume_from=saved, **settings)
 
 
 def process_device(wanted: str, gpus: int | None) -> str:
@@ -281,12 +280,16 @@ def process_device(wanted: str, gpus: int | None) -> str:
     local_rank, local_size = distributed.local_rank_and_size()
     need, have = max(gpus or 1, local_size), torch.cuda.device_count()
     if have < need:
-        raise DeviceError(f"{need} processes need a GPU each, and torch sees {have}", hint=f"--gpus {have}")
+        raise DeviceError(f"{need} processes need a GPU each, but torch finds {have}", hint=f"--gpus {have}")
     return f"cuda:{local_rank}"
 
 
 def _trainer_device(resolved: Resolved, device: str, wanted: str) -> str:
-    """Return the device, or the CPU if the trainer cannot use the GPU and the user did not name a device."""
+    """Return the device, or the CPU if the trainer cannot use a GPU and the user gave no device.
+
+    Raises:
+        UsageError: if the trainer cannot use the device that the user gave.
+    """
     assert resolved.agent is not None
     assert resolved.trainer is not None
     if device == "cpu" or resolved.trainer.gpu:
@@ -300,27 +303,27 @@ def _trainer_device(resolved: Resolved, device: str, wanted: str) -> str:
 
 
 def _require_parallel(resolved: Resolved, gpus: int = 1) -> None:
-    """Check that the trainer works in several processes if there are several.
+    """Check that the trainer supports several processes, if there are several.
 
     Raises:
-        UsageError: if it does not.
+        UsageError: if the trainer does not support several processes.
     """
     resolved.require_agent()
     assert resolved.agent is not None
     assert resolved.trainer is not None
     if (gpus > 1 or distributed.launched()) and not resolved.trainer.parallel:
         raise UsageError(
-            f"trainer '{resolved.agent.trainer}' of agent '{resolved.agent_name}' trains in one process",
-            hint="name an agent of trainer ppo with --agent",
+            f"trainer '{resolved.agent.trainer}' of agent '{resolved.agent_name}' trains in one process only",
+            hint="choose an agent with trainer ppo: --agent NAME",
         )
 
 
 def _require_video(video_every: int | None) -> None:
-    """Check before training that videos can be drawn and encoded.
+    """Check before training that videos can be rendered and encoded.
 
     Raises:
         DependencyError: if imageio is not installed.
-        MachineError: if nothing on this machine can draw.
+        MachineError: if this machine cannot render.
     """
     if not video_every:
         return
@@ -333,7 +336,10 @@ def _require_video(video_every: int | None) -> None:
 
 
 def _find_checkpoint(request: TrainingRequest) -> tuple[Run, Path | None, str]:
-    """Return the run, the checkpoint to resume from and the reason; no checkpoint if the run ended before its first."""
+    """Return the run to resume, its checkpoint, and how the run was chosen.
+
+    The checkpoint is None if the run ended before its first checkpoint.
+    """
     from rlcli.runs.checkpoint import steps
     from rlcli.runs.run_ref import find_checkpoint, find_run
 
@@ -346,14 +352,14 @@ def _find_checkpoint(request: TrainingRequest) -> tuple[Run, Path | None, str]:
             run, why = find_run(request.resume, request.runs, task)
         except (CheckpointError, UsageError):
             run = None
-        # a run that has a step in its record had checkpoints and has lost them: it is damaged
+        # a run with a step in its record had checkpoints: without any it is damaged
         if run is None or not run.checkpoints.is_dir() or steps(run.checkpoints) or "step" in run.record:
             raise
         return run, None, why
 
 
 def _overrides_in(given: object) -> Any:
-    """Return the entries of a run's `given` that came from overrides."""
+    """Return the entries of `given` that overrides have set."""
     if not isinstance(given, dict):
         return given
     return {key: origin for key, origin in given.items() if str(origin).startswith("override")}

@@ -1,4 +1,4 @@
-"""Loggers of metrics: always `metrics.jsonl`, TensorBoard if it is installed, and the trackers that the user names."""
+"""Loggers of metrics: `metrics.jsonl` always, TensorBoard if it is installed, and trackers if the user names them."""
 
 from __future__ import annotations
 
@@ -9,23 +9,27 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import DependencyError, require_known
 from rlcli.registry import load_object
 from rlcli.runs.atomic_io import disk_error, write_atomic
 from rlcli.runs.run import Run
 
+if TYPE_CHECKING:
+    from rlcli.training.trackers import Logger
+
 
 @dataclass(frozen=True, slots=True)
 class LoggerKind:
-    """Logger that `--logger` can name."""
+    """Logger for `--logger`."""
 
     needs: str
-    """The module that must be installed; its extra has the logger's name."""
+    """Module that must be installed; the extra of rlcli that installs it has the logger's name."""
     factory: str
-    """`module:name` of its class."""
+    """`module:name` of the class."""
     title: str
+    """Name in messages."""
 
 
 LOGGERS = {
@@ -36,29 +40,23 @@ LOGGERS = {
 }
 """Name for `--logger` -> logger; `none` means no logger."""
 _LONGEST_LINE = 1024**2
-"""Bytes of one iteration's metrics."""
-
-
-class Logger(Protocol):
-    """Logger of the metrics of every iteration."""
-
-    def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
-        """Record one iteration."""
-        ...
-
-    def close(self, state: str = "finished") -> None:
-        """Flush and close, with the state of the run: finished, stopped, diverged or failed."""
-        ...
+"""Longest line of `metrics.jsonl`, which has the metrics of one iteration [bytes]."""
 
 
 class JsonLines:
-    """Logger that writes one JSON object an iteration into `metrics.jsonl`, at once."""
+    """Logger that writes one JSON object per iteration into `metrics.jsonl`, without delay.
+
+    Args:
+        file: the file.
+        resume_after: iteration at which the run is resumed; later rows are removed.
+    """
 
     def __init__(self, file: Path, *, resume_after: int | None = None) -> None:
         self._path = file
-        if resume_after is not None:
-            _cut(file, resume_after)
         try:
+            if resume_after is not None and file.exists():
+                rows = [row for row in read_metrics(file) if row["iteration"] <= resume_after]
+                write_atomic(file, "".join(json.dumps(row) + "\n" for row in rows))
             self._file = file.open("a", encoding="utf-8", buffering=1)
         except OSError as error:
             raise disk_error(file, error) from error
@@ -77,7 +75,12 @@ class JsonLines:
 
 
 class TensorBoard:
-    """Logger that writes event files of TensorBoard."""
+    """Logger that writes TensorBoard event files.
+
+    Args:
+        folder: folder of the files.
+        resume_after_step: environment steps at which the run is resumed; later events are removed.
+    """
 
     def __init__(self, folder: Path, *, resume_after_step: int | None = None) -> None:
         from torch.utils.tensorboard import SummaryWriter
@@ -85,7 +88,7 @@ class TensorBoard:
         try:
             if resume_after_step is not None:
                 for file in sorted(folder.glob("events.out.tfevents.*")):
-                    _cut_events(file, resume_after_step)
+                    _remove_events_after(file, resume_after_step)
             self._writer: Any = SummaryWriter(str(folder))
         except OSError as error:
             raise disk_error(folder, error) from error
@@ -104,16 +107,14 @@ def check_loggers(names: Sequence[str] | None) -> list[str]:
     """Return the loggers to use; by default TensorBoard if it is installed.
 
     Raises:
-        UsageError: for a name that is no logger.
-        DependencyError: for one that is not installed.
+        UsageError: if a name is not a logger.
+        DependencyError: if a logger is not installed.
     """
     if not names:
         return ["tensorboard"] if _installed("tensorboard") else []
-    known = [*LOGGERS, "none"]
     wanted = [name for name in dict.fromkeys(names) if name != "none"]
     for name in wanted:
-        require_known(name, known, "logger", "loggers")
-    for name in wanted:
+        require_known(name, [*LOGGERS, "none"], "logger", "loggers")
         if not _installed(name):
             raise DependencyError(f"{LOGGERS[name].title} is not installed", hint=f'pip install "rlcli[{name}]"')
     return wanted
@@ -130,17 +131,17 @@ def open_loggers(
 
     Args:
         run: the run.
-        names: the loggers besides `metrics.jsonl`.
-        resume: iteration and step after which the run is resumed.
+        names: names of the loggers besides `metrics.jsonl`.
+        resume: iteration and environment steps at which the run is resumed.
         config: the resolved configuration, which trackers store.
 
     Raises:
-        MachineError: if one cannot be opened.
+        MachineError: if a logger cannot be opened.
     """
     from rlcli.training.trackers import FailSafeLogger, open_tracker  # heavy; `check_loggers` does not need it
 
     iteration, step = resume if resume is not None else (None, None)
-    reached = None if resume is None else max(resume, _end(run.metrics))
+    reached = None if resume is None else max(resume, _last_boundary(run.metrics))
     loggers: list[Logger] = [JsonLines(run.metrics, resume_after=iteration)]
     try:
         for name in names:
@@ -158,7 +159,7 @@ def open_loggers(
 
 
 def read_metrics(file: Path) -> list[dict[str, Any]]:
-    """Return the rows of a metrics file up to the first damaged one; a kill leaves an incomplete last line."""
+    """Return the rows of a metrics file before the first damaged row; a killed process may leave an incomplete row."""
     rows = []
     with file.open("rb") as lines:
         for line in iter(lambda: lines.readline(_LONGEST_LINE), b""):
@@ -176,8 +177,8 @@ def _installed(name: str) -> bool:
     return importlib.util.find_spec(LOGGERS[name].needs) is not None
 
 
-def _end(file: Path) -> tuple[int, int]:
-    """Return the last iteration and step in a file."""
+def _last_boundary(file: Path) -> tuple[int, int]:
+    """Return the last iteration and step in a metrics file; (0, 0) without a row."""
     try:
         last = read_metrics(file)[-1]
     except (OSError, IndexError):
@@ -185,19 +186,8 @@ def _end(file: Path) -> tuple[int, int]:
     return last["iteration"], last["step"]
 
 
-def _cut(file: Path, iteration: int) -> None:
-    """Remove the rows after the checkpoint from which the run is resumed."""
-    if not file.exists():
-        return
-    try:
-        rows = [row for row in read_metrics(file) if row["iteration"] <= iteration]
-        write_atomic(file, "".join(json.dumps(row) + "\n" for row in rows))
-    except OSError as error:
-        raise disk_error(file, error) from error
-
-
-def _cut_events(file: Path, step: int) -> None:
-    """Remove the events after the checkpoint; the last event of a killed run may be incomplete."""
+def _remove_events_after(file: Path, step: int) -> None:
+    """Remove the events after a step, and an incomplete last event of a killed process."""
     from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
     from tensorboard.compat.proto.event_pb2 import Event
     from tensorboard.summary.writer.record_writer import RecordWriter

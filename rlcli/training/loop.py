@@ -17,19 +17,20 @@ from rlcli.rl.trainer import Report, Trainer
 from rlcli.runs import checkpoint
 from rlcli.runs.run import Run
 from rlcli.training.checkpoint_writer import CheckpointWriter
-from rlcli.training.loggers import Logger
 from rlcli.training.periodic_eval import PeriodicEval
 from rlcli.training.progress import Progress
 from rlcli.training.signals import Interrupted, StopRequest
 
 if TYPE_CHECKING:
+    from rlcli.training.trackers import Logger
     from rlcli.viewer.training_videos import TrainingVideos
 
 _log = logging.getLogger(__name__)
 
 SAVE_EVERY_S = 60.0
+"""Time between checkpoints without a `save_interval` [s]."""
 LONG_S = 0.1
-"""An iteration that takes longer can be interrupted: the state before it is copied [s]."""
+"""Duration above which an iteration can be interrupted: the trainer's state before it is copied [s]."""
 DIVERGED_SHARE = 0.01
 """Share of an iteration's environment steps that may diverge before the run stops."""
 
@@ -38,7 +39,7 @@ DIVERGED_SHARE = 0.01
 class TrainLoop:
     """Training loop of one run: iterate, log, evaluate and save until the budget is spent or a signal arrives.
 
-    A checkpoint is always taken at a boundary between iterations. All ranks pass each boundary together; rank 0 writes
+    A checkpoint is always of a boundary between two iterations. All ranks reach each boundary together; rank 0 writes
     the checkpoints.
     """
 
@@ -47,42 +48,40 @@ class TrainLoop:
     writer: CheckpointWriter
     loggers: Sequence[Logger] = ()
     save_interval: int | None = None
-    """Iterations between checkpoints; None: `SAVE_EVERY_S` seconds."""
+    """Number of iterations between checkpoints; None: a checkpoint every `SAVE_EVERY_S` seconds."""
     periodic_eval: PeriodicEval | None = None
     videos: TrainingVideos | None = None
     show: Callable[[Progress], None] = lambda _: None
     """Called after each iteration."""
     count_divergences: Callable[[], int] = lambda: 0
-    """Returns how many environment steps have diverged since the environment was built."""
+    """Returns the number of environment steps that have diverged since the environment was built."""
     stop: StopRequest = field(default_factory=StopRequest)
     _ranks: distributed.ProcessGroup = field(init=False, default_factory=distributed.current)
     _boundary: tuple[int, int] = field(init=False, default=(0, 0))
-    """Iteration and environment steps before the iteration that runs."""
+    """Iteration and environment steps at the beginning of the current iteration."""
     _iteration_s: float = field(init=False, default=0.0)
-    """Duration of the last iteration."""
+    """Duration of the last iteration [s]."""
     _saved_at: float = field(init=False, default_factory=time.monotonic)
 
     def train(self, budget: Budget) -> None:
         """Train until the budget is spent.
 
         Raises:
-            Stopped: on a signal, after the checkpoint of the last boundary was written; at once on the second.
-            DivergedError: if the learner or too much of the simulation diverges; the last good checkpoint is kept.
-            MachineError: if the disk refuses.
+            Stopped: on a signal, after the checkpoint of the last boundary is written; on a second signal at once.
+            DivergedError: if the learner or too many environment steps diverge; the last good checkpoint is kept.
+            MachineError: if the run cannot be written.
         """
         self._boundary = self.trainer.iteration, self.trainer.env_steps
         try:
             self._train(budget)
         except Interrupted:
             number = self._boundary[0] + 1
-            raise self._stopped(f"stopped in iteration {number}; resumed, it begins again") from None
+            raise self._stopped(f"stopped in iteration {number}; a resumed run repeats this iteration") from None
         except KeyboardInterrupt:
-            raise self._stopped("stopped at once; what came after the last checkpoint is lost") from None
-        except Stopped:
-            raise
+            raise self._stopped("stopped at once; the work after the last checkpoint is lost") from None
         except BaseException as error:
             with contextlib.suppress(Exception):  # the first error is the one to report
-                self.writer.wait()  # a good checkpoint may still be in the background thread
+                self.writer.wait()  # the background thread may be writing a good checkpoint
                 if isinstance(error, DivergedError):
                     iteration, step = self._boundary
                     self.writer.save_cases(iteration + 1, step + self.trainer.steps_per_iteration)
@@ -94,12 +93,13 @@ class TrainLoop:
             self._save()
             writer.wait()
         begin, first_step = time.monotonic(), trainer.env_steps
-        while not (stopped := self._signal_on_any_rank()) and not budget.spent(trainer):
+        # a signal on any rank stops all ranks at the same boundary
+        while not (stopped := any(self._ranks.sum(self.stop.signal is not None))) and not budget.spent(trainer):
             report, evaluation, is_best, must_save = self._iterate()
             metrics = {**_with_rates(report, trainer.steps_per_iteration), **evaluation}
             for logger in self.loggers:
                 logger.write(trainer.iteration, trainer.env_steps, metrics)
-            self.show(_progress(trainer, budget, report, metrics, time.monotonic() - begin, first_step))
+            self.show(self._progress(budget, report, metrics, time.monotonic() - begin, first_step))
             if must_save or writer.is_due(trainer.iteration, self.save_interval):
                 self._save()
             if is_best:
@@ -115,11 +115,11 @@ class TrainLoop:
             raise self._stopped(f"stopped at iteration {trainer.iteration}, checkpoint written")
 
     def _iterate(self) -> tuple[Report, dict[str, float], bool, bool]:
-        """Do one iteration and, if it is due, one evaluation.
+        """Do one iteration and, if it is due, an evaluation.
 
         Returns:
-            The trainer's report, the metrics of the evaluation, whether that was the best one (on the rank that
-            evaluates), and whether all ranks must take a checkpoint.
+            The trainer's report; the metrics of the evaluation; whether it is the best evaluation (on the rank that
+            evaluates); and whether all ranks must save a checkpoint.
 
         Raises:
             DivergedError: if too many environment steps diverged.
@@ -133,7 +133,8 @@ class TrainLoop:
                 cases.commit(trainer.iteration, trainer.env_steps)
             evaluation = evaluator.run(trainer.policy) if evaluator is not None and evaluates else {}
             is_best = evaluator is not None and evaluator.improves(evaluation)
-            is_overdue = self.save_interval is None and self._ranks.is_rank_zero and self._unsaved_s() > SAVE_EVERY_S
+            unsaved_s = time.monotonic() - self._saved_at
+            is_overdue = self.save_interval is None and self._ranks.is_rank_zero and unsaved_s > SAVE_EVERY_S
             new_divergences = self.count_divergences() - diverged_before
             diverged, *must_save = self._ranks.sum(new_divergences, is_overdue, is_best)
             _require_stable(diverged, trainer)
@@ -141,10 +142,10 @@ class TrainLoop:
 
     @contextlib.contextmanager
     def _interruptible(self, is_long: bool) -> Iterator[None]:
-        """Surround an iteration: a signal or a divergence ends a long one and saves the boundary before it.
+        """Let a signal or a divergence end a long iteration, and save the boundary before it.
 
-        A short iteration is cheaper to finish than to copy the trainer's state before it. On a GPU and with several
-        ranks every iteration is finished.
+        A short iteration is always finished: this takes less time than to copy the trainer's state before it. On a GPU
+        and with several ranks every iteration is finished.
         """
         self._boundary = self.trainer.iteration, self.trainer.env_steps
         interruptible = self.stop.can_interrupt and self._ranks.world_size == 1
@@ -163,29 +164,35 @@ class TrainLoop:
         self._iteration_s = time.monotonic() - begin
 
     def _save(self) -> None:
-        """Take a checkpoint of this boundary, unless there is one."""
+        """Save a checkpoint of this boundary, unless it exists."""
         boundary = self.trainer.iteration, self.trainer.env_steps
         if self.writer.newest != boundary:
-            state = self.trainer.state()  # every rank takes part
+            state = self.trainer.state()  # collective: every rank must call it
             if self._ranks.is_rank_zero:
                 self.writer.save(state, *boundary)
             else:
                 self.writer.newest = boundary
         self._saved_at = time.monotonic()
 
-    def _unsaved_s(self) -> float:
-        return time.monotonic() - self._saved_at
-
-    def _signal_on_any_rank(self) -> bool:
-        return any(self._ranks.sum(self.stop.signal is not None))
+    def _progress(
+        self, budget: Budget, report: Report, metrics: dict[str, float], elapsed_s: float, first_step: int
+    ) -> Progress:
+        """Return the progress after an iteration of a training that started at `first_step` environment steps."""
+        trainer, iterations = self.trainer, budget.iterations(self.trainer)
+        rate = (trainer.env_steps - first_step) / max(elapsed_s, 1e-9)
+        left = (iterations - trainer.iteration) * trainer.steps_per_iteration / max(rate, 1e-9)
+        done = trainer.iteration, iterations, trainer.env_steps
+        return Progress(*done, elapsed_s, left, rate, report.seconds, metrics)
 
     def _stopped(self, message: str) -> Stopped:
+        """Return the error of a stopped run, with the command that resumes it."""
         hint = f"rlcli train --resume {shlex.quote(str(self.run.folder))}"
         have_checkpoint = checkpoint.steps(self.run.checkpoints)
         return Stopped(message, exit_code=self.stop.exit_code, hint=hint if have_checkpoint else None)
 
 
 def _with_rates(report: Report, steps: int) -> dict[str, float]:
+    """Return the metrics of an iteration of `steps` environment steps, with its speed and durations."""
     seconds = report.seconds
     total = max(sum(seconds.values()), 1e-9)
     rates = {
@@ -197,21 +204,12 @@ def _with_rates(report: Report, steps: int) -> dict[str, float]:
     return {**report.metrics, **rates}
 
 
-def _progress(
-    trainer: Trainer,
-    budget: Budget,
-    report: Report,
-    metrics: dict[str, float],
-    elapsed: float,
-    first_step: int,
-) -> Progress:
-    iterations = budget.iterations(trainer)
-    rate = (trainer.env_steps - first_step) / max(elapsed, 1e-9)
-    remaining = (iterations - trainer.iteration) * trainer.steps_per_iteration / max(rate, 1e-9)
-    return Progress(trainer.iteration, iterations, trainer.env_steps, elapsed, remaining, rate, report.seconds, metrics)
-
-
 def _require_stable(diverged: float, trainer: Trainer) -> None:
+    """Check that at most `DIVERGED_SHARE` of the iteration's environment steps have diverged.
+
+    Raises:
+        DivergedError: if there are more.
+    """
     share = diverged / trainer.steps_per_iteration
     if share > DIVERGED_SHARE:
         raise DivergedError(

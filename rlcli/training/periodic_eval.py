@@ -1,4 +1,4 @@
-"""Evaluation between iterations, which decides which checkpoint is the best."""
+"""Evaluation between iterations, which finds the best checkpoint."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rlcli.evaluation.evaluate import evaluate
-from rlcli.rl.acting import acting
+from rlcli.rl.acting import trained_policy
 from rlcli.rl.rng import seed_generators, undisturbed
 
 if TYPE_CHECKING:
@@ -20,13 +20,15 @@ _SUCCESS, _RETURN, _LENGTH = "Eval/success_rate", "Eval/mean_reward", "Eval/mean
 
 
 class PeriodicEval:
-    """Evaluation of the deterministic policy every few iterations, always in the same episodes; training is unaffected.
+    """Evaluation of the deterministic policy every few iterations, always in the same episodes.
+
+    It changes no random generator and no number of threads of the training.
 
     Args:
-        make_env: builds the environment at the first evaluation.
-        episodes: episodes of an evaluation.
-        interval: iterations between evaluations.
-        history: metrics of the iterations so far; those with an evaluation count.
+        make_env: builds the environment; it is called at the first evaluation.
+        episodes: number of episodes of an evaluation.
+        interval: number of iterations between evaluations.
+        history: metrics of the previous iterations; an iteration without an evaluation is ignored.
     """
 
     def __init__(
@@ -38,32 +40,34 @@ class PeriodicEval:
     ) -> None:
         self._make_env, self._episodes, self._interval = make_env, episodes, interval
         self._env: VecEnv | None = None
-        self._fresh: Mapping[str, Tensor] = {}
-        best = max(history, key=_score, default={})  # the earliest of equals
+        self._initial_state: Mapping[str, Tensor] = {}
+        best = max(history, key=_score, default={})  # the first of equal scores
         self._best = _score(best)
-        self.best: int | None = best["step"] if self._best > _NONE else None
-        """Environment steps of the best iteration of the history."""
+        self.best: int | None = best["step"] if self._best > _score({}) else None
+        """Environment steps of the best iteration in the history; None: it has no evaluation."""
 
     def due(self, iteration: int) -> bool:
         """Return whether an evaluation is due after this iteration."""
         return iteration % self._interval == 0
 
     def run(self, policy: Callable[[], Policy]) -> dict[str, float]:
-        """Evaluate a policy; it is made in here, since making one draws random weights."""
+        """Evaluate a policy. The policy is made inside, because making it draws random weights."""
         with undisturbed():
             if self._env is None:
-                seed_generators(0)  # tasks may draw random numbers while they are built
+                seed_generators(0)  # a task may draw random numbers while it is built
                 self._env = self._make_env()
                 self._env.reset(seed=self._env.seed)
-                self._fresh = self._env.state_dict()
-            self._env.load_state_dict(self._fresh)  # restores curricula too
+                self._initial_state = self._env.state_dict()
+            self._env.load_state_dict(
+                self._initial_state
+            )  # also resets curricula, so that each evaluation has the same episodes
             seed_generators(self._env.seed)
-            summary = evaluate(self._env, acting(self._env, policy()), self._episodes).summary()
+            summary = evaluate(self._env, trained_policy(self._env, policy()), self._episodes).summary()
         metrics = {_RETURN: summary["return"]["mean"], _LENGTH: summary["length"]["mean"]}
         return {**metrics, _SUCCESS: summary["success"]["rate"]} if "success" in summary else metrics
 
     def improves(self, metrics: Mapping[str, float]) -> bool:
-        """Return whether an evaluation was better than all before it: by success, then by return."""
+        """Return whether an evaluation is better than all before it, by success rate, then by return."""
         better = _score(metrics) > self._best
         self._best = max(self._best, _score(metrics))
         return better
@@ -74,8 +78,6 @@ class PeriodicEval:
             self._env.close()
 
 
-_NONE = (-math.inf, -math.inf)
-
-
 def _score(metrics: Mapping[str, Any]) -> tuple[float, float]:
+    """Return the success rate and the mean return of an evaluation; -inf for a missing one."""
     return metrics.get(_SUCCESS, -math.inf), metrics.get(_RETURN, -math.inf)

@@ -1,4 +1,4 @@
-"""Where a training stands, for whoever shows it; light, so that another process can show it too."""
+"""Progress of a training, for display. The module imports nothing heavy: another process displays it too."""
 
 from __future__ import annotations
 
@@ -7,52 +7,53 @@ from dataclasses import dataclass
 from typing import Any
 
 PARTS = ("physics", "task", "policy", "update")
-"""What the seconds of an iteration are split into."""
+"""Parts of an iteration whose durations are measured."""
 _FOREVER_S = 1e10
-"""What is further away than that [s] is not foreseen."""
+"""Longest remaining time that is displayed [s]."""
 
 
 @dataclass(slots=True)
 class Progress:
-    """Where training stands."""
+    """Progress of a training after an iteration."""
 
     iteration: int
     iterations: int | None
-    """Iterations in all, where that is known."""
+    """Iterations of the whole training; None: unknown."""
     env_steps: int
     elapsed_s: float
     remaining_s: float | None
+    """Estimated remaining time [s]; None: unknown."""
     steps_per_s: float
     seconds: dict[str, float]
+    """Part of an iteration -> its duration [s], or its share of the iteration."""
     metrics: dict[str, float]
 
 
-def progress_of(rows: Sequence[Mapping[str, Any]], iterations: int | None, elapsed_s: float) -> Progress:
-    """The same from the newest rows of `metrics.jsonl`, at least one; the rate is that of all of them.
+def progress_from_metrics(rows: Sequence[Mapping[str, Any]], iterations: int | None, elapsed_s: float) -> Progress:
+    """Return the progress of a run from the newest rows of its `metrics.jsonl`. The speed is the mean over the rows.
 
     Args:
-        rows: the rows, oldest first.
-        iterations: iterations in all, where that is known.
-        elapsed_s: how long the run has trained.
+        rows: the rows, at least one, oldest first.
+        iterations: iterations of the whole training; None: unknown.
+        elapsed_s: duration of the training so far [s].
     """
     last = rows[-1]
-    metrics = {name: value for name, value in last.items() if type(value) is float or type(value) is int}
-    for name in ("iteration", "step"):
-        metrics.pop(name, None)
-    took = sum(_number(row, "Perf/collection_time") + _number(row, "Perf/learning_time") for row in rows)
+    metrics = {k: v for k, v in last.items() if type(v) in (int, float) and k not in ("iteration", "step")}
+    duration = sum(_number(row, "Perf/collection_time") + _number(row, "Perf/learning_time") for row in rows)
     before = rows[0]["step"] - rows[0]["step"] // max(1, rows[0]["iteration"])
-    rate = (last["step"] - before) / took if took > 0.0 else 0.0
-    one = last["step"] / max(1, last["iteration"])
+    rate = (last["step"] - before) / duration if duration > 0.0 else 0.0
+    steps_per_iteration = last["step"] / max(1, last["iteration"])
     left = None
     if iterations is not None and rate > 0.0:
         done = max(1, last["iteration"])
-        left = max(0, iterations - done) * max(one / rate, elapsed_s / done)  # rows leave clips and checkpoints out
-    if left is not None and not left < _FOREVER_S:
-        left = None
+        # the rows do not count the time of videos and checkpoints, `elapsed_s` does
+        left = max(0, iterations - done) * max(steps_per_iteration / rate, elapsed_s / done)
+        left = left if left < _FOREVER_S else None
     seconds = {part: _number(last, f"Perf/{part}_share") for part in PARTS}
     return Progress(last["iteration"], iterations, last["step"], elapsed_s, left, rate, seconds, metrics)
 
 
 def _number(row: Mapping[str, Any], name: str) -> float:
+    """Return a metric of an untrusted row; 0 if it is not a number of at least 0."""
     value = row.get(name, 0.0)
     return float(value) if type(value) in (int, float) and value >= 0.0 else 0.0

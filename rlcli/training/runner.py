@@ -1,4 +1,4 @@
-"""Run of a training: open the run for writing, drive the loop, and record in the run how it ended."""
+"""Runner of a training: it opens loggers and checkpoints, runs the loop, and records the end in the run."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from rlcli.rl.budget import Budget
 from rlcli.runs.checkpoint import steps
 from rlcli.runs.provenance import built_record, differences, environment_record
 from rlcli.runs.restore import resolve_run
-from rlcli.training.checkpoint_writer import CheckpointWriter, Keep
+from rlcli.training.checkpoint_writer import CheckpointWriter, Keep, manifest_entries
 from rlcli.training.job import Job, TrainingResult
-from rlcli.training.loggers import Logger, open_loggers, read_metrics
+from rlcli.training.loggers import open_loggers, read_metrics
 from rlcli.training.loop import TrainLoop
 from rlcli.training.periodic_eval import PeriodicEval
 from rlcli.training.progress import Progress
@@ -30,16 +30,17 @@ from rlcli.training.signals import StopRequest
 
 if TYPE_CHECKING:
     from rlcli.rl.trainer import Trainer
+    from rlcli.training.trackers import Logger
     from rlcli.viewer.training_videos import TrainingVideos
 
 _log = logging.getLogger(__name__)
 
 
 class ProgressView(Protocol):
-    """Context that shows the progress of a training."""
+    """Context manager that displays the progress of a training."""
 
     def show(self, progress: Progress) -> None:
-        """Show one iteration."""
+        """Display the progress after an iteration."""
         ...
 
     def __enter__(self) -> Any: ...
@@ -50,17 +51,17 @@ class ProgressView(Protocol):
 def run_training(
     job: Job, trainer: Trainer, env: VecEnv, stop: StopRequest, view: ProgressView
 ) -> TrainingResult | None:
-    """Train a job until its budget is spent; an error of the loop is recorded in the run and raised.
+    """Train a job until its budget is spent; record an error of the loop in the run and raise it.
 
     Args:
-        job: what to train; its run is unlocked at the end.
-        trainer: its trainer, at the boundary where training begins.
-        env: the trainer's environment, which is closed at the end.
-        stop: the request to stop by a signal.
-        view: shows each iteration.
+        job: run and settings of the training; the run is unlocked at the end.
+        trainer: the trainer, in the state in which training starts.
+        env: the trainer's environment; it is closed at the end.
+        stop: stop request of a signal.
+        view: display of the progress.
 
     Returns:
-        The result; None on ranks that do not write the run.
+        The result; None on a rank that does not write the run.
     """
     run, resolved = job.run, job.resolved
     _log.debug("built in %.1f s", time.monotonic() - job.begin)
@@ -85,7 +86,7 @@ def run_training(
 
 
 def _train(job: Job, trainer: Trainer, env: VecEnv, stop: StopRequest, view: ProgressView) -> None:
-    """Open the run for writing, drive the loop, and record in the run how it ended."""
+    """Open loggers and checkpoints, run the loop, and record in the run how it ended."""
     run, agent = job.run, job.resolved.agent
     assert agent is not None
     budgets = [Budget(end, None) for end in job.stages] or [Budget(agent.max_iterations, agent.max_steps)]
@@ -94,7 +95,7 @@ def _train(job: Job, trainer: Trainer, env: VecEnv, stop: StopRequest, view: Pro
     trained_before = run.record.get("trained_s", 0.0)
 
     def close(state: str, reason: str | None = None) -> None:
-        with contextlib.ExitStack() as stack:
+        with contextlib.ExitStack() as stack:  # closes all loggers even if one of them fails; then updates the run
             if job.writes and writer.written is not None:
                 iteration, step = writer.written
                 trained_s = trained_before + time.monotonic() - job.begin
@@ -133,17 +134,11 @@ def _train(job: Job, trainer: Trainer, env: VecEnv, stop: StopRequest, view: Pro
 
 
 def _open_writer(job: Job, env: VecEnv) -> CheckpointWriter:
-    """Open the writer of checkpoints, with what every manifest holds and the recorder of failed episodes."""
+    """Open the writer of checkpoints and the recorder of failed episodes."""
     run, agent = job.run, job.resolved.agent
     assert agent is not None
-    manifest = {
-        **{key: run.record[key] for key in ("task", "agent", "seed")},
-        "trainer": agent.trainer,
-        "layout": env.layout.record(),
-        "deployment": describe(env),
-        "versions": {"rlcli": run.record["rlcli"], **run.record["versions"]},
-    }
-    keep = Keep() if job.stages else Keep.of(agent.keep_last, agent.keep_every, agent.save_interval)
+    manifest = manifest_entries(run, agent.trainer, env.layout, describe(env))
+    keep = Keep() if job.stages else Keep.from_settings(agent.keep_last, agent.keep_every, agent.save_interval)
     cases = None
     if job.writes and not job.stages:
         step = None if job.resume_from is None else job.resume_from.step
@@ -152,72 +147,82 @@ def _open_writer(job: Job, env: VecEnv) -> CheckpointWriter:
 
 
 def _record_begin(job: Job, trainer: Trainer, env: VecEnv, budget: Budget) -> None:
-    """Write the state of the run, and whether it resumes exactly, into run.json."""
+    """Write the start of the training into run.json, and whether the run can be resumed with the same bits."""
     unsaved = env.unsaved_state()
     if unsaved:
-        _log.warning("a resumed run may differ: no checkpoint can hold %s", ", ".join(unsaved))
+        _log.warning("a resumed run may differ: no checkpoint can store %s", ", ".join(unsaved))
     exact = not unsaved and env.device.type == "cpu"
     job.run.update(state="running", since=datetime.now(UTC).isoformat(), iterations=budget.iterations(trainer))
     job.run.update(resumes_exactly=exact, **_provenance(job, trainer, env))
 
 
 def _provenance(job: Job, trainer: Trainer, env: VecEnv) -> dict[str, Any]:
-    """Return run.json's entries on the built model and the machine; of a resumed run those that have changed."""
+    """Return run.json's entries on the compiled model and the machine; for a resumed run, only changed entries."""
     record, device = job.run.record, str(env.device)
     built = built_record(env.engine.model, device)
     if job.resume_from is None:
         return built
     now = environment_record(job.resolved, env.engine.threads, record.get("torch_threads") or 0) | built
-    now["engine_threads"] = record.get("engine_threads")  # the number of threads changes no bit
+    now["engine_threads"] = record.get("engine_threads")  # not compared: the number of engine threads changes no bit
     same = env.device.type == str(record.get("device", "cpu")).partition(":")[0]
     now["device"] = record.get("device") if same else device
     changed = {name: after for name, _, after in differences(record, now)}
     if not changed:
         return {}
-    _log.warning("resumed in another environment, the bits may differ: %s", ", ".join(changed))
+    _log.warning(
+        "the run is resumed on another machine or with other versions, so the bits may differ: %s", ", ".join(changed)
+    )
     return {"resumed": [*record.get("resumed", []), {"step": trainer.env_steps, "changed": changed}]}
 
 
+def _make_play_env(job: Job, purpose: str, flags: dict[str, Any]) -> VecEnv:
+    """Make an environment of the job's task in play mode, with its own seed.
+
+    Args:
+        job: run and settings of the training.
+        purpose: name from which the seed is derived.
+        flags: dotted key -> value of further settings.
+    """
+    resolved = resolve_run(job.run, play=True, flags=flags, named=job.resolved.source)
+    return make_env(resolved, seed=derive(job.run.record["seed"], purpose))
+
+
 def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest) -> PeriodicEval | None:
-    """Return the evaluation between iterations, if the agent wants one; only the rank that writes evaluates."""
+    """Return the evaluation between iterations, if the agent has one; only the rank that writes the run evaluates."""
     run, agent = job.run, job.resolved.agent
     assert agent is not None
     if agent.eval_interval is None or not job.writes:
         return None
+    num_envs = min(agent.eval_episodes, job.resolved.task.scene.num_envs)
 
     def make() -> VecEnv:
-        num_envs = min(agent.eval_episodes, job.resolved.task.scene.num_envs)
-        resolved = resolve_run(run, play=True, flags={"scene.num_envs": num_envs}, named=job.resolved.source)
-        env = make_env(resolved, seed=derive(run.record["seed"], "evaluation"))
+        env = _make_play_env(job, "evaluation", {"scene.num_envs": num_envs})
         env.observers.add(stop)
         return env
 
     evaluator = PeriodicEval(make, agent.eval_episodes, agent.eval_interval, read_metrics(run.metrics))
     writer.best = evaluator.best if evaluator.best in steps(run.checkpoints) else None
-    if run.record.get("best") != writer.best:  # the run was killed in between, or is resumed from before its best
+    # they differ if the run was killed before it wrote `best`, or is resumed from a step before its best evaluation
+    if run.record.get("best") != writer.best:
         run.update(best=writer.best)
     return evaluator
 
 
 def _training_videos(job: Job, stop: StopRequest) -> TrainingVideos | None:
-    """Return the recorder of videos between iterations, if the user wants them; only the rank that writes records."""
-    run, interval = job.run, job.video_every
-    if not interval or not job.writes:
+    """Return the recorder of videos, if the user wants videos; only the rank that writes the run records."""
+    if not job.video_every or not job.writes:
         return None
-    from rlcli.viewer.training_videos import (
-        TrainingVideos,  # imports OpenGL and video modules, which most trainings do not need
-    )
+    # imported here: most trainings do not need OpenGL and the video modules
+    from rlcli.viewer.training_videos import TrainingVideos
 
     def make() -> VecEnv:
-        single = {"scene.num_envs": 1, "sim.engine_threads": 1}
-        resolved = resolve_run(run, play=True, flags=single, named=job.resolved.source)
-        return make_env(resolved, seed=derive(run.record["seed"], "video"))
+        return _make_play_env(job, "video", {"scene.num_envs": 1, "sim.engine_threads": 1})
 
-    return TrainingVideos(make, run.folder / "videos", interval, lambda: stop.signal is not None)
+    return TrainingVideos(make, job.run.folder / "videos", job.video_every, lambda: stop.signal is not None)
 
 
 def _end_state(error: BaseException) -> tuple[str, str | None]:
-    """Return the state in which an error leaves the run, and the reason."""
+    """Return the state of the run after an error, and the reason for run.json."""
     if isinstance(error, Stopped | KeyboardInterrupt):
         return "stopped", None
     message = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"
@@ -225,6 +230,7 @@ def _end_state(error: BaseException) -> tuple[str, str | None]:
 
 
 def _warn_of_physics(env: VecEnv) -> None:
+    """Log MuJoCo's warnings of the whole training, with advice."""
     advice = {
         "contact_full": "contacts were dropped; enlarge <size memory=...> in the MJCF",
         "constraint_full": "constraints were dropped; enlarge <size memory=...> in the MJCF",

@@ -1,4 +1,4 @@
-"""Setup of a training: build the environment and the trainer of a job, at the boundary where training begins."""
+"""Setup of a training: the environment and the trainer of a job, in the state in which training starts."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _log = logging.getLogger(__name__)
 
 
 def build_trainer(job: Job, device: str) -> tuple[Trainer, VecEnv]:
-    """Build the trainer and its environment; start it, or load the checkpoint to resume from.
+    """Build the trainer and its environment; start the trainer, or load the checkpoint to resume from.
 
-    The run's configuration is written last: only then it is certain that training goes on.
+    The changed configuration of a resumed run is written only after everything that may fail.
 
     Raises:
         CheckpointError: if a checkpoint does not fit.
@@ -37,7 +37,7 @@ def build_trainer(job: Job, device: str) -> tuple[Trainer, VecEnv]:
     resolved, record, saved = job.resolved, job.run.record, job.resume_from
     assert resolved.agent is not None
     state = None
-    if saved is not None:  # read the untrusted files before anything is built
+    if saved is not None:  # read and check the untrusted files before anything is built
         require_trainer(saved, resolved.agent.trainer)
         state = saved.state()
     torch_threads = int(record.get("torch_threads") or threads(resolved)[1])
@@ -57,10 +57,10 @@ def build_trainer(job: Job, device: str) -> tuple[Trainer, VecEnv]:
 
 
 def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int) -> tuple[Trainer, VecEnv]:
-    """Make the environment and the trainer of a configuration; every rank has environments with seeds of its own."""
+    """Make the environment and the trainer of a configuration. Every rank has other seeds for its environments."""
     assert resolved.trainer is not None
     ranks = distributed.current()
-    seed_generators(ranks.seed(derive(seed, "task"), "task"))  # some tasks draw from them while they are built
+    seed_generators(ranks.seed(derive(seed, "task"), "task"))  # a task may draw random numbers while it is built
     env = make_env(resolved, seed=ranks.seed(seed, "environments"), device=device)
     try:
         make: Callable[..., Trainer] = load_object(resolved.trainer.trainer)
@@ -71,23 +71,23 @@ def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int)
 
 
 def _resume(job: Job, saved: Checkpoint, state: TrainerState, trainer: Trainer, env: VecEnv) -> None:
-    """Load the state of a checkpoint and remove the checkpoints after it."""
+    """Load the state of a checkpoint and remove the later checkpoints."""
     require_fit(saved, env.layout)
     _load(saved, lambda: trainer.load(state), "it cannot be resumed")
     if (trainer.iteration, trainer.env_steps) != (saved.iteration, saved.step):
-        raise CheckpointError(f"{saved.folder} cannot be resumed: its manifest and its state name different steps")
+        raise CheckpointError(f"{saved.folder} cannot be resumed: manifest.json and state.json have different steps")
     processes, size = state.values.get("processes", 1), distributed.current().world_size
     if processes != size:
-        _log.info("saved by %s processes, going on in %s: every environment begins a new episode", processes, size)
+        _log.info("saved by %s processes, continued by %s: every environment starts a new episode", processes, size)
     if job.config is not None:
         write_atomic(job.run.config, job.config)
     dropped = drop_after(job.run.checkpoints, saved.step) if job.writes else []
     if dropped:
-        _log.info("removed %s later checkpoints: they are not what comes next", len(dropped))
+        _log.info("removed %s later checkpoints: the resumed run replaces them", len(dropped))
 
 
 def _load(saved: Checkpoint, load: Callable[[], Any], failure: str) -> None:
-    """Call a loader; what untrusted numbers make it raise becomes a CheckpointError."""
+    """Call a loader of untrusted data; raise any error of it as a CheckpointError."""
     try:
         load()
     except RlcliError:

@@ -1,4 +1,4 @@
-"""Trainings in subprocesses: `rlcli` commands that are started in turn, watched, and stopped together."""
+"""Trainings in subprocesses: `rlcli` commands that are started one after the other and stopped together."""
 
 from __future__ import annotations
 
@@ -24,63 +24,59 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 STOP_WITH_PARENT = "RLCLI_LEASH"
-"""Environment variable of a process that stops when its parent ends, which closes the process's standard input."""
+"""Environment variable that tells a subprocess to stop when its standard input closes: its parent has ended."""
 LOG = "train.log"
-"""File of a run with the messages of its process."""
+"""File in a run with the messages of its process."""
 POLL_S = 0.1
-"""Time between two looks at running processes."""
+"""Time between two checks of running processes [s]."""
 STOPPED = 75
-"""Exit code of a training that was stopped by SIGTERM."""
+"""Exit code of a training that SIGTERM has stopped."""
 
 
 @dataclass(slots=True)
 class TrainingProcess:
-    """Subprocess with a command for one run."""
+    """Subprocess that runs a command for one run."""
 
     run: Path
+    """Folder of the run."""
     process: subprocess.Popen[bytes]
     stop_requested: bool = False
     document: dict[str, Any] = field(default_factory=dict)
-    """The JSON document that the process printed, once it has ended."""
+    """JSON document that the process has printed; empty while it runs."""
 
     def stop(self) -> None:
-        """Request a stop at the next step, with a checkpoint; further calls do nothing."""
+        """Request a stop at the next step, with a checkpoint. Later calls do nothing."""
         if not self.stop_requested:
             self.stop_requested = True
             with contextlib.suppress(OSError):
                 self.process.terminate()
 
     def has_ended(self) -> bool:
-        """Return whether the process has ended; read its document then."""
+        """Return whether the process has ended; if so, read its document."""
         if self.process.poll() is None:
             return False
         if not self.document:
-            assert self.process.stdout is not None
-            output = self.process.stdout.read()
+            output, _ = self.process.communicate()  # also closes the pipes
             with contextlib.suppress(ValueError):
                 self.document = json.loads(output)
-            self.process.stdout.close()
-            if self.process.stdin is not None:
-                with contextlib.suppress(OSError):
-                    self.process.stdin.close()
         return True
 
     @property
     def exit_code(self) -> int:
-        """The exit code as a shell gives it."""
+        """Exit code in the form of a shell: 128 + N after signal N."""
         code = self.process.returncode
         return 128 - code if code < 0 else code
 
     @property
     def has_failed(self) -> bool:
-        """Whether the process ended with an error other than being stopped."""
+        """Whether the process has ended with an error; a requested stop is no error."""
         return self.exit_code != 0 and not (self.stop_requested and self.exit_code == STOPPED)
 
     def error(self) -> RlcliError:
-        """Return the error that the process printed, or one that names its log."""
+        """Return the error that the process has printed, or an error with the path of its log."""
         printed = self.document.get("error")
         if not isinstance(printed, dict):
-            error = RlcliError(f"its process ended with {self.exit_code}; {self.run / LOG} has what it said")
+            error = RlcliError(f"its process ended with exit code {self.exit_code}; see {self.run / LOG}")
         else:
             error = RlcliError(str(printed.get("message")))
             error.kind = str(printed.get("kind"))
@@ -90,7 +86,7 @@ class TrainingProcess:
 
 def start_command(run: Path, words: Sequence[str]) -> TrainingProcess:
     """Start `rlcli WORDS --json` in a subprocess; its messages are appended to a log in the run."""
-    # a process group of its own: Ctrl-C reaches the subprocess once, through this process
+    # a new process group: Ctrl-C reaches the subprocess once, through this process
     group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP} if os.name == "nt" else {"start_new_session": True}  # type: ignore[attr-defined]
     with (run / LOG).open("ab") as log:
         process = subprocess.Popen(
@@ -105,7 +101,7 @@ def start_command(run: Path, words: Sequence[str]) -> TrainingProcess:
 
 
 def start_training(run: Path, device: str, options: Sequence[str] = ()) -> TrainingProcess:
-    """Start the training of a run that waits, or resume one that was interrupted."""
+    """Start the training of a waiting run, or resume an interrupted run."""
     return start_command(run, ["train", "--resume", str(run), "--device", device, *options])
 
 
@@ -132,18 +128,18 @@ def train_all(
     stop: StopRequest,
     poll: Callable[[], None],
 ) -> list[TrainingProcess]:
-    """Train runs in subprocesses until all have ended; after a signal start no more and stop those that train.
+    """Train runs in subprocesses until all have ended. After a signal stop all of them and start no more.
 
     Args:
-        runs: their folders.
-        device: where they train.
-        jobs: number of processes at a time.
+        runs: folders of the runs.
+        device: device of the trainings.
+        jobs: largest number of processes at a time.
         options: further options of each command.
-        stop: the request to stop by a signal.
-        poll: called regularly.
+        stop: stop request of a signal.
+        poll: called every `POLL_S` seconds.
 
     Returns:
-        The processes in the order in which they ended.
+        The processes in the order in which they have ended.
     """
     waiting = list(runs)
     active: list[TrainingProcess] = []
@@ -156,7 +152,7 @@ def train_all(
                     process.stop()
             while waiting and len(active) < jobs:
                 active.append(start_training(waiting.pop(0), device, options))
-                _log.debug("%s begins", active[-1].run.name)
+                _log.debug("%s starts", active[-1].run.name)
             for process in [process for process in active if process.has_ended()]:
                 active.remove(process)
                 ended.append(process)
@@ -165,6 +161,6 @@ def train_all(
             poll()
             time.sleep(POLL_S)
     finally:
-        for process in active:  # not empty only after an error
+        for process in active:  # after an error some may still run
             process.process.kill()
     return ended

@@ -1,5 +1,6 @@
-"""Experiment trackers: Weights & Biases, MLflow and trackio, each on this machine alone unless the user's settings say
-otherwise, and none of them able to stop a training or to make it wait.
+"""Experiment trackers: Weights & Biases, MLflow and trackio.
+
+Without settings of the user a tracker writes only to this machine. A tracker can neither stop nor delay a training.
 """
 
 from __future__ import annotations
@@ -17,67 +18,69 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Annotated, Any, Protocol
 from urllib.parse import urlsplit
 
+from pydantic import Field, ValidationError
+
+from rlcli.config.layers import leaves
 from rlcli.errors import MachineError, one_line
 from rlcli.rl.rng import undisturbed
 from rlcli.runs.run import Run
-
-if TYPE_CHECKING:
-    from rlcli.training.loggers import Logger
+from rlcli.runs.safe_io import FileModel
 
 _log = logging.getLogger(__name__)
 
-_MOST_ROWS = 100_000
-"""Longest queue of iterations before a tracker is given up."""
-_PATIENCE_S = 60.0
+_MAX_ROWS = 100_000
+"""Longest queue of iterations; a tracker with a longer queue has failed."""
+_TIMEOUT_S = 60.0
 """Longest time that the end of a training waits for a tracker [s]."""
-_ID = re.compile(r"[A-Za-z0-9_.-]{1,128}")
-_MOST_STEPS = 2**53
 
 
-class Tracker(Protocol):
-    """Library that stores the metrics of a run."""
-
-    id: str
-    """The library's name of the run, by which a resumed run is continued."""
+class Logger(Protocol):
+    """Logger of the metrics of every iteration."""
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
         """Record one iteration."""
         ...
 
     def close(self, state: str) -> None:
-        """Close, with the state of the run: finished, stopped, diverged or failed."""
+        """Flush and close, with the state of the run: finished, stopped, diverged or failed."""
         ...
 
 
+class Tracker(Logger, Protocol):
+    """Library that stores the metrics of a run."""
+
+    id: str
+    """Identifier of the run in the library; a resumed run continues it."""
+
+
 class FailSafeLogger:
-    """Logger whose failure is logged once; training continues without it.
+    """Wrapper of a logger. If the logger fails, a warning is logged once and training continues without the logger.
 
     Args:
-        name: its name in messages.
+        name: name of the logger in messages.
         logger: the logger.
-        after: the last environment step that it has already.
+        last_step: environment steps up to which the logger already has the metrics.
     """
 
-    def __init__(self, name: str, logger: Logger | BackgroundTracker, after: int) -> None:
-        self._logger: Logger | BackgroundTracker | None = logger
-        self._name, self._after = name, after
+    def __init__(self, name: str, logger: Logger, last_step: int) -> None:
+        self._logger: Logger | None = logger
+        self._name, self._last_step = name, last_step
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
-        """Record one iteration, unless the logger has failed."""
-        if self._logger is None or step <= self._after:
+        """Record one iteration, unless the logger has failed or already has it."""
+        if self._logger is None or step <= self._last_step:
             return
         try:
             self._logger.write(iteration, step, metrics)
-        except Exception as error:  # of any library or server
+        except Exception as error:  # libraries and servers raise any kind of error
             self._logger = None
-            reason = one_line(error, 300)
-            _log.warning("the logger %s has failed and is left out from now on: %s", self._name, reason)
+            _log.warning("the logger %s has failed and is not used any more: %s", self._name, one_line(error, 300))
 
-    def close(self, state: str = "finished") -> None:
-        """Close the logger."""
+    def close(self, state: str) -> None:
+        """Close the logger; log a warning if that fails."""
         if self._logger is None:
             return
         try:
@@ -87,7 +90,7 @@ class FailSafeLogger:
 
 
 class BackgroundTracker:
-    """Tracker in a background thread: only the end of training waits for it, for a limited time."""
+    """Tracker in a background thread. Only the end of a training waits for it, for a limited time."""
 
     def __init__(self, tracker: Tracker) -> None:
         self._tracker = tracker
@@ -100,21 +103,21 @@ class BackgroundTracker:
         """Queue one iteration, or raise the error of an earlier one."""
         if self._failure is not None:
             raise self._failure
-        if self._rows.qsize() > _MOST_ROWS:
-            raise TimeoutError(f"it is {_MOST_ROWS} iterations behind")
+        if self._rows.qsize() > _MAX_ROWS:
+            raise TimeoutError(f"its queue has more than {_MAX_ROWS} iterations")
         self._rows.put((iteration, step, {name: value for name, value in metrics.items() if math.isfinite(value)}))
 
     def close(self, state: str) -> None:
-        """Wait until everything is written.
+        """Close the tracker and wait until everything is written.
 
         Raises:
-            TimeoutError: if that takes too long.
+            TimeoutError: if that takes longer than `_TIMEOUT_S`.
         """
         with _without_stdout():
             self._rows.put(state)
-            self._thread.join(_PATIENCE_S)
+            self._thread.join(_TIMEOUT_S)
         if self._thread.is_alive():
-            raise TimeoutError(f"it did not finish within {_PATIENCE_S:g} s")
+            raise TimeoutError(f"it did not finish within {_TIMEOUT_S:g} s")
         if self._failure is not None:
             raise self._failure
 
@@ -134,63 +137,63 @@ def open_tracker(
     config: Mapping[str, Any],
     resume: tuple[int, int] | None,
 ) -> FailSafeLogger:
-    """Open a tracker of a run; a resumed run is continued in it without writing a step twice.
+    """Open a tracker of a run. A resumed run is continued in the tracker, without a step twice.
 
-    `run.json` stores the tracker's own name of the run, and the last step that the tracker had when the run was
+    `run.json` stores the tracker's identifier of the run, and the last step that the tracker had when the run was
     resumed.
 
     Args:
-        name: the logger's name.
-        kind: its class.
+        name: name of the logger.
+        kind: class of the tracker.
         run: the run.
         config: the resolved configuration.
-        resume: the last iteration and step before the run was resumed.
+        resume: last iteration and step before the run was resumed; None: the run is new.
 
     Raises:
-        MachineError: if it cannot be opened.
+        MachineError: if the tracker cannot be opened.
     """
-    known, after = _stored_mark(run, name) if resume is not None else (None, 0)
-    if known is not None and resume is not None:
-        after = max(after, resume[1])
+    stored = None if resume is None else _stored_tracker(run, name)
     try:
-        with undisturbed(), _without_stdout():  # a library may draw random names
-            tracker = contextvars.copy_context().run(kind, run, config, known)  # trackio sets a context variable
+        with undisturbed(), _without_stdout():  # a library may draw random numbers for names
+            # in a copy of the context: trackio sets a context variable
+            tracker = contextvars.copy_context().run(kind, run, config, stored and stored.id)
     except Exception as error:
-        raise MachineError(
-            f"the logger {name} cannot be opened: {one_line(error, 300)}", hint="--logger none trains without it"
-        ) from error
-    marks = run.record.get("trackers") or {}
-    run.update(trackers={**marks, name: {"id": tracker.id, "step": after if tracker.id == known else 0}})
-    return FailSafeLogger(name, BackgroundTracker(tracker), after if tracker.id == known else 0)
+        message = f"the logger {name} cannot be opened: {one_line(error, 300)}"
+        raise MachineError(message, hint="use --logger none to train without it") from error
+    last_step = 0
+    if resume is not None and stored is not None and tracker.id == stored.id:
+        last_step = max(stored.step, resume[1])
+    trackers = run.record.get("trackers") or {}
+    run.update(trackers={**trackers, name: {"id": tracker.id, "step": last_step}})
+    return FailSafeLogger(name, BackgroundTracker(tracker), last_step)
 
 
 class _LibraryRun:
-    """Base of trackers whose library has a run with `log` and `finish`."""
+    """Base class of trackers whose library has a run object with `log` and `finish`."""
 
     _run: Any
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
-        """Log at the environment step."""
+        """Log the metrics of an iteration at the environment step."""
         self._run.log({**metrics, "iteration": iteration}, step=step)
 
     def close(self, state: str) -> None:
-        """Finish, and wait for pending uploads."""
+        """Finish the run in the library and wait for pending uploads."""
         self._run.finish()
 
 
 class Wandb(_LibraryRun):
-    """Tracker of Weights & Biases: online with the user's key, else offline; its files lie in the run."""
+    """Tracker for Weights & Biases: online if the user has a key, else offline. Its files are in the run."""
 
-    def __init__(self, run: Run, config: Mapping[str, Any], known: str | None) -> None:
+    def __init__(self, run: Run, config: Mapping[str, Any], resume_id: str | None) -> None:
         _set_default_variables(WANDB_ERROR_REPORTING="false", WANDB_SILENT="true")
         wandb = importlib.import_module("wandb")
+        self._folder = run.folder / "wandb"
         mode = os.environ.get("WANDB_MODE")
         if mode is None and not _has_key():
             mode = "offline"
-            folder = run.folder / "wandb"
-            _log.warning("wandb has no key: it writes offline; `wandb sync %s/offline-run-*` uploads", folder)
-        self.id = known or f"{int(time.time()):x}{os.urandom(4).hex()}"
-        self._folder = run.folder / "wandb"
+            _log.warning("wandb has no key and writes offline; to upload: `wandb sync %s/offline-run-*`", self._folder)
+        self.id = resume_id or f"{int(time.time()):x}{os.urandom(4).hex()}"
         quiet = {"console": "off", "silent": True, "disable_git": True, "save_code": False, "symlink": False}
         self._run = wandb.init(
             project=os.environ.get("WANDB_PROJECT") or "rlcli",
@@ -206,15 +209,15 @@ class Wandb(_LibraryRun):
         _drop_links(self._folder)
 
     def close(self, state: str) -> None:
-        """Finish, and wait for pending uploads."""
+        """Finish the run in the library and wait for pending uploads."""
         self._run.finish(exit_code=0 if state == "finished" else 1)
         _drop_links(self._folder)
 
 
 class MLflow:
-    """Tracker of MLflow: at MLFLOW_TRACKING_URI, else files in the run."""
+    """Tracker for MLflow: at MLFLOW_TRACKING_URI, else in files of the run."""
 
-    def __init__(self, run: Run, config: Mapping[str, Any], known: str | None) -> None:
+    def __init__(self, run: Run, config: Mapping[str, Any], resume_id: str | None) -> None:
         _set_default_variables(
             MLFLOW_DISABLE_TELEMETRY="true",
             MLFLOW_ALLOW_FILE_STORE="true",  # a database would need more packages
@@ -223,60 +226,62 @@ class MLflow:
         )
         mlflow = importlib.import_module("mlflow")
         self._entities = importlib.import_module("mlflow.entities")
-        place = os.environ.get("MLFLOW_TRACKING_URI") or (run.folder / "mlflow").resolve().as_uri()
-        self._client = mlflow.MlflowClient(place)
-        if known is not None and self._exists(known):
-            self._client.update_run(known, status="RUNNING")
-            self.id = known
+        uri = os.environ.get("MLFLOW_TRACKING_URI") or (run.folder / "mlflow").resolve().as_uri()
+        self._client = mlflow.MlflowClient(uri)
+        if resume_id is not None and self._exists(resume_id):
+            self._client.update_run(resume_id, status="RUNNING")
+            self.id = resume_id
             return
         name = run.record["task"]["name"]
         experiment = self._client.get_experiment_by_name(name)
         number = self._client.create_experiment(name) if experiment is None else experiment.experiment_id
         tags = {"agent": str(run.record.get("agent")), "rlcli": str(run.record.get("rlcli")), "run": str(run.folder)}
         self.id = self._client.create_run(number, run_name=run.folder.name, tags=tags).info.run_id
+        agent = (config.get("agents") or {}).get(run.record.get("agent"))
         values = {
             "seed": run.record["seed"],
-            **_flat("agent", (config.get("agents") or {}).get(run.record.get("agent"))),
+            **{".".join(("agent", *map(str, path))): value for path, value in leaves(agent) if value != {}},
         }
+        # MLflow's limits: 100 parameters in a batch, 500 characters in a value
         params = [self._entities.Param(_mlflow_name(key), str(value)[:500]) for key, value in values.items()]
         self._client.log_batch(self.id, params=params[:100])
 
-    def _exists(self, known: str) -> bool:
+    def _exists(self, run_id: str) -> bool:
         try:
-            self._client.get_run(known)
-        except Exception:  # another server than before, or a folder that was cleared
+            self._client.get_run(run_id)
+        except Exception:  # the server is another one, or its data was deleted
             return False
         return True
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
-        """Log at the environment step."""
+        """Log the metrics of an iteration at the environment step."""
         now, metric = int(time.time() * 1000), self._entities.Metric
         rows = {**metrics, "iteration": float(iteration)}
         self._client.log_batch(self.id, metrics=[metric(_mlflow_name(key), v, now, step) for key, v in rows.items()])
 
     def close(self, state: str) -> None:
-        """Set the final status."""
+        """Set the final status of the run in MLflow."""
         states = {"finished": "FINISHED", "stopped": "KILLED"}
         self._client.set_terminated(self.id, states.get(state, "FAILED"))
 
 
 class Trackio(_LibraryRun):
-    """Tracker of trackio: a database in TRACKIO_DIR, else in the run."""
+    """Tracker for trackio: a database in TRACKIO_DIR, else in the run."""
 
-    def __init__(self, run: Run, config: Mapping[str, Any], known: str | None) -> None:
+    def __init__(self, run: Run, config: Mapping[str, Any], resume_id: str | None) -> None:
         _set_default_variables(
             TRACKIO_DIR=str((run.folder / "trackio").resolve()),
             HF_HUB_DISABLE_TELEMETRY="1",
             GRADIO_ANALYTICS_ENABLED="False",
         )
         if not any(os.environ.get(name) for name in ("TRACKIO_SPACE_ID", "TRACKIO_SERVER_URL")):
-            _set_default_variables(HF_HUB_OFFLINE="1")  # it would ask whose key this is
+            _set_default_variables(HF_HUB_OFFLINE="1")  # else it asks the Hugging Face hub for the owner of the key
         trackio = importlib.import_module("trackio")
-        self.id = known or run.folder.name
+        self.id = resume_id or run.folder.name
         self._run = trackio.init(
             project=re.sub(r"[^\w.-]", "-", run.record["task"]["name"]),
             name=self.id,
-            resume="never" if known is None else "allow",
+            resume="never" if resume_id is None else "allow",
             config={**config, "seed": run.record["seed"]},
             embed=False,
             auto_log_gpu=False,
@@ -284,32 +289,36 @@ class Trackio(_LibraryRun):
         )
 
 
-def _stored_mark(run: Run, name: str) -> tuple[str | None, int]:
-    """Return a tracker's name of the run and the last step that it has; run.json is untrusted."""
-    mark = (run.record.get("trackers") or {}).get(name)
-    if not isinstance(mark, dict):
-        return None, 0
-    known, step = mark.get("id"), mark.get("step")
-    if not (isinstance(known, str) and _ID.fullmatch(known) and type(step) is int and 0 <= step <= _MOST_STEPS):
-        return None, 0
-    return known, step
+class _StoredTracker(FileModel):
+    """Entry of a tracker in run.json."""
+
+    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,128}$")]
+    step: Annotated[int, Field(ge=0, le=2**53)]
+
+
+def _stored_tracker(run: Run, name: str) -> _StoredTracker | None:
+    """Return the entry of a tracker in run.json, which is untrusted; None if it is missing or not valid."""
+    try:
+        return _StoredTracker.model_validate((run.record.get("trackers") or {}).get(name))
+    except ValidationError:
+        return None
 
 
 def _has_key() -> bool:
-    """Return whether there is a key: in the environment, or from `wandb login`."""
+    """Return whether the user has a key of wandb: in the environment, or in the netrc file of `wandb login`."""
     if os.environ.get("WANDB_API_KEY") or os.environ.get("WANDB_IDENTITY_TOKEN_FILE"):
         return True
     host = urlsplit(os.environ.get("WANDB_BASE_URL") or "https://api.wandb.ai").hostname or ""
-    places = [os.environ["NETRC"]] if os.environ.get("NETRC") else ["~/.netrc", "~/_netrc"]
-    for place in places:
+    files = [os.environ["NETRC"]] if os.environ.get("NETRC") else ["~/.netrc", "~/_netrc"]
+    for file in files:
         with contextlib.suppress(OSError, netrc.NetrcParseError, UnicodeDecodeError):
-            if netrc.netrc(str(Path(place).expanduser())).authenticators(host):
+            if netrc.netrc(str(Path(file).expanduser())).authenticators(host):
                 return True
     return False
 
 
 def _drop_links(folder: Path) -> None:
-    """Remove links: wandb links a log outside of the run, and a run must not hold links."""
+    """Remove wandb's links to logs outside of the run: a run must not contain links."""
     with contextlib.suppress(OSError):
         for file in folder.glob("*/logs/*"):
             if file.is_symlink():
@@ -324,16 +333,11 @@ def _set_default_variables(**variables: str) -> None:
 
 @contextlib.contextmanager
 def _without_stdout() -> Iterator[None]:
-    """Discard what a library prints: stdout is for the command's result."""
+    """Discard the output of a library to stdout, which is for the command's result."""
     with open(os.devnull, "w", encoding="utf-8") as nothing, contextlib.redirect_stdout(nothing):
         yield
 
 
-def _flat(prefix: str, value: object) -> dict[str, Any]:
-    if not isinstance(value, Mapping):
-        return {prefix: value}
-    return {name: inner for key in value for name, inner in _flat(f"{prefix}.{key}", value[key]).items()}
-
-
 def _mlflow_name(name: str) -> str:
+    """Return a name with only the characters that MLflow allows, at most 250."""
     return re.sub(r"[^\w\-./: ]", "_", name)[:250]

@@ -8,7 +8,7 @@ import torch
 
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError
-from rlcli.rl.acting import Act, acting
+from rlcli.rl.acting import Act, trained_policy
 from rlcli.runs.checkpoint import open_checkpoint, steps
 from rlcli.runs.restore import policy_of, require_fit
 from rlcli.runs.run import Run
@@ -53,4 +53,4 @@ class RunCheckpoints:
         except OSError as error:  # removed while it is read
             raise CheckpointError(f"{folder} cannot be read: {error.strerror or error}") from None
         generator = torch.Generator().manual_seed(self.seed)
-        return acting(self.env, policy, stochastic=self.stochastic, generator=generator)
+        return trained_policy(self.env, policy, stochastic=self.stochastic, generator=generator)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rlcli.envs.observers import StepObserver
-from rlcli.rl.acting import acting
+from rlcli.rl.acting import trained_policy
 from rlcli.rl.rng import seed_generators, undisturbed
 from rlcli.viewer.record_video import record_episode
 
@@ -61,7 +61,7 @@ class TrainingVideos(StepObserver):
                     self._env = self._make_env()
                     self._env.observers.add(self)
                 seed_generators(self._env.seed)
-                record_episode(self._env, acting(self._env, policy()), file)
+                record_episode(self._env, trained_policy(self._env, policy()), file)
         except VideoAborted:
             return None
         except Exception as error:  # a full disk, a driver, an encoder, a task's own code

@@ -568,22 +568,22 @@ def test_many_names_for_one_tensor_do_not_fill_the_memory(monkeypatch):
     ("weights", "said"),
     [
         ({}, "no actor"),
-        ({"actor.0.weight": torch.zeros(1, 4)}, "no linear layer"),
-        ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(3)}, "no linear layer"),
+        ({"actor.0.weight": torch.zeros(1, 4)}, "is not a linear layer"),
+        ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(3)}, "is not a linear layer"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1)}, "depends on the state"),
         ({"actor.1.weight": torch.zeros(1, 4), "actor.1.bias": torch.zeros(1)}, "missing"),
-        ({"actor.x.weight": torch.zeros(1, 4), "actor.x.bias": torch.zeros(1)}, "no layers"),
+        ({"actor.x.weight": torch.zeros(1, 4), "actor.x.bias": torch.zeros(1)}, "is not a sequence of numbered layers"),
         ({"actor.00.weight": torch.zeros(1, 4), "actor.0.weight": torch.zeros(1, 4)}, "actor"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1), "std": torch.ones(2)}, "log_std"),
         (
             {"actor.0.weight": torch.zeros(8, 4), "actor.0.bias": torch.zeros(8), "actor.2.weight": torch.zeros(1, 9),
              "actor.2.bias": torch.zeros(1), "std": torch.ones(1)},
-            "gives 8",
+            "has 8 outputs",
         ),
         (
             {"actor.0.weight": torch.zeros(1, 6), "actor.0.bias": torch.zeros(1), "std": torch.ones(1),
              "memory_a.rnn.weight_hh_l0": torch.zeros(18, 6), "memory_a.rnn.weight_ih_l0": torch.zeros(18, 4)},
-            "no LSTM",
+            "is not an LSTM",
         ),
         (
             {"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1), "std": torch.ones(1),

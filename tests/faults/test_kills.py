@@ -183,7 +183,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(child, whole, tmp
     assert steps(run_in(folder) / "checkpoints") == []
     resumed = child(folder, "train", "--resume", "latest").ended()
     assert resumed.code == 0, resumed.err
-    assert "begins again" in resumed.err
+    assert "starts again" in resumed.err
     assert_same_run(run_in(folder), whole("sac")[0])
 
 

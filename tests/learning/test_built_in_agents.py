@@ -1,4 +1,4 @@
-"""What the off-policy agents of the built-in tasks learn in the budget that they come with."""
+"""Tests that the off-policy agents of the built-in tasks solve them within their budget."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from rlcli.cli.app import main
 
 
 @pytest.fixture(autouse=True)
-def _threads_as_before():
+def _restore_torch_threads():
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
@@ -15,7 +15,7 @@ def _threads_as_before():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "agent"), [("cartpole", "sac"), ("cartpole", "td3"), ("cartpole-direct", "sac")])
-def test_an_off_policy_agent_solves_its_task(task, agent, tmp_path):
+def test_off_policy_agent_solves_task(task, agent, tmp_path):
     runs = ("--runs-dir", str(tmp_path))
     assert main(["train", task, "--agent", agent, "--seed", "4", "--logger", "none", "-q", *runs]) == 0
     assert main(["eval", task, "--episodes", "1000", "--fail-under", "success=0.97", *runs]) == 0

@@ -1,9 +1,9 @@
-"""Intervals against published tables and numbers worked out by hand."""
+"""Tests of confidence intervals against published tables and hand-computed numbers."""
 
 import numpy as np
 import pytest
 
-from rlcli.rl.confidence import difference, improvement, mean, proportion, student
+from rlcli.rl.confidence import difference, improvement, mean, proportion, student_quantile
 
 
 @pytest.mark.parametrize(
@@ -16,14 +16,14 @@ from rlcli.rl.confidence import difference, improvement, mean, proportion, stude
         (1, 29, 0.0061, 0.1718),
     ],
 )
-def test_the_interval_of_a_share_is_wilsons(hits, count, low, high):
+def test_proportion_matches_published_wilson_intervals(hits, count, low, high):
     interval = proportion(hits, count)
     assert interval["rate"] == hits / count
     assert interval["low"] == pytest.approx(low, abs=5e-5)
     assert interval["high"] == pytest.approx(high, abs=5e-5)
 
 
-def test_the_interval_of_certainty_ends_at_one():
+def test_proportion_interval_ends_at_zero_and_one():
     assert proportion(20, 20)["high"] == 1.0
     assert proportion(0, 20)["low"] == 0.0
     assert proportion(20, 20)["low"] == pytest.approx(1 - 0.1611, abs=5e-5)
@@ -31,38 +31,38 @@ def test_the_interval_of_certainty_ends_at_one():
 
 @pytest.mark.parametrize(
     ("freedom", "quantile"),
-    # a printed table of Student's t, 0.975
+    # table of Student's t distribution, quantile 0.975
     [(1, 12.706), (2, 4.303), (3, 3.182), (10, 2.228), (30, 2.042), (120, 1.980), (499, 1.965), (501, 1.965)],
 )
-def test_students_quantiles_are_those_of_the_tables(freedom, quantile):
-    assert student(freedom) == pytest.approx(quantile, abs=6e-4)
+def test_student_quantile_matches_tables(freedom, quantile):
+    assert student_quantile(freedom) == pytest.approx(quantile, abs=6e-4)
 
 
-def test_the_interval_of_a_mean_is_students():
+def test_mean_has_student_interval():
     values = [1.0, 2.0, 3.0, 4.0]  # std sqrt(5/3), t of 3 degrees 3.182
     assert mean(values) == pytest.approx({"mean": 2.5, "std": 1.29099, "low": 0.4457, "high": 4.5543}, abs=1e-4)
 
 
-def test_a_single_value_has_a_mean_and_no_interval():
+def test_single_value_has_no_interval():
     assert mean([3.0]) == {"mean": 3.0, "std": 0.0, "low": None, "high": None}
     assert difference([3.0], [1.0]) == {"mean": 2.0, "low": None, "high": None}
     assert improvement([3.0], [1.0]) == {"probability": 1.0, "low": None, "high": None}
 
 
 @pytest.mark.parametrize("samples", [8, 60])
-def test_the_interval_of_a_mean_holds_the_truth_as_often_as_it_says(samples):
+def test_mean_interval_covers_true_mean_in_95_percent(samples):
     generator = np.random.default_rng(1)
-    held = 0
+    inside = 0
     for _ in range(1000):
         found = mean(generator.normal(2.0, 3.0, samples).tolist())
-        held += found["low"] < 2.0 < found["high"]
-    assert 0.93 < held / 1000 < 0.97
+        inside += found["low"] < 2.0 < found["high"]
+    assert 0.93 < inside / 1000 < 0.97
 
 
 @pytest.mark.parametrize(
     ("left", "right", "probability"),
     [
-        # pairs won and half of those tied, of all, counted by hand
+        # (wins + ties / 2) / all pairs, counted by hand
         ([1, 2, 3], [0, 0, 0], 1.0),
         ([0, 0, 1], [1, 2, 3], 0.5 / 9),
         ([1, 3], [2, 2], 0.5),
@@ -70,28 +70,28 @@ def test_the_interval_of_a_mean_holds_the_truth_as_often_as_it_says(samples):
         ([True, True, False], [True, False, False], (1 * 2 * 2 + 0.5 * (2 * 1 + 1 * 2)) / 9),
     ],
 )
-def test_the_probability_of_improvement_by_hand(left, right, probability):
+def test_improvement_matches_hand_computation(left, right, probability):
     assert improvement(left, right)["probability"] == pytest.approx(probability)
 
 
-def test_compared_with_itself_a_sample_is_as_good_and_no_different():
+def test_comparison_of_a_sample_with_itself_is_neutral():
     values = np.random.default_rng(3).normal(size=50).tolist()
     assert improvement(values, values)["probability"] == 0.5
     assert difference(values, values) == {"mean": 0.0, "low": 0.0, "high": 0.0}
 
 
-def test_the_intervals_of_a_comparison_hold_the_truth_and_leave_out_what_is_not():
+def test_comparison_intervals_cover_true_values_and_exclude_zero():
     generator = np.random.default_rng(5)
-    held = told = 0
+    inside = covered = 0
     for _ in range(60):
         base = generator.normal(size=40)
         left, right = base + generator.normal(0.5, 0.3, 40), base
         found = difference(left.tolist(), right.tolist())
-        held += found["low"] < 0.5 < found["high"]
+        inside += found["low"] < 0.5 < found["high"]
         assert found["high"] < 1.0
-        # of two normal distributions of variance 1.09 and 1, 0.5 apart
+        # P(left > right) for normal distributions with variances 1.09 and 1 and a distance of 0.5
         chance = improvement(left.tolist(), right.tolist())
-        told += chance["low"] < 0.635 < chance["high"]
+        covered += chance["low"] < 0.635 < chance["high"]
         assert chance["low"] > 0.5
-    assert held >= 52
-    assert told >= 52
+    assert inside >= 52
+    assert covered >= 52

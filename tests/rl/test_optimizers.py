@@ -1,11 +1,11 @@
-"""The optimiser that leaves torch's compiler unread."""
+"""Tests of the Adam optimiser that does not import torch's compiler."""
 
 import torch
 
 from rlcli.rl.optimizers import Adam, load_optimizer, optimizer_tensors
 
 
-def trained(kind, steps, **settings):
+def train(kind, steps, **settings):
     torch.manual_seed(0)
     network = torch.nn.Sequential(torch.nn.Linear(5, 7), torch.nn.Tanh(), torch.nn.Linear(7, 2))
     inputs = torch.randn(16, 5)
@@ -17,20 +17,20 @@ def trained(kind, steps, **settings):
     return network, optimizer
 
 
-def test_adam_gives_the_bits_of_torchs():
+def test_adam_matches_torch_bit_for_bit():
     for settings in ({}, {"fused": True, "eps": 1e-5}, {"weight_decay": 0.1}):
-        (own, _), (theirs, _) = (trained(kind, 6, **settings) for kind in (Adam, torch.optim.Adam))
+        (own, _), (theirs, _) = (train(kind, 6, **settings) for kind in (Adam, torch.optim.Adam))
         for mine, other in zip(own.parameters(), theirs.parameters(), strict=True):
             assert torch.equal(mine, other)
 
 
-def test_a_step_leaves_no_graph_behind():
-    network, _ = trained(Adam, 2)
+def test_step_builds_no_autograd_graph():
+    network, _ = train(Adam, 2)
     assert all(parameter.is_leaf and parameter.grad_fn is None for parameter in network.parameters())
 
 
-def test_hooks_see_every_step():
-    _, optimizer = trained(Adam, 1)
+def test_step_calls_hooks():
+    _, optimizer = train(Adam, 1)
     seen = []
     optimizer.register_step_pre_hook(lambda *_: seen.append("before"))
     optimizer.register_step_post_hook(lambda *_: seen.append("after"))
@@ -38,9 +38,9 @@ def test_hooks_see_every_step():
     assert seen == ["before", "after"]
 
 
-def test_states_pass_between_it_and_torchs():
-    _, own = trained(Adam, 3)
-    _, theirs = trained(torch.optim.Adam, 1)
+def test_state_can_be_exchanged_with_torch_adam():
+    _, own = train(Adam, 3)
+    _, theirs = train(torch.optim.Adam, 1)
     saved = optimizer_tensors(own, "o.")
     load_optimizer(theirs, saved, "o.")
     back = optimizer_tensors(theirs, "o.")

@@ -1,4 +1,4 @@
-"""Statistics of finished episodes, on episodes made by hand."""
+"""Tests of episode statistics with hand-made episodes."""
 
 import json
 
@@ -11,7 +11,7 @@ from rlcli.rl.statistics import EpisodeStatistics
 LENGTH_S = 2.0
 
 
-def ended(returns, lengths, fell, success=None, mask=None):
+def make_episodes(returns, lengths, fell, success=None, mask=None):
     returns, fell = torch.tensor(returns), torch.tensor(fell)
     return Episodes(
         ids=torch.arange(len(returns)),
@@ -25,8 +25,8 @@ def ended(returns, lengths, fell, success=None, mask=None):
     )
 
 
-TWO = ended([4.0, 8.0], [10, 20], [True, False], [False, True])
-FIGURES = {
+TWO = make_episodes([4.0, 8.0], [10, 20], [True, False], [False, True])
+METRICS = {
     "Train/mean_reward": 6.0,
     "Train/mean_episode_length": 15.0,
     "Train/success_rate": 0.5,
@@ -38,60 +38,60 @@ FIGURES = {
 
 
 @pytest.mark.parametrize("mode", [torch.enable_grad, torch.no_grad, torch.inference_mode])
-def test_figures_of_two_episodes_whatever_mode_they_were_collected_in(mode):
+def test_metrics_do_not_depend_on_gradient_mode(mode):
     statistics = EpisodeStatistics(LENGTH_S)
     for _ in range(3):
         with mode():
             statistics.add(None)
             statistics.add(TWO)
-        assert statistics.flush() == pytest.approx(FIGURES)
+        assert statistics.flush() == pytest.approx(METRICS)
     assert statistics.total == 6
 
 
-def test_sums_begun_without_inference_mode_go_on_within_it():
+def test_sums_continue_in_inference_mode():
     statistics = EpisodeStatistics(LENGTH_S)
     statistics.add(TWO)
     with torch.inference_mode():
-        statistics.add(ended([4.0, 8.0], [10, 20], [True, False], [False, True]))
-    assert statistics.flush() == pytest.approx(FIGURES)
+        statistics.add(make_episodes([4.0, 8.0], [10, 20], [True, False], [False, True]))
+    assert statistics.flush() == pytest.approx(METRICS)
     assert statistics.total == 4
 
 
-def test_rows_that_did_not_end_do_not_count():
+def test_masked_rows_do_not_count():
     statistics = EpisodeStatistics(LENGTH_S)
     columns = [4.0, 99.0, 8.0], [10, 77, 20], [True, True, False], [False, True, True]
-    statistics.add(ended(*columns, mask=[True, False, True]))
-    assert statistics.flush() == pytest.approx(FIGURES)
-    statistics.add(ended(*columns, mask=[False, False, False]))
-    means = {name: value for name, value in FIGURES.items() if name.startswith("Train/")}
-    assert statistics.flush() == pytest.approx(means), "a mean over no episode is left out"
+    statistics.add(make_episodes(*columns, mask=[True, False, True]))
+    assert statistics.flush() == pytest.approx(METRICS)
+    statistics.add(make_episodes(*columns, mask=[False, False, False]))
+    means = {name: value for name, value in METRICS.items() if name.startswith("Train/")}
+    assert statistics.flush() == pytest.approx(means), "without an episode a mean is left out"
     assert statistics.total == 2
 
 
-def test_without_a_success_condition_there_is_no_success_rate():
+def test_no_success_rate_without_success_condition():
     statistics = EpisodeStatistics(LENGTH_S)
-    statistics.add(ended([1.0], [5], [False]))
+    statistics.add(make_episodes([1.0], [5], [False]))
     assert "Train/success_rate" not in statistics.flush()
 
 
-def test_before_any_episode_ends_there_are_no_figures():
+def test_no_metrics_before_an_episode_ends():
     assert EpisodeStatistics(LENGTH_S).flush() == {}
 
 
-def test_means_are_those_of_the_last_iterations_with_a_hundred_episodes():
+def test_means_cover_last_iterations_with_100_episodes():
     statistics = EpisodeStatistics(LENGTH_S)
     for value in (1.0, 2.0, 3.0):
-        statistics.add(ended([value] * 60, [10] * 60, [False] * 60))
+        statistics.add(make_episodes([value] * 60, [10] * 60, [False] * 60))
         metrics = statistics.flush()
-    assert metrics["Train/mean_reward"] == 2.5  # the last two
-    statistics.add(ended([7.0] * 100, [10] * 100, [False] * 100))
+    assert metrics["Train/mean_reward"] == 2.5  # mean of the last two iterations
+    statistics.add(make_episodes([7.0] * 100, [10] * 100, [False] * 100))
     assert statistics.flush()["Train/mean_reward"] == 7.0
 
 
-def test_statistics_restored_from_json_go_on_with_the_same_figures():
+def test_state_restores_from_json():
     statistics, other = EpisodeStatistics(LENGTH_S), EpisodeStatistics(LENGTH_S)
     for value in (0.1, 0.7):
-        statistics.add(ended([value] * 40, [10] * 40, [False] * 40, [True] * 40))
+        statistics.add(make_episodes([value] * 40, [10] * 40, [False] * 40, [True] * 40))
         statistics.flush()
     other.add(TWO)
     other.flush()

@@ -143,7 +143,7 @@ def change_policy(folder, change):
     [
         (lambda t: t["log_std"].fill_(float("nan")), "log_std.*not finite"),
         (lambda t: t["actor.0.weight"].view(-1)[0].fill_(float("inf")), "actor.0.weight.*not finite"),
-        (lambda t: t.update(log_std=torch.zeros(3)), r"log_std is \(3,\), expected \(2,\)"),
+        (lambda t: t.update(log_std=torch.zeros(3)), r"log_std is float32 \(3,\), expected float32 \(2,\)"),
         (lambda t: t.pop("log_std"), "log_std is missing"),
         (lambda t: t.update(extra=torch.zeros(1)), "extra is .*expected nothing"),
         (lambda t: t.update(log_std=torch.zeros(2, dtype=torch.int64)), "log_std.*int64"),

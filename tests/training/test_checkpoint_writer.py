@@ -1,11 +1,11 @@
-"""Checkpoints are written beside the training, as many as are wanted, and rows of logs once."""
+"""Tests of the checkpoint writer: background writing, pruning, and rows of logs."""
 
 import json
 import threading
 
 import pytest
 import torch
-from test_checkpoints import state_of
+from support.saved_states import state_of
 
 from rlcli.errors import MachineError
 from rlcli.rl.trainer import Rows
@@ -22,87 +22,87 @@ def folder(tmp_path):
 
 
 def save_all(folder, keep, iterations, best=None):
-    saver = CheckpointWriter(folder, keep, {})
+    writer = CheckpointWriter(folder, keep, {})
     for iteration in iterations:
-        saver.save(state_of(), iteration, 100 * iteration)
-        saver.wait()
+        writer.save(state_of(), iteration, 100 * iteration)
+        writer.wait()
         if iteration == best:
-            saver.best = 100 * iteration
-    return saver
+            writer.best = 100 * iteration
+    return writer
 
 
 @pytest.mark.parametrize(
-    ("keep", "best", "left"),
+    ("keep", "best", "remaining"),
     [
         (Keep(), None, list(range(0, 13))),
         (Keep(last=2), None, [0, 11, 12]),
         (Keep(last=1), 4, [0, 4, 12]),
         (Keep(last=2, every=5), None, [0, 5, 10, 11, 12]),
         (Keep(last=20), None, list(range(0, 13))),
-        (Keep.of(None, None, None), None, [0, *range(3, 13)]),
-        (Keep.of(None, None, 1), None, list(range(0, 13))),
-        (Keep.of(3, None, 1), None, [0, 10, 11, 12]),
+        (Keep.from_settings(None, None, None), None, [0, *range(3, 13)]),
+        (Keep.from_settings(None, None, 1), None, list(range(0, 13))),
+        (Keep.from_settings(3, None, 1), None, [0, 10, 11, 12]),
     ],
 )
-def test_the_first_the_best_and_the_newest_stay(folder, keep, best, left):
+def test_first_best_and_newest_checkpoints_are_kept(folder, keep, best, remaining):
     save_all(folder, keep, range(13), best)
-    assert checkpoint.steps(folder) == [100 * iteration for iteration in left]
-    assert sorted(file.name for file in folder.iterdir()) == [*(f"{100 * i:012d}" for i in left), "latest"]
+    assert checkpoint.steps(folder) == [100 * iteration for iteration in remaining]
+    assert sorted(file.name for file in folder.iterdir()) == [*(f"{100 * i:012d}" for i in remaining), "latest"]
 
 
-def test_only_the_newest_boundary_is_said_to_be_saved_and_when_it_is(folder):
-    saver = CheckpointWriter(folder, Keep(), {"seed": 1})
-    assert saver.newest is None
-    saver.save(state_of(), 3, 300)
-    assert saver.newest == (3, 300)
-    saver.wait()
+def test_newest_is_set_by_save_and_by_resume(folder):
+    writer = CheckpointWriter(folder, Keep(), {"seed": 1})
+    assert writer.newest is None
+    writer.save(state_of(), 3, 300)
+    assert writer.newest == (3, 300)
+    writer.wait()
     opened = checkpoint.open_checkpoint(folder / f"{300:012d}")
     assert (opened.iteration, opened.step, opened.manifest["seed"]) == (3, 300, 1)
     assert CheckpointWriter(folder, Keep(), {}, resumed=opened).newest == (3, 300)
 
 
-def test_training_goes_on_while_a_checkpoint_is_written(folder, monkeypatch):
-    go, begun = threading.Event(), threading.Event()
+def test_save_does_not_block_while_a_checkpoint_is_written(folder, monkeypatch):
+    go, started = threading.Event(), threading.Event()
     write = checkpoint_writer.write_checkpoint
 
     def slow(*arguments):
-        begun.set()
+        started.set()
         assert go.wait(30)
         return write(*arguments)
 
     monkeypatch.setattr(checkpoint_writer, "write_checkpoint", slow)
-    saver = CheckpointWriter(folder, Keep(), {})
-    saver.save(state_of(), 1, 100)
-    assert begun.wait(30)
+    writer = CheckpointWriter(folder, Keep(), {})
+    writer.save(state_of(), 1, 100)
+    assert started.wait(30)
     assert checkpoint.steps(folder) == []
     go.set()
-    saver.save(state_of(), 2, 200)
-    saver.wait()
+    writer.save(state_of(), 2, 200)
+    writer.wait()
     assert checkpoint.steps(folder) == [100, 200]
 
 
-def test_what_the_disk_refused_is_said_once_at_the_next_chance(folder):
-    saver = CheckpointWriter(folder / "gone", Keep(), {})
-    saver.save(state_of(), 1, 100)
-    while saver._thread.is_alive():
+def test_write_error_is_raised_once_by_check(folder):
+    writer = CheckpointWriter(folder / "gone", Keep(), {})
+    writer.save(state_of(), 1, 100)
+    while writer._thread.is_alive():
         pass
     with pytest.raises(MachineError, match="No such file"):
-        saver.check()
-    saver.check()
+        writer.check()
+    writer.check()
 
 
 # --- rows ---
 
 
-def ring(total, size, at_risk=0):
-    """A ring buffer of `size` rows, into which row r wrote r, at a boundary after `total` rows."""
+def ring_rows(total, size, at_risk=0):
+    """Return the rows of a ring buffer of `size` rows after `total` rows; row r contains r."""
     first = max(0, total - size)
     return Rows(first, total, lambda start, stop: {"x": torch.arange(start, stop).float()[:, None]})
 
 
 def state_with(total, size=10):
     state = state_of()
-    state.logs["replay"] = ring(total, size)
+    state.logs["replay"] = ring_rows(total, size)
     return state
 
 
@@ -111,11 +111,11 @@ def rows_of(folder, step):
     return rows.first, rows.stop, rows.read(rows.first, rows.stop)["x"].flatten().tolist()
 
 
-def test_rows_are_written_once_and_each_checkpoint_has_its_own(folder):
-    saver = CheckpointWriter(folder, Keep(), {})
+def test_rows_are_written_once_for_all_checkpoints(folder):
+    writer = CheckpointWriter(folder, Keep(), {})
     for iteration, total in enumerate([0, 4, 4, 9, 14, 30]):
-        saver.save(state_with(total), iteration, 100 * iteration)
-    saver.wait()
+        writer.save(state_with(total), iteration, 100 * iteration)
+    writer.wait()
     files = sorted(file.name for file in (folder / "logs/replay").iterdir())
     spans = [tuple(map(int, name.removesuffix(".safetensors").split("-"))) for name in files]
     assert spans == [(0, 4), (4, 9), (9, 14), (20, 30)]
@@ -124,47 +124,47 @@ def test_rows_are_written_once_and_each_checkpoint_has_its_own(folder):
         assert rows_of(folder, 100 * iteration) == (first, total, [float(r) for r in range(first, total)])
 
 
-def test_rows_that_no_checkpoint_needs_go_with_the_checkpoints(folder):
-    saver = CheckpointWriter(folder, Keep(last=1), {})
+def test_pruning_removes_unneeded_rows(folder):
+    writer = CheckpointWriter(folder, Keep(last=1), {})
     for iteration in range(8):
-        saver.save(state_with(5 * iteration), iteration, 100 * iteration)
-    saver.wait()
+        writer.save(state_with(5 * iteration), iteration, 100 * iteration)
+    writer.wait()
     assert checkpoint.steps(folder) == [0, 700]
     assert sorted(file.name[:12] for file in (folder / "logs/replay").iterdir()) == [f"{n:012d}" for n in (25, 30)]
     assert rows_of(folder, 700) == (25, 35, [float(r) for r in range(25, 35)])
 
 
-def test_going_on_from_an_older_checkpoint_drops_the_rows_after_it_and_writes_them_anew(folder):
-    saver = CheckpointWriter(folder, Keep(), {})
+def test_resume_from_older_checkpoint_rewrites_later_rows(folder):
+    writer = CheckpointWriter(folder, Keep(), {})
     for iteration in range(1, 5):
-        saver.save(state_with(6 * iteration), iteration, 100 * iteration)
-    saver.wait()
+        writer.save(state_with(6 * iteration), iteration, 100 * iteration)
+    writer.wait()
     resumed = checkpoint.open_checkpoint(folder / f"{200:012d}")
     assert checkpoint_writer.drop_after(folder, 200) == [300, 400]
     assert sorted(file.name[:12] for file in (folder / "logs/replay").iterdir()) == [f"{n:012d}" for n in (0, 6)]
-    saver = CheckpointWriter(folder, Keep(), {}, resumed=resumed)
-    saver.save(state_with(15), 3, 300)
-    saver.wait()
+    writer = CheckpointWriter(folder, Keep(), {}, resumed=resumed)
+    writer.save(state_with(15), 3, 300)
+    writer.wait()
     assert rows_of(folder, 300) == (5, 15, [float(r) for r in range(5, 15)])
 
 
-def test_large_logs_are_cut_into_files(folder, monkeypatch):
+def test_large_logs_are_split_into_files(folder, monkeypatch):
     monkeypatch.setattr(checkpoint_writer, "_SHARD_BYTES", 12)
-    saver = CheckpointWriter(folder, Keep(), {})
-    saver.save(state_with(8), 1, 100)
-    saver.wait()
+    writer = CheckpointWriter(folder, Keep(), {})
+    writer.save(state_with(8), 1, 100)
+    writer.wait()
     assert [file.name[:12] for file in sorted((folder / "logs/replay").iterdir())] == [f"{n:012d}" for n in (0, 3, 6)]
     assert rows_of(folder, 100)[2] == [float(r) for r in range(8)]
 
 
 @pytest.mark.parametrize("damage", ["missing", "short", "flipped", "gap"])
-def test_damaged_rows_are_named(folder, damage):
+def test_damaged_rows_are_a_checkpoint_error(folder, damage):
     from rlcli.errors import CheckpointError
 
-    saver = CheckpointWriter(folder, Keep(), {})
+    writer = CheckpointWriter(folder, Keep(), {})
     for iteration in (1, 2):
-        saver.save(state_with(5 * iteration), iteration, 100 * iteration)
-    saver.wait()
+        writer.save(state_with(5 * iteration), iteration, 100 * iteration)
+    writer.wait()
     (file, _) = sorted((folder / "logs/replay").iterdir())
     data = bytearray(file.read_bytes())
     if damage == "missing":
@@ -184,7 +184,7 @@ def test_damaged_rows_are_named(folder, damage):
         rows_of(folder, 200)
 
 
-def test_a_boundary_reads_its_rows_while_the_next_ones_are_stored():
+def test_rows_can_be_read_while_new_rows_are_stored():
     from gymnasium.spaces import Box
 
     from rlcli.rl.sb3.buffers import TorchReplayBuffer
@@ -210,9 +210,9 @@ def test_a_boundary_reads_its_rows_while_the_next_ones_are_stored():
         assert (fresh.pos, fresh.full, fresh.added) == (filled % 8, filled >= 8, filled)
 
 
-@pytest.mark.parametrize("said", [None, "000000000100\n", ""])
-def test_the_newest_checkpoint_is_said_to_be_it_also_after_a_kill_before_that(folder, said):
+@pytest.mark.parametrize("content", [None, "000000000100\n", ""])
+def test_drop_after_repairs_latest_file(folder, content):
     save_all(folder, Keep(), range(3))
-    (folder / "latest").unlink() if said is None else (folder / "latest").write_text(said)
+    (folder / "latest").unlink() if content is None else (folder / "latest").write_text(content)
     assert checkpoint_writer.drop_after(folder, 200) == []
     assert (folder / "latest").read_text() == "000000000200\n"

@@ -1,4 +1,4 @@
-"""Metrics files: a line an iteration, valid JSON, no step twice after a resume."""
+"""Tests of loggers: one line of valid JSON per iteration, and no step twice after a resume."""
 
 import json
 import math
@@ -13,21 +13,21 @@ def steps_of(file):
     return [row["step"] for row in read_metrics(file)]
 
 
-def test_a_line_is_on_the_disk_when_its_iteration_is_over(tmp_path):
+def test_json_lines_writes_each_row_at_once(tmp_path):
     log = JsonLines(tmp_path / "metrics.jsonl")
     log.write(1, 16, {"Loss/value": 0.5})
     assert json.loads((tmp_path / "metrics.jsonl").read_text()) == {"iteration": 1, "step": 16, "Loss/value": 0.5}
     log.close()
 
 
-def test_a_number_that_json_does_not_have_is_left_out(tmp_path):
+def test_json_lines_leaves_out_nan_and_infinity(tmp_path):
     log = JsonLines(tmp_path / "metrics.jsonl")
     log.write(1, 16, {"a": math.nan, "b": math.inf, "c": 1.0})
     log.close()
     assert json.loads((tmp_path / "metrics.jsonl").read_text()) == {"iteration": 1, "step": 16, "c": 1.0}
 
 
-def test_resume_drops_what_came_after_the_checkpoint_and_a_line_cut_short(tmp_path):
+def test_resume_removes_later_rows_and_incomplete_row(tmp_path):
     file = tmp_path / "metrics.jsonl"
     log = JsonLines(file)
     for iteration in range(1, 5):
@@ -44,7 +44,7 @@ def test_resume_drops_what_came_after_the_checkpoint_and_a_line_cut_short(tmp_pa
 @pytest.mark.parametrize(
     "line", [b"[1]", b'{"a": 1}', b'{"iteration": "1", "step": 1}', b"\xff", b"[" * 100_000, b"\0" * 2**21]
 )
-def test_metrics_end_where_a_line_is_no_iterations(tmp_path, line):
+def test_read_metrics_ends_at_first_damaged_row(tmp_path, line):
     file = tmp_path / "metrics.jsonl"
     good = b'{"iteration": %d, "step": 16}\n'
     file.write_bytes(good % 1 + line + b"\n" + good % 2)
@@ -52,7 +52,7 @@ def test_metrics_end_where_a_line_is_no_iterations(tmp_path, line):
     assert file.read_bytes() == good % 1
 
 
-def test_tensorboard_holds_no_step_twice_after_a_resume(tmp_path):
+def test_tensorboard_has_no_step_twice_after_resume(tmp_path):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     board = TensorBoard(tmp_path)
     for step in (16, 32, 48):
@@ -68,7 +68,7 @@ def test_tensorboard_holds_no_step_twice_after_a_resume(tmp_path):
     assert [(e.step, e.value) for e in written] == [(16, 16.0), (32, 32.0), (48, 480.0)]
 
 
-def test_loggers_by_name(monkeypatch):
+def test_check_loggers_accepts_installed_names(monkeypatch):
     assert check_loggers(["none"]) == []
     assert check_loggers(["tensorboard"]) == ["tensorboard"]
     with pytest.raises(UsageError, match="no logger 'tensorbord'") as caught:
@@ -81,6 +81,6 @@ def test_loggers_by_name(monkeypatch):
     assert 'pip install "rlcli[tensorboard]"' in missing.value.hint
 
 
-def test_a_metrics_file_that_cannot_be_opened_is_a_machine_error(tmp_path):
+def test_metrics_file_that_cannot_be_opened_is_a_machine_error(tmp_path):
     with pytest.raises(MachineError, match=r"metrics\.jsonl"):
         JsonLines(tmp_path / "gone" / "metrics.jsonl")

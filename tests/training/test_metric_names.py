@@ -1,4 +1,4 @@
-"""Metrics mean the same whoever learns: equal names, and terms that add up to the return."""
+"""Tests that all trainers report the same metrics, and that reward terms add up to the return."""
 
 import pytest
 import torch
@@ -18,9 +18,9 @@ AGENTS = {
         for name in ("sac", "td3", "ddpg")
     },
 }
-OWN = ("Loss/", "Policy/")
-"""What an algorithm says of its own learning."""
-WANTED = {
+ALGORITHM_METRICS = ("Loss/", "Policy/")
+"""Prefixes of metrics that differ between algorithms."""
+EXPECTED = {
     "Train/mean_reward", "Train/mean_episode_length", "Train/success_rate", "Episode_Reward/alive",
     "Episode_Reward/terminating", "Episode_Reward/pole_pos", "Episode_Reward/cart_vel", "Episode_Reward/pole_vel",
     "Episode_Termination/time_out", "Episode_Termination/cart_out_of_bounds", "Perf/total_fps",
@@ -39,7 +39,7 @@ def _one_thread():
 
 
 def first_iteration(tmp_path, agent):
-    """Metrics of an iteration in which episodes ended, none of which ended before."""
+    """Return the metrics of a first iteration in which episodes end."""
     file = tmp_path / "agent.yaml"
     file.write_text(
         f"scene: {{num_envs: 6}}\nepisode_length_s: {LENGTH_S}\nsim: {{engine_threads: 1}}\n"
@@ -55,9 +55,9 @@ def first_iteration(tmp_path, agent):
 
 
 @pytest.mark.parametrize("agent", AGENTS)
-def test_names_are_the_same_for_all_algorithms_and_terms_add_up_to_the_return(tmp_path, agent):
+def test_metric_names_are_equal_and_terms_sum_to_the_return(tmp_path, agent):
     metrics = first_iteration(tmp_path, agent)
-    assert {name for name in metrics if not name.startswith(OWN)} == WANTED
+    assert {name for name in metrics if not name.startswith(ALGORITHM_METRICS)} == EXPECTED
     terms = sum(value for name, value in metrics.items() if name.startswith("Episode_Reward/"))
     assert terms * LENGTH_S == pytest.approx(metrics["Train/mean_reward"], rel=1e-6)
     assert metrics["Train/mean_reward"] != 0.0

@@ -1,4 +1,4 @@
-"""Evaluations between iterations: they choose the best checkpoint, and training does not notice them."""
+"""Tests of evaluations between iterations: they choose the best checkpoint and do not change training."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ SMALL = ("--num-envs", "8", "--logger", "none", "-q", "sim.engine_threads=1", "a
 
 
 @pytest.fixture(autouse=True)
-def _here(tmp_path, monkeypatch):
+def _temporary_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     threads = torch.get_num_threads()
     yield
@@ -33,8 +33,8 @@ def train(task, name, *words):
 
 def without_times(run, *, evaluation=True):
     rows = read_metrics(run / "metrics.jsonl")
-    left = "Perf/" if evaluation else ("Perf/", "Eval/")
-    return [{name: value for name, value in row.items() if not name.startswith(left)} for row in rows]
+    excluded = "Perf/" if evaluation else ("Perf/", "Eval/")
+    return [{name: value for name, value in row.items() if not name.startswith(excluded)} for row in rows]
 
 
 def weights(run):
@@ -42,17 +42,17 @@ def weights(run):
 
 
 @pytest.mark.parametrize(("task", "agent"), [("cartpole", "sb3-ppo"), ("cartpole-direct", "ppo")])
-def test_evaluations_change_nothing_of_training(task, agent, capsys):
+def test_evaluation_does_not_change_training(task, agent, capsys):
     words = ("--agent", agent, "--max-iterations", "4", "episode_length_s=0.3", "agent.eval_episodes=4")
     plain = train(task, "plain", *words)
-    tried = train(task, "tried", *words, "agent.eval_interval=2")
-    assert weights(plain) == weights(tried)
-    assert without_times(plain) == without_times(tried, evaluation=False)
-    with_trial = [row["iteration"] for row in without_times(tried) if "Eval/mean_reward" in row]
-    assert with_trial == [2, 4]
+    with_eval = train(task, "with_eval", *words, "agent.eval_interval=2")
+    assert weights(plain) == weights(with_eval)
+    assert without_times(plain) == without_times(with_eval, evaluation=False)
+    evaluated = [row["iteration"] for row in without_times(with_eval) if "Eval/mean_reward" in row]
+    assert evaluated == [2, 4]
 
 
-def test_the_best_evaluation_has_a_checkpoint_of_its_own_and_a_name(capsys):
+def test_best_evaluation_has_a_checkpoint_and_a_reference(capsys):
     run = train(
         "cartpole", "a", "--max-iterations", "4", "agent.eval_interval=1", "agent.eval_episodes=8", "agent.keep_last=1"
     )
@@ -66,7 +66,7 @@ def test_the_best_evaluation_has_a_checkpoint_of_its_own_and_a_name(capsys):
     assert "its best evaluation" in capsys.readouterr().err
 
 
-def test_a_resumed_run_remembers_its_best(capsys):
+def test_resumed_run_keeps_its_best_checkpoint(capsys):
     words = ("--agent", "ppo", "agent.eval_interval=1", "agent.eval_episodes=8", "agent.save_interval=1")
     whole = train("cartpole", "whole", "--max-iterations", "4", *words)
     cut = train("cartpole", "cut", "--max-iterations", "4", *words)
@@ -78,7 +78,7 @@ def test_a_resumed_run_remembers_its_best(capsys):
     assert weights(cut) == weights(whole)
 
 
-def test_going_back_before_the_best_forgets_it(capsys):
+def test_resume_before_the_best_checkpoint_removes_it(capsys):
     words = ("--agent", "ppo", "agent.eval_interval=1", "agent.eval_episodes=8", "agent.save_interval=1")
     run = train("cartpole", "a", "--max-iterations", "3", *words)
     steps = sorted(int(f.parent.name) for f in run.glob("checkpoints/*/manifest.json"))
@@ -88,12 +88,12 @@ def test_going_back_before_the_best_forgets_it(capsys):
     assert json.loads((run / "run.json").read_text())["best"] in steps[:3]
 
 
-def test_success_counts_before_return():
-    trials = PeriodicEval(
+def test_success_rate_counts_before_return():
+    evaluator = PeriodicEval(
         lambda: None, 1, 1, [{"step": 7, "Eval/success_rate": 0.5, "Eval/mean_reward": 9.0}, {"step": 9}]
     )
-    assert trials.best == 7
-    assert not trials.improves({"Eval/success_rate": 0.4, "Eval/mean_reward": 20.0})
-    assert not trials.improves({"Eval/success_rate": 0.5, "Eval/mean_reward": 9.0})
-    assert trials.improves({"Eval/success_rate": 0.5, "Eval/mean_reward": 9.5})
-    assert trials.improves({"Eval/success_rate": 0.6, "Eval/mean_reward": 1.0})
+    assert evaluator.best == 7
+    assert not evaluator.improves({"Eval/success_rate": 0.4, "Eval/mean_reward": 20.0})
+    assert not evaluator.improves({"Eval/success_rate": 0.5, "Eval/mean_reward": 9.0})
+    assert evaluator.improves({"Eval/success_rate": 0.5, "Eval/mean_reward": 9.5})
+    assert evaluator.improves({"Eval/success_rate": 0.6, "Eval/mean_reward": 1.0})

@@ -1,4 +1,4 @@
-"""A task that keeps things of its own in Python goes on exactly; where it cannot, the run says so."""
+"""Tests of the exact resume of a task with state in Python, and of the warning where this is not possible."""
 
 import json
 from pathlib import Path
@@ -64,7 +64,7 @@ class drift:
         return torch.full((self.env.num_envs,), 0.01 * self.calls) + self.total
 '''
 MANAGED = """
-summary: A reward that remembers.
+summary: A reward with state.
 decimation: 1
 episode_length_s: 0.03
 sim: {dt: 0.01}
@@ -107,7 +107,7 @@ def rows(run):
 
 
 @pytest.mark.parametrize("kind", ["direct", "managed"])
-def test_what_a_task_remembers_in_python_is_resumed_exactly(task, kind, capsys):
+def test_python_state_of_task_is_resumed_exactly(task, kind, capsys):
     folder = task(kind)
     train(folder, "--name", "whole", "--max-iterations", "6")
     train(folder, "--name", "cut", "--max-iterations", "3")
@@ -118,8 +118,8 @@ def test_what_a_task_remembers_in_python_is_resumed_exactly(task, kind, capsys):
     assert "may differ" not in capsys.readouterr().err
 
 
-def test_a_run_says_what_no_checkpoint_can_hold(task, capsys):
+def test_run_warns_of_state_that_no_checkpoint_can_store(task, capsys):
     train(task("direct", "self.order = itertools.cycle([1, 2, 3])"), "--max-iterations", "1")
-    assert "a resumed run may differ: no checkpoint can hold Task.order (cycle)" in capsys.readouterr().err
+    assert "a resumed run may differ: no checkpoint can store Task.order (cycle)" in capsys.readouterr().err
     (run,) = Path("runs").glob("*/*")
     assert not json.loads((run / "run.json").read_text())["resumes_exactly"]

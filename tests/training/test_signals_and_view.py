@@ -1,4 +1,4 @@
-"""Stopping a training, and what it shows while it runs."""
+"""Tests of stopping a training and of its display."""
 
 import json
 import os
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("empty_folder")]
 
 
 def wait_for_training(process, seconds=60):
-    """Until metrics are being written."""
+    """Wait until metrics are being written."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline and process.poll() is None:
         if any(file.stat().st_size for file in Path("runs").glob("*/*/metrics.jsonl")):
@@ -26,7 +26,7 @@ def wait_for_training(process, seconds=60):
     raise AssertionError(process.communicate()[1])
 
 
-def test_configuration_and_checkpoint_0_come_first(start):
+def test_run_folder_is_written_before_heavy_imports(start):
     process = start("train", "cartpole", *LONG, "--max-iterations", 100_000)
     deadline = time.monotonic() + 60
     while not list(Path().glob("runs/*/*/run.json")) and time.monotonic() < deadline:
@@ -40,8 +40,8 @@ def test_configuration_and_checkpoint_0_come_first(start):
     assert (run / "checkpoints/000000000000/manifest.json").is_file()
 
 
-def on_a_terminal(*arguments):
-    """What a command writes to a terminal, and its exit code."""
+def run_on_terminal(*arguments):
+    """Run a command on a terminal; return its output and exit code."""
     pid, terminal = pty.fork()
     if pid == 0:
         os.environ.update(TERM="xterm-256color", COLUMNS="160", LINES="50")
@@ -64,8 +64,8 @@ def on_a_terminal(*arguments):
     return shown.decode(errors="replace"), os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
 
-def test_a_terminal_shows_the_live_table():
-    shown, code = on_a_terminal("train", "cartpole", *LONG, "episode_length_s=0.3", "--max-iterations", 20)
+def test_terminal_shows_live_table():
+    shown, code = run_on_terminal("train", "cartpole", *LONG, "episode_length_s=0.3", "--max-iterations", 20)
     assert code == 0, shown
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown)
     for word in (
@@ -75,17 +75,17 @@ def test_a_terminal_shows_the_live_table():
     ):  # fmt: skip
         assert word in text, word
     assert "\x1b[" in shown
-    assert shown.count("\x1b[?25l") <= shown.count("\x1b[?25h")  # the cursor is back
+    assert shown.count("\x1b[?25l") <= shown.count("\x1b[?25h")  # the cursor is visible again
 
 
-def test_a_mistake_on_a_terminal_is_one_message():
-    shown, code = on_a_terminal("train", "cartpole", "rewards.alive.wieght=2")
+def test_error_on_terminal_is_one_message():
+    shown, code = run_on_terminal("train", "cartpole", "rewards.alive.wieght=2")
     assert code == 3
     assert "did you mean 'weight'" in shown
     assert "Traceback" not in shown
 
 
-def test_elsewhere_plain_lines_and_the_run_on_stdout(start, only_run):
+def test_pipe_gets_plain_lines_and_run_on_stdout(start, only_run):
     process = start("train", "cartpole", *LONG, "--max-iterations", 10)
     out, err = process.communicate(timeout=60)
     assert out == f"{only_run()}\n"
@@ -95,20 +95,20 @@ def test_elsewhere_plain_lines_and_the_run_on_stdout(start, only_run):
     assert "rlcli play --checkpoint" in err
 
 
-def test_quiet_says_nothing_but_the_result(start, only_run):
+def test_quiet_prints_only_the_result(start, only_run):
     out, err = start("train", "cartpole", *LONG, "-q", "--max-iterations", 2).communicate(timeout=60)
     assert (out, err) == (f"{only_run()}\n", "")
 
 
 @pytest.mark.parametrize("more", [(), ("rewards.alive.wieght=2",), ("agent.learning_rate=1e30",)])
-def test_json_keeps_stdout_to_one_document(start, more):
+def test_json_prints_one_document(start, more):
     out, _ = start("train", "cartpole", *LONG, *more, "--max-iterations", 2, "--json").communicate(timeout=60)
     document = json.loads(out)
     assert document["schema"] == 1
     assert ("error" in document) == bool(more)
 
 
-def test_json_of_a_stopped_run_names_its_exit_code(start):
+def test_json_of_stopped_run_has_exit_code(start):
     process = start("train", "cartpole", *LONG, "--max-iterations", 100_000, "--json")
     wait_for_training(process)
     process.send_signal(signal.SIGINT)

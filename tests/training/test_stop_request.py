@@ -1,4 +1,4 @@
-"""What a signal before training becomes, whatever the code that it met made of it."""
+"""Tests of a signal before training, which other code may turn into another error."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rlcli.training.signals import StopRequest
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 75)])
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ImportError("initialization failed"), None])
-def test_a_signal_ends_what_comes_before_training(number, code, error):
+def test_signal_before_training_raises_stopped(number, code, error):
     stop = StopRequest()
 
     def interrupted():
@@ -26,6 +26,6 @@ def test_a_signal_ends_what_comes_before_training(number, code, error):
     assert stopped.value.exit_code == code
 
 
-def test_without_a_signal_an_error_stays_what_it_is():
+def test_error_without_signal_is_not_changed():
     with pytest.raises(ImportError, match="no such module"), StopRequest().before_training():
         raise ImportError("no such module")

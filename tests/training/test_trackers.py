@@ -1,4 +1,4 @@
-"""Experiment trackers: none of them stops a training, changes it, makes it wait, or gets a step twice."""
+"""Tests of experiment trackers: they do not stop, change or delay a training, and get no step twice."""
 
 import importlib.util
 import json
@@ -21,7 +21,7 @@ from rlcli.training.trackers import BackgroundTracker
 
 SMALL = ("cartpole", "--agent", "ppo", "--num-envs", "8", "-q", "sim.engine_threads=1", "agent.torch_threads=1")
 NOTEBOOK = '''
-"""A tracker that writes into a file of the run, by the name that it was given."""
+"""A tracker that writes into a file of the run."""
 
 import json
 import random
@@ -31,10 +31,10 @@ import torch
 
 
 class Notebook:
-    def __init__(self, run, config, known):
+    def __init__(self, run, config, resume_id):
         random.random(), torch.rand(3), np.random.rand(3)
         print("Notebook is the best library of its kind")
-        self.id = known or f"note-{len(list(run.folder.glob('*.notes')))}"
+        self.id = resume_id or f"note-{len(list(run.folder.glob('*.notes')))}"
         self.file = run.folder / f"{self.id}.notes"
         self.note(opened=sorted(config))
 
@@ -62,13 +62,13 @@ class FailsAtTheEnd(Notebook):
 
 
 class NeverOpens:
-    def __init__(self, run, config, known):
+    def __init__(self, run, config, resume_id):
         raise ConnectionError("the server said no")
 '''
 
 
 @pytest.fixture(autouse=True)
-def _here(tmp_path, monkeypatch):
+def _temporary_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     threads = torch.get_num_threads()
     (tmp_path / "notebook.py").write_text(NOTEBOOK)
@@ -96,7 +96,7 @@ def without_times(row):
     return {key: value for key, value in row.items() if not key.startswith("Perf/")}
 
 
-def test_a_tracker_gets_what_metrics_jsonl_gets_and_the_configuration(capfd):
+def test_tracker_gets_metrics_and_configuration(capfd):
     run = train("a", "--max-iterations", "3", "--logger", "notebook")
     opened, *rows, closed = notes(run)
     assert rows == read_metrics(run / "metrics.jsonl")
@@ -106,7 +106,7 @@ def test_a_tracker_gets_what_metrics_jsonl_gets_and_the_configuration(capfd):
 
 
 @pytest.mark.parametrize("logger", ["notebook", "fails", "failsattheend"])
-def test_training_does_not_notice_a_tracker(logger, capfd):
+def test_tracker_does_not_change_training(logger, capfd):
     plain = train("plain", "--max-iterations", "3", "--logger", "none")
     tracked = train("tracked", "--max-iterations", "3", "--logger", logger)
     assert weights(plain) == weights(tracked)
@@ -116,7 +116,7 @@ def test_training_does_not_notice_a_tracker(logger, capfd):
 
 
 @pytest.mark.parametrize("iterations", [2, 5])
-def test_a_tracker_that_fails_is_said_once_and_left_out(iterations, capfd):
+def test_failed_tracker_is_reported_once_and_dropped(iterations, capfd):
     run = train("a", "--max-iterations", iterations, "--logger", "fails", "--logger", "notebook")
     err = capfd.readouterr().err
     assert err.count("the server said no") == 1
@@ -125,12 +125,12 @@ def test_a_tracker_that_fails_is_said_once_and_left_out(iterations, capfd):
     assert len(read_metrics(run / "metrics.jsonl")) == iterations
 
 
-def test_a_tracker_that_fails_at_the_end_is_said(capfd):
+def test_tracker_that_fails_at_the_end_is_reported(capfd):
     train("a", "--max-iterations", "1", "--logger", "failsattheend")
     assert "may lack the last iterations: the server said no" in capfd.readouterr().err
 
 
-def test_a_tracker_that_cannot_be_opened_is_said_before_training(capfd):
+def test_tracker_that_cannot_be_opened_is_a_machine_error(capfd):
     run = train("a", "--max-iterations", "3", "--logger", "neveropens", code=10)
     err = capfd.readouterr().err
     assert "the logger neveropens cannot be opened: the server said no" in err
@@ -138,12 +138,16 @@ def test_a_tracker_that_cannot_be_opened_is_said_before_training(capfd):
     assert read_metrics(run / "metrics.jsonl") == []
 
 
-def test_a_resumed_run_goes_on_in_its_tracker_without_a_step_twice(capfd):
+def test_resumed_run_continues_its_tracker_without_duplicate_steps(capfd):
     words = ("--logger", "notebook", "agent.save_interval=1")
     run = train("a", "--max-iterations", "4", *words)
     rows = read_metrics(run / "metrics.jsonl")
     steps = [row["step"] for row in rows]
-    for begin, end in ((steps[0], 2), (steps[1], 3), (steps[0], 6)):  # the second knows no more of the fourth iteration
+    for begin, end in (
+        (steps[0], 2),
+        (steps[1], 3),
+        (steps[0], 6),
+    ):  # the second resume ends before the fourth iteration
         assert main(["train", "--resume", f"{run}@step:{begin}", "--max-iterations", str(end), "-q"]) == 0
     written = [row for row in notes(run) if "step" in row]
     assert [row["iteration"] for row in written] == [1, 2, 3, 4, 5, 6]
@@ -155,7 +159,7 @@ def test_a_resumed_run_goes_on_in_its_tracker_without_a_step_twice(capfd):
     "trackers",
     [{"notebook": {"id": "../../x", "step": 0}}, {"notebook": {"id": "note-0", "step": "9"}}, {"notebook": 3}],
 )
-def test_a_run_whose_tracker_is_malformed_gets_a_new_one(trackers, capfd):
+def test_malformed_tracker_entry_gives_a_new_tracker_run(trackers, capfd):
     run = train("a", "--max-iterations", "1", "--logger", "notebook")
     record = json.loads((run / "run.json").read_text())
     (run / "run.json").write_text(json.dumps(record | {"trackers": trackers}))
@@ -163,14 +167,14 @@ def test_a_run_whose_tracker_is_malformed_gets_a_new_one(trackers, capfd):
     assert [row["iteration"] for row in notes(run, "note-1") if "step" in row] == [2]
 
 
-def test_the_state_of_a_stopped_training_reaches_the_tracker(capfd):
+def test_tracker_gets_final_state_of_diverged_run(capfd):
     run = train(
         "a", "--agent", "sb3-ppo", "agent.learning_rate=1e30", "--max-iterations", "3", "--logger", "notebook", code=6
     )
     assert notes(run)[-1] == {"closed": "diverged"}
 
 
-def test_training_does_not_wait_for_a_slow_tracker_but_its_end_does():
+def test_only_close_waits_for_a_slow_tracker():
     class Slow:
         id = "slow"
 
@@ -185,30 +189,30 @@ def test_training_does_not_wait_for_a_slow_tracker_but_its_end_does():
             self.rows.append(state)
 
     slow = Slow()
-    behind = BackgroundTracker(slow)
+    tracker = BackgroundTracker(slow)
     for step in range(3):
-        behind.write(step, step, {"a": 1.0, "b": float("nan")})
+        tracker.write(step, step, {"a": 1.0, "b": float("nan")})
     assert slow.rows == []
     threading.Timer(0.1, slow.may.set).start()
-    behind.close("finished")
+    tracker.close("finished")
     assert slow.rows == [(step, step, {"a": 1.0}) for step in range(3)] + ["finished"]
 
 
 @pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow", "trackio"])
-def test_a_logger_that_is_not_installed_names_its_extra(name, monkeypatch):
+def test_missing_logger_error_names_its_extra(name, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(DependencyError) as missing:
         check_loggers([name])
     assert missing.value.hint == f'pip install "rlcli[{name}]"'
 
 
-def test_loggers_repeat_and_none_is_none_of_them(monkeypatch):
+def test_check_loggers_removes_duplicates_and_none(monkeypatch):
     monkeypatch.setattr(loggers, "_installed", lambda name: True)
     assert check_loggers(["wandb", "tensorboard", "wandb"]) == ["wandb", "tensorboard"]
     assert check_loggers(["none", "mlflow"]) == ["mlflow"]
 
 
-ALONE = """
+WITHOUT_NETWORK = """
 import sys
 
 def refuse(event, arguments):
@@ -226,15 +230,15 @@ TRACKERS = ["wandb", "mlflow", "trackio"]
 KEYS = ("WANDB_API_KEY", "WANDB_MODE", "MLFLOW_TRACKING_URI", "TRACKIO_DIR", "TRACKIO_SPACE_ID", "HF_TOKEN", "NETRC")
 
 
-def alone(tmp_path, *words):
-    """Train in a process that is refused the network, and in a world without one where the system offers it."""
+def train_without_network(tmp_path, *words):
+    """Train in a process without network access; if the system can, also in a network namespace without devices."""
     import os
 
     settings = {name: value for name, value in os.environ.items() if name not in KEYS}
     settings |= {"HOME": str(tmp_path), "OMP_NUM_THREADS": "1"}
-    nowhere = ["unshare", "-rn"]
-    able = shutil.which("unshare") and subprocess.run([*nowhere, "true"], capture_output=True).returncode == 0
-    command = [*(nowhere if able else []), sys.executable, "-c", ALONE, "train", *words]
+    unshare = ["unshare", "-rn"]
+    can_unshare = shutil.which("unshare") and subprocess.run([*unshare, "true"], capture_output=True).returncode == 0
+    command = [*(unshare if can_unshare else []), sys.executable, "-c", WITHOUT_NETWORK, "train", *words]
     done = subprocess.run(command, capture_output=True, text=True, timeout=280, env=settings)
     assert done.returncode == 0, done.stderr
     assert "NETWORK" not in done.stderr
@@ -245,20 +249,20 @@ def alone(tmp_path, *words):
 
 
 def test_training_needs_no_network(tmp_path):
-    run, _ = alone(tmp_path, *SMALL, "--max-iterations", "2")
+    run, _ = train_without_network(tmp_path, *SMALL, "--max-iterations", "2")
     assert len(read_metrics(run / "metrics.jsonl")) == 2
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TRACKERS)
-def test_the_library_itself_works_offline_and_goes_on_after_a_resume(name, tmp_path):
+def test_library_works_offline_and_continues_after_resume(name, tmp_path):
     if importlib.util.find_spec(name) is None:
         pytest.skip("not installed")
     words = ("--max-iterations", "4", "agent.save_interval=1", "--logger", name)
-    run, err = alone(tmp_path, *SMALL, *words)
+    run, err = train_without_network(tmp_path, *SMALL, *words)
     assert ("wandb sync" in err) == (name == "wandb")
     step = read_metrics(run / "metrics.jsonl")[1]["step"]
-    alone(tmp_path, "--resume", f"{run}@step:{step}", "--max-iterations", "6", "-q")
+    train_without_network(tmp_path, "--resume", f"{run}@step:{step}", "--max-iterations", "6", "-q")
     rows = read_metrics(run / "metrics.jsonl")
     assert len(rows) == 6
     read = {"wandb": _read_wandb, "mlflow": _read_mlflow, "trackio": _read_trackio}[name]
@@ -266,7 +270,7 @@ def test_the_library_itself_works_offline_and_goes_on_after_a_resume(name, tmp_p
 
 
 def _read_wandb(run, metric):
-    """The records of its offline files, a log of 32 KiB blocks as LevelDB writes them."""
+    """Return (step, value) rows of the offline files, which are LevelDB logs with blocks of 32 KiB."""
     from wandb.proto import wandb_internal_pb2
 
     rows = []
@@ -313,7 +317,7 @@ def _read_trackio(run, metric):
     return [(step, json.loads(metrics)[metric]) for step, metrics in rows]
 
 
-def test_the_draws_of_a_tracker_are_not_those_of_the_training(capfd):
+def test_random_numbers_of_tracker_do_not_change_training(capfd):
     random.seed(3)
     before = random.getstate()
     train("a", "--max-iterations", "1", "--logger", "none")

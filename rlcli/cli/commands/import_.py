@@ -107,10 +107,10 @@ def _as_run(
     form: str, file: Path, foreign: ImportedPolicy, resolved: Resolved, runs_dir: Path | None, name: str | None
 ) -> None:
     from rlcli.runs.run_ref import default_runs_dir
-    from rlcli.training.import_checkpoint import as_run
+    from rlcli.training.import_checkpoint import create_imported_run
 
     record = {"imported": {"form": form, "file": file.name, "algorithm": foreign.algorithm}}
-    run = as_run(foreign, resolved, record, runs_dir or default_runs_dir(), name)
+    run = create_imported_run(foreign, resolved, record, runs_dir or default_runs_dir(), name)
     spec = foreign.spec
     hidden = " x ".join(map(str, spec["hidden"])) or "none"
     bound = "unbounded" if spec["action_bound"] is None else f"within +-{spec['action_bound']:g}"

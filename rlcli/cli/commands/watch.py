@@ -64,12 +64,12 @@ def _follow(run: Run) -> Overview:
 
 def _progress(run: Run) -> Progress | None:
     from rlcli.runs.index import count, newest_rows, times
-    from rlcli.training.progress import progress_of
+    from rlcli.training.progress import progress_from_metrics
 
     rows = newest_rows(run)
     if not rows:
         return None
-    return progress_of(rows, count(run.record.get("iterations")), times(run)[1] or 0.0)
+    return progress_from_metrics(rows, count(run.record.get("iterations")), times(run)[1] or 0.0)
 
 
 def _report(final: Overview) -> None:

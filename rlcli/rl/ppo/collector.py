@@ -1,7 +1,7 @@
 """Rollouts of the PPO trainer and their advantages.
 
-`collect` and `estimate_advantages` take and return nothing, and never read a value back from the device: they only read
-and write tensors allocated beforehand, so that a GPU captures each of them once as a CUDA graph and replays it.
+`collect` and `estimate_advantages` have no arguments and no results. They read and write preallocated tensors and never
+read a value back from the device, so that a GPU can capture each of them as a CUDA graph and replay it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rlcli.rl.distributed import ProcessGroup
 from rlcli.rl.nan_check import moments, require_finite
 from rlcli.rl.policy import Normalizer
 from rlcli.rl.ppo.config import PpoConfig
-from rlcli.rl.ppo.loss import log_prob, standardized
+from rlcli.rl.ppo.loss import log_prob, standardize
 from rlcli.rl.ppo.networks import ActorCritic, ValueNormalizer, unroll
 from rlcli.rl.ppo.rollout_buffer import RolloutBuffer
 from rlcli.rl.ppo.setup import minibatch_sizes
@@ -25,15 +25,15 @@ from rlcli.rl.statistics import EpisodeStatistics
 
 
 class Collector:
-    """Collects rollouts with the current policy, and estimates the advantages of their samples.
+    """Collector of rollouts with the current policy, which also estimates the advantages of the samples.
 
     Args:
         env: the environment.
-        config: the agent.
+        config: configuration of the agent.
         networks: actor and critic.
         groups: observation groups of the critic.
-        statistics: statistics of the episodes that end.
-        process_group: the processes of the run.
+        statistics: statistics of finished episodes.
+        process_group: processes of the run.
     """
 
     def __init__(
@@ -58,12 +58,9 @@ class Collector:
         self._critic_reads_actor_obs = groups == ("policy",)
         obs_size, critic_size = layout.size("policy"), sum(layout.size(group) for group in groups)
 
-        self.normalizer: Normalizer | None = None
-        self.critic_normalizer: Normalizer | None = None
-        if config.normalize_observations:
-            self.normalizer = Normalizer(obs_size).to(device)
-            if not self._critic_reads_actor_obs:
-                self.critic_normalizer = Normalizer(critic_size).to(device)
+        normalizes_critic_obs = config.normalize_observations and not self._critic_reads_actor_obs
+        self.normalizer = Normalizer(obs_size).to(device) if config.normalize_observations else None
+        self.critic_normalizer = Normalizer(critic_size).to(device) if normalizes_critic_obs else None
         self.value_normalizer = ValueNormalizer().to(device) if config.normalize_value else None
 
         self.rollout = RolloutBuffer(
@@ -78,30 +75,31 @@ class Collector:
             group: torch.zeros(env.num_envs, layout.size(group), device=device)
             for group in dict.fromkeys(("policy", *groups))
         }
-        """Observations that the next action is chosen from, by group. (num_envs, d) each"""
+        """Current observations by group; the next action depends on them. (num_envs, d) each"""
         self.raw_obs = {
             group: torch.zeros(config.num_steps, *obs.shape, device=device)
             for group, obs in self.obs.items()
             if config.normalize_observations
         }
-        """The rollout's observations before normalisation, by group. (num_steps, num_envs, d) each"""
+        """Observations of the rollout before normalisation, by group. (num_steps, num_envs, d) each"""
         self.episode_start = torch.ones(env.num_envs, device=device)
-        """1 where `obs` is the first observation of an episode."""
+        """1 where `obs` is the first observation of an episode, 0 elsewhere. (num_envs,)"""
         self.hidden_state = {name: lstm.blank(env.num_envs) for name, lstm in networks.recurrent_modules().items()}
         """Current hidden states of the LSTMs of actor and critic. (num_envs, m) each"""
         self.initial_hidden_state = {name: state.clone() for name, state in self.hidden_state.items()}
         """Hidden states at the beginning of the rollout."""
         self.explained_variance = torch.zeros((), device=device)
-        """Share of the variance of the returns that the critic predicted."""
+        """Share of the variance of the returns that the critic predicts: 1 - Var(target - value) / Var(target). ()"""
 
     # --- the rollout ---
 
     @torch.no_grad()
     def collect(self) -> None:
-        """Take `num_steps` in every environment with the current policy."""
+        """Do `num_steps` steps in every environment with the current policy."""
         rollout, samples, bound = self.rollout, self.rollout.samples, self.config.action_bound
         for name, state in self.hidden_state.items():
             self.initial_hidden_state[name].copy_(state)
+        # one call samples the noise of all steps: faster than a call per step
         std, noise = self.networks.std, torch.randn_like(samples.action)
         deviation = std * noise
         samples.log_prob.copy_(log_prob(noise, std))
@@ -117,7 +115,7 @@ class Collector:
             samples.action[t].copy_(action)
             samples.mean[t].copy_(mean)
             self._store_outcome(t, step)
-            raw_obs, episode_start = step.obs, rollout.done[t]
+            raw_obs, episode_start = step.obs, rollout.done[t]  # a step returns the new episode's first observation
         self.set_obs(raw_obs)
         samples.episode_start[0].copy_(self.episode_start)
         samples.episode_start[1:].copy_(rollout.done[:-1])
@@ -125,12 +123,12 @@ class Collector:
         rollout.old_std.copy_(std.expand_as(rollout.old_std))
 
     def set_obs(self, obs: Mapping[str, Tensor]) -> None:
-        """Set the observations that the next action is chosen from."""
+        """Set the current observations. (num_envs, d) each"""
         for group, own in self.obs.items():
             own.copy_(obs[group])
 
     def _inputs(self, t: int, obs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the inputs of actor and critic at step t, normalised."""
+        """Return the normalised inputs of actor and critic at step t; store and count the raw observations."""
         if self.normalizer is not None:
             for group, raw in self.raw_obs.items():
                 raw[t].copy_(obs[group])
@@ -139,7 +137,7 @@ class Collector:
         return self.actor_input(obs), self._critic_input(obs)
 
     def _actor_features(self, obs: Tensor, episode_start: Tensor) -> Tensor:
-        """Return the input of the actor's MLP: the observation, or the output of the LSTM before the MLP."""
+        """Return the input of the actor's MLP: the observation, or the output of the LSTM."""
         if self.networks.memory is None:
             return obs
         state = self.hidden_state["actor"]
@@ -149,6 +147,7 @@ class Collector:
         return features
 
     def _store_outcome(self, t: int, step: StepResult) -> None:
+        """Store reward, episode end and last observation of step t, and count finished episodes."""
         rollout = self.rollout
         torch.mul(step.reward, self.config.reward_scale, out=rollout.reward[t])
         torch.logical_or(step.terminated, step.truncated, out=rollout.done[t])
@@ -161,13 +160,13 @@ class Collector:
 
     @torch.no_grad()
     def estimate_advantages(self) -> None:
-        """Generalised advantage estimation, equations 11 and 12 of Schulman et al. 2017 (PPO):
+        """Estimate advantages and targets by GAE, equations 11 and 12 of Schulman et al. 2017 (PPO):
 
             delta_t = r_t + gamma V(s_t+1) - V(s_t)                             (12)
             A_t     = delta_t + gamma lambda A_t+1                              (11, as a recursion)
 
-        Both V(s_t+1) and A_t+1 are 0 at the end of an episode. A time-out adds gamma V(its last observation) to
-        r_t. The regression target of the critic is A_t + V(s_t).
+        At the end of an episode both V(s_t+1) and A_t+1 are 0. At a time-out the reward r_t gets an additional
+        gamma V(last observation of the episode). The regression target of the critic is A_t + V(s_t).
         """
         config, rollout, samples = self.config, self.rollout, self.rollout.samples
         values = self._values() if self.networks.memory is None else self._recurrent_values()
@@ -176,10 +175,10 @@ class Collector:
             time_out_value = value * rollout.time_out
         reward, not_done = rollout.reward + config.gamma * time_out_value, 1.0 - rollout.done
         next_value = torch.cat([value[1:], last_value[None]])
-        delta = reward + config.gamma * next_value * not_done - value
+        delta = reward + config.gamma * next_value * not_done - value  # equation 12
         decay, advantage = config.gamma * config.lam * not_done, torch.zeros_like(last_value)
         for t in reversed(range(config.num_steps)):
-            advantage = torch.addcmul(delta[t], decay[t], advantage, out=samples.advantage[t])
+            advantage = torch.addcmul(delta[t], decay[t], advantage, out=samples.advantage[t])  # equation 11
         samples.value.copy_(value)
         torch.add(samples.advantage, value, out=samples.target)
         if self.checks_every_stage and not rollout.is_finite():
@@ -187,20 +186,26 @@ class Collector:
             self.require_finite_rollout()
         self.explained_variance.copy_(1.0 - (samples.target - value).var() / samples.target.var())
         if self.value_normalizer is not None:
+            # in this order: the old values are normalised before the targets enter the statistics
             for column in (samples.value, samples.target):
                 self._update_normalizer(self.value_normalizer, column.flatten())
                 column.copy_(self.value_normalizer(column))
         if config.normalize_advantage == "batch":
-            samples.advantage.copy_(standardized(samples.advantage, self._process_group))
+            samples.advantage.copy_(standardize(samples.advantage, self._process_group))
 
     def _values(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the values of all observations, of those after the rollout, and of the last ones before time-outs."""
+        """Return the critic's values that GAE needs.
+
+        Returns:
+            The values of the rollout's observations, (num_steps, num_envs); of the observations after the rollout,
+            (num_envs,); and of the last observations before time-outs, 0 elsewhere, (num_steps, num_envs).
+        """
         rollout = self.rollout
         value, last_value = self._value(rollout.samples.critic_obs), self._value(self._critic_input(self.obs))
         return value, last_value, self._value_where(rollout.time_out, rollout.final_obs)
 
     def _recurrent_values(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the same for a critic with an LSTM."""
+        """Return the values of `_values` for a critic with an LSTM, and advance the LSTM's hidden state."""
         lstm, state, rollout = self.networks.critic_memory, self.hidden_state["critic"], self.rollout
         assert lstm is not None
         features, states = unroll(lstm, rollout.samples.critic_obs, rollout.samples.episode_start, state)
@@ -215,7 +220,10 @@ class Collector:
         return value if self.value_normalizer is None else self.value_normalizer.inverse(value)
 
     def _value_where(self, mask: Tensor, critic_obs: Tensor) -> Tensor:
-        """Return the value where the mask is set, 0 elsewhere; a GPU computes all, since counting would synchronise."""
+        """Return the value where the mask is set, 0 elsewhere.
+
+        A CPU computes only the masked values. A GPU computes all: to select rows it would have to synchronise.
+        """
         if self.env.device.type == "cpu":
             value = torch.zeros(mask.shape)
             value[mask] = self._value(critic_obs[mask])
@@ -225,7 +233,7 @@ class Collector:
     # --- observations and their normalisation ---
 
     def actor_input(self, obs: Mapping[str, Tensor]) -> Tensor:
-        """Return the actor's observation, normalised."""
+        """Return the normalised observation of the actor."""
         return obs["policy"] if self.normalizer is None else self.normalizer(obs["policy"])
 
     def _critic_input(self, obs: Mapping[str, Tensor]) -> Tensor:
@@ -235,7 +243,7 @@ class Collector:
         return critic_obs if self.critic_normalizer is None else self.critic_normalizer(critic_obs)
 
     def _concatenated(self, obs: Mapping[str, Tensor]) -> Tensor:
-        """Return the critic's observation groups side by side."""
+        """Return the critic's observation groups, concatenated by columns."""
         groups = self._critic_groups
         return obs[groups[0]] if len(groups) == 1 else torch.cat([obs[group] for group in groups], dim=-1)
 
@@ -252,18 +260,22 @@ class Collector:
         mean, var = batch.mean(dim=0), batch.var(dim=0, unbiased=False)
         if processes > 1:
             mean, square = self._process_group.average_(torch.stack((mean, var + mean.square())))
-            var = square - mean.square()
+            var = square - mean.square()  # Var(x) = E[x^2] - E[x]^2 over the batches of all processes
         normalizer.merge(mean, var, float(len(batch) * processes))
 
-    # --- which tensor is not finite ---
+    # --- checks for NaN ---
 
     def require_finite_rollout(self) -> None:
-        """Raise `DivergedError` if a sample of the rollout is not finite."""
+        """Check that all samples of the rollout are finite.
+
+        Raises:
+            DivergedError: with the first sample that is not finite.
+        """
         require_finite(self.rollout.in_causal_order(), self.iteration, ("step", "environment"))
 
     def rollout_dependencies(self) -> list[tuple[str, Tensor]]:
         """Return the named tensors that a rollout depends on: normalisers, weights and hidden states."""
-        states = [(f"the memory of the {name}", state) for name, state in self.initial_hidden_state.items()]
+        states = [(f"the hidden state of the {name}", state) for name, state in self.initial_hidden_state.items()]
         return [*self.normalizer_moments(), *self.named_weights(), *states]
 
     def named_weights(self) -> list[tuple[str, Tensor]]:
@@ -272,10 +284,5 @@ class Collector:
 
     def normalizer_moments(self) -> list[tuple[str, Tensor]]:
         """Return the running statistics of all normalisers with their names."""
-        return moments(
-            [
-                ("observation", self.normalizer),
-                ("critic's observation", self.critic_normalizer),
-                ("value", self.value_normalizer),
-            ]
-        )
+        critic, value = ("critic's observation", self.critic_normalizer), ("value", self.value_normalizer)
+        return moments([("observation", self.normalizer), critic, value])

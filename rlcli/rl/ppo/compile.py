@@ -1,6 +1,6 @@
 """Faster updates on a GPU: functions fused by torch's compiler, and matrix products in TF32.
 
-Compiled code is kept in the user's cache folder. No compiler is imported before `compile_update` is called.
+Compiled code is stored in the user's cache folder. The compiler is imported only when `compile_update` is called.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _log = logging.getLogger(__name__)
 def compile_update(
     functions: UpdateFunctions, warm_up: Callable[[UpdateFunctions], None], *, tuned: bool = False
 ) -> UpdateFunctions:
-    """Return the functions compiled; if that fails, log a warning and return them as they are.
+    """Return the compiled functions; if compiling fails, log a warning and return the functions unchanged.
 
     Args:
         functions: the functions to compile.
-        warm_up: calls each of them once with every shape that an update uses, on tensors that may be overwritten.
-        tuned: try out kernels for matrix products, which takes half a minute, once a machine.
+        warm_up: calls each function once with every shape of an update, on tensors that may be overwritten.
+        tuned: benchmark kernels for matrix products. This takes half a minute, once per machine.
     """
     _use_user_cache()
     mode = "max-autotune-no-cudagraphs" if tuned else None
@@ -37,18 +37,18 @@ def compile_update(
     compiled = UpdateFunctions(*map(compile_, functions))
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # advice to the authors of compiled code
+            warnings.simplefilter("ignore")  # the compiler advises the authors of the code
             warm_up(compiled)
     except (RuntimeError, ImportError, OSError) as error:
         reason = next(iter(str(error).strip().splitlines()), "")
-        _log.warning(f"the update cannot be compiled and runs as it is: {type(error).__name__}: {reason[:200]}")
+        _log.warning(f"the update cannot be compiled and runs uncompiled: {type(error).__name__}: {reason[:200]}")
         return functions
     return compiled
 
 
 @contextlib.contextmanager
 def tf32_matmul(allowed: bool) -> Iterator[None]:
-    """Allow float32 matrix products to round their factors to TF32 (10 bits of mantissa) within the context."""
+    """Allow float32 matrix products in the block to round their factors to TF32 (10 bits of mantissa)."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if allowed else before)
     try:
@@ -58,7 +58,10 @@ def tf32_matmul(allowed: bool) -> Iterator[None]:
 
 
 def _use_user_cache() -> None:
-    """Keep compiled code in the user's cache folder; torch sets a temporary one as soon as it is imported."""
+    """Set the cache folder of the compiler, unless the user has set it.
+
+    torch sets the variable to a temporary folder, `torchinductor_USER`, when it is imported.
+    """
     import platformdirs
 
     folder = os.environ.get(_FOLDER)

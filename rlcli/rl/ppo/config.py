@@ -1,4 +1,4 @@
-"""Settings of the built-in PPO trainer; light, so that a YAML is checked without importing torch."""
+"""Settings of the built-in PPO trainer. The module does not import torch, so that a YAML is checked fast."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class NetworkConfig(StrictModel):
-    """A multilayer perceptron."""
+    """Multilayer perceptron."""
 
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
     """Widths of the hidden layers."""
@@ -23,160 +23,169 @@ class NetworkConfig(StrictModel):
 
 
 class RnnConfig(StrictModel):
-    """A memory before each network. Minibatches then hold whole environments."""
+    """RNN before each network. A minibatch then holds all steps of its environments."""
 
     type: Literal["lstm"] = "lstm"
-    """lstm"""
+    """Kind of the RNN: lstm."""
     hidden: Count = 64
-    """Cells of a layer."""
+    """Number of cells of a layer."""
     layers: Count = 1
-    """Layers."""
+    """Number of layers."""
 
 
 class CnnConfig(StrictModel):
-    """Convolutions over every picture of an observation, with the activation of the network behind them; no padding."""
+    """CNN over each image of an observation, without padding, with the activation of the network behind it."""
 
     channels: Annotated[tuple[Count, ...], Field(min_length=1)] = (16, 32)
-    """What each layer gives."""
+    """Output channels of each layer."""
     kernels: Annotated[tuple[Count, ...], Field(min_length=1)] = (8, 4)
-    """Edge of each layer's square window [pixels]."""
+    """Edge of each layer's square kernel [pixels]."""
     strides: Annotated[tuple[Count, ...], Field(min_length=1)] = (4, 2)
-    """How far each layer's window moves [pixels]."""
+    """Stride of each layer [pixels]."""
     motion: Positive | None = None
-    """The steps of a history before the newest become what has changed since them, times this: velocities are learned
-    much sooner; null: they stay pictures."""
+    """Each older image of a history becomes (newest - older) times this factor, so that velocities are learned much
+    sooner; null: images are not changed."""
 
     @model_validator(mode="after")
     def _layers(self) -> CnnConfig:
         counts = [len(self.channels), len(self.kernels), len(self.strides)]
         if len(set(counts)) > 1:
-            raise ValueError(f"channels, kernels and strides have a number for each layer, not {counts}")
+            raise ValueError(
+                f"channels, kernels and strides must have one number for each layer, found {counts} numbers"
+            )
         return self
 
 
 class PpoConfig(AgentConfig):
-    """Proximal policy optimisation, on the CPU or the GPU."""
+    """Proximal policy optimisation on the CPU or the GPU."""
 
     algorithm: Literal["ppo"] = "ppo"
-    """ppo"""
+    """Algorithm: ppo."""
     dialect: Literal["rsl_rl", "rl_games", "sb3"] | None = None
-    """Whose defaults the keys that are not given take: those of RSL-RL, rl_games or Stable-Baselines3."""
+    """Library whose defaults are used for keys that are not given: RSL-RL, rl_games or Stable-Baselines3."""
 
     num_steps: Count = 16
-    """Steps an environment and iteration."""
+    """Steps of each environment per iteration."""
     gamma: Fraction = 0.99
-    """Discount."""
+    """Discount factor."""
     lam: Fraction = 0.95
     """Lambda of generalised advantage estimation."""
     bootstrap: Literal["final_obs", "pre_step"] = "final_obs"
-    """What a step that ran out of time still earns: gamma times the value of its true last observation, or, as RSL-RL
-    and rl_games have it, of the observation before the step."""
+    """Bootstrap of a time-out: the reward gets gamma times the value of the last observation of the episode
+    (final_obs), or of the observation before the step (pre_step, as in RSL-RL and rl_games)."""
     reward_scale: Positive = 1.0
-    """Factor on rewards in training; returns are reported without it."""
+    """Factor on rewards in training; reported returns do not include it."""
 
     num_epochs: Count = 5
-    """Passes over the rollout an iteration."""
+    """Passes over the rollout per iteration."""
     num_minibatches: Count = 4
-    """Parts of the rollout, an update each; any number of environments divides into them."""
+    """Number of minibatches of a rollout; the number of environments need not be a multiple."""
     minibatch_size: Count | None = None
-    """Samples an update, instead of a number of minibatches; the last one may be smaller."""
+    """Samples of a minibatch, instead of num_minibatches; the last minibatch may be smaller."""
     shuffle: Literal["epoch", "update", "none"] = "epoch"
-    """Samples are shuffled before each epoch, once an iteration, or not at all: then a minibatch holds whole
-    environments."""
+    """When samples are shuffled: before each epoch, once per iteration, or never. If never, a minibatch holds all
+    steps of its environments."""
     clip_range: Positive = 0.2
-    """Clipping of the probability ratio."""
+    """Clipping range of the probability ratio: 1 +- clip_range."""
     clip_value: Literal["larger", "clipped"] | None = "larger"
-    """The value's error is taken of the value clipped about its old one: alone, or the larger of that and the plain
-    one; null: the plain one."""
+    """Value loss with the value clipped to old value +- clip_value_range: the clipped error alone, or the larger of the
+    clipped and the plain error; null: the plain error."""
     clip_value_range: Positive | None = None
-    """Clipping of the value's change; null: clip_range."""
+    """Clipping range of the change of the value; null: clip_range."""
     value_coef: NotNegative = 1.0
-    """Weight of the value loss, a mean square."""
+    """Weight of the value loss, a mean squared error."""
     entropy_coef: NotNegative = 0.0
     """Weight of the entropy bonus."""
     bounds_coef: NotNegative = 0.0
-    """Weight of the bounds loss: the square of what the mean action exceeds bounds_margin by."""
+    """Weight of the bounds loss: the squared excess of the mean action over bounds_margin."""
     bounds_margin: Positive = 1.1
-    """Mean actions within +-this cost nothing."""
+    """The bounds loss is 0 for mean actions within +-bounds_margin."""
     normalize_advantage: Literal["batch", "minibatch"] | None = "batch"
-    """Over what advantages are normalised; null: they are not."""
+    """Samples over which advantages are normalised; null: no normalisation."""
     max_grad_norm: Positive | None = 1.0
-    """Norm the gradient is clipped to; null: it is not."""
+    """Largest norm of the gradient; null: no clipping."""
     clip_grad: Literal["joint", "separate"] = "joint"
-    """Actor and critic have one gradient norm, or one each."""
+    """Whether the gradients of actor and critic are clipped by one joint norm or separately."""
 
     learning_rate: Positive = 1e-3
-    """Step size of Adam."""
+    """Learning rate of Adam."""
     adam_eps: Positive = 1e-8
     """Adam's epsilon."""
     schedule: Literal["constant", "linear", "adaptive", "adaptive_linear"] = "constant"
-    """How the learning rate moves: linear goes to 0 over the budget; adaptive follows desired_kl: / 1.5 above twice
-    that divergence, x 1.5 below half of it; adaptive_linear does so under a ceiling that goes from the upper end of
-    learning_rate_range to 0 over the budget, so that the last iterations settle."""
+    """Schedule of the learning rate. linear: it decreases to 0 over the budget. adaptive: it is divided by 1.5 if the
+    KL divergence is above 2 desired_kl, and multiplied by 1.5 if it is below desired_kl / 2. adaptive_linear: like
+    adaptive, with an upper limit that decreases from the upper end of learning_rate_range to 0 over the budget."""
     desired_kl: Positive | None = None
-    """Divergence between the policies before and after an update that an adaptive schedule aims at."""
+    """Target of an adaptive schedule: KL divergence between the policies before and after an update."""
     kl_grain: Literal["minibatch", "epoch", "iteration"] = "minibatch"
-    """How often an adaptive schedule looks at the divergence; of an epoch at its mean, of an iteration at that of the
-    last epoch."""
+    """How often an adaptive schedule changes the learning rate. epoch: by the mean KL divergence of the epoch.
+    iteration: by the mean of the last epoch."""
     kl_from: Literal["rollout", "last_pass"] = "rollout"
-    """The old policy: the one that acted, looked at before a minibatch's update; or, as rl_games has it, the one that
-    the epoch before found for the same sample, looked at after the update."""
+    """Old policy of the KL divergence. rollout: the policy that collected the rollout; the schedule acts before the
+    minibatch's update. last_pass: the policy of the previous epoch for the same sample; the schedule acts after the
+    update, as in rl_games."""
     learning_rate_range: tuple[Positive, Positive] = (1e-5, 1e-2)
-    """Where an adaptive schedule stays."""
+    """Lowest and highest learning rate of an adaptive schedule."""
 
     normalize_observations: bool = False
-    """Normalise observations by their running mean and deviation; the statistics are part of the policy."""
+    """Normalise observations by their running mean and standard deviation, which are part of the policy."""
     normalizer_update: Literal["rollout", "step"] = "rollout"
-    """When these statistics take in observations: a rollout's at its end, or each step's before acting."""
+    """When these statistics are updated: at the end of a rollout, or in each step before the action."""
     normalize_value: bool = False
-    """The critic learns returns normalised by their running mean and deviation."""
+    """Train the critic on returns normalised by their running mean and standard deviation."""
 
     critic_obs: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
-    """Observation groups that the critic sees; null: critic if the task has it, else policy."""
+    """Observation groups of the critic; null: critic if the task has this group, else policy."""
     actor: NetworkConfig = NetworkConfig()
-    """The policy's network."""
+    """Network of the policy."""
     critic: NetworkConfig = NetworkConfig()
-    """The value's network."""
+    """Network of the value function."""
     rnn: RnnConfig | None = None
-    """Actor and critic remember what they saw of the episode; null: they do not."""
+    """RNN of actor and critic, one each; null: none."""
     cnn: CnnConfig | None = None
-    """Actor and critic see pictures through convolutions of their own; null: as columns like all others."""
+    """CNN of actor and critic, one each; null: the pixels of images are columns like all others."""
     tell_coef: NotNegative = 0.0
-    """Weight of a loss by which the actor's last hidden layer learns to tell what the critic sees, through a linear
-    layer that is not in the policy: each column less its mean, by its deviation, within +-3. So an actor of pictures
-    learns sooner what it looks at, where the critic has the state."""
+    """Weight of an auxiliary loss: a linear layer, which is not a part of the policy, predicts the critic's observation
+    from the actor's last hidden layer. The targets are standardised and clipped to +-3. An actor of images learns
+    sooner with it if the critic observes the state."""
     init: Literal["default", "zero_bias", "orthogonal"] = "default"
-    """Initial weights: torch's; torch's with biases of zero; orthogonal, with a gain of sqrt(2) in the hidden layers,
-    0.01 at the actor's output and 1 at the critic's, and biases of zero."""
+    """Initial weights. default: torch's. zero_bias: torch's weights and zero biases. orthogonal: zero biases and
+    orthogonal weights with gain sqrt(2) in hidden layers, 0.01 in the actor's and 1 in the critic's output layer."""
     init_std: Positive = 1.0
-    """Standard deviation of the untrained policy, the same in every state, learned."""
+    """Initial standard deviation of the actions; it is learned and does not depend on the state."""
     std: Literal["log", "scalar"] = "log"
-    """Whether the logarithm of the deviation is learned, or the deviation itself."""
+    """Learned parameter: the logarithm of the standard deviation (log), or the standard deviation (scalar)."""
 
     compile: bool | Literal["tuned"] | None = None
-    """Whether torch's compiler fuses what a minibatch computes; tuned: it also tries out matrix kernels, for half a
-    minute more the first time; null: true on a GPU, if the run is long enough for it."""
+    """Whether torch's compiler fuses the operations of a minibatch. tuned: it also benchmarks matrix kernels, which
+    takes half a minute the first time. null: true on a GPU if the run is long enough."""
     tf32: bool = True
-    """On a GPU, updates multiply matrices in TF32: sums are float32, factors have 10 bits of mantissa. Acting is always
-    float32."""
+    """On a GPU, multiply matrices in TF32 in updates: factors have 10 bits of mantissa, sums are float32. Rollouts
+    always use float32."""
 
     @model_validator(mode="before")
     @classmethod
     def _dialect(cls, data: Any) -> Any:
         if not isinstance(data, dict):
             return data
-        dialect = data.get("dialect")
-        preset = DIALECTS.get(dialect, {}) if isinstance(dialect, str) else {}
-        return _tuples(_over(preset, data))
+        preset = DIALECTS.get(str(data.get("dialect")), {})
+        networks = {
+            name: {**preset[name], **data[name]}
+            for name in ("actor", "critic")
+            if name in preset and isinstance(data.get(name), dict)
+        }
+        return _lists_to_tuples({**preset, **data, **networks})
 
     @model_validator(mode="after")
     def _relations(self) -> PpoConfig:
         if self.schedule.startswith("adaptive") != (self.desired_kl is not None):
-            raise ValueError("desired_kl belongs to an adaptive schedule, and an adaptive schedule needs it")
+            raise ValueError("desired_kl must be given for an adaptive schedule, and only for it")
         if self.kl_from == "last_pass" and self.shuffle == "epoch":
-            raise ValueError("kl_from last_pass needs the same minibatches in every epoch: shuffle update or none")
+            raise ValueError(
+                "kl_from last_pass needs the same minibatches in every epoch: set shuffle to update or none"
+            )
         if self.cnn is not None and self.rnn is not None:
-            raise ValueError("cnn and rnn cannot be had together: a history of pictures shows what moves")
+            raise ValueError("cnn and rnn cannot be combined; give the image a history to show motion")
         low, high = self.learning_rate_range
         if low > high:
             raise ValueError(f"learning_rate_range: {low:g} is above {high:g}")
@@ -188,15 +197,10 @@ DIALECTS: Mapping[str, Mapping[str, Any]] = {
         "num_steps": 24,
         "bootstrap": "pre_step",
         "shuffle": "update",
-        "clip_value": "larger",
-        "value_coef": 1.0,
         "entropy_coef": 0.01,
-        "normalize_advantage": "batch",
         "clip_grad": "separate",
         "schedule": "adaptive",
         "desired_kl": 0.01,
-        "kl_grain": "minibatch",
-        "learning_rate_range": [1e-5, 1e-2],
         "std": "scalar",
         "actor": {"hidden": [256, 256, 256], "activation": "elu"},
         "critic": {"hidden": [256, 256, 256], "activation": "elu"},
@@ -204,28 +208,21 @@ DIALECTS: Mapping[str, Mapping[str, Any]] = {
     "rl_games": {
         "bootstrap": "pre_step",
         "shuffle": "none",
-        "clip_value": "larger",
         "value_coef": 2.0,
         "bounds_coef": 1e-4,
-        "normalize_advantage": "batch",
-        "clip_grad": "joint",
         "learning_rate": 3e-4,
         "schedule": "adaptive",
         "desired_kl": 0.008,
-        "kl_grain": "minibatch",
         "kl_from": "last_pass",
         "learning_rate_range": [1e-6, 1e-2],
         "init": "zero_bias",
     },
     "sb3": {
-        "bootstrap": "final_obs",
-        "shuffle": "epoch",
         "num_epochs": 10,
         "clip_value": None,
         "value_coef": 0.5,
         "normalize_advantage": "minibatch",
         "max_grad_norm": 0.5,
-        "clip_grad": "joint",
         "learning_rate": 3e-4,
         "adam_eps": 1e-5,
         "init": "orthogonal",
@@ -233,10 +230,10 @@ DIALECTS: Mapping[str, Mapping[str, Any]] = {
         "critic": {"activation": "tanh"},
     },
 }
-"""Dialect -> the defaults that it replaces."""
+"""Dialect -> its defaults where they differ from those of `PpoConfig`."""
 
 SPEC = TrainerSpec(
-    summary="Built-in PPO in torch alone; on a GPU all of it is captured",
+    summary="Built-in PPO in torch; on a GPU it runs as CUDA graphs",
     algorithms={"ppo": "rlcli.rl.ppo.config:PpoConfig"},
     trainer="rlcli.rl.ppo.trainer:PpoTrainer",
     parallel=True,
@@ -244,17 +241,12 @@ SPEC = TrainerSpec(
 )
 
 
-def _over(base: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with what is given put over it, mappings key by key."""
-    merged = {**base, **given}
-    for key, value in base.items():
-        if isinstance(value, dict) and isinstance(given.get(key), dict):
-            merged[key] = {**value, **given[key]}
-    return merged
+def _lists_to_tuples(value: object) -> Any:
+    """Return JSON data with tuples for lists.
 
-
-def _tuples(value: object) -> Any:
-    """JSON's lists as tuples: what a validator returns counts as Python's, of which a list is no tuple."""
+    A tuple field accepts a list from a YAML file, but not in the output of a validator, which is checked strictly as
+    Python data.
+    """
     if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+        return {key: _lists_to_tuples(item) for key, item in value.items()}
+    return tuple(_lists_to_tuples(item) for item in value) if isinstance(value, list) else value

@@ -1,7 +1,17 @@
 """Gradient of a minibatch's loss: by autograd, or in closed form, which is faster for MLPs on a CPU.
 
-Both are called alike and write the same vector: the gradient of all parameters, followed by the KL divergence. In the
-closed form, where a minimum or a maximum is taken of two equal numbers, each counts half, as in autograd.
+Both have the same arguments and write the same vector: the gradient of all parameters, followed by the KL divergence.
+
+The closed form differentiates the loss of `rlcli.rl.ppo.loss.minibatch_loss` (equations 7 and 9 of Schulman et al.
+2017) with respect to the networks' outputs. With z = (a - mean) / std, n samples and the ratio r:
+
+    log pi           = - sum over actions of (z^2 / 2 + log std + log(2 pi) / 2)
+    dlog pi/dmean    = z / std
+    dlog pi/dlog std = z^2 - 1
+    dL_clip/dlog pi  = r A / n   where r A is the minimum in equation 7, 0 where the clipped product is
+    dL_value/dvalue  = 2 (value - target) / n
+
+Where a minimum or a maximum has two equal arguments, each gets half of the gradient, as in autograd.
 """
 
 from __future__ import annotations
@@ -22,16 +32,16 @@ _HALF = torch.tensor(0.5)
 
 
 MinibatchGradient = Callable[[PpoConfig, Samples, Tensor, Tensor, Tensor, Tensor], LossResult]
-"""Computes the loss of a minibatch and writes its gradient; the arguments are those of `minibatch_loss`."""
+"""Function that computes the loss of a minibatch and writes its gradient; for its arguments see `minibatch_loss`."""
 
 
 class AutogradGradient:
-    """Gradient by autograd: any networks, any device.
+    """Gradient by autograd, for any networks and any device.
 
     Args:
         networks: actor and critic.
-        out: vector for the gradient and, behind it, the divergence.
-        loss: `minibatch_loss`, or that compiled.
+        out: vector for the gradient and, after it, the KL divergence.
+        loss: `minibatch_loss`, compiled or not.
     """
 
     def __init__(self, networks: ActorCritic, out: Tensor, loss: Callable[..., LossResult] = minibatch_loss) -> None:
@@ -40,7 +50,7 @@ class AutogradGradient:
     def __call__(
         self, config: PpoConfig, batch: Samples, obs: Tensor, critic_obs: Tensor, advantage: Tensor, old_std: Tensor
     ) -> LossResult:
-        """Return the loss of a minibatch and write its gradient."""
+        """Return the loss of a minibatch and write its gradient into `out`."""
         result = self._loss(self._networks, config, batch, obs, critic_obs, advantage, old_std)
         gradients = torch.autograd.grad(result.loss, list(self._networks.parameters()))
         torch.cat([*(part.flatten() for part in gradients), result.metrics[KL : KL + 1]], out=self._out)
@@ -48,7 +58,7 @@ class AutogradGradient:
 
 
 def has_closed_form(networks: ActorCritic) -> bool:
-    """Return whether `ClosedFormGradient` can be used: MLPs on a CPU, without RNN, CNN or the `tell_coef` loss."""
+    """Return whether `ClosedFormGradient` supports the networks: MLPs on a CPU, no RNN, no CNN, no `tell_coef` loss."""
     others = (networks.memory, networks.vision, networks.critic_vision, networks.teller)
     return all(other is None for other in others) and all(map(is_plain, (networks.actor, networks.critic)))
 
@@ -57,24 +67,24 @@ class ClosedFormGradient:
     """Closed-form gradient for MLPs on a CPU.
 
     Args:
-        networks: actor and critic, of which `has_closed_form` holds.
-        out: vector for the gradient and, behind it, the divergence.
-        places: where in it each parameter's gradient lies.
-        rows: samples of the largest minibatch.
-        threads: threads that share the work.
+        networks: actor and critic for which `has_closed_form` is true.
+        out: vector for the gradient and, after it, the KL divergence.
+        slices: parameter name -> slice of its gradient in `out`.
+        rows: number of samples of the largest minibatch.
+        threads: number of threads that share the work.
     """
 
     def __init__(
         self,
         networks: ActorCritic,
         out: Tensor,
-        places: Mapping[str, slice],
+        slices: Mapping[str, slice],
         rows: int,
         threads: int,
     ) -> None:
         self._networks, self._out = networks, out
         parameters = dict(networks.named_parameters())
-        gradients = {name: out[place].view_as(parameters[name]) for name, place in places.items()}
+        gradients = {name: out[part].view_as(parameters[name]) for name, part in slices.items()}
         (name,) = (name for name in gradients if name.endswith("_std"))
         self._std_gradient = gradients.pop(name)
         self._mlps = MlpGradients(networks.actor, networks.critic, list(gradients.values()), rows, threads)
@@ -82,7 +92,7 @@ class ClosedFormGradient:
     def __call__(
         self, config: PpoConfig, batch: Samples, obs: Tensor, critic_obs: Tensor, advantage: Tensor, old_std: Tensor
     ) -> LossResult:
-        """Return the loss of a minibatch, without a graph, and write its gradient."""
+        """Return the loss of a minibatch, without an autograd graph, and write its gradient into `out`."""
         networks = self._networks
         with torch.no_grad():
             std, policy_entropy = networks.std, entropy(networks.std)
@@ -91,6 +101,7 @@ class ClosedFormGradient:
             actor_means, value_loss = (values / len(advantage) for values in sums)
             losses, log_std_gradient, distance = actor_means.split_with_sizes([3, len(std), len(std)])
             surrogate, clip_fraction, bounds = losses
+            # the entropy has the gradient 1 with respect to each log std
             self._std_gradient.copy_(networks.std_gradient(log_std_gradient - config.entropy_coef))
             kl = policy_divergence(config, distance, std, old_std)
             self._out[-1:].copy_(kl)
@@ -101,22 +112,26 @@ class ClosedFormGradient:
 
 
 class _Objective:
-    """Loss of a minibatch as a function of the networks' outputs, with its gradient with respect to them."""
+    """Loss of a minibatch as a function of the networks' outputs, with the gradient with respect to the outputs."""
 
     def __init__(self, config: PpoConfig, batch: Samples, advantage: Tensor, std: Tensor) -> None:
         self._config, self._batch, self._advantage, self._std = config, batch, advantage, std
         self._mean_scale = 1.0 / (std * len(advantage))
         self.mean = torch.empty_like(batch.mean)
-        """The actor's outputs. (n, a)"""
+        """Outputs of the actor. (n, a)"""
 
     def mean_gradient(self, rows: slice, mean: Tensor) -> tuple[Tensor, Tensor]:
-        """`rlcli.rl.mlp_gradients.OutputGradient`; the sums are losses, log-std gradients and square distances."""
+        """Return the gradient of the actor's outputs, as `rlcli.rl.mlp_gradients.OutputGradient`.
+
+        The summed numbers are surrogate, number of clipped ratios, bounds loss, (3,); gradients of the log std, (a,);
+        and squared distances between old and new mean, (a,).
+        """
         config, batch = self._config, self._batch
         self.mean[rows] = mean
         distance = (batch.mean[rows] - mean).square_().sum(dim=0)
         noise = (batch.action[rows] - mean).div_(self._std)
         surrogate, clipped, log_prob_gradient, log_std_gradient = self._surrogate(rows, noise)
-        gradient = noise.mul_(log_prob_gradient[:, None]).mul_(self._mean_scale)
+        gradient = noise.mul_(log_prob_gradient[:, None]).mul_(self._mean_scale)  # dlog pi/dmean = z / std
         bounds = torch.zeros(())
         if config.bounds_coef:
             excess = (mean.abs() - config.bounds_margin).clamp_(min=0.0)
@@ -125,40 +140,39 @@ class _Objective:
         return gradient, torch.cat((torch.stack((surrogate, clipped, bounds)), log_std_gradient, distance))
 
     def value_gradient(self, rows: slice, value: Tensor) -> tuple[Tensor, Tensor]:
-        """`rlcli.rl.mlp_gradients.OutputGradient`; the sum is that of the square errors."""
-        config, batch = self._config, self._batch
-        error, gradient = _value_error(value.squeeze(-1), batch.value[rows], batch.target[rows], config)
-        return gradient.mul_(2.0 * config.value_coef / len(self._advantage))[:, None], error
+        """Return the gradient of the critic's outputs, as `OutputGradient`; the summed number is the squared error."""
+        config, value, old_value = self._config, value.squeeze(-1), self._batch.value[rows]
+        error = value - self._batch.target[rows]
+        if config.clip_value is None:
+            gradient, square = error, error.square()
+        else:
+            limit = config.clip_value_range or config.clip_range
+            change = value - old_value
+            within = change.clamp(-limit, limit)
+            clipped = old_value + within - self._batch.target[rows]
+            # within the range `clipped` equals `error` except for rounding and has its gradient; outside it is constant
+            gradient, square = torch.where(change == within, clipped, 0.0), clipped.square()
+            if config.clip_value == "larger":
+                plain = error.square()
+                gradient = torch.lerp(gradient, error, _share_of_minimum(square, plain))
+                square = torch.max(plain, square)
+        # `gradient` is half the derivative of `square`
+        return gradient.mul_(2.0 * config.value_coef / len(self._advantage))[:, None], square.sum()
 
     def _surrogate(self, rows: slice, noise: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the clipped surrogate, the count of clipped ratios, the log-prob and the log-std gradients."""
+        """Return the surrogate loss (equation 7), the number of clipped ratios, and dL/dlog pi and dL/dlog std."""
         limit, advantage, square = self._config.clip_range, self._advantage[rows], noise.square()
         ratio = (log_prob(noise, self._std) - self._batch.log_prob[rows]).exp_()
         within = ratio.clamp(1.0 - limit, 1.0 + limit)
         plain, bounded, clipped = advantage * ratio, advantage * within, ratio != within
+        # dr/dlog pi = r, so dL_clip/dlog pi = r A = `plain` where the minimum is not the clipped product
         share = torch.where(clipped, _share_of_minimum(plain, bounded), 1.0)
         log_prob_gradient = share.mul_(plain).neg_()
+        # dlog pi/dlog std = z^2 - 1, summed over the samples
         log_std_gradient = torch.mv(square.t(), log_prob_gradient) - log_prob_gradient.sum()
         return -torch.min(plain, bounded).sum(), clipped.sum(), log_prob_gradient, log_std_gradient
 
 
-def _value_error(value: Tensor, old: Tensor, target: Tensor, config: PpoConfig) -> tuple[Tensor, Tensor]:
-    """Return the sum of the square errors, and half its gradient for each value. (n,) each -> (), (n,)"""
-    error = value - target
-    if config.clip_value is None:
-        return error.square().sum(), error
-    limit = config.clip_value_range or config.clip_range
-    change = value - old
-    within = change.clamp(-limit, limit)
-    clipped = old + within - target
-    # within the range this is the error but for rounding, and has its gradient
-    gradient, square = torch.where(change == within, clipped, 0.0), clipped.square()
-    if config.clip_value == "larger":
-        plain = error.square()
-        gradient, square = torch.lerp(gradient, error, _share_of_minimum(square, plain)), torch.max(plain, square)
-    return square.sum(), gradient
-
-
 def _share_of_minimum(one: Tensor, other: Tensor) -> Tensor:
-    """Return 1 where `one` is the smaller, 0.5 where they are equal, 0 elsewhere."""
+    """Return 1 where `one` is smaller than `other`, 0.5 where both are equal, 0 elsewhere."""
     return torch.heaviside(other - one, _HALF)

@@ -1,7 +1,7 @@
 """Update of the PPO trainer: several epochs of minibatches over one rollout.
 
-Like a rollout, `update` takes and returns nothing and never reads a value back from the device, so that a GPU captures
-it once as a CUDA graph and replays it. `metrics` reads one small tensor.
+`update` has no arguments and no result, and never reads a value back from the device, so that a GPU can capture it as a
+CUDA graph and replay it. `metrics` reads one small tensor.
 """
 
 from __future__ import annotations
@@ -11,28 +11,27 @@ import math
 import torch
 from torch import Tensor
 
-from rlcli.errors import DivergedError
 from rlcli.rl.distributed import ProcessGroup
-from rlcli.rl.nan_check import LEARNER_HINT, require_finite
+from rlcli.rl.nan_check import require_finite, require_finite_learner
 from rlcli.rl.ppo.collector import Collector
 from rlcli.rl.ppo.compile import compile_update, tf32_matmul
 from rlcli.rl.ppo.config import PpoConfig
 from rlcli.rl.ppo.gradient import AutogradGradient, ClosedFormGradient, MinibatchGradient, has_closed_form
-from rlcli.rl.ppo.loss import KL, METRICS, LossResult, UpdateFunctions, standardized
+from rlcli.rl.ppo.loss import KL, METRICS, LossResult, UpdateFunctions, standardize
 from rlcli.rl.ppo.networks import adam, flatten, unroll
 from rlcli.rl.ppo.rollout_buffer import Samples
-from rlcli.rl.ppo.setup import compilation
+from rlcli.rl.ppo.setup import compile_mode
 from rlcli.rl.trainer_base import finite_values
 from rlcli.sim.state_cache import is_finite
 
 
 class Learner:
-    """Updates actor and critic from the rollout of a collector.
+    """Learner that updates actor and critic with the rollout of a collector.
 
     Args:
         collector: the collector.
-        config: the agent.
-        process_group: the processes of the run.
+        config: configuration of the agent.
+        process_group: processes of the run.
         torch_threads: threads of the update.
     """
 
@@ -42,10 +41,10 @@ class Learner:
         self.collector, self.config, self._process_group = collector, config, process_group
         self._networks, device = collector.networks, collector.env.device
         self._samples_per_rollout = config.num_steps * collector.env.num_envs
-        self.weights, self.gradient_and_kl, places = flatten(self._networks)
+        self.weights, self.gradient_and_kl, slices = flatten(self._networks)
         self.gradient, self._minibatch_kl = self.gradient_and_kl[:-1], self.gradient_and_kl[-1]
         process_group.broadcast_(self.weights.data)
-        actor_end = min(place.start for name, place in places.items() if name.startswith("critic"))
+        actor_end = min(part.start for name, part in slices.items() if name.startswith("critic"))
         joint = config.clip_grad == "joint"
         self._clipped_parts = (self.gradient,) if joint else (self.gradient[:actor_end], self.gradient[actor_end:])
         self.learning_rate = torch.tensor(config.learning_rate, device=device)
@@ -53,23 +52,23 @@ class Learner:
         self.optimizer = adam(self.weights, self.learning_rate, config.adam_eps)
 
         self._kl_sum = torch.zeros((), device=device)
-        """Sum of the minibatches' divergences in the current epoch."""
+        """Sum of the KL divergences of the minibatches in the current epoch."""
         self._metric_sums = torch.zeros(len(METRICS), device=device)
         self.metric_values = torch.zeros(len(METRICS) + 4, device=device)
-        """`METRICS`, then mean action std, learning rate, whether all weights are finite, explained variance."""
+        """`METRICS`, then mean action std, learning rate, 1 if all weights are finite, explained variance. (10,)"""
 
         self._tf32 = config.tf32 and device.type == "cuda"
         self.functions = UpdateFunctions()
         self.torch_threads = torch_threads
-        """Threads of torch in `update`: one with the closed-form gradient, since that has threads of its own."""
+        """Threads of torch in `update`: one with the closed-form gradient, which has its own threads."""
         self.minibatch_gradient: MinibatchGradient
-        mode = compilation(config, device, self._samples_per_rollout * process_group.world_size)
+        mode = compile_mode(config, device, self._samples_per_rollout * process_group.world_size)
         if mode:
             self.functions = compile_update(self.functions, self._call_all, tuned=mode == "tuned")
         if not mode and has_closed_form(self._networks):
             rows = max(len(minibatch.target) for minibatch in collector.rollout.minibatches)
             self.minibatch_gradient = ClosedFormGradient(
-                self._networks, self.gradient_and_kl, places, rows, torch_threads
+                self._networks, self.gradient_and_kl, slices, rows, torch_threads
             )
             self.torch_threads = 1
         else:
@@ -81,6 +80,7 @@ class Learner:
         with tf32_matmul(self._tf32):
             collector.estimate_advantages()
             if collector.normalizer is not None and self.config.normalizer_update == "rollout":
+                # after the advantages: the networks still see the observations as in the rollout
                 collector.update_normalizers(collector.raw_obs)
             self.optimize()
             self._write_metrics()
@@ -135,17 +135,15 @@ class Learner:
         obs, critic_obs = self.network_inputs(batch, number)
         advantage = batch.advantage
         if config.normalize_advantage == "minibatch":
-            advantage = standardized(advantage, self._process_group)
+            advantage = standardize(advantage, self._process_group)
         return minibatch_gradient(config, batch, obs, critic_obs, advantage, old_std)
 
     def network_inputs(self, batch: Samples, number: int) -> tuple[Tensor, Tensor]:
-        """Return the inputs of the MLPs: observations, or the outputs of the LSTMs over all steps of the rollout."""
+        """Return the inputs of the MLPs: observations, or the outputs of the LSTMs unrolled over the rollout."""
         if self._networks.memory is None:
             return batch.obs, batch.critic_obs
-        environments, obs = (
-            self.collector.rollout.environments[number],
-            {"actor": batch.obs, "critic": batch.critic_obs},
-        )
+        environments = self.collector.rollout.environments[number]
+        obs = {"actor": batch.obs, "critic": batch.critic_obs}
         shape = (self.config.num_steps, len(environments))
         features = []
         for name, lstm in self._networks.recurrent_modules().items():
@@ -156,12 +154,16 @@ class Learner:
         return features[0], features[1]
 
     def clip_gradient(self) -> None:
-        """Clip the norm of the gradient: joint, or that of the actor and that of the critic."""
+        """Clip the norm of the joint gradient, or of the gradients of actor and critic separately."""
         if self.config.max_grad_norm is not None:
             self.functions.clip_gradient_(self._clipped_parts, self.config.max_grad_norm)
 
     def decay_learning_rate(self, remaining: float) -> None:
-        """Set the learning rate, or the ceiling of an adaptive one, by the remaining share of the budget."""
+        """Decrease the learning rate linearly, or the upper limit of an adaptive learning rate.
+
+        Args:
+            remaining: share of the budget that is left, 0 to 1.
+        """
         if self.config.schedule == "linear":
             self.learning_rate.fill_(self.config.learning_rate * remaining)
         elif self.config.schedule == "adaptive_linear":
@@ -169,17 +171,18 @@ class Learner:
             self.learning_rate.clamp_(max=self._rate_ceiling)
 
     def _adapt_learning_rate(self, kl: Tensor, grain: str) -> None:
-        """Adapt the learning rate, if the schedule is adaptive and this is its grain."""
+        """Adapt the learning rate to the KL divergence, if the schedule is adaptive and `kl_grain` is `grain`."""
         if self.config.desired_kl is not None and grain == self.config.kl_grain:
             self.functions.adapt_learning_rate_(self.learning_rate, self._rate_ceiling, kl, self.config)
 
     def _call_all(self, functions: UpdateFunctions) -> None:
-        """Call the functions of an update once with every size of a minibatch, without changing weights or rates."""
+        """Call the functions of an update once with each minibatch size; weights and learning rate do not change."""
         gradient = AutogradGradient(self._networks, self.gradient_and_kl, functions.loss)
         minibatches = self.collector.rollout.minibatches
         with tf32_matmul(self._tf32):
-            for number, minibatch in {len(b.target): (i, b) for i, b in enumerate(minibatches)}.values():
-                self.compute_gradient(gradient, minibatch, number)
+            number_by_size = {len(minibatch.target): number for number, minibatch in enumerate(minibatches)}
+            for number in number_by_size.values():
+                self.compute_gradient(gradient, minibatches[number], number)
             if self.config.max_grad_norm is not None:
                 functions.clip_gradient_(self._clipped_parts, self.config.max_grad_norm)
             if self.config.desired_kl is not None:
@@ -190,9 +193,10 @@ class Learner:
 
     @torch.no_grad()
     def _write_metrics(self) -> None:
-        """Write the metrics of the update into one tensor."""
+        """Write the metrics of the update into `metric_values`."""
         updates = self.config.num_epochs * len(self.collector.rollout.minibatches)
         moments = [values for _, values in self.collector.normalizer_moments()]
+        # a sum is finite only if all its terms are: one number per tensor instead of one per weight
         sums = torch.stack([values.sum().double() for values in (self.weights, *moments)])
         all_finite = sums.isfinite().all().float()
         last = (self._networks.std.mean(), self.learning_rate, all_finite, self.collector.explained_variance)
@@ -204,34 +208,28 @@ class Learner:
         """Return the metrics of the last update.
 
         Raises:
-            DivergedError: if the learner diverged, naming the first tensor that is not finite.
+            DivergedError: if the learner diverged, with the first tensor that is not finite.
         """
         *losses, std, learning_rate, all_finite, explained = self.metric_values.tolist()
         metrics = {f"Loss/{name}": value for name, value in zip(METRICS, losses, strict=True)}
         metrics |= {"Policy/mean_std": std, "Loss/learning_rate": learning_rate, "Loss/explained_variance": explained}
-        required = ("Loss/surrogate", "Loss/value", "Policy/mean_std")
-        not_finite = [name for name in required if not math.isfinite(metrics[name])]
-        if not_finite or all_finite < 1.0:
+        required = {name: metrics[name] for name in ("Loss/surrogate", "Loss/value", "Policy/mean_std")}
+        if all_finite < 1.0 or not all(map(math.isfinite, required.values())):
             iteration = self.collector.iteration
             if not self.collector.rollout.is_finite():
                 self.collector.require_finite_rollout()
             require_finite(self.collector.normalizer_moments(), iteration)
-            if not_finite:
-                raise DivergedError(f"{not_finite[0]} is not finite in iteration {iteration}", hint=LEARNER_HINT)
+            require_finite_learner(required, {}, iteration)
             require_finite(self.collector.named_weights(), iteration)
         if not self.config.bounds_coef:
             del metrics["Loss/bounds"]
         return finite_values(metrics)
 
     def _gradient_in_causal_order(self, result: LossResult) -> list[tuple[str, Tensor]]:
-        """Return the named tensors of a minibatch: the losses, then the gradients from the outputs backwards."""
+        """Return the named tensors of a minibatch: losses, then gradients in the order of the backward pass."""
         losses = [(f"the loss ({name})", result.metrics[i]) for i, name in enumerate(METRICS) if i != KL]
         names, parameters = zip(*self._networks.named_parameters(), strict=True)
-        gradients = self.gradient.split_with_sizes([parameter.numel() for parameter in parameters])
-        named = [(f"the gradient of '{name}'", gradient) for name, gradient in zip(names, gradients, strict=True)]
-        return [
-            *losses,
-            ("the loss", result.loss.detach()),
-            *reversed(named),
-            ("the divergence (KL)", self._minibatch_kl),
-        ]
+        parts = self.gradient.split_with_sizes([parameter.numel() for parameter in parameters])
+        gradients = [(f"the gradient of '{name}'", part) for name, part in zip(names, parts, strict=True)]
+        loss, kl = ("the loss", result.loss.detach()), ("the KL divergence", self._minibatch_kl)
+        return [*losses, loss, *reversed(gradients), kl]

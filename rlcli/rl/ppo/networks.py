@@ -1,4 +1,4 @@
-"""Actor and critic in training: float32, with all parameters in one vector and all gradients in another."""
+"""Actor and critic in training: float32 networks, with all parameters in one vector and all gradients in another."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from rlcli.rl.policy import ACTIVATIONS, Lstm, Normalizer
 from rlcli.rl.ppo.config import NetworkConfig, PpoConfig
 
 _POLICY = ("memory.", "vision.", "actor.")
+"""Prefixes of the weights that belong to the policy."""
 _MIN_STD = 1e-6
 _VALUE_CLIP = 5.0
 _VALUE_EPS = 1e-5
+"""As in rl_games: normalised values are clipped to +-5, and epsilon is added to the variance."""
 
 
 class ActorCritic(nn.Module):
@@ -27,7 +29,7 @@ class ActorCritic(nn.Module):
         obs_size: columns of the actor's observation.
         critic_obs_size: columns of the critic's observation.
         action_size: columns of the action.
-        config: networks, initial weights, parametrisation of the standard deviation.
+        config: configuration of networks, initial weights and standard deviation.
         vision: CNN over the images in the actor's observation.
         critic_vision: CNN over the images in the critic's observation.
     """
@@ -61,10 +63,10 @@ class ActorCritic(nn.Module):
         return self.log_std.exp() if hasattr(self, "log_std") else self.raw_std.clamp(min=_MIN_STD)
 
     def std_gradient(self, log_std_gradient: Tensor) -> Tensor:
-        """Return the gradient of the parameter from that of the logarithm of the standard deviation. (a,) -> (a,)"""
+        """Return the gradient of the std parameter, given the gradient of the log standard deviation. (a,) -> (a,)"""
         if hasattr(self, "log_std"):
             return log_std_gradient
-        return log_std_gradient / self.std * (self.raw_std >= _MIN_STD)
+        return log_std_gradient / self.std * (self.raw_std >= _MIN_STD)  # dlog std/dstd = 1 / std; 0 where clamped
 
     def mean(self, obs: Tensor) -> Tensor:
         """Return the mean action. (n, d) -> (n, a)"""
@@ -87,17 +89,14 @@ class ActorCritic(nn.Module):
         return value
 
     def recurrent_modules(self) -> dict[str, Lstm]:
-        """Return the LSTMs of actor and critic; of MLPs, an empty mapping."""
+        """Return the LSTMs of actor and critic; an empty mapping for MLPs."""
         modules = {"actor": self.memory, "critic": self.critic_memory}
         return {name: module for name, module in modules.items() if module is not None}
 
     def policy_tensors(self) -> dict[str, Tensor]:
-        """Return copies of the policy's weights, by their names in a saved policy."""
-        tensors = {
-            name: value.detach().clone() for name, value in self.state_dict().items() if name.startswith(_POLICY)
-        }
-        log_std = self.log_std if hasattr(self, "log_std") else self.std.log()
-        return {**tensors, "log_std": log_std.detach().clone()}
+        """Return the policy's weights, not copied, by their names in a saved policy."""
+        tensors = {name: value for name, value in self.state_dict().items() if name.startswith(_POLICY)}
+        return {**tensors, "log_std": self.log_std if hasattr(self, "log_std") else self.std.log()}
 
     def load_policy_tensors(self, policy: Mapping[str, Tensor]) -> None:
         """Load the weights returned by `policy_tensors()`."""
@@ -112,11 +111,11 @@ class ActorCritic(nn.Module):
 
 
 def unroll(lstm: Lstm, obs: Tensor, episode_start: Tensor, state: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Run an LSTM over several steps; its hidden state is zero where an episode starts.
+    """Run an LSTM over several steps; its hidden state is reset to zero where an episode starts.
 
     Args:
-        lstm: the module.
-        obs: its inputs. (steps, n, d)
+        lstm: the LSTM.
+        obs: inputs. (steps, n, d)
         episode_start: 1 at the first step of an episode. (steps, n)
         state: hidden state before the first step. (n, m)
 
@@ -139,11 +138,11 @@ class ValueNormalizer(Normalizer):
         self.count.fill_(1.0)
 
     def forward(self, value: Tensor) -> Tensor:
-        """Normalise returns."""
+        """Return normalised returns, clipped."""
         return ((value - self.mean.float()) / self._std).clamp(-_VALUE_CLIP, _VALUE_CLIP)
 
     def inverse(self, value: Tensor) -> Tensor:
-        """Turn normalised values back into returns."""
+        """Return the returns for normalised values."""
         return value.clamp(-_VALUE_CLIP, _VALUE_CLIP) * self._std + self.mean.float()
 
     @property
@@ -152,25 +151,25 @@ class ValueNormalizer(Normalizer):
 
 
 def flatten(module: nn.Module) -> tuple[nn.Parameter, Tensor, dict[str, slice]]:
-    """Make a module's parameters views of one vector.
+    """Replace a module's parameters by views of one vector.
 
     Returns:
-        The vector, its gradient with room for one more number behind it, and the slice of each parameter.
+        The vector, (p,); its gradient followed by one more number, (p + 1,); and the slice of each parameter.
     """
     parameters = dict(module.named_parameters())
     vector = nn.Parameter(torch.cat([value.detach().flatten() for value in parameters.values()]))
     gradient = torch.zeros(len(vector) + 1, device=vector.device)
     vector.grad = gradient[:-1]
-    places, start = {}, 0
+    slices, start = {}, 0
     for name, parameter in parameters.items():
-        place = slice(start, start + parameter.numel())
-        parameter.data = vector.data[place].view_as(parameter)
-        places[name], start = place, place.stop
-    return vector, gradient, places
+        part = slice(start, start + parameter.numel())
+        parameter.data = vector.data[part].view_as(parameter)
+        slices[name], start = part, part.stop
+    return vector, gradient, slices
 
 
 def adam(vector: nn.Parameter, learning_rate: Tensor, eps: float) -> Adam:
-    """Return an Adam optimiser whose state is allocated, since a captured step must not allocate it."""
+    """Return an Adam optimiser with allocated state: a step inside a CUDA graph must not allocate it."""
     optimizer = Adam([vector], lr=learning_rate, eps=eps, fused=True, capturable=vector.is_cuda)
     optimizer.step()  # the gradient is zero: no parameter changes
     optimizer.state[vector]["step"].zero_()
@@ -180,13 +179,13 @@ def adam(vector: nn.Parameter, learning_rate: Tensor, eps: float) -> Adam:
 def _mlp(inputs: int, config: NetworkConfig, outputs: int, init: str, gain: float) -> Mlp:
     layers: list[nn.Module] = []
     for width in config.hidden:
-        layers += [_linear(inputs, width, init, math.sqrt(2.0)), _activation(config.activation)]
+        layers += [_initialize(nn.Linear(inputs, width), init, math.sqrt(2.0)), _activation(config.activation)]
         inputs = width
-    return Mlp(*layers, _linear(inputs, outputs, init, gain))
+    return Mlp(*layers, _initialize(nn.Linear(inputs, outputs), init, gain))
 
 
 def _make_cnn(spec: VisionSpec | None, columns: int, config: NetworkConfig, init: str) -> tuple[Vision | None, int]:
-    """Return the CNN, if there are images, and the number of columns that the MLP behind it reads."""
+    """Return the CNN, or None without images, and the number of columns that the MLP behind it reads."""
     if spec is None:
         return None, columns
     vision = Vision(spec, ACTIVATIONS[config.activation])
@@ -197,20 +196,15 @@ def _make_cnn(spec: VisionSpec | None, columns: int, config: NetworkConfig, init
 
 
 def _activation(name: str) -> nn.Module:
-    """Return an activation, in place where the gradient needs only its result."""
+    """Return an activation; it works in place if its gradient needs only its output."""
     return ACTIVATIONS[name](inplace=True) if name in ("elu", "relu") else ACTIVATIONS[name]()
 
 
-def _linear(inputs: int, outputs: int, init: str, gain: float) -> nn.Linear:
-    layer = nn.Linear(inputs, outputs)
-    _initialize(layer, init, gain)
-    return layer
-
-
-def _initialize(layer: nn.Linear | nn.Conv2d, init: str, gain: float) -> None:
-    """Set the initial weights, where they are not torch's."""
+def _initialize(layer: nn.Linear | nn.Conv2d, init: str, gain: float) -> nn.Module:
+    """Set the initial weights for the `init` settings other than torch's default; return the layer."""
     if init == "orthogonal":
         nn.init.orthogonal_(layer.weight, gain)
     if init != "default":
         assert layer.bias is not None
         nn.init.zeros_(layer.bias)
+    return layer

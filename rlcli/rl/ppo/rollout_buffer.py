@@ -12,12 +12,12 @@ from rlcli.sim.state_cache import is_finite
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Columns of one packed array, so that a minibatch is a single gather. (..., d) each, scalars (...)"""
+    """Columns of one packed tensor, so that one gather makes a minibatch. (..., d) each; scalars (...)"""
 
     obs: Tensor
-    """Observation, as the actor's network reads it."""
+    """Normalised observation of the actor."""
     critic_obs: Tensor
-    """Observation, as the critic's network reads it."""
+    """Normalised observation of the critic."""
     action: Tensor
     """Sampled action, before it is clipped to a bound."""
     mean: Tensor
@@ -32,19 +32,19 @@ class Samples:
 
     @classmethod
     def views(cls, packed: Tensor, obs: int, critic_obs: int, action: int) -> Samples:
-        """Return the columns of `packed`; with a `critic_obs` of 0 the critic reads the actor's observation."""
+        """Return the columns of `packed`; if `critic_obs` is 0, the critic reads the actor's observation."""
         parts = packed.split_with_sizes([obs, critic_obs, action, action, 1, 1, 1, 1, 1], dim=-1)
         scalars = [part.squeeze(-1) for part in parts[4:]]
         return cls(parts[0], parts[1] if critic_obs else parts[0], parts[2], parts[3], *scalars)
 
 
 class RolloutBuffer:
-    """`num_steps` of every environment, and the same samples in the order of the minibatches.
+    """Samples of a rollout, and a copy of them in the order of the minibatches.
 
     Args:
-        steps: steps of every environment.
+        steps: number of steps of every environment.
         envs: number of environments.
-        sizes: columns of the actor's observation, of the critic's (0: the same) and of the action.
+        sizes: columns of the actor's observation, of the critic's observation (0: the actor's) and of the action.
         minibatches: number of samples of each minibatch.
         whole_envs: whether a minibatch holds all steps of its environments.
         device: device of all tensors.
@@ -67,52 +67,48 @@ class RolloutBuffer:
         self.minibatches = [Samples.views(part, *sizes) for part in self._ordered.split_with_sizes(minibatches)]
         """(n, ...) each"""
         self.old_std = torch.ones(len(minibatches), action, device=device)
-        """Standard deviation of the old policy, whose mean is `mean`, by minibatch."""
+        """Standard deviation of the old policy, for each minibatch; its mean is `Samples.mean`. (minibatches, a)"""
         self.reward = torch.zeros(steps, envs, device=device)
         self.done = torch.zeros(steps, envs, device=device)
-        """1 where the step ended the episode, by termination or truncation."""
+        """1 where the step ended the episode by termination or truncation, 0 elsewhere."""
         self.time_out = torch.zeros(steps, envs, dtype=torch.bool, device=device)
-        """Where the episode was truncated and not terminated."""
+        """True where the episode was truncated and not terminated."""
         self.final_obs = torch.zeros(steps, envs, critic_obs or obs, device=device)
-        """The episode's last observation, as the critic's network reads it; valid at time-outs."""
+        """Normalised last observation of the episode for the critic; valid only at time-outs."""
         self._indices = torch.arange(steps * envs, device=device).view(steps, envs)
         self.by_environment = self._indices.T.flatten()
-        """Order in which the samples of an environment follow each other."""
+        """Order of samples that puts the steps of each environment one after the other."""
         parts = self._indices[0].split_with_sizes([size // steps for size in minibatches]) if whole_envs else ()
         self.environments = [part.clone() for part in parts]
-        """Environments of each minibatch, with `whole_envs`. (n,) each"""
+        """Environments of each minibatch; empty without `whole_envs`. (n,) each"""
 
     def is_finite(self) -> bool:
         """Return whether all samples are finite."""
         return is_finite(self._packed)
 
     def in_causal_order(self) -> list[tuple[str, Tensor]]:
-        """Return all tensors with their names, each after those it is computed from. (num_steps, num_envs, ...)"""
+        """Return all tensors with their names, each after the tensors that it depends on. (num_steps, num_envs, ...)"""
         samples = self.samples
+        final_obs = torch.where(self.time_out[..., None], self.final_obs, 0.0)
         return [
-            ("the observation, as the actor sees it,", samples.obs),
+            ("the observation of the actor", samples.obs),
             ("the mean action", samples.mean),
             ("the action", samples.action),
             ("the action's log-probability", samples.log_prob),
             ("the reward", self.reward),
-            ("the observation, as the critic sees it,", samples.critic_obs),
-            (
-                "the last observation, as the critic sees it,",
-                torch.where(self.time_out[..., None], self.final_obs, 0.0),
-            ),
+            ("the observation of the critic", samples.critic_obs),
+            ("the last observation of the critic", final_obs),
             ("the value", samples.value),
             ("the advantage", samples.advantage),
             ("the value's target", samples.target),
         ]
 
     def order_by_environment(self, environments: Tensor) -> Tensor:
-        """Assign `environments` to the minibatches; return the order of samples, step 0 of a minibatch first."""
-        order, start = [], 0
-        for own in self.environments:
-            own.copy_(environments[start : start + len(own)])
-            order.append(self._indices.index_select(1, own).flatten())
-            start += len(own)
-        return torch.cat(order)
+        """Assign environments to the minibatches; return the order of the samples, step by step in each minibatch."""
+        parts = environments.split_with_sizes([len(own) for own in self.environments])
+        for own, part in zip(self.environments, parts, strict=True):
+            own.copy_(part)
+        return torch.cat([self._indices.index_select(1, part).flatten() for part in parts])
 
     def fill_minibatches(self, order: Tensor) -> None:
         """Copy the samples into the minibatches; sample (t, env) has index t * num_envs + env."""

@@ -1,4 +1,4 @@
-"""Sizes and structure of the PPO trainer, from its configuration and the environment."""
+"""Sizes and structure of the PPO trainer for a configuration and an environment."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from rlcli.rl.ppo.config import PpoConfig
 from rlcli.rl.trainer_base import agent_error
 
 _WORTH_COMPILING = 40_000
-"""Minibatches of a run from which compiling saves time on a GPU (docs/explanation/benchmarks.md)."""
+"""Number of minibatches in a run from which compiling saves time on a GPU (docs/explanation/benchmarks.md)."""
 
 
 def policy_spec(env: VecEnv, config: PpoConfig) -> PolicySpec:
     """Return the structure of the trained policy."""
     vision = vision_spec(env, config, ("policy",))
     if config.cnn is not None and vision is None:
-        message = "no term of the observation group 'policy' is a picture"
+        message = "no term of the observation group 'policy' is an image"
         raise agent_error(env, ("cnn",), message, "an observation term like `image`, or cnn: null")
     return PolicySpec(
         kind="gaussian-lstm" if config.rnn else "gaussian-mlp" if vision is None else "gaussian-cnn",
@@ -35,10 +35,10 @@ def policy_spec(env: VecEnv, config: PpoConfig) -> PolicySpec:
 
 
 def vision_spec(env: VecEnv, config: PpoConfig, groups: tuple[str, ...]) -> VisionSpec | None:
-    """Return the images in observation groups side by side; None without images or without a CNN.
+    """Return the CNN over the images in concatenated observation groups; None without images or without a CNN.
 
     Raises:
-        ConfigError: if the layers do not fit them.
+        ConfigError: if the layers do not fit the images.
     """
     if config.cnn is None:
         return None
@@ -50,15 +50,12 @@ def vision_spec(env: VecEnv, config: PpoConfig, groups: tuple[str, ...]) -> Visi
         start += term.size
     if not pictures:
         return None
-    cnn = config.cnn
-    layers = {name: list(getattr(cnn, name)) for name in ("channels", "kernels", "strides")}
     try:
-        return VisionSpec.model_validate({"pictures": pictures, "motion": cnn.motion, **layers})
+        return VisionSpec.model_validate({"pictures": pictures, **config.cnn.model_dump()})
     except ValidationError as error:
         message = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
-        raise agent_error(
-            env, ("cnn",), message, "smaller kernels or strides, fewer layers, or larger pictures"
-        ) from None
+        hint = "smaller kernels or strides, fewer layers, or larger images"
+        raise agent_error(env, ("cnn",), message, hint) from None
 
 
 def critic_groups(env: VecEnv, config: PpoConfig) -> tuple[str, ...]:
@@ -67,11 +64,12 @@ def critic_groups(env: VecEnv, config: PpoConfig) -> tuple[str, ...]:
     Raises:
         ConfigError: if the task has no such group.
     """
-    have = env.layout.observations
-    groups = config.critic_obs or (("critic",) if "critic" in have else ("policy",))
+    available = env.layout.observations
+    groups = config.critic_obs or (("critic",) if "critic" in available else ("policy",))
     for group in groups:
-        if group not in have:
-            raise agent_error(env, ("critic_obs",), f"no observation group '{group}'", f"groups: {', '.join(have)}")
+        if group not in available:
+            hint = f"groups: {', '.join(available)}"
+            raise agent_error(env, ("critic_obs",), f"no observation group '{group}'", hint)
     return groups
 
 
@@ -79,10 +77,10 @@ def minibatch_sizes(env: VecEnv, config: PpoConfig, total: int) -> list[int]:
     """Return the number of samples of each minibatch.
 
     Raises:
-        ConfigError: if the rollout is too small for them.
+        ConfigError: if the rollout has too few samples.
     """
     rollout = f"a rollout holds num_steps x num_envs = {config.num_steps} x {env.num_envs} = {total} samples"
-    whole = config.num_steps if config.rnn else 1  # samples that stay together
+    whole = config.num_steps if config.rnn else 1  # samples that must stay in one minibatch
     parts = torch.arange(total // whole)
     if config.minibatch_size is not None:
         split = torch.split(parts, max(1, config.minibatch_size // whole))
@@ -99,8 +97,8 @@ def minibatch_sizes(env: VecEnv, config: PpoConfig, total: int) -> list[int]:
     raise agent_error(env, (key,), message, "more environments, more num_steps, or fewer minibatches")
 
 
-def compilation(config: PpoConfig, device: torch.device, steps_per_iteration: int) -> bool | str:
-    """Return whether, and how, to compile the update: as configured, else on a GPU if the run is long enough."""
+def compile_mode(config: PpoConfig, device: torch.device, steps_per_iteration: int) -> bool | str:
+    """Return `compile` of the configuration; if it is null, whether the device is a GPU and the run long enough."""
     if config.compile is not None or device.type != "cuda":
         return config.compile or False
     limits = []

@@ -1,6 +1,6 @@
 """Proximal policy optimisation (Schulman et al. 2017): collect a rollout, update actor and critic, repeat.
 
-On a GPU the rollout and the update are each captured once as a CUDA graph and replayed (`rlcli.rl.cuda_graph`).
+On a GPU, rollout and update are captured as CUDA graphs and replayed (`rlcli.rl.cuda_graph`).
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import DivergedError
 from rlcli.random import derive
 from rlcli.rl import distributed
-from rlcli.rl.budget import Budget
-from rlcli.rl.cuda_graph import captured
+from rlcli.rl.budget import remaining_budget
+from rlcli.rl.cuda_graph import capture_on_gpu
 from rlcli.rl.nan_check import require_finite
 from rlcli.rl.optimizers import below
 from rlcli.rl.ppo.collector import Collector
@@ -32,14 +32,14 @@ from rlcli.sim.tensor_state import require_matching_tensors
 
 
 class PpoTrainer(BaseTrainer):
-    """PPO, one iteration at a time.
+    """PPO trainer.
 
     Args:
         env: the environment.
-        config: the agent.
-        seed: of the networks and of exploration.
-        device: device of the networks and the samples, that of the environment.
-        torch_threads: threads of the update; the rollout runs torch on one thread, since two thread pools compete.
+        config: configuration of the agent.
+        seed: seed of the initial weights and of exploration.
+        device: device of networks and samples; it must be the device of the environment.
+        torch_threads: threads of torch in the update; see `BaseTrainer`.
     """
 
     def __init__(self, env: VecEnv, config: PpoConfig, *, seed: int, device: str, torch_threads: int) -> None:
@@ -61,15 +61,16 @@ class PpoTrainer(BaseTrainer):
             self.spec.vision,
             vision_spec(env, config, groups),
         ).to(self.device)
+        # all ranks start with equal weights and explore with different noise
         seed_generators(self.process_group.seed(derive(seed, "exploration"), "exploration"))
         self.collector = Collector(env, config, self.networks, groups, self.statistics, self.process_group)
         self.learner = Learner(self.collector, config, self.process_group, torch_threads)
-        self._collect = captured(self.collector.collect, self.device, env.stateful_objects())
-        self._update = captured(self.learner.update, self.device)
+        self._collect = capture_on_gpu(self.collector.collect, self.device, env.stateful_objects())
+        self._update = capture_on_gpu(self.learner.update, self.device)
 
     @property
     def iteration(self) -> int:
-        """Iterations done."""
+        """Number of finished iterations."""
         return self.collector.iteration
 
     def start(self) -> None:
@@ -84,15 +85,13 @@ class PpoTrainer(BaseTrainer):
         try:
             self._collect()
         except DivergedError:
-            require_finite(
-                self.collector.rollout_dependencies(), self.iteration + 1
-            )  # the cause, if it is not the task
+            # if the policy caused the divergence, name its first tensor that is not finite instead
+            require_finite(self.collector.rollout_dependencies(), self.iteration + 1)
             raise
         self._keep_recent_obs(self.collector.obs["policy"])
         collected = self._timestamp()
         torch.set_num_threads(self.learner.torch_threads)
-        spent = Budget(self.config.max_iterations, self.config.max_steps).share(self)
-        self.learner.decay_learning_rate(max(0.0, 1.0 - spent))
+        self.learner.decay_learning_rate(remaining_budget(self.config, self))  # before the iteration is counted
         self.collector.iteration += 1
         self.env_steps += self.steps_per_iteration
         self._update()
@@ -105,13 +104,13 @@ class PpoTrainer(BaseTrainer):
         if isinstance(collected, float):
             rollout = collected - begin
             seconds = self._split_seconds(before, rollout, total - rollout)
-        else:  # the parts of a replayed rollout cannot be timed
+        else:  # on a GPU the parts of a replayed rollout cannot be timed
             update = collected.elapsed_time(updated) / 1e3
             seconds = {"rollout": total - update, "update": update}
         return self._report(losses, seconds)
 
     def _timestamp(self) -> Any:
-        """Return the time, or on a GPU an event in the order of its work, which forces no host sync."""
+        """Return the time [s]; on a GPU a CUDA event in its stream of work, which forces no host sync."""
         if self.device.type != "cuda":
             return time.perf_counter()
         event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]  # torch has no type here
@@ -122,11 +121,8 @@ class PpoTrainer(BaseTrainer):
 
     def state(self) -> TrainerState:
         """Return a copy of everything that the next iteration depends on."""
-        tensors = {
-            "policy": self._policy_tensors(),
-            "trainer": {name: _copy(value) for name, value in self._learner_tensors().items()},
-        }
-        tensors["trainer"]["observations"] = _copy(self._recent_obs)
+        trainer = _copies({**self._learner_tensors(), "observations": self._recent_obs})
+        tensors = {"policy": self._policy_tensors(), "trainer": trainer}
         values = {
             "policy": self.spec.model_dump(),
             "iteration": self.iteration,
@@ -134,24 +130,23 @@ class PpoTrainer(BaseTrainer):
             "processes": self.process_group.world_size,
         }
         for rank, (env, rng, statistics) in enumerate(self.process_group.gather_object(self._process_state())):
-            suffix = f".{rank}" if rank else ""
+            suffix = _suffix(rank)
             tensors[f"env{suffix}"], tensors[f"rng{suffix}"] = env, rng
             values[f"statistics{suffix}"] = statistics
         return TrainerState(tensors, values)
 
     def _process_state(self) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
-        """Return what differs between processes: environments, random generators, statistics."""
+        """Return the state that differs between processes: environments, random generators, statistics."""
         rng = rng_state()
         if self.device.type == "cuda":
             rng["cuda"] = torch.cuda.get_rng_state(self.device)
         env = {name: value.cpu() for name, value in self.env.state_dict().items()}
-        env |= {name: _copy(value) for name, value in self._episode_tensors().items()}
-        return env, rng, self.statistics.state()
+        return {**env, **_copies(self._episode_tensors())}, rng, self.statistics.state()
 
     def load(self, state: TrainerState) -> None:
-        """Restore a state: on a CPU the next iteration gives the same bits as it did then.
+        """Restore a state. On a CPU the next iteration gives the same bits as in the original run.
 
-        With another number of processes than then, the learner continues, in new episodes.
+        If the number of processes has changed, the learner continues and every environment starts a new episode.
         """
         values, saved = state.values, state.tensors["trainer"]
         require_matching_tensors(saved, self._learner_tensors(), "trainer")
@@ -167,7 +162,7 @@ class PpoTrainer(BaseTrainer):
             torch.manual_seed(derive(torch.initial_seed(), f"after {self.env_steps} steps"))
             self.collector.set_obs(self.env.reset(seed=derive(self.env.seed, f"after {self.env_steps} steps")))
             return
-        suffix = f".{self.process_group.rank}" if self.process_group.rank else ""
+        suffix = _suffix(self.process_group.rank)
         self.statistics.load(values[f"statistics{suffix}"])
         env = state.tensors[f"env{suffix}"]
         require_matching_tensors(env, self._episode_tensors(), "env")
@@ -175,43 +170,49 @@ class PpoTrainer(BaseTrainer):
             value.copy_(env[name])
         self.collector.set_obs(self.env.load_state_dict(env))
         rng = state.tensors[f"rng{suffix}"]
-        load_rng_state(rng)
+        load_rng_state(rng)  # last: `load_state_dict` of a task may draw random numbers
         if self.device.type == "cuda" and "cuda" in rng:
             torch.cuda.set_rng_state(rng["cuda"], self.device)
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normaliser; the critic keeps its own."""
+        """Load the weights and the normaliser of a policy; the critic does not change."""
         self.networks.load_policy_tensors(policy)
         if self.collector.normalizer is not None:
             self.collector.normalizer.load_state_dict(below(policy, "normalizer."))
 
     def _policy_tensors(self) -> dict[str, Tensor]:
-        tensors = {name: _copy(value) for name, value in self.networks.policy_tensors().items()}
-        if self.collector.normalizer is not None:
-            state = self.collector.normalizer.state_dict()
-            tensors.update({f"normalizer.{name}": _copy(value) for name, value in state.items()})
-        return tensors
+        normalizer = _module_tensors("normalizer", self.collector.normalizer)
+        return _copies({**self.networks.policy_tensors(), **normalizer})
 
     def _learner_tensors(self) -> dict[str, Tensor]:
-        """Return, uncopied, everything that the learner depends on except the policy."""
-        tensors = {
+        """Return the tensors of the learner, not copied, by their names in a checkpoint; without the policy."""
+        tensors: dict[str, Tensor] = {
             name: value
             for name, value in self.networks.named_parameters()
             if not name.startswith(("actor.", "memory.", "vision."))
         }
-        for name in ("critic_normalizer", "value_normalizer"):
-            module = getattr(self.collector, name)
-            if module is not None:
-                tensors.update({f"{name}.{key}": value for key, value in module.state_dict().items()})
+        tensors |= _module_tensors("critic_normalizer", self.collector.critic_normalizer)
+        tensors |= _module_tensors("value_normalizer", self.collector.value_normalizer)
         slots = self.learner.optimizer.state[self.learner.weights]
         optimizer = {f"optimizer.{slot}": value for slot, value in slots.items()}
         return {**tensors, **optimizer, "learning_rate": self.learner.learning_rate}
 
     def _episode_tensors(self) -> dict[str, Tensor]:
-        """Return, uncopied, what the collector carries from one rollout to the next, by its name in a checkpoint."""
+        """Return the tensors that the collector keeps between rollouts, not copied, by their names in a checkpoint."""
         states = {f"memory.{name}": value for name, value in self.collector.hidden_state.items()}
         return {"begins": self.collector.episode_start, **states}
 
 
-def _copy(value: Tensor) -> Tensor:
-    return value.detach().to("cpu", copy=True)
+def _copies(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return copies of tensors on the CPU."""
+    return {name: value.detach().to("cpu", copy=True) for name, value in tensors.items()}
+
+
+def _module_tensors(name: str, module: nn.Module | None) -> dict[str, Tensor]:
+    """Return the tensors of a module, not copied, with the prefix `name.`; none for None."""
+    return {} if module is None else {f"{name}.{key}": value for key, value in module.state_dict().items()}
+
+
+def _suffix(rank: int) -> str:
+    """Return the suffix of a rank's files and entries in a checkpoint."""
+    return f".{rank}" if rank else ""

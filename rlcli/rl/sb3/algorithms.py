@@ -1,6 +1,6 @@
-"""Stable-Baselines3's algorithms with rollouts that stay in torch: SB3's updates, rlcli's collection.
+"""Stable-Baselines3's algorithms with SB3's updates and rollouts that stay in torch.
 
-Only public hooks are used: buffers passed to the constructors, `collect_rollouts` and `train`.
+Only public hooks of SB3 are used: buffers passed to the constructors, `collect_rollouts` and `train`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,17 @@ from rlcli.rl.statistics import EpisodeStatistics
 
 
 class _Collecting:
-    """Attributes of every collecting algorithm, set once the model is built."""
+    """Attributes of both kinds of algorithms, which the trainer sets after it has built the model."""
 
     source: VecEnv
     statistics: EpisodeStatistics
     normalizer: Normalizer | None
     reward_scale: float
     action_bound: float | None
+    # attributes of SB3's algorithms
+    policy: Any
+    num_timesteps: int
+    _last_obs: Any
 
     def _normalized(self, obs: Tensor, update: bool) -> Tensor:
         if self.normalizer is None:
@@ -36,22 +40,18 @@ class _Collecting:
 
 
 class _OnPolicy(_Collecting):
-    """On-policy collection; one call of the critic bootstraps all time-outs of a step."""
+    """On-policy collection. One call of the critic bootstraps all time-outs of a step."""
 
     rollout_buffer: TorchRolloutBuffer
-    policy: Any
     gamma: float
-    num_timesteps: int
-    _last_obs: Any
     _last_episode_starts: Any
 
     def collect_rollouts(self, env: object, callback: object, rollout_buffer: object, n_rollout_steps: int) -> bool:
-        """Fill the buffer with `n_rollout_steps` of every environment."""
+        """Fill the buffer with `n_rollout_steps` steps of every environment; see SB3's `collect_rollouts`."""
         buffer, source, policy, bound = self.rollout_buffer, self.source, self.policy, self.action_bound
         policy.set_training_mode(False)
         buffer.reset()
         obs, start = torch.as_tensor(self._last_obs), torch.as_tensor(self._last_episode_starts)
-        done = start
         with torch.inference_mode():
             for _ in range(n_rollout_steps):
                 normalized = self._normalized(obs, update=True)
@@ -59,14 +59,14 @@ class _OnPolicy(_Collecting):
                 result = source.step(action if bound is None else action.clamp(-bound, bound))
                 reward = result.reward * self.reward_scale
                 if result.final_obs is not None:
+                    # a time-out: r += gamma V(last observation of the episode)
                     timed_out = (result.truncated & ~result.terminated).nonzero().squeeze(1)
                     final = self._normalized(result.final_obs["policy"].index_select(0, timed_out), update=False)
                     reward.index_add_(0, timed_out, policy.predict_values(final).flatten(), alpha=self.gamma)
                 buffer.put(normalized, action, reward, start, value.flatten(), log_prob)
                 self.statistics.add(result.episodes)
-                done = result.terminated | result.truncated
-                obs, start = result.obs["policy"], done
-            buffer.finish(policy.predict_values(self._normalized(obs, update=False)).flatten(), done)
+                obs, start = result.obs["policy"], result.terminated | result.truncated
+            buffer.finish(policy.predict_values(self._normalized(obs, update=False)).flatten(), start)
         self.num_timesteps += n_rollout_steps * source.num_envs
         self._last_obs = obs.numpy()
         self._last_episode_starts = start.numpy()
@@ -82,20 +82,18 @@ class FastA2C(_OnPolicy, A2C):  # type: ignore[misc]
 
 
 class _OffPolicy(_Collecting):
-    """Off-policy collection. Actions in the buffer are in [-1, 1]; the environment receives them times the bound."""
+    """Off-policy collection. The buffer holds actions in [-1, 1]; the environment gets them times the action bound."""
 
     replay_buffer: TorchReplayBuffer
     actor: Any
     learning_starts: int
-    num_timesteps: int
     exploration_noise: float
-    _last_obs: Any
 
     def collect(self, steps: int) -> None:
-        """Step every environment `steps` times into the replay buffer; random actions before `learning_starts`."""
+        """Do `steps` steps of every environment; before `learning_starts` the actions are uniformly random."""
         assert self.action_bound is not None
         source, buffer = self.source, self.replay_buffer
-        self.policy.set_training_mode(False)  # type: ignore[attr-defined]
+        self.policy.set_training_mode(False)
         obs = torch.as_tensor(self._last_obs)
         with torch.inference_mode():
             for _ in range(steps):
@@ -116,7 +114,7 @@ class _OffPolicy(_Collecting):
         self._last_obs = obs.numpy()
 
     def _explore(self, normalized: Tensor) -> Tensor:
-        action: Tensor = self.actor(normalized)  # SAC's samples; the others' are deterministic
+        action: Tensor = self.actor(normalized)  # SAC samples here; the actors of TD3 and DDPG are deterministic
         if not self.exploration_noise:
             return action
         return (action + self.exploration_noise * torch.randn_like(action)).clamp_(-1.0, 1.0)

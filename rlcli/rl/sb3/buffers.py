@@ -1,4 +1,4 @@
-"""Stable-Baselines3's buffers with torch storage: no copy to numpy and back, minibatches by `index_select`."""
+"""Stable-Baselines3's buffers with torch storage, so that samples are not copied to numpy and back."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from rlcli.sim.tensor_state import require_matching_tensors
 
 
 class TorchRolloutBuffer(RolloutBuffer):
-    """SB3's rollout buffer with torch storage, gathered by `index_select`. All tensors are (n_steps, n_envs, ...)."""
+    """SB3's rollout buffer with torch storage. All tensors are (n_steps, n_envs, ...)."""
 
     num_minibatches: int | None = None
-    """Number of minibatches of `get`, as even as possible; None: minibatches of its `batch_size`."""
+    """Number of minibatches of `get`, which are as even as possible; None: minibatches of `batch_size` samples."""
 
     def reset(self) -> None:
-        """Discard the rollout; the storage is allocated once."""
+        """Discard the rollout. The first call allocates the storage."""
         if not hasattr(self, "obs"):
             steps, envs = self.buffer_size, self.n_envs
             self.obs = torch.zeros(steps, envs, *self.obs_shape)
@@ -30,59 +30,55 @@ class TorchRolloutBuffer(RolloutBuffer):
             self.reward, self.start, self.value, self.log_prob, self.advantage, self.target = (
                 torch.zeros(steps, envs) for _ in range(6)
             )
-            # SB3's update reads these two, as numpy, for its explained variance
+            # SB3's update reads these two numpy arrays for its explained variance
             self.values, self.returns = self.value.numpy(), self.target.numpy()
         self.pos, self.full = 0, False
 
     def put(self, obs: Tensor, action: Tensor, reward: Tensor, start: Tensor, value: Tensor, log_prob: Tensor) -> None:
-        """Store one step of every environment."""
-        for storage, values in (
-            (self.obs, obs),
-            (self.action, action),
-            (self.reward, reward),
-            (self.start, start),
-            (self.value, value),
-            (self.log_prob, log_prob),
-        ):
-            storage[self.pos].copy_(values)
+        """Store one step of every environment. (n_envs, ...) each"""
+        columns = (self.obs, self.action, self.reward, self.start, self.value, self.log_prob)
+        for column, values in zip(columns, (obs, action, reward, start, value, log_prob), strict=True):
+            column[self.pos].copy_(values)
         self.pos += 1
         self.full = self.pos == self.buffer_size
 
     def finish(self, last_value: Tensor, last_done: Tensor) -> None:
-        """Generalised advantage estimation, equations 11 and 12 of Schulman et al. 2017 (PPO), backwards in time."""
+        """Estimate advantages and targets by GAE, equations 11 and 12 of Schulman et al. 2017 (PPO).
+
+        Args:
+            last_value: values of the observations after the rollout. (n_envs,)
+            last_done: whether the last step ended an episode. (n_envs,)
+        """
         advantage = torch.zeros_like(last_value)
-        next_value, alive = last_value, 1.0 - last_done.float()
+        next_value, not_done = last_value, 1.0 - last_done.float()
         for step in reversed(range(self.buffer_size)):
-            delta = self.reward[step] + self.gamma * next_value * alive - self.value[step]
-            advantage = delta + self.gamma * self.gae_lambda * alive * advantage
+            delta = self.reward[step] + self.gamma * next_value * not_done - self.value[step]  # equation 12
+            advantage = delta + self.gamma * self.gae_lambda * not_done * advantage  # equation 11, as a recursion
             self.advantage[step].copy_(advantage)
-            next_value, alive = self.value[step], 1.0 - self.start[step]
+            next_value, not_done = self.value[step], 1.0 - self.start[step]
         torch.add(self.advantage, self.value, out=self.target)
 
     def get(self, batch_size: int | None = None) -> Iterator[RolloutBufferSamples]:  # type: ignore[override]
-        """Return the minibatches of a new permutation."""
+        """Shuffle the samples and yield the minibatches."""
         total = self.buffer_size * self.n_envs
         storage = (self.obs, self.action, self.value, self.log_prob, self.advantage, self.target)
         columns = [tensor.view(total, *tensor.shape[2:]) for tensor in storage]
-        rows_of_parts = (
-            torch.split(torch.randperm(total), batch_size or total)
-            if self.num_minibatches is None
-            else torch.randperm(total).tensor_split(self.num_minibatches)
-        )
-        for rows in rows_of_parts:
+        order, parts = torch.randperm(total), self.num_minibatches
+        for rows in torch.split(order, batch_size or total) if parts is None else order.tensor_split(parts):
             yield RolloutBufferSamples(*(column.index_select(0, rows) for column in columns))
 
 
 class TorchReplayBuffer(ReplayBuffer):
-    """Ring buffer of transitions of every environment; observations are normalised when they are sampled.
+    """SB3's replay buffer with torch storage: a ring buffer that normalises observations when they are sampled.
 
-    A time-out is stored as not done, with the last observation of the episode as its next one.
+    A time-out is stored as not done, with the last observation of the episode as the next observation. All tensors are
+    (rows, n_envs, ...).
     """
 
     normalizer: Normalizer | None = None
 
     def __init__(self, buffer_size: int, *args: Any, **kwargs: Any) -> None:
-        super().__init__(1, *args, **kwargs)  # SB3's own storage stays small: it is not used
+        super().__init__(1, *args, **kwargs)  # SB3's own storage has one row: it is not used
         self.buffer_size = max(1, buffer_size // self.n_envs)
         rows, envs = self.buffer_size, self.n_envs
         self.obs = torch.zeros(rows, envs, *self.obs_shape)
@@ -91,22 +87,16 @@ class TorchReplayBuffer(ReplayBuffer):
         self.reward = torch.zeros(rows, envs, 1)
         self.done = torch.zeros(rows, envs, 1)
         self.added = 0
-        """Steps ever stored."""
+        """Number of steps ever stored."""
 
     def put(self, obs: Tensor, next_obs: Tensor, action: Tensor, reward: Tensor, done: Tensor) -> None:
-        """Store one step of every environment."""
-        for storage, values in (
-            (self.obs, obs),
-            (self.next_obs, next_obs),
-            (self.action, action),
-            (self.reward, reward[:, None]),
-            (self.done, done[:, None]),
-        ):
-            storage[self.pos].copy_(values)
+        """Store one step of every environment. (n_envs, ...) each"""
+        for name, values in zip(_COLUMNS, (obs, next_obs, action, reward[:, None], done[:, None]), strict=True):
+            getattr(self, name)[self.pos].copy_(values)
         self._count(1)
 
     def sample(self, batch_size: int, env: object = None) -> ReplayBufferSamples:
-        """Return uniformly sampled transitions."""
+        """Return uniformly sampled transitions; observations are normalised."""
         rows = torch.randint((self.buffer_size if self.full else self.pos) * self.n_envs, (batch_size,))
         obs, action, next_obs, done, reward = (
             storage.view(-1, storage.shape[2]).index_select(0, rows)
@@ -117,7 +107,12 @@ class TorchReplayBuffer(ReplayBuffer):
         return ReplayBufferSamples(obs, action, next_obs, done, reward)
 
     def rows(self, at_risk: int) -> Rows:
-        """Return the stored rows, readable until `at_risk` more steps are stored."""
+        """Return the stored rows for a checkpoint.
+
+        Args:
+            at_risk: number of steps that may be stored before the rows are read. The rows that these steps would
+                overwrite are copied.
+        """
         first, stop = max(0, self.added - self.buffer_size), self.added
         overwritten = max(0, stop + at_risk - self.buffer_size - first)
         kept = self._read(first, first + overwritten)
@@ -133,24 +128,24 @@ class TorchReplayBuffer(ReplayBuffer):
         """Restore the rows returned by `rows()`.
 
         Raises:
-            ValueError: if they are rows of another buffer.
+            ValueError: if the rows do not fit this buffer.
         """
         count = rows.stop - rows.first
         if not 0 <= count <= self.buffer_size:
-            raise ValueError(f"replay: {count} rows, and the buffer holds {self.buffer_size}")
+            raise ValueError(f"replay: {count} rows, but the buffer holds at most {self.buffer_size}")
         saved = rows.read(rows.first, rows.stop)
         if count:
             own = {name: getattr(self, name)[:count] for name in _COLUMNS}
             require_matching_tensors({name: saved[name] for name in own}, own, "replay")
-        places = torch.arange(rows.first, rows.stop) % self.buffer_size
+        positions = torch.arange(rows.first, rows.stop) % self.buffer_size
         for name, values in saved.items():
-            getattr(self, name)[places] = values
+            getattr(self, name)[positions] = values
         self.added = rows.first
         self._count(count)
 
     def _read(self, start: int, stop: int) -> dict[str, Tensor]:
-        places = torch.arange(start, stop) % self.buffer_size
-        return {name: getattr(self, name)[places] for name in _COLUMNS}
+        positions = torch.arange(start, stop) % self.buffer_size
+        return {name: getattr(self, name)[positions] for name in _COLUMNS}
 
     def _count(self, steps: int) -> None:
         self.added += steps

@@ -1,4 +1,4 @@
-"""Settings of the Stable-Baselines3 trainer; light, so that a YAML is checked without importing the library."""
+"""Settings of the Stable-Baselines3 trainer. The module does not import the library: a YAML is checked fast."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ Discount = Annotated[float, Field(ge=0, le=1)]
 
 
 class NetworkConfig(StrictModel):
-    """Actor and critic: networks of the same shape."""
+    """Networks of actor and critic, which have the same shape."""
 
     hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
     """Widths of the hidden layers."""
     activation: Literal["elu", "relu", "tanh", "silu"] = "tanh"
     """Activation between layers."""
     init_std: Positive = 1.0
-    """On-policy: standard deviation of the untrained policy, the same in every state, learned."""
+    """On-policy: initial standard deviation of the actions; it is learned and does not depend on the state."""
     ortho_init: bool = False
-    """On-policy: orthogonal initial weights, SB3's own default; torch's otherwise."""
+    """On-policy: whether initial weights are orthogonal, as by default in SB3; else they are torch's."""
 
 
 class Sb3Config(AgentConfig):
-    """What all algorithms have in common, under SB3's names."""
+    """Settings of all algorithms, with SB3's names."""
 
     learning_rate: Positive = 3e-4
-    """Step size of the optimiser."""
+    """Learning rate of the optimiser."""
     schedule: Literal["constant", "linear", "adaptive"] = "constant"
-    """How the learning rate moves: linear goes to 0 over the budget; adaptive (PPO only) follows desired_kl."""
+    """Schedule of the learning rate: linear decreases to 0 over the budget; adaptive (PPO only) follows desired_kl."""
     gamma: Discount = 0.99
-    """Discount."""
+    """Discount factor."""
     reward_scale: Positive = 1.0
-    """Factor on rewards in training; returns are reported without it."""
+    """Factor on rewards in training; reported returns do not include it."""
     normalize_observations: bool = False
-    """Normalise observations by their running mean and deviation; the statistics are part of the policy."""
+    """Normalise observations by their running mean and standard deviation, which are part of the policy."""
     policy: NetworkConfig = NetworkConfig()
-    """Networks."""
+    """Networks of actor and critic."""
 
 
 class OnPolicyConfig(Sb3Config):
-    """PPO and A2C."""
+    """Settings of PPO and A2C."""
 
     n_steps: Count = 16
-    """Steps an environment and iteration."""
+    """Steps of each environment per iteration."""
     gae_lambda: Discount = 0.95
     """Lambda of generalised advantage estimation."""
     normalize_advantage: bool = True
@@ -56,43 +56,44 @@ class OnPolicyConfig(Sb3Config):
     vf_coef: NotNegative = 0.5
     """Weight of the value loss."""
     max_grad_norm: Positive = 0.5
-    """Norm the gradient is clipped to."""
+    """Largest norm of the gradient."""
 
 
 class PpoConfig(OnPolicyConfig):
     """Proximal policy optimisation (SB3's `PPO`)."""
 
     algorithm: Literal["ppo"] = "ppo"
-    """ppo"""
+    """Algorithm: ppo."""
     n_epochs: Count = 5
-    """Passes over the rollout an iteration."""
+    """Passes over the rollout per iteration."""
     num_minibatches: Count = 4
-    """Parts of the rollout, an update each; any number of environments divides into them."""
+    """Number of minibatches of a rollout; the number of environments need not be a multiple."""
     desired_kl: Positive | None = None
-    """For schedule adaptive: after an iteration, / 1.5 above twice this divergence, x 1.5 below half of it."""
+    """For schedule adaptive: after an iteration the learning rate is divided by 1.5 if the KL divergence is above twice
+    this value, and multiplied by 1.5 if it is below half of it."""
     clip_range: Positive = 0.2
-    """Clipping of the probability ratio."""
+    """Clipping range of the probability ratio: 1 +- clip_range."""
     clip_range_vf: Positive | None = None
-    """Clipping of the value's change; null: none."""
+    """Clipping range of the change of the value; null: no clipping."""
 
     @model_validator(mode="after")
     def _schedule(self) -> PpoConfig:
         if (self.schedule == "adaptive") != (self.desired_kl is not None):
-            raise ValueError("desired_kl belongs to schedule adaptive, and schedule adaptive needs it")
+            raise ValueError("desired_kl must be given for schedule adaptive, and only for it")
         return self
 
 
 class A2cConfig(OnPolicyConfig):
-    """Advantage actor-critic (SB3's `A2C`): one update of the whole rollout an iteration, RMSprop."""
+    """Advantage actor-critic (SB3's `A2C`): one update with the whole rollout per iteration, by RMSprop."""
 
     algorithm: Literal["a2c"] = "a2c"
-    """a2c"""
+    """Algorithm: a2c."""
     n_steps: Count = 5
-    """Steps an environment and iteration."""
+    """Steps of each environment per iteration."""
     learning_rate: Positive = 7e-4
-    """Step size of the optimiser."""
+    """Learning rate of the optimiser."""
     schedule: Literal["constant", "linear"] = "constant"
-    """How the learning rate moves: linear goes to 0 over the budget."""
+    """Schedule of the learning rate: linear decreases to 0 over the budget."""
     gae_lambda: Discount = 1.0
     """Lambda of generalised advantage estimation."""
     normalize_advantage: bool = False
@@ -100,26 +101,29 @@ class A2cConfig(OnPolicyConfig):
 
 
 class OffPolicyConfig(Sb3Config):
-    """SAC, TD3 and DDPG. An iteration is `train_freq` steps of every environment, then `gradient_steps` updates."""
+    """Settings of SAC, TD3 and DDPG.
+
+    An iteration is `train_freq` steps of every environment, then `gradient_steps` updates.
+    """
 
     schedule: Literal["constant", "linear"] = "constant"
-    """How the learning rate moves: linear goes to 0 over the budget."""
+    """Schedule of the learning rate: linear decreases to 0 over the budget."""
     action_bound: Positive = 1.0
-    """Actions are tanh times this; an off-policy algorithm needs a bound."""
+    """Actions are tanh times this bound; an off-policy algorithm needs a bound."""
     train_freq: Count = 16
-    """Steps an environment and iteration."""
+    """Steps of each environment per iteration."""
     gradient_steps: Count = 32
-    """Updates an iteration."""
+    """Updates per iteration."""
     batch_size: Count = 256
-    """Transitions an update."""
+    """Transitions of an update."""
     buffer_size: Count = 1_000_000
-    """Transitions kept, over all environments."""
+    """Transitions in the replay buffer, over all environments."""
     learning_starts: Annotated[int, Field(ge=0)] = 4096
-    """Environment steps of random actions before the first update."""
+    """Environment steps with random actions before the first update."""
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005
-    """Share of the new weights that a target network takes on at each update."""
+    """Weight of the new network in each update of a target network: target = tau new + (1 - tau) target."""
     policy: NetworkConfig = NetworkConfig(hidden=(256, 256), activation="relu")
-    """Networks."""
+    """Networks of actor and critic."""
 
     @model_validator(mode="after")
     def _sizes(self) -> OffPolicyConfig:
@@ -132,33 +136,33 @@ class SacConfig(OffPolicyConfig):
     """Soft actor-critic (SB3's `SAC`)."""
 
     algorithm: Literal["sac"] = "sac"
-    """sac"""
+    """Algorithm: sac."""
     ent_coef: Positive | Literal["auto"] = "auto"
-    """Entropy temperature; auto learns it."""
+    """Entropy temperature; auto: it is learned."""
 
 
 class Td3Config(OffPolicyConfig):
     """Twin delayed deterministic policy gradient (SB3's `TD3`)."""
 
     algorithm: Literal["td3"] = "td3"
-    """td3"""
+    """Algorithm: td3."""
     exploration_noise: NotNegative = 0.1
-    """Deviation of the Gaussian noise on actions in [-1, 1] while collecting."""
+    """Standard deviation of the Gaussian exploration noise on actions in [-1, 1]."""
     policy_delay: Count = 2
-    """Updates of the critics for one of the actor."""
+    """Number of updates of the critics per update of the actor."""
     target_policy_noise: NotNegative = 0.2
-    """Deviation of the noise on the target's actions."""
+    """Standard deviation of the noise on the target's actions."""
     target_noise_clip: NotNegative = 0.5
-    """Limit of that noise."""
+    """Largest absolute value of that noise."""
 
 
 class DdpgConfig(OffPolicyConfig):
     """Deep deterministic policy gradient (SB3's `DDPG`)."""
 
     algorithm: Literal["ddpg"] = "ddpg"
-    """ddpg"""
+    """Algorithm: ddpg."""
     exploration_noise: NotNegative = 0.1
-    """Deviation of the Gaussian noise on actions in [-1, 1] while collecting."""
+    """Standard deviation of the Gaussian exploration noise on actions in [-1, 1]."""
 
 
 SPEC = TrainerSpec(

@@ -1,10 +1,9 @@
-"""The Stable-Baselines3 trainer: SB3's own updates, one iteration at a time, saved and restored exactly."""
+"""Trainer with the algorithms of Stable-Baselines3."""
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,8 @@ from torch import Tensor
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import DivergedError
 from rlcli.random import derive
-from rlcli.rl.budget import Budget
-from rlcli.rl.nan_check import LEARNER_HINT, GradientWatch, moments, require_finite
+from rlcli.rl.budget import remaining_budget
+from rlcli.rl.nan_check import LEARNER_HINT, GradientWatch, moments, require_finite, require_finite_learner
 from rlcli.rl.optimizers import below, load_optimizer, optimizer_tensors
 from rlcli.rl.policy import Normalizer
 from rlcli.rl.rng import load_rng_state, rng_state
@@ -40,19 +39,21 @@ _METRICS = {
     "train/critic_loss": "Loss/critic",
     "train/ent_coef": "Loss/entropy_coefficient",
 }
+"""SB3's name -> name of the metric."""
 _MUST_BE_FINITE = ("Loss/surrogate", "Loss/value", "Loss/actor", "Loss/critic", "Policy/mean_std")
 _LR_RANGE = (1e-5, 1e-2)
+"""Lowest and highest learning rate of the adaptive schedule."""
 
 
 class Sb3Trainer(BaseTrainer):
-    """SB3, one iteration at a time, so that a run can stop, save and resume between any two.
+    """SB3 trainer that does one iteration at a time, so that a run can be saved and resumed between two iterations.
 
     Args:
         env: the environment.
-        config: the agent.
-        seed: of the networks and of exploration.
+        config: configuration of the agent.
+        seed: seed of the initial weights and of exploration.
         device: cpu.
-        torch_threads: threads of the update; the rollout runs torch on one thread, since two thread pools compete.
+        torch_threads: threads of torch in the update; see `BaseTrainer`.
     """
 
     def __init__(self, env: VecEnv, config: Sb3Config, *, seed: int, device: str, torch_threads: int) -> None:
@@ -64,17 +65,17 @@ class Sb3Trainer(BaseTrainer):
         self.model: Any = make_model(env, config, derive(seed, "trainer"), device)
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self.model._current_progress_remaining = 1.0
+        self._learning_rate: float = config.learning_rate
+        self.model.lr_schedule = lambda _: self._learning_rate  # SB3's update sets its optimisers to this
         self.model.source, self.model.statistics = env, self.statistics
         self.model.reward_scale, self.model.action_bound = config.reward_scale, config.action_bound
         self.normalizer = Normalizer(self.spec.observation_size) if config.normalize_observations else None
         self.model.normalizer = self.normalizer
-        self._actor_names = actor_names(config.algorithm, self.model.policy.state_dict())
-        if isinstance(config, OffPolicyConfig):
+        self._actor_names = actor_names(config, self.model.policy.state_dict())
+        self._is_off_policy = isinstance(config, OffPolicyConfig)
+        self._horizon: int = getattr(config, "train_freq" if self._is_off_policy else "n_steps")
+        if self._is_off_policy:
             self.model.replay_buffer.normalizer = self.normalizer
-            self._horizon = config.train_freq
-        else:
-            assert isinstance(config, OnPolicyConfig)
-            self._horizon = config.n_steps
         self.steps_per_iteration = self._horizon * env.num_envs
         self._gradients = GradientWatch(self.model.policy, self._optimizers().values())
 
@@ -95,28 +96,36 @@ class Sb3Trainer(BaseTrainer):
         try:
             return self._iterate()
         except ValueError as error:
-            if not str(error).startswith("Expected parameter"):  # how torch refuses a distribution of NaNs
+            if not str(error).startswith("Expected parameter"):  # torch's message for a distribution with NaN
                 raise
             self._require_finite_learner()
-            raise DivergedError(
-                f"the policy's distribution is not finite in iteration {self.iteration}", hint=LEARNER_HINT
-            ) from error
+            message = f"the policy's distribution is not finite in iteration {self.iteration}"
+            raise DivergedError(message, hint=LEARNER_HINT) from error
 
     def _iterate(self) -> Report:
+        """Do one iteration; torch raises ValueError for a distribution with NaN."""
         before, begin = dict(self.env.seconds), time.perf_counter()
         torch.set_num_threads(1)
         try:
-            self._collect()
+            if self._is_off_policy:
+                self.model.collect(self._horizon)
+            else:
+                self.model.collect_rollouts(self.model.env, None, self.model.rollout_buffer, self._horizon)
         except (DivergedError, ValueError):
+            # if the policy caused the divergence, name its first tensor that is not finite instead
             require_finite(self._rollout_dependencies(), self.iteration + 1)
             raise
         self._keep_recent_obs(torch.as_tensor(self.model._last_obs))
         collected = time.perf_counter()
         torch.set_num_threads(self.torch_threads)
-        self._decay_learning_rate()
+        if self.config.schedule == "linear":
+            self._learning_rate = self.config.learning_rate * remaining_budget(self.config, self)
         self.iteration += 1
         self._require_finite_rollout()
-        self._update()
+        if not isinstance(self.config, OffPolicyConfig):
+            self.model.train()
+        elif self.env_steps > self.config.learning_starts:
+            self.model.train(self.config.gradient_steps, self.config.batch_size)
         updated = time.perf_counter()
         metrics = self._losses()
         self._adapt_learning_rate(metrics.get("Loss/kl"))
@@ -137,9 +146,7 @@ class Sb3Trainer(BaseTrainer):
             "env": {**self.env.state_dict(), "episode_starts": torch.tensor(self.model._last_episode_starts)},
             "rng": rng_state(),
         }
-        logs = {}
-        if isinstance(self.config, OffPolicyConfig):
-            logs["replay"] = self.model.replay_buffer.rows(self._horizon)
+        logs = {"replay": self.model.replay_buffer.rows(self._horizon)} if self._is_off_policy else {}
         values = {
             "policy": self.spec.model_dump(),
             "iteration": self.iteration,
@@ -151,14 +158,13 @@ class Sb3Trainer(BaseTrainer):
         return TrainerState(tensors, values, logs)
 
     def load(self, state: TrainerState) -> None:
-        """Restore a state: the next iteration gives the same bits as it did then."""
+        """Restore a state; the next iteration gives the same bits as in the original run."""
         values, rest = state.values, state.tensors["trainer"]
         weights = {f"weights.{name}": value for name, value in self.model.policy.state_dict().items()}
         require_matching_tensors(rest, weights, "trainer")
-        require_matching_tensors(
-            state.tensors["env"], {"episode_starts": torch.ones(self.env.num_envs, dtype=torch.bool)}, "env"
-        )
-        self._load_weights(state.tensors["policy"], rest)
+        starts = torch.ones(self.env.num_envs, dtype=torch.bool)
+        require_matching_tensors(state.tensors["env"], {"episode_starts": starts}, "env")
+        self.load_weights(state.tensors["policy"], rest)
         for name, optimizer in self._optimizers().items():
             load_optimizer(optimizer, rest, f"optimizer.{name}.")
         if "log_ent_coef" in rest:
@@ -168,27 +174,11 @@ class Sb3Trainer(BaseTrainer):
             self.model.replay_buffer.load_rows(state.logs["replay"])
         self.iteration, self.model.num_timesteps = values["iteration"], values["env_steps"]
         self.model._n_updates = values["updates"]
-        self._set_learning_rate(values["learning_rate"])
+        self._learning_rate = values["learning_rate"]
         self.statistics.load(values["statistics"])
         self.model._last_episode_starts = state.tensors["env"]["episode_starts"].numpy()
         self.model._last_obs = self.env.load_state_dict(state.tensors["env"])["policy"].numpy()
         load_rng_state(state.tensors["rng"])
-
-    def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normaliser; the critics keep their own."""
-        self._load_weights(policy, {})
-
-    def _collect(self) -> None:
-        if isinstance(self.config, OffPolicyConfig):
-            self.model.collect(self._horizon)
-        else:
-            self.model.collect_rollouts(self.model.env, None, self.model.rollout_buffer, self._horizon)
-
-    def _update(self) -> None:
-        if not isinstance(self.config, OffPolicyConfig):
-            self.model.train()
-        elif self.env_steps > self.config.learning_starts:
-            self.model.train(self.config.gradient_steps, self.config.batch_size)
 
     def _policy_tensors(self) -> dict[str, Tensor]:
         weights = self.model.policy.state_dict()
@@ -197,15 +187,20 @@ class Sb3Trainer(BaseTrainer):
             tensors.update({f"normalizer.{k}": v.clone() for k, v in self.normalizer.state_dict().items()})
         return tensors
 
-    def _load_weights(self, policy: Mapping[str, Tensor], rest: Mapping[str, Tensor]) -> None:
+    def load_weights(self, policy: Mapping[str, Tensor], rest: Mapping[str, Tensor] | None = None) -> None:
+        """Load the weights and the normaliser of a policy.
+
+        Args:
+            policy: the tensors of a saved policy.
+            rest: tensors of a checkpoint with all other weights. None: the critics do not change, and the target actor
+                becomes a copy of the loaded actor.
+        """
         weights = self.model.policy.state_dict()
-        for name in weights:
-            if name in self._actor_names:
-                weights[name] = policy[self._actor_names[name]]
-            elif rest:
-                weights[name] = rest[f"weights.{name}"]
+        if rest is not None:
+            weights |= {name: rest[f"weights.{name}"] for name in weights if name not in self._actor_names}
+        weights |= {name: policy[own] for name, own in self._actor_names.items()}
         self.model.policy.load_state_dict(weights)
-        if not rest and hasattr(self.model, "actor_target"):
+        if rest is None and hasattr(self.model, "actor_target"):
             self.model.actor_target.load_state_dict(self.model.actor.state_dict())
         if self.normalizer is not None:
             self.normalizer.load_state_dict(below(policy, "normalizer."))
@@ -218,50 +213,49 @@ class Sb3Trainer(BaseTrainer):
             optimizers["ent_coef"] = self.model.ent_coef_optimizer
         return optimizers
 
-    def _losses(self) -> dict[str, float]:
+    def _recorded_metrics(self) -> dict[str, float]:
+        """Return the metrics that SB3 has recorded, with the names of rlcli."""
         recorded = self.model.logger.name_to_value
-        metrics = {name: float(recorded[key]) for key, name in _METRICS.items() if key in recorded}
-        metrics["Loss/learning_rate"] = self._learning_rate
+        return {name: float(recorded[key]) for key, name in _METRICS.items() if key in recorded}
+
+    def _losses(self) -> dict[str, float]:
+        """Check the learner and return the finite metrics of the update."""
         self._require_finite_learner()
-        recorded.clear()
+        metrics = {**self._recorded_metrics(), "Loss/learning_rate": self._learning_rate}
+        self.model.logger.name_to_value.clear()
         return finite_values(metrics)
 
     def _require_finite_rollout(self) -> None:
-        """Check the rollout before the update; a replay buffer holds samples that the environment has checked."""
-        if isinstance(self.config, OffPolicyConfig):
-            require_finite(moments([("observation", self.normalizer)]), self.iteration)
-            return
-        buffer = self.model.rollout_buffer
-        in_order = [
-            ("the observation, as the policy sees it,", buffer.obs),
-            ("the action", buffer.action),
-            ("the action's log-probability", buffer.log_prob),
-            ("the value", buffer.value),
-            ("the reward, with the value of what time cut off,", buffer.reward),
-            ("the advantage", buffer.advantage),
-            ("the value's target", buffer.target),
-        ]
-        if not all(is_finite(values) for _, values in in_order):
-            require_finite(self._rollout_dependencies(), self.iteration)
-            require_finite(in_order, self.iteration, ("step", "environment"))
+        """Check the rollout before the update; the environment has already checked the samples of a replay buffer."""
+        if not self._is_off_policy:
+            buffer = self.model.rollout_buffer
+            in_causal_order = [
+                ("the normalised observation", buffer.obs),
+                ("the action", buffer.action),
+                ("the action's log-probability", buffer.log_prob),
+                ("the value", buffer.value),
+                ("the reward with the bootstrap of time-outs", buffer.reward),
+                ("the advantage", buffer.advantage),
+                ("the value's target", buffer.target),
+            ]
+            if not all(is_finite(values) for _, values in in_causal_order):
+                require_finite(self._rollout_dependencies(), self.iteration)
+                require_finite(in_causal_order, self.iteration, ("step", "environment"))
         require_finite(moments([("observation", self.normalizer)]), self.iteration)
 
     def _require_finite_learner(self) -> None:
-        """Check the learner after an update. `GradientWatch` keeps gradients that are not finite from the weights."""
+        """Check weights, losses and gradients after an update.
+
+        `GradientWatch` does not let a gradient that is not finite change the weights.
+        """
         require_finite(self._weights(), self.iteration)
-        recorded = self.model.logger.name_to_value
-        metrics = {name: float(recorded[key]) for key, name in _METRICS.items() if key in recorded}
-        for name in _MUST_BE_FINITE:
-            if not math.isfinite(metrics.get(name, 0.0)):
-                raise DivergedError(f"{name} is not finite in iteration {self.iteration}", hint=LEARNER_HINT)
-        if not math.isfinite(recorded.get("train/loss", 0.0)):
-            raise DivergedError(f"the loss is not finite in iteration {self.iteration}", hint=LEARNER_HINT)
+        metrics = self._recorded_metrics()
+        required = {name: metrics[name] for name in _MUST_BE_FINITE if name in metrics}
+        required["the loss"] = self.model.logger.name_to_value.get("train/loss", 0.0)
+        require_finite_learner(required, {}, self.iteration)
         if self._gradients.first is not None:
-            raise DivergedError(
-                f"the gradient of '{self._gradients.first}' is not finite, in iteration {self.iteration};"
-                " the losses are",
-                hint=LEARNER_HINT,
-            )
+            message = f"the gradient of '{self._gradients.first}' is not finite, in iteration {self.iteration};"
+            raise DivergedError(f"{message} the losses are finite", hint=LEARNER_HINT)
 
     def _rollout_dependencies(self) -> list[tuple[str, Tensor]]:
         """Return the named tensors that a rollout depends on."""
@@ -272,45 +266,29 @@ class Sb3Trainer(BaseTrainer):
         entropy = getattr(self.model, "log_ent_coef", None)
         return weights if entropy is None else [*weights, ("the entropy coefficient", entropy.detach())]
 
-    def _decay_learning_rate(self) -> None:
-        if self.config.schedule == "linear":
-            done = Budget(self.config.max_iterations, self.config.max_steps).share(self)
-            self._set_learning_rate(self.config.learning_rate * max(0.0, 1.0 - done))
-
     def _adapt_learning_rate(self, kl: float | None) -> None:
+        """Adapt the learning rate to the KL divergence; for the rule see `rlcli.rl.ppo.loss.adapt_learning_rate_`."""
         desired = getattr(self.config, "desired_kl", None)
         if desired is None or kl is None:
             return
         low, high = _LR_RANGE
         if kl > 2.0 * desired:
-            self._set_learning_rate(max(low, self._learning_rate / 1.5))
+            self._learning_rate = max(low, self._learning_rate / 1.5)
         elif 0.0 < kl < 0.5 * desired:
-            self._set_learning_rate(min(high, self._learning_rate * 1.5))
-
-    @property
-    def _learning_rate(self) -> float:
-        return float(self.model.lr_schedule(1.0))
-
-    def _set_learning_rate(self, value: float) -> None:
-        self.model.lr_schedule = lambda _: value
+            self._learning_rate = min(high, self._learning_rate * 1.5)
 
 
-def actor_names(algorithm: str, weights: Mapping[str, Tensor]) -> dict[str, str]:
-    """Map SB3's names of the actor's weights to those of a saved policy, the output layer after the hidden ones."""
-    hidden, output = {
-        "sac": ("actor.latent_pi.", "actor.mu."),
-        "td3": ("actor.mu.", None),
-        "ddpg": ("actor.mu.", None),
-    }.get(algorithm, ("mlp_extractor.policy_net.", "action_net."))
-    layers = sum(name.startswith(hidden) and name.endswith(".weight") for name in weights)
-    names = {}
-    for name in weights:
-        if name == "log_std":
-            names[name] = name
-        elif name.startswith(hidden):
-            names[name] = f"actor.{name.removeprefix(hidden)}"
-        elif output is not None and name.startswith(output):
-            names[name] = f"actor.{2 * layers}.{name.removeprefix(output)}"
-        elif name.startswith("actor.log_std."):
-            names[name] = f"log_std_head.{name.removeprefix('actor.log_std.')}"
-    return names
+def actor_names(config: Sb3Config, weights: Iterable[str]) -> dict[str, str]:
+    """Map SB3's names of the actor's weights to their names in a saved policy."""
+    output = f"actor.{2 * len(config.policy.hidden)}."  # each hidden layer is followed by an activation
+    prefixes = {
+        "sac": {"actor.latent_pi.": "actor.", "actor.mu.": output, "actor.log_std.": "log_std_head."},
+        "td3": {"actor.mu.": "actor."},
+        "ddpg": {"actor.mu.": "actor."},
+    }.get(config.algorithm, {"mlp_extractor.policy_net.": "actor.", "action_net.": output, "log_std": "log_std"})
+    return {
+        name: saved + name.removeprefix(prefix)
+        for name in weights
+        for prefix, saved in prefixes.items()
+        if name.startswith(prefix)
+    }

@@ -1,4 +1,4 @@
-"""A `VecEnv` with the interface of Stable-Baselines3: numpy arrays and one info dict per environment."""
+"""Adapter that gives a `VecEnv` the interface of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from rlcli.envs.step import StepResult
 from rlcli.envs.vec_env import VecEnv
 
 UNBOUNDED = 1e6
-"""Action bound that stands for none: SB3 requires a finite one."""
+"""Action bound for unbounded actions: SB3 requires a finite bound."""
 
 
 class Sb3VecEnv(Sb3Base):
-    """The policy group of a `VecEnv`. Environments whose episode goes on share one empty info.
+    """SB3 environment for the observation group `policy` of a `VecEnv`, with numpy arrays and one info dict each.
 
     Args:
         env: the environment.
-        action_bound: limits of the action space; None for unbounded.
+        action_bound: the action space is [-action_bound, action_bound]; None: unbounded.
     """
 
     def __init__(self, env: VecEnv, action_bound: float | None = 1.0) -> None:
@@ -37,7 +37,7 @@ class Sb3VecEnv(Sb3Base):
         self._action = torch.zeros(env.num_envs, env.layout.action_size)
 
     def reset(self) -> np.ndarray:
-        """Start new episodes in all environments, once with the seed set by `seed`. (num_envs, d)"""
+        """Start new episodes in all environments; use a seed set by `seed` once. (num_envs, d)"""
         seed = self._seeds[0]
         self._reset_seeds()
         return self.env.reset(seed=seed)["policy"].numpy()
@@ -47,7 +47,7 @@ class Sb3VecEnv(Sb3Base):
         self._action = torch.as_tensor(actions, dtype=torch.float32)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Step; see SB3's `VecEnv.step`."""
+        """Step with the stored actions; see SB3's `VecEnv.step`."""
         result = self.env.step(self._action)
         dones = (result.terminated | result.truncated).numpy()
         return result.obs["policy"].numpy(), result.reward.numpy(), dones, self._infos(result)
@@ -75,12 +75,12 @@ class Sb3VecEnv(Sb3Base):
         return [False for _ in self._get_indices(indices)]
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seed of the next reset; every environment derives its own stream from it."""
+        """Set the seed of the next reset; every environment derives its own random stream from it."""
         self._seeds = [seed] * self.num_envs
         return self._seeds
 
     def _infos(self, result: StepResult) -> list[dict[str, Any]]:
-        infos = [self._empty_info] * self.num_envs
+        infos = [self._empty_info] * self.num_envs  # one shared dict: most steps end no episode
         if result.episodes is not None and result.final_obs is not None:
             final = result.final_obs["policy"].numpy()
             ended = result.episodes.ended()

@@ -11,7 +11,7 @@ from rlcli.cli.ui.progress_view import TrainingView
 from rlcli.cli.ui.tables import flow
 from rlcli.evaluation.stress_params import read_sweeps
 from rlcli.reporting.heat_map import heat_map
-from rlcli.training.progress import progress_of
+from rlcli.training.progress import progress_from_metrics
 
 COLUMNS = ["RUN", "STATE", "PROGRESS", "RETURN", "SUCCESS", "AGE", "REMARK"]
 ROWS = [
@@ -100,7 +100,7 @@ def test_the_live_table_breaks_no_number_from_its_unit(width):
     view = TrainingView("rlcli train cartpole")
     screen = Console(file=io.StringIO(), width=width)
     view._live = Live(console=screen)
-    screen.print(view._table(progress_of([row], 240, 12.0)))
+    screen.print(view._table(progress_from_metrics([row], 240, 12.0)))
     said = screen.file.getvalue()
     for whole in ("rlcli train cartpole", "iteration 80/240", "655,360 steps", "54,613 steps/s", "0:24 left"):
         assert whole in said
@@ -109,6 +109,6 @@ def test_the_live_table_breaks_no_number_from_its_unit(width):
 def test_what_is_left_counts_what_lies_between_iterations():
     """Clips, evaluations and checkpoints take time that no iteration tells."""
     row = {"iteration": 50, "step": 5000, "Perf/collection_time": 0.1, "Perf/learning_time": 0.1}
-    assert progress_of([row], 100, 10.0).remaining_s == pytest.approx(10.0)
-    assert progress_of([row], 100, 30.0).remaining_s == pytest.approx(30.0)
-    assert progress_of([row], 100, 0.0).remaining_s == pytest.approx(10.0)  # how long it trained is not known
+    assert progress_from_metrics([row], 100, 10.0).remaining_s == pytest.approx(10.0)
+    assert progress_from_metrics([row], 100, 30.0).remaining_s == pytest.approx(30.0)
+    assert progress_from_metrics([row], 100, 0.0).remaining_s == pytest.approx(10.0)  # how long it trained is not known

@@ -1,4 +1,4 @@
-"""The compiled update: the same numbers as the plain one, and the plain one where there is no compiler."""
+"""Tests of the compiled update: it matches the uncompiled update, which is used without a compiler."""
 
 import shutil
 
@@ -12,7 +12,7 @@ from rlcli.registry import find_task
 from rlcli.rl.ppo.compile import tf32_matmul
 from rlcli.rl.ppo.config import PpoConfig
 from rlcli.rl.ppo.loss import UpdateFunctions
-from rlcli.rl.ppo.setup import compilation
+from rlcli.rl.ppo.setup import compile_mode
 from rlcli.rl.ppo.trainer import PpoTrainer
 
 AGENTS = """
@@ -24,8 +24,8 @@ agents:
 
 
 @pytest.fixture
-def trainer_of(tmp_path):
-    """Overrides -> a trainer in a world whose critic sees other things than its policy."""
+def make_trainer(tmp_path):
+    """Function that makes a trainer from overrides; the critic has other observations than the actor."""
     task = str(worlds.critter(tmp_path, worlds.CRITTER_TASK + AGENTS))
 
     def build(*overrides):
@@ -37,7 +37,7 @@ def trainer_of(tmp_path):
     return build
 
 
-def learned(trainer, iterations=2):
+def train(trainer, iterations=2):
     reports = [trainer.iterate() for _ in range(iterations)]
     return trainer, {**trainer.state().tensors["policy"], **trainer.state().tensors["trainer"]}, reports
 
@@ -45,13 +45,14 @@ def learned(trainer, iterations=2):
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch compiles with g++ on a CPU, and there is none here")
 @pytest.mark.parametrize("setting", ["agent.dialect=rsl_rl", "agent.dialect=rl_games", "agent.rnn={hidden: 4}"])
-def test_a_compiled_update_gives_the_numbers_of_the_plain_one(trainer_of, setting, tmp_path, monkeypatch, caplog):
-    """Minibatches of 26 and 27 samples; gradients clipped apart or jointly, an adaptive learning rate at work."""
+def test_compiled_update_matches_uncompiled_update(make_trainer, setting, tmp_path, monkeypatch, caplog):
+    """The settings cover minibatches of 26 and 27 samples, both kinds of clipping and an adaptive learning rate."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "/tmp/torchinductor_somebody")  # as torch sets it when imported
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "/tmp/torchinductor_user")  # as torch sets it when it is imported
     torch._dynamo.reset()
     (plain, expected, reports), (fused, found, fused_reports) = (
-        learned(trainer_of(setting, f"agent.compile={given}", "agent.max_grad_norm=0.1")) for given in ("false", "true")
+        train(make_trainer(setting, f"agent.compile={compiled}", "agent.max_grad_norm=0.1"))
+        for compiled in ("false", "true")
     )
     assert plain.learner.functions == UpdateFunctions()
     assert not set(fused.learner.functions) & set(plain.learner.functions)
@@ -64,17 +65,17 @@ def test_a_compiled_update_gives_the_numbers_of_the_plain_one(trainer_of, settin
 
 
 @pytest.mark.slow
-def test_without_a_compiler_the_update_runs_as_it_is_and_one_warning_says_so(trainer_of, tmp_path, monkeypatch, caplog):
+def test_missing_compiler_runs_uncompiled_with_one_warning(make_trainer, tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
     torch._dynamo.reset()
     import torch._inductor.config as inductor
 
     monkeypatch.setattr(inductor.cpp, "cxx", (None, str(tmp_path / "no-compiler")))
-    trainer, _, _ = learned(trainer_of("agent.compile=true"))
+    trainer, _, _ = train(make_trainer("agent.compile=true"))
     assert trainer.learner.functions == UpdateFunctions()
     (warning,) = [record for record in caplog.records if record.name.startswith("rlcli")]
     assert warning.levelname == "WARNING"
-    assert "cannot be compiled and runs as it is" in warning.message
+    assert "cannot be compiled and runs uncompiled" in warning.message
 
 
 @pytest.mark.parametrize(
@@ -92,13 +93,13 @@ def test_without_a_compiler_the_update_runs_as_it_is_and_one_warning_says_so(tra
         ({"max_iterations": 120, "minibatch_size": 16}, "cuda", True),
     ],
 )
-def test_an_update_is_compiled_if_asked_for_and_on_a_gpu_if_the_run_is_long(settings, device, expected):
+def test_compile_mode_depends_on_setting_device_and_run_length(settings, device, expected):
     config = PpoConfig(trainer="ppo", **settings)
-    assert compilation(config, torch.device(device), 65536) == expected
+    assert compile_mode(config, torch.device(device), 65536) == expected
 
 
 @pytest.mark.parametrize("allowed", [True, False])
-def test_rounding_to_tf32_ends_with_what_it_is_allowed_for(allowed):
+def test_tf32_matmul_restores_precision(allowed):
     before = torch.get_float32_matmul_precision()
     with tf32_matmul(allowed):
         assert torch.get_float32_matmul_precision() == ("high" if allowed else before)

@@ -1,5 +1,8 @@
-"""Each dialect against the library it is named after: on the same rollout and minibatch order, one update of that
-library's own code gives the same losses, the same learning rate and the same parameters."""
+"""Tests of each dialect against its library.
+
+For the same rollout and the same order of samples, one update of the library gives the same losses, learning rate and
+parameters.
+"""
 
 import warnings
 from types import SimpleNamespace
@@ -44,8 +47,8 @@ SIZES = [(8, 4, 2, 3), (16, 12, 4, 5), (30, 40, 3, 4)]
 
 
 @pytest.fixture
-def trainer_of(tmp_path):
-    """Dialect, sizes and overrides -> a trainer with a rollout whose policy and value are far from trivial."""
+def make_trainer(tmp_path):
+    """Function that makes a trainer with a rollout; its policy and value are far from their initial zeros."""
 
     def build(dialect, size, *overrides, seed=0):
         steps, envs, minibatches, epochs = size
@@ -75,21 +78,21 @@ def permutation(count, seed=7):
     return torch.randperm(count, generator=torch.Generator().manual_seed(seed))
 
 
-def ours_after(trainer, monkeypatch, orders=None):
-    """One update; minibatches in the given orders of samples."""
+def update_ours(trainer, monkeypatch, orders=None):
+    """Do one update with these orders of samples; return the metrics."""
     if orders is not None:
-        given = iter(orders)
-        monkeypatch.setattr(trainer.learner, "sample_order", lambda: next(given))
+        remaining = iter(orders)
+        monkeypatch.setattr(trainer.learner, "sample_order", lambda: next(remaining))
     rates, learner, step = [], trainer.learner, trainer.learner.optimizer.step
     monkeypatch.setattr(learner.optimizer, "step", lambda: (rates.append(learner.learning_rate.item()), step()))
     learner.update()
     if trainer.config.schedule == "adaptive":
-        assert len({*rates, trainer.learner.learning_rate.item()}) > 1  # the divergence did move it
+        assert len({*rates, trainer.learner.learning_rate.item()}) > 1  # the KL divergence has changed it
     return trainer.learner.metrics()
 
 
-def pairs(ours, theirs):
-    """Parameters of two sequences of layers."""
+def paired_parameters(ours, theirs):
+    """Return pairs of corresponding parameters of two sequences of layers."""
     mine = [layer for layer in ours if isinstance(layer, nn.Linear)]
     yours = [layer for layer in theirs if isinstance(layer, nn.Linear)]
     assert len(mine) == len(yours)
@@ -100,29 +103,29 @@ def pairs(ours, theirs):
     ]
 
 
-def take_weights(theirs):
+def copy_weights(theirs):
     with torch.no_grad():
         for mine, yours in theirs:
             yours.copy_(mine)
 
 
-def require_equal(parameters, before, ours, theirs):
+def require_equal_update(parameters, before, ours, theirs):
     for (mine, yours), old in zip(parameters, before, strict=True):
-        assert (mine - old).abs().max().item() > 1e-4  # the update did move them
+        assert (mine - old).abs().max().item() > 1e-4  # the update has changed them
         torch.testing.assert_close(mine.detach(), yours.detach(), rtol=1e-5, atol=1e-5)
     for name, value in theirs.items():
         assert ours[name] == pytest.approx(value, rel=1e-5, abs=1e-5), name
 
 
-def copies(parameters):
+def copy_parameters(parameters):
     return [mine.detach().clone() for mine, _ in parameters]
 
 
 # --- RSL-RL ---
 
 
-def rsl_rl_of(trainer):
-    """RSL-RL's PPO with the trainer's weights and settings, and its rollout, given to it step by step."""
+def make_rsl_rl(trainer):
+    """Return RSL-RL's PPO with the trainer's weights, settings and rollout."""
     config, samples, rollout = trainer.config, trainer.collector.rollout.samples, trainer.collector.rollout
     steps, envs = rollout.reward.shape
     groups = {"actor": ["policy"], "critic": ["critic"]}
@@ -146,9 +149,11 @@ def rsl_rl_of(trainer):
     std = trainer.networks.raw_std if config.std == "scalar" else trainer.networks.log_std
     their_std = actor.distribution.std_param if config.std == "scalar" else actor.distribution.log_std_param
     parameters = [
-        *pairs(trainer.networks.actor, actor.mlp), (std, their_std), *pairs(trainer.networks.critic, critic.mlp)
-    ]  # fmt: skip
-    take_weights(parameters)
+        *paired_parameters(trainer.networks.actor, actor.mlp),
+        (std, their_std),
+        *paired_parameters(trainer.networks.critic, critic.mlp),
+    ]
+    copy_weights(parameters)
     with torch.no_grad():
         for t in range(steps):
             theirs.act(observed(t))
@@ -172,11 +177,11 @@ def rsl_rl_of(trainer):
         ("agent.learning_rate=5e-3", "agent.desired_kl=0.002"),
     ],
 )
-def test_the_rsl_rl_dialect_is_rsl_rls_update(trainer_of, monkeypatch, size, overrides):
-    trainer = trainer_of("rsl_rl", size, *overrides)
-    theirs, parameters = rsl_rl_of(trainer)
-    before, order = copies(parameters), permutation(trainer.steps_per_iteration)
-    ours = ours_after(trainer, monkeypatch, [order])
+def test_rsl_rl_dialect_matches_rsl_rl(make_trainer, monkeypatch, size, overrides):
+    trainer = make_trainer("rsl_rl", size, *overrides)
+    theirs, parameters = make_rsl_rl(trainer)
+    before, order = copy_parameters(parameters), permutation(trainer.steps_per_iteration)
+    ours = update_ours(trainer, monkeypatch, [order])
     samples = trainer.collector.rollout.samples
     torch.testing.assert_close(samples.target, theirs.storage.returns.squeeze(-1), rtol=1e-5, atol=1e-5)
     if trainer.config.normalize_advantage == "batch":
@@ -184,14 +189,14 @@ def test_the_rsl_rl_dialect_is_rsl_rls_update(trainer_of, monkeypatch, size, ove
     monkeypatch.setattr(torch, "randperm", lambda count, **_: order[:count])
     losses = theirs.update()
     expected = {f"Loss/{name}": losses[name] for name in ("value", "surrogate", "entropy")}
-    require_equal(parameters, before, ours, {**expected, "Loss/learning_rate": theirs.learning_rate})
+    require_equal_update(parameters, before, ours, {**expected, "Loss/learning_rate": theirs.learning_rate})
 
 
 # --- Stable-Baselines3 ---
 
 
-class Sizes(Sb3VecEnv):
-    """Only what SB3 asks an environment for when it builds its networks."""
+class SpacesOnlyVecEnv(Sb3VecEnv):
+    """Environment with only the parts that SB3 needs to build its networks."""
 
     def __init__(self, envs, obs, actions):
         super().__init__(envs, spaces.Box(-np.inf, np.inf, (obs,)), spaces.Box(-1, 1, (actions,)))
@@ -208,12 +213,12 @@ class Sizes(Sb3VecEnv):
         return [False] * self.num_envs
 
 
-def sb3_of(trainer):
-    """SB3's PPO with the trainer's weights and settings and its rollout."""
+def make_sb3(trainer):
+    """Return SB3's PPO with the trainer's weights, settings and rollout."""
     config, rollout, samples = trainer.config, trainer.collector.rollout, trainer.collector.rollout.samples
     steps, envs, obs = samples.obs.shape
     theirs = Sb3Ppo(
-        "MlpPolicy", Sizes(envs, obs, samples.action.shape[2]), config.learning_rate, steps,
+        "MlpPolicy", SpacesOnlyVecEnv(envs, obs, samples.action.shape[2]), config.learning_rate, steps,
         steps * envs // config.num_minibatches, config.num_epochs, config.gamma, config.lam, config.clip_range,
         config.clip_value_range, ent_coef=config.entropy_coef, vf_coef=config.value_coef,
         max_grad_norm=config.max_grad_norm, device="cpu",
@@ -224,11 +229,11 @@ def sb3_of(trainer):
     theirs.set_logger(Logger(folder=None, output_formats=[]))
     policy = theirs.policy
     parameters = [
-        *pairs(trainer.networks.actor, [*policy.mlp_extractor.policy_net, policy.action_net]),
+        *paired_parameters(trainer.networks.actor, [*policy.mlp_extractor.policy_net, policy.action_net]),
         (trainer.networks.log_std, policy.log_std),
-        *pairs(trainer.networks.critic, [*policy.mlp_extractor.value_net, policy.value_net]),
+        *paired_parameters(trainer.networks.critic, [*policy.mlp_extractor.value_net, policy.value_net]),
     ]
-    take_weights(parameters)
+    copy_weights(parameters)
     with torch.no_grad():
         value = trainer.networks.value(samples.critic_obs)
         last = trainer.networks.value(trainer.collector.obs["policy"])
@@ -252,14 +257,14 @@ def sb3_of(trainer):
         ("agent.entropy_coef=0.01", "agent.learning_rate=2e-3", "agent.max_grad_norm=1.0"),
     ],
 )
-def test_the_sb3_dialect_is_sb3s_update(trainer_of, monkeypatch, size, overrides):
+def test_sb3_dialect_matches_sb3(make_trainer, monkeypatch, size, overrides):
     steps, envs, _, epochs = size
-    trainer = trainer_of("sb3", size, "agent.critic_obs=[policy]", "agent.actor={activation: elu}", *overrides)
-    theirs, parameters = sb3_of(trainer)
-    before = copies(parameters)
+    trainer = make_trainer("sb3", size, "agent.critic_obs=[policy]", "agent.actor={activation: elu}", *overrides)
+    theirs, parameters = make_sb3(trainer)
+    before = copy_parameters(parameters)
     orders = [permutation(steps * envs, seed) for seed in range(epochs)]
-    ours = ours_after(trainer, monkeypatch, orders)
-    # SB3 numbers samples environment by environment
+    ours = update_ours(trainer, monkeypatch, orders)
+    # SB3 numbers the samples of one environment after the other
     numbers = iter([((order % envs) * steps + order // envs).numpy() for order in orders])
     monkeypatch.setattr(np.random, "permutation", lambda count: next(numbers))
     theirs.train()
@@ -272,14 +277,14 @@ def test_the_sb3_dialect_is_sb3s_update(trainer_of, monkeypatch, size, overrides
         "Loss/explained_variance": logged["train/explained_variance"],
         "Policy/mean_std": logged["train/std"],
     }
-    require_equal(parameters, before, ours, expected)
+    require_equal_update(parameters, before, ours, expected)
 
 
 # --- rl_games ---
 
 
-def rl_games_of(trainer, folder, schedule_type):
-    """rl_games' continuous agent with the trainer's weights and settings, and a rollout to give it."""
+def make_rl_games(trainer, folder, schedule_type):
+    """Return rl_games' continuous agent with the trainer's weights, settings and rollout."""
     config, rollout, samples = trainer.config, trainer.collector.rollout, trainer.collector.rollout.samples
     steps, envs, obs = samples.obs.shape
     initial = {"name": "default"}
@@ -311,18 +316,21 @@ def rl_games_of(trainer, folder, schedule_type):
     theirs.init_tensors()
     model = theirs.model.a2c_network
     parameters = [
-        *pairs(trainer.networks.actor, [*model.actor_mlp, model.mu]), (trainer.networks.log_std, model.sigma),
-        *pairs(trainer.networks.critic, [*model.critic_mlp, model.value]),
-    ]  # fmt: skip
-    take_weights(parameters)
+        *paired_parameters(trainer.networks.actor, [*model.actor_mlp, model.mu]),
+        (trainer.networks.log_std, model.sigma),
+        *paired_parameters(trainer.networks.critic, [*model.critic_mlp, model.value]),
+    ]
+    copy_weights(parameters)
 
-    sigma = trainer.collector.rollout.old_std[:1, None].clone().expand(samples.mean.shape)  # an update moves it
+    sigma = (
+        trainer.collector.rollout.old_std[:1, None].clone().expand(samples.mean.shape)
+    )  # a copy: an update changes it
 
     def by_environment(values):
         return values.transpose(0, 1).reshape(steps * envs, *values.shape[2:]).clone()
 
-    def given():
-        """What `play_steps` would have returned, its returns by the library's own recursion."""
+    def play_steps():
+        """Return the rollout in the form of rl_games' `play_steps`; its own recursion computes the returns."""
         with torch.no_grad():
             theirs.model.eval()
             value = theirs.model.denorm_value(model.value(model.critic_mlp(samples.obs)))
@@ -337,7 +345,7 @@ def rl_games_of(trainer, folder, schedule_type):
             "played_frames": steps * envs, "step_time": 0.0,
         }  # fmt: skip
 
-    theirs.play_steps = given
+    theirs.play_steps = play_steps
     return theirs, parameters
 
 
@@ -352,11 +360,11 @@ def rl_games_of(trainer, folder, schedule_type):
         ("legacy", ("agent.clip_value=null", "agent.bounds_coef=0.01")),
     ],
 )
-def test_the_rl_games_dialect_is_rl_games_update(trainer_of, monkeypatch, tmp_path, size, grain, overrides):
-    trainer = trainer_of("rl_games", size, "agent.critic_obs=[policy]", "agent.critic={hidden: [16, 12]}", *overrides)
-    theirs, parameters = rl_games_of(trainer, tmp_path, grain)
-    before = copies(parameters)
-    ours = ours_after(trainer, monkeypatch)
+def test_rl_games_dialect_matches_rl_games(make_trainer, monkeypatch, tmp_path, size, grain, overrides):
+    trainer = make_trainer("rl_games", size, "agent.critic_obs=[policy]", "agent.critic={hidden: [16, 12]}", *overrides)
+    theirs, parameters = make_rl_games(trainer, tmp_path, grain)
+    before = copy_parameters(parameters)
+    ours = update_ours(trainer, monkeypatch)
     *_, surrogates, values, bounds, entropies, _, _, _ = theirs.train_epoch()
     theirs.writer.close()
     expected = {
@@ -366,16 +374,16 @@ def test_the_rl_games_dialect_is_rl_games_update(trainer_of, monkeypatch, tmp_pa
         "Loss/bounds": torch.stack(bounds).mean().item(),
         "Loss/learning_rate": theirs.last_lr,
     }
-    require_equal(parameters, before, ours, expected)
+    require_equal_update(parameters, before, ours, expected)
     assert expected["Loss/bounds"] > 0.0
 
 
-def test_value_clipping_and_the_learning_rate_matter_in_these_tests(trainer_of, monkeypatch):
-    """Otherwise equality would say nothing about them."""
+def test_value_clipping_and_schedule_change_the_update(make_trainer, monkeypatch):
+    """Check that the tests above cover value clipping and the adaptive schedule."""
     ends, clipped = [], []
     for overrides in ((), ("agent.clip_value=null",), ("agent.schedule=constant", "agent.desired_kl=null")):
-        trainer = trainer_of("rsl_rl", SIZES[1], *overrides)
-        losses = ours_after(trainer, monkeypatch, [permutation(trainer.steps_per_iteration)])
+        trainer = make_trainer("rsl_rl", SIZES[1], *overrides)
+        losses = update_ours(trainer, monkeypatch, [permutation(trainer.steps_per_iteration)])
         clipped.append(losses["Loss/clip_fraction"])
         ends.append(trainer.learner.weights.detach().clone())
     assert (ends[0] - ends[1]).abs().max().item() > 1e-3

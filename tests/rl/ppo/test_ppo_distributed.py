@@ -1,4 +1,4 @@
-"""Several processes that train one policy, for real: gloo on the CPU, PyTorch's own launcher."""
+"""Tests of data-parallel training with real processes: gloo on the CPU and PyTorch's launcher."""
 
 import json
 import os
@@ -41,12 +41,12 @@ agents:
 """
 WORKER = """
 import glob, sys, torch
-from test_ppo_distributed import trainer_of, give
+from test_ppo_distributed import make_trainer, load_rollout
 from rlcli.rl import distributed
 folder, task = sys.argv[1:]
 process_group = distributed.join("cpu")
-trainer = trainer_of(task, 4, process_group.seed(3, "environments"))
-give(trainer, torch.load(folder + "/rollout.pt"), slice(4 * process_group.rank, 4 * process_group.rank + 4))
+trainer = make_trainer(task, 4, process_group.seed(3, "environments"))
+load_rollout(trainer, torch.load(folder + "/rollout.pt"), slice(4 * process_group.rank, 4 * process_group.rank + 4))
 trainer.learner.update()
 given = {"update": trainer.learner.weights.detach().clone(), "metrics": trainer.learner.metrics(),
          "normalizer": {name: value.clone() for name, value in trainer.collector.normalizer.state_dict().items()},
@@ -62,20 +62,20 @@ torch.save({**given, "first": first, "vector": trainer.learner.weights.detach(),
             "ended": sum(ended), "episodes": trainer.statistics.total,
             "noise": trainer.collector.rollout.samples.action}, f"{folder}/{process_group.rank}.pt")
 distributed.leave()
-# a thread of the group that outlives it can take the process down when Python ends
+# a thread that outlives the process group can crash the process at exit
 assert not [task for task in glob.glob("/proc/self/task/*/comm") if "gloo" in open(task).read()]
 """
 
 
-def trainer_of(task, envs, seed=3):
+def make_trainer(task, envs, seed=3):
     resolved = resolve(find_task(task), agent="ppo", overrides=[f"scene.num_envs={envs}"])
     trainer = PpoTrainer(make_env(resolved, seed=seed), resolved.agent, seed=0, device="cpu", torch_threads=1)
     trainer.start()
     return trainer
 
 
-def take(trainer):
-    """What a rollout left, environments second."""
+def copy_rollout(trainer):
+    """Return copies of the tensors of a rollout; the second axis is the environment."""
     rollout = trainer.collector.rollout
     kept = {name: getattr(rollout, name) for name in ("_packed", "reward", "done", "time_out", "final_obs")}
     kept |= {f"raw.{name}": value for name, value in trainer.collector.raw_obs.items()}
@@ -83,13 +83,13 @@ def take(trainer):
     return {name: value.clone() for name, value in kept.items()}
 
 
-def give(trainer, kept, envs):
-    """The share of some environments of what `take` kept."""
-    held = {**take(trainer)}
+def load_rollout(trainer, kept, envs):
+    """Load the columns `envs` of a rollout that `copy_rollout` has returned."""
+    held = {**copy_rollout(trainer)}
     for name in held:
         kind, _, group = name.partition(".")
-        place = {"raw": trainer.collector.raw_obs, "obs": trainer.collector.obs}.get(kind)
-        target = place[group] if place is not None else getattr(trainer.collector.rollout, name)
+        tensors = {"raw": trainer.collector.raw_obs, "obs": trainer.collector.obs}.get(kind)
+        target = tensors[group] if tensors is not None else getattr(trainer.collector.rollout, name)
         target.copy_(kept[name][:, envs].reshape(target.shape))
 
 
@@ -104,8 +104,8 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def in_two_processes(*arguments: str) -> None:
-    """Run a program twice, with what a launcher tells its processes."""
+def run_in_two_processes(*arguments: str) -> None:
+    """Run a program in two processes, with the environment variables of a launcher."""
     port = str(free_port())
     workers = [
         subprocess.Popen(
@@ -124,11 +124,11 @@ def in_two_processes(*arguments: str) -> None:
     assert [worker.returncode for worker in workers] == [0, 0], "\n".join(errors)
 
 
-def test_two_processes_update_as_one_does_on_both_their_rollouts_and_act_differently(critter, tmp_path):
-    alone = trainer_of(critter, 8)
+def test_two_processes_update_like_one_with_both_rollouts(critter, tmp_path):
+    alone = make_trainer(critter, 8)
     alone.collector.collect()
-    torch.save(take(alone), tmp_path / "rollout.pt")
-    in_two_processes(WORKER, str(tmp_path), critter)
+    torch.save(copy_rollout(alone), tmp_path / "rollout.pt")
+    run_in_two_processes(WORKER, str(tmp_path), critter)
     alone.learner.update()
     losses = alone.learner.metrics()
     both = [torch.load(tmp_path / f"{rank}.pt") for rank in range(2)]
@@ -142,7 +142,7 @@ def test_two_processes_update_as_one_does_on_both_their_rollouts_and_act_differe
             for key, value in normalizer.state_dict().items():
                 torch.testing.assert_close(one[name][key], value, rtol=1e-5, atol=1e-6)
     assert losses["Loss/learning_rate"] != pytest.approx(1e-3)
-    # what they learn is the same to the bit, what they see and draw is not
+    # equal weights to the bit, but different observations and noise
     assert torch.equal(both[0]["vector"], both[1]["vector"])
     assert not torch.equal(both[0]["vector"], both[0]["update"])
     assert not torch.equal(both[0]["first"], both[1]["first"])
@@ -162,62 +162,62 @@ LAUNCHED = "import sys; from rlcli.rl.distributed import launch; sys.exit(launch
 TORCHRUN = ("torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "rlcli")
 
 
-def started(folder: Path, *command: str) -> subprocess.Popen:
+def start(folder: Path, *command: str) -> subprocess.Popen:
     environment = {**os.environ, "RLCLI_RUNS_DIR": str(folder / "runs"), "OMP_NUM_THREADS": "1"}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen([sys.executable, *command], env=environment, cwd=folder, **pipes)
 
 
-def finished(process: subprocess.Popen, code: int = 0) -> tuple[dict, str]:
+def wait_for(process: subprocess.Popen, code: int = 0) -> tuple[dict, str]:
     out, err = process.communicate(timeout=200)
     assert process.returncode == code, err
     return json.loads(out) if out.strip() else {}, err
 
 
 def run(folder: Path, *command: str, code: int = 0) -> tuple[dict, str]:
-    return finished(started(folder, *command), code)
+    return wait_for(start(folder, *command), code)
 
 
-def lines(done: dict) -> list[dict]:
+def metrics_of(done: dict) -> list[dict]:
     return [json.loads(line) for line in (Path(done["run"]) / "metrics.jsonl").read_text().splitlines()]
 
 
-def weights(done: dict) -> torch.Tensor:
+def policy_weights(done: dict) -> torch.Tensor:
     return open_checkpoint(Path(done["checkpoint"])).tensors("policy")["actor.0.weight"]
 
 
 @pytest.mark.slow
-def test_torchrun_makes_one_run_that_one_process_or_two_go_on_with(tmp_path):
+def test_torchrun_run_resumes_with_one_or_two_processes(tmp_path):
     done, _ = run(tmp_path, "-m", *TORCHRUN, *TRAIN, "--max-iterations", "2", "--name", "parts")
     assert len(list_runs(tmp_path / "runs", "cartpole")) == 1
     assert done["step"] == 2 * 16 * 16 * 2
-    assert [line["step"] for line in lines(done)] == [512, 1024]
+    assert [line["step"] for line in metrics_of(done)] == [512, 1024]
     assert json.loads((Path(done["run"]) / "run.json").read_text())["processes"] == 2
 
     again, err = run(tmp_path, "-m", *TORCHRUN, "train", "--resume", "latest", "--max-iterations", "4", "--device",
                      "cpu", "--json")  # fmt: skip
     assert "new episode" not in err
     whole, _ = run(tmp_path, "-m", *TORCHRUN, *TRAIN, "--max-iterations", "4", "--name", "whole")
-    assert torch.equal(weights(again), weights(whole))
+    assert torch.equal(policy_weights(again), policy_weights(whole))
 
     alone, err = run(tmp_path, "-m", "rlcli", "train", "--resume", done["run"], "--max-iterations", "6", "--json")
-    assert "saved by 2 processes, going on in 1: every environment begins a new episode" in err
+    assert "saved by 2 processes, continued by 1: every environment starts a new episode" in err
     assert alone["run"] == done["run"]
-    assert [line["step"] for line in lines(alone)] == [512, 1024, 1536, 2048, 2304, 2560]
+    assert [line["step"] for line in metrics_of(alone)] == [512, 1024, 1536, 2048, 2304, 2560]
     single, _ = run(tmp_path, "-m", "rlcli", *TRAIN, "--max-iterations", "2", "--name", "single")
-    assert not torch.equal(weights(single), weights(done))
+    assert not torch.equal(policy_weights(single), policy_weights(done))
 
 
 @pytest.mark.slow
-def test_a_signal_stops_all_processes_at_the_same_boundary(tmp_path):
-    process = started(tmp_path, "-c", LAUNCHED, *TRAIN, "--max-iterations", "100000")
+def test_signal_stops_all_processes_at_the_same_boundary(tmp_path):
+    process = start(tmp_path, "-c", LAUNCHED, *TRAIN, "--max-iterations", "100000")
     for _ in range(600):
         if any((tmp_path / "runs").glob("cartpole/*/metrics.jsonl")):
             break
         time.sleep(0.1)
     time.sleep(1.0)
     process.send_signal(signal.SIGTERM)
-    _, err = finished(process, code=75)
+    _, err = wait_for(process, code=75)
     (trained,) = list_runs(tmp_path / "runs", "cartpole")
     assert trained.record["state"] == "stopped"
     newest = max(trained.checkpoints.glob("*/manifest.json")).parent
@@ -228,26 +228,26 @@ def test_a_signal_stops_all_processes_at_the_same_boundary(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("changes", "code", "said"),
+    ("changes", "code", "fragment"),
     [
         (("agent.learning_rate=1e30", "agent.learning_rate_range=[1e-5, 1e30]"), 6, "not finite"),
         (("agent.num_stepz=3",), 3, "num_stepz"),
-        (("--agent", "sb3-ppo", "agent.desired_kl=0.01"), 2, "trains in one process"),
+        (("--agent", "sb3-ppo", "agent.desired_kl=0.01"), 2, "trains in one process only"),
     ],
 )
-def test_the_launcher_passes_on_why_the_processes_failed(tmp_path, changes, code, said):
+def test_launcher_reports_error_of_failed_process(tmp_path, changes, code, fragment):
     document, err = run(tmp_path, "-c", LAUNCHED, *TRAIN, "--max-iterations", "3", *changes, code=code)
     assert document["error"]["exit_code"] == code
-    assert said in err
+    assert fragment in err
     assert "Traceback" not in err
 
 
-def test_gpus_that_are_not_there_are_a_device_error(tmp_path):
+def test_missing_gpus_are_a_device_error(tmp_path):
     document, _ = run(tmp_path, "-m", "rlcli", "train", "cartpole", "--gpus", "2", "--json", code=8)
     assert document["error"]["kind"] == "device"
 
 
-def test_gpus_on_a_cpu_are_a_usage_error(tmp_path):
+def test_gpus_with_device_cpu_is_a_usage_error(tmp_path):
     document, _ = run(tmp_path, "-m", "rlcli", "train", "cartpole", "--gpus", "2", "--device", "cpu", "--json", code=2)
     assert "contradict" in document["error"]["message"]
 
@@ -255,5 +255,5 @@ def test_gpus_on_a_cpu_are_a_usage_error(tmp_path):
 @pytest.mark.parametrize(
     ("codes", "expected"), [([10, 6], 6), ([-15, 3], 3), ([-9], 10), ([10, -15], 10), ([1, 10], 1)]
 )
-def test_the_exit_code_is_that_of_the_process_that_failed_by_itself(codes, expected):
+def test_exit_code_is_of_the_process_that_failed_by_itself(codes, expected):
     assert _exit_code(codes) == expected

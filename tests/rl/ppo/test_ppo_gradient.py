@@ -1,4 +1,4 @@
-"""The gradient that is written out for plain networks on a CPU, against autograd's of the same minibatch."""
+"""Tests of the closed-form gradient against autograd on the same minibatch."""
 
 import itertools
 import warnings
@@ -42,8 +42,8 @@ MODES = {
 
 
 @pytest.fixture
-def trainer_of(tmp_path):
-    """Overrides -> a trainer with a rollout, in a world whose critic sees other things than its policy."""
+def make_trainer(tmp_path):
+    """Function that makes a trainer with a rollout; the critic has other observations than the actor."""
     task = str(worlds.critter(tmp_path, worlds.CRITTER_TASK + AGENT))
 
     def build(*overrides, threads=1):
@@ -58,21 +58,21 @@ def trainer_of(tmp_path):
     return build
 
 
-def disturb(trainer, much):
-    """Move the networks away from those that acted."""
+def perturb_weights(trainer, scale):
+    """Add noise to the weights, so that they differ from those of the rollout."""
     weights, generator = trainer.learner.weights, torch.Generator().manual_seed(4)
     with torch.no_grad():
-        weights.add_(much * torch.randn(weights.shape, generator=generator))
+        weights.add_(scale * torch.randn(weights.shape, generator=generator))
 
 
-def autograd(trainer):
+def autograd_gradient(trainer):
     return AutogradGradient(trainer.networks, trainer.learner.gradient_and_kl)
 
 
-def both(trainer, number):
-    """Gradient with divergence, and loss: in closed form, then by autograd."""
+def both_gradients(trainer, number):
+    """Return (gradient with KL divergence, loss) in closed form, then by autograd."""
     learner, found = trainer.learner, []
-    for gradient in (learner.minibatch_gradient, autograd(trainer)):
+    for gradient in (learner.minibatch_gradient, autograd_gradient(trainer)):
         result = learner.compute_gradient(gradient, trainer.collector.rollout.minibatches[number], number)
         found.append((learner.gradient_and_kl.clone(), result))
     return found
@@ -81,7 +81,7 @@ def both(trainer, number):
 def require_equal_gradients(trainer):
     assert isinstance(trainer.learner.minibatch_gradient, ClosedFormGradient)
     for number in range(len(trainer.collector.rollout.minibatches)):
-        (shared, result), (expected, theirs) = both(trainer, number)
+        (shared, result), (expected, theirs) = both_gradients(trainer, number)
         scale = expected[:-1].abs().max().item()
         assert scale > 1e-4
         torch.testing.assert_close(shared, expected, rtol=0, atol=1e-6 * max(scale, expected[-1].item()))
@@ -92,50 +92,50 @@ def require_equal_gradients(trainer):
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_the_gradient_is_autograds_for_every_activation_and_loss(trainer_of, activation, mode):
+def test_gradient_matches_autograd_for_activations_and_losses(make_trainer, activation, mode):
     networks = (f"agent.actor.activation={activation}", f"agent.critic.activation={activation}")
-    trainer = trainer_of(*networks, *MODES[mode])
-    disturb(trainer, 0.03)
+    trainer = make_trainer(*networks, *MODES[mode])
+    perturb_weights(trainer, 0.03)
     require_equal_gradients(trainer)
 
 
 @pytest.mark.parametrize("dialect", ["rsl_rl", "rl_games", "sb3"])
 @pytest.mark.parametrize("critic", ["[critic]", "[policy]", "[policy, critic]"])
-def test_the_gradient_is_autograds_in_every_dialect_and_for_every_critic(trainer_of, dialect, critic):
-    trainer = trainer_of(f"agent.dialect={dialect}", f"agent.critic_obs={critic}", "agent.critic.activation=relu")
-    disturb(trainer, 0.02)
+def test_gradient_matches_autograd_for_dialects_and_critics(make_trainer, dialect, critic):
+    trainer = make_trainer(f"agent.dialect={dialect}", f"agent.critic_obs={critic}", "agent.critic.activation=relu")
+    perturb_weights(trainer, 0.02)
     require_equal_gradients(trainer)
 
 
 @pytest.mark.parametrize("by", [-30.0, -5.0, 5.0, 30.0])
-def test_the_gradient_is_autograds_for_ratios_far_from_one(trainer_of, by):
-    trainer = trainer_of()
+def test_gradient_matches_autograd_for_extreme_ratios(make_trainer, by):
+    trainer = make_trainer()
     for batch in trainer.collector.rollout.minibatches:
         batch.log_prob[::2] += by
     require_equal_gradients(trainer)
 
 
-def test_the_gradient_is_autograds_for_minibatches_of_one_sample(trainer_of):
-    trainer = trainer_of("agent.minibatch_size=1", "scene.num_envs=2")
-    disturb(trainer, 0.03)
+def test_gradient_matches_autograd_for_minibatches_of_one_sample(make_trainer):
+    trainer = make_trainer("agent.minibatch_size=1", "scene.num_envs=2")
+    perturb_weights(trainer, 0.03)
     require_equal_gradients(trainer)
 
 
-def test_a_ratio_beyond_all_numbers_is_a_divergence(trainer_of):
-    trainer = trainer_of()
+def test_overflowing_ratio_is_a_divergence(make_trainer):
+    trainer = make_trainer()
     trainer.collector.rollout.samples.log_prob.sub_(200.0)
     trainer.collector.rollout.fill_minibatches(trainer.learner.sample_order())
     with pytest.raises(DivergedError, match="is not finite"):
         trainer.learner.step(trainer.collector.rollout.minibatches[0], 0)
 
 
-def test_a_training_step_follows_autograds(trainer_of):
-    """Over a whole update, in which each step starts from where the one before ended."""
+def test_update_matches_autograd_update(make_trainer):
+    """Check a whole update, in which each step starts from the result of the previous step."""
     ends = []
-    for way in ("written", "autograd"):
-        trainer = trainer_of("agent.dialect=rsl_rl")
+    for way in ("closed form", "autograd"):
+        trainer = make_trainer("agent.dialect=rsl_rl")
         if way == "autograd":
-            trainer.learner.minibatch_gradient = autograd(trainer)
+            trainer.learner.minibatch_gradient = autograd_gradient(trainer)
         before = trainer.learner.weights.detach().clone()
         torch.manual_seed(8)
         trainer.learner.optimize()
@@ -147,24 +147,24 @@ def test_a_training_step_follows_autograds(trainer_of):
 # --- the objective alone, at the edges of its cases ---
 
 
-def neighbours(values):
-    """Each value with the next float32 below and above it."""
+def with_neighbours(values):
+    """Return each value with the next smaller and the next larger float32."""
     middle = torch.tensor(values)
     away = torch.full_like(middle, torch.inf)
     return torch.cat([middle.nextafter(-away), middle, middle.nextafter(away)])
 
 
 def edge_cases():
-    """Ratios and changes of the value on, just inside and just outside their ranges, for advantages of either sign."""
-    ratios = neighbours([0.8, 1.0, 1.2, 0.5, 3.0]).log()
-    changes = neighbours([-0.2, 0.0, 0.2, -1.0, 1.0])
+    """Return log ratios and value changes on, inside and outside their ranges, with advantages of both signs."""
+    ratios = with_neighbours([0.8, 1.0, 1.2, 0.5, 3.0]).log()
+    changes = with_neighbours([-0.2, 0.0, 0.2, -1.0, 1.0])
     rows = itertools.product(ratios.tolist(), changes.tolist(), (-1.5, 0.0, 2.0), (-0.7, -0.1, 0.0, 0.1, 1.3))
     return torch.tensor(list(rows)).unbind(dim=1)
 
 
 @pytest.mark.parametrize("clip_value", [None, "clipped", "larger"])
 @pytest.mark.parametrize("clip_value_range", [None, 0.2, 1.0])
-def test_slopes_are_autograds_at_the_edges_of_the_clipping_ranges(clip_value, clip_value_range):
+def test_output_gradients_match_autograd_at_clipping_edges(clip_value, clip_value_range):
     log_ratio, change, advantage, miss = edge_cases()
     count = len(log_ratio)
     config = PpoConfig(trainer="ppo", max_iterations=1, clip_value=clip_value, clip_value_range=clip_value_range)
@@ -194,15 +194,15 @@ def test_slopes_are_autograds_at_the_edges_of_the_clipping_ranges(clip_value, cl
 # --- networks alone ---
 
 
-def plain(activation, *widths):
+def make_mlp(activation, *widths):
     layers = []
     for inputs, outputs in itertools.pairwise(widths):
         layers += [nn.Linear(inputs, outputs), ACTIVATIONS[activation]()]
     return nn.Sequential(*layers[:-1])
 
 
-def gradients_of(actor, critic, rows, threads):
-    """Of a smooth function of both outputs on `rows` samples: written out, in float64 by autograd, and the sums."""
+def compute_gradients(actor, critic, rows, threads):
+    """Return gradients of a smooth function of both outputs in closed form and by autograd in float64, and the sums."""
     generator = torch.Generator().manual_seed(rows)
     packed = torch.randn(rows, actor[0].in_features + critic[0].in_features + 1, generator=generator)
     obs, critic_obs = packed[:, : actor[0].in_features], packed[:, -critic[0].in_features :]
@@ -224,37 +224,39 @@ def gradients_of(actor, critic, rows, threads):
 
 
 @pytest.fixture(params=[True, False], ids=["AVX-512", "other"])
-def processor(request, monkeypatch):
-    """The ways of a processor with AVX-512 and of one without, as far as this one can go them."""
+def processor_kind(request, monkeypatch):
+    """Use the operations for a processor with AVX-512 or without, as far as this processor supports them."""
     monkeypatch.setattr(mlp, "_AVX512", request.param)
     monkeypatch.setattr(mlp, "_linear", mlp._onednn())
 
 
-@pytest.mark.usefixtures("processor")
+@pytest.mark.usefixtures("processor_kind")
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("rows", [1, 5, 8191, 8193, 20001])
-def test_gradients_of_networks_are_autograds_however_many_parts(activation, rows):
+def test_mlp_gradients_match_autograd_for_any_number_of_parts(activation, rows):
     torch.manual_seed(2)
-    actor, critic = plain(activation, 5, 130, 70, 2), plain(activation, 3, 130, 1)
-    gradients, expected, sums = gradients_of(actor, critic, rows, 2)
+    actor, critic = make_mlp(activation, 5, 130, 70, 2), make_mlp(activation, 3, 130, 1)
+    gradients, expected, sums = compute_gradients(actor, critic, rows, 2)
     scale = max(gradient.abs().max().item() for gradient in expected)
     for mine, theirs in zip(gradients, expected, strict=True):
         torch.testing.assert_close(mine, theirs.float(), rtol=0, atol=1e-6 * scale)
     assert sums[1:].tolist() == [rows, rows]
 
 
-def test_gradients_have_the_same_bits_for_any_number_of_threads():
+def test_mlp_gradients_do_not_depend_on_threads():
     found = []
     for threads in (1, 2, 3, 5):
         torch.manual_seed(2)
-        gradients, _, sums = gradients_of(plain("elu", 4, 32, 32, 1), plain("elu", 4, 32, 32, 1), 30000, threads)
+        gradients, _, sums = compute_gradients(
+            make_mlp("elu", 4, 32, 32, 1), make_mlp("elu", 4, 32, 32, 1), 30000, threads
+        )
         found.append(torch.cat([part.flatten() for part in (*gradients, sums)]))
     assert all(torch.equal(found[0], other) for other in found[1:])
 
 
-def test_a_smaller_minibatch_leaves_nothing_of_a_larger_one():
+def test_smaller_minibatch_overwrites_larger_one():
     torch.manual_seed(2)
-    actor, critic = plain("tanh", 4, 8, 1), plain("tanh", 4, 8, 1)
+    actor, critic = make_mlp("tanh", 4, 8, 1), make_mlp("tanh", 4, 8, 1)
     found = []
     for largest in (20000, 3000):
         gradients = [torch.zeros_like(parameter) for parameter in (*actor.parameters(), *critic.parameters())]
@@ -269,9 +271,9 @@ def test_a_smaller_minibatch_leaves_nothing_of_a_larger_one():
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_what_is_not_finite_reaches_the_gradient_without_a_warning(activation):
+def test_nan_inputs_reach_the_gradient_without_warning(activation):
     torch.manual_seed(2)
-    actor, critic = plain(activation, 2, 4, 1), plain(activation, 2, 4, 1)
+    actor, critic = make_mlp(activation, 2, 4, 1), make_mlp(activation, 2, 4, 1)
     gradients = [torch.zeros_like(parameter) for parameter in (*actor.parameters(), *critic.parameters())]
     obs = torch.tensor([[torch.nan, 1.0], [torch.inf, 2.0], [-torch.inf, 1.0], [1e30, -1e30]])
     with warnings.catch_warnings():
@@ -281,20 +283,20 @@ def test_what_is_not_finite_reaches_the_gradient_without_a_warning(activation):
     assert not any(gradient.isfinite().all() for gradient in gradients)
 
 
-def test_only_layers_of_which_the_gradient_is_known_are_plain():
-    assert is_plain(plain("elu", 3, 4, 1))
+def test_is_plain_accepts_only_known_layers():
+    assert is_plain(make_mlp("elu", 3, 4, 1))
     assert not is_plain(nn.Sequential(nn.Linear(3, 4), nn.ELU(alpha=0.5), nn.Linear(4, 1)))
     assert not is_plain(nn.Sequential(nn.Linear(3, 4), nn.GELU(), nn.Linear(4, 1)))
     assert not is_plain(nn.Sequential(nn.Linear(3, 4), nn.ELU(), nn.Linear(4, 4), nn.Tanh(), nn.Linear(4, 1)))
     assert not is_plain(nn.Sequential(nn.Linear(3, 4, bias=False), nn.ELU(), nn.Linear(4, 1)))
 
 
-@pytest.mark.usefixtures("processor")
+@pytest.mark.usefixtures("processor_kind")
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("rows", [(), (1,), (7,), (3, 3000), (0,)])
-def test_networks_give_the_same_whether_or_not_a_gradient_is_asked_for(activation, rows):
+def test_mlp_outputs_are_equal_with_and_without_autograd(activation, rows):
     torch.manual_seed(2)
-    network = Mlp(*plain(activation, 5, 130, 70, 2))
+    network = Mlp(*make_mlp(activation, 5, 130, 70, 2))
     seen = torch.randn(*rows, 9)[..., 2:7]
     expected = network(seen)
     assert expected.requires_grad
@@ -304,28 +306,28 @@ def test_networks_give_the_same_whether_or_not_a_gradient_is_asked_for(activatio
 
 
 @pytest.mark.parametrize("model", ["Intel(R) Xeon(R) Platinum 8481C CPU @ 2.70GHz", "Neoverse-N1"])
-def test_products_are_the_usual_ones_where_onednns_are_slower(model, monkeypatch):
+def test_onednn_is_not_used_on_other_processors(model, monkeypatch):
     monkeypatch.setattr(mlp, "processor", lambda: {"model": model})
     assert mlp._onednn() is None
 
 
-def test_networks_that_are_not_plain_go_torchs_way():
+def test_other_layers_use_torch_operations():
     odd = Mlp(nn.Linear(3, 4), nn.GELU(), nn.Linear(4, 1))
     with torch.no_grad():
         assert torch.equal(odd(torch.ones(2, 3)), nn.Sequential(*odd)(torch.ones(2, 3)))
 
 
 @pytest.mark.parametrize("override", ["agent.rnn={hidden: 4}", "agent.tell_coef=0.1"])
-def test_other_networks_are_left_to_autograd(trainer_of, override):
-    trainer = trainer_of(override)
+def test_other_networks_use_autograd(make_trainer, override):
+    trainer = make_trainer(override)
     assert isinstance(trainer.learner.minibatch_gradient, AutogradGradient)
     assert trainer.iterate().metrics["Loss/value"] > 0.0
 
 
-def test_training_has_the_same_bits_for_any_number_of_threads(trainer_of):
+def test_training_does_not_depend_on_threads(make_trainer):
     ends = []
     for threads in (1, 3):
-        trainer = trainer_of("scene.num_envs=600", "agent.num_minibatches=1", threads=threads)
+        trainer = make_trainer("scene.num_envs=600", "agent.num_minibatches=1", threads=threads)
         trainer.iterate()
         ends.append(trainer.learner.weights.detach().clone())
     assert torch.equal(*ends)

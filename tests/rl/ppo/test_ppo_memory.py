@@ -1,4 +1,4 @@
-"""Recurrent policies: the update replays what was remembered while acting, per environment and episode."""
+"""Tests of recurrent policies: the update replays the hidden states of the rollout."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError
 from rlcli.registry import find_task
-from rlcli.rl.acting import acting
+from rlcli.rl.acting import trained_policy
 from rlcli.rl.policy import Lstm
 from rlcli.rl.ppo.trainer import PpoTrainer
 
@@ -21,7 +21,7 @@ agents:
         rnn: {hidden: 6, layers: 2}, actor: {hidden: [5]}, critic: {hidden: [7]}}
 """
 CUE = """
-summary: The first observation of an episode says which action is right in all of it.
+summary: The first observation of an episode gives the right action for the whole episode.
 decimation: 1
 episode_length_s: 0.06
 sim: {dt: 0.01}
@@ -48,21 +48,21 @@ class Task(DirectTask):
 
 
 @pytest.fixture
-def remembering(scheduled: str) -> str:
-    """The scheduled task with a recurrent agent; its episodes end at different steps of different environments."""
+def recurrent_task(scheduled: str) -> str:
+    """The scheduled task with a recurrent agent; episodes of different environments end at different steps."""
     file = Path(scheduled) / "task.yaml"
     file.write_text(file.read_text().partition("agents:")[0] + AGENT)
     return scheduled
 
 
-def trainer_of(task, *overrides, seed=5, env_seed=3):
+def make_trainer(task, *overrides, seed=5, env_seed=3):
     resolved = resolve(find_task(task), agent="ppo", overrides=overrides)
     trainer = PpoTrainer(make_env(resolved, seed=env_seed), resolved.agent, seed=seed, device="cpu", torch_threads=1)
     trainer.start()
     return trainer
 
 
-def test_a_memory_is_torchs_lstm():
+def test_lstm_matches_torch():
     mine, theirs = Lstm(3, [5, 5]), torch.nn.LSTM(3, 5, num_layers=2)
     with torch.no_grad():
         for number, layer in enumerate(mine.layers):
@@ -79,9 +79,9 @@ def test_a_memory_is_torchs_lstm():
 
 @pytest.mark.parametrize("shuffle", ["epoch", "none"])
 @pytest.mark.parametrize("minibatches", ["num_minibatches=3", "minibatch_size=17"])
-def test_the_update_sees_of_each_minibatch_what_acting_saw(remembering, shuffle, minibatches):
-    trainer = trainer_of(remembering, "scene.num_envs=7", f"agent.shuffle={shuffle}", f"agent.{minibatches}")
-    trainer.iterate()  # the next rollout begins in the middle of episodes
+def test_update_reproduces_outputs_of_rollout(recurrent_task, shuffle, minibatches):
+    trainer = make_trainer(recurrent_task, "scene.num_envs=7", f"agent.shuffle={shuffle}", f"agent.{minibatches}")
+    trainer.iterate()  # the next rollout starts in the middle of episodes
     trainer.collector.collect()
     assert any(memory.any() for memory in trainer.collector.initial_hidden_state.values())
     assert trainer.collector.rollout.samples.episode_start.any()
@@ -96,38 +96,38 @@ def test_the_update_sees_of_each_minibatch_what_acting_saw(remembering, shuffle,
     torch.testing.assert_close(seen.sort().values, trainer.collector.rollout.samples.log_prob.flatten().sort().values)
 
 
-def test_an_episode_begins_without_memory_of_the_last_one(remembering):
-    trainer = trainer_of(remembering)
+def test_hidden_state_is_reset_at_episode_start(recurrent_task):
+    trainer = make_trainer(recurrent_task)
     trainer.collector.collect()
     samples = trainer.collector.rollout.samples
-    # env 1 lives through three steps again and again
+    # each episode of environment 1 has three steps
     assert samples.episode_start[:, 1].tolist() == [1, 0, 0, 1, 0, 0, 1, 0]
     torch.testing.assert_close(samples.mean[0, 1], samples.mean[3, 1], rtol=0, atol=0)
     torch.testing.assert_close(samples.mean[1, 1], samples.mean[4, 1], rtol=0, atol=0)
     assert not torch.equal(samples.mean[0, 1], samples.mean[1, 1])
 
 
-def test_a_step_out_of_time_earns_what_the_critic_thinks_having_seen_the_episode(remembering):
-    trainer = trainer_of(remembering, "agent.lam=0.0", "agent.normalize_advantage=null", "agent.gamma=0.9")
+def test_time_out_bootstraps_with_hidden_state_of_critic(recurrent_task):
+    trainer = make_trainer(recurrent_task, "agent.lam=0.0", "agent.normalize_advantage=null", "agent.gamma=0.9")
     trainer.collector.collect()
     trainer.collector.estimate_advantages()
     recall, networks = trainer.networks.critic_memory, trainer.networks
     memory = recall.blank(1)
     with torch.no_grad():
-        for progress in range(4):  # env 1 runs out of time at its third step
+        for progress in range(4):  # environment 1 has a time-out at its third step
             features, memory = recall(torch.tensor([[float(progress), 1.0]]), memory)
     expected = 13.0 + 0.9 * networks.value(features).item()
     assert trainer.collector.rollout.samples.target[2, 1].item() == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize("overrides", [(), ("agent.normalize_observations=true", "agent.std=scalar")])
-def test_a_state_loads_back_bit_for_bit_memories_included(remembering, overrides):
-    trainer = trainer_of(remembering, *overrides)
+def test_state_restores_hidden_states_bit_for_bit(recurrent_task, overrides):
+    trainer = make_trainer(recurrent_task, *overrides)
     trainer.iterate()
     state = trainer.state()
     trainer.iterate()
     after = trainer.state()
-    other = trainer_of(remembering, *overrides, seed=98, env_seed=99)
+    other = make_trainer(recurrent_task, *overrides, seed=98, env_seed=99)
     other.load(state)
     other.iterate()
     for part, tensors in after.tensors.items():
@@ -135,24 +135,24 @@ def test_a_state_loads_back_bit_for_bit_memories_included(remembering, overrides
             assert torch.equal(value.nan_to_num(), other.state().tensors[part][name].nan_to_num()), (part, name)
 
 
-def test_a_deployed_policy_remembers_in_an_environment_as_the_learner_does(remembering):
-    trainer = trainer_of(remembering, "agent.init_std=1e-6")
+def test_deployed_recurrent_policy_matches_learner(recurrent_task):
+    trainer = make_trainer(recurrent_task, "agent.init_std=1e-6")
     trainer.collector.collect()
     means = trainer.collector.rollout.samples.mean.clone()
-    env = make_env(resolve(find_task(remembering), agent="ppo"), seed=3)
-    act, obs = acting(env, trainer.policy()), env.reset(seed=3)["policy"]
+    env = make_env(resolve(find_task(recurrent_task), agent="ppo"), seed=3)
+    act, obs = trained_policy(env, trainer.policy()), env.reset(seed=3)["policy"]
     for t in range(8):
         action = act(obs)
         torch.testing.assert_close(action, means[t].clamp(-1.0, 1.0), rtol=1e-4, atol=1e-5)
         obs = env.step(action).obs["policy"]
 
 
-def test_fewer_environments_than_minibatches_are_a_configuration_error(remembering):
+def test_fewer_environments_than_minibatches_is_a_config_error(recurrent_task):
     with pytest.raises(ConfigError, match="5 minibatches cannot be made"):
-        trainer_of(remembering, "agent.num_minibatches=5")
+        make_trainer(recurrent_task, "agent.num_minibatches=5")
 
 
-def test_a_recurrent_run_is_resumed_evaluated_and_exported(remembering, tmp_path, monkeypatch, capfd):
+def test_recurrent_run_is_resumed_evaluated_and_exported(recurrent_task, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments):
@@ -160,7 +160,7 @@ def test_a_recurrent_run_is_resumed_evaluated_and_exported(remembering, tmp_path
         code = main([*arguments, "--json"])
         return code, json.loads(capfd.readouterr().out)
 
-    code, done = run("train", remembering, "--runs-dir", "runs", "--logger", "none")
+    code, done = run("train", recurrent_task, "--runs-dir", "runs", "--logger", "none")
     assert code == 0
     code, again = run("train", "--resume", done["run"], "--max-iterations", "3")
     assert (code, again["iteration"]) == (0, 3)
@@ -173,7 +173,7 @@ def test_a_recurrent_run_is_resumed_evaluated_and_exported(remembering, tmp_path
 
 
 @pytest.mark.slow
-def test_what_only_a_memory_can_do_is_learnt_with_one_and_not_without(tmp_path):
+def test_only_recurrent_policy_learns_memory_task(tmp_path):
     folder = tmp_path / "cue"
     folder.mkdir()
     model = (
@@ -183,9 +183,9 @@ def test_what_only_a_memory_can_do_is_learnt_with_one_and_not_without(tmp_path):
         (folder / name).write_text(text)
     returns = []
     for overrides in (("agent.rnn={hidden: 16}",), ()):
-        trainer = trainer_of(str(folder), *overrides)
+        trainer = make_trainer(str(folder), *overrides)
         reports = [trainer.iterate() for _ in range(60)]
         returns.append(reports[-1].metrics["Train/mean_reward"])
-    # six steps, each at worst 1 off without a memory but the first
+    # six steps; without an RNN every step but the first has a mean error of about 1
     assert returns[0] > -2.5
     assert returns[1] < -4.0

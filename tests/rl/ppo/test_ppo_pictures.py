@@ -1,4 +1,4 @@
-"""Policies that see: convolutions over the pictures in an observation, from training to the exported file."""
+"""Tests of policies with a CNN over images, from training to the exported file."""
 
 import json
 import runpy
@@ -26,7 +26,7 @@ MODEL = """
   <geom type="sphere" size="0.3" contype="0" conaffinity="0" mass="1"/></body></worldbody></mujoco>
 """
 YAML = """
-summary: Push the way the cart stands; where it stands, only the picture says.
+summary: Push in the direction of the cart; only the image shows its position.
 decimation: 1
 episode_length_s: 0.05
 sim: {dt: 0.01, gravity: [0, 0, 0]}
@@ -52,16 +52,16 @@ agents:
 """
 TERMS = '''
 def way(env):
-    """1 where the action points to where the cart stands. (num_envs,)"""
+    """1 where the action has the direction of the cart position. (num_envs,)"""
     return (env.action_manager.action[:, 0].sign() == env.entities["robot"].data.joint_pos[:, 0].sign()).float()
 '''
 STATE = "\n  critic: {pos: {func: joint_pos}}\nevents"
 
 
 @pytest.fixture
-def seeing(tmp_path: Path) -> str:
-    """A task whose agent has eyes."""
-    folder = tmp_path / "seeing"
+def image_task(tmp_path: Path) -> str:
+    """A task whose agent has a CNN."""
+    folder = tmp_path / "image_task"
     folder.mkdir()
     for name, text in (("task.yaml", YAML), ("model.xml", MODEL), ("terms.py", TERMS)):
         (folder / name).write_text(text)
@@ -69,13 +69,13 @@ def seeing(tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def trainer_of(seeing):
+def make_trainer(image_task):
     made = []
 
     def make(*overrides, seed=5, env_seed=3, text=None):
         if text is not None:
-            (Path(seeing) / "task.yaml").write_text(text)
-        resolved = resolve(find_task(seeing), agent="ppo", overrides=overrides)
+            (Path(image_task) / "task.yaml").write_text(text)
+        resolved = resolve(find_task(image_task), agent="ppo", overrides=overrides)
         env = make_env(resolved, seed=env_seed)
         made.append(env)
         trainer = PpoTrainer(env, resolved.agent, seed=seed, device="cpu", torch_threads=1)
@@ -91,7 +91,7 @@ def trainer_of(seeing):
     ("channels", "height", "width", "outputs", "edge", "step"),
     [(1, 5, 5, 1, 5, 1), (3, 7, 11, 4, 3, 2), (2, 6, 4, 3, 4, 3), (4, 9, 8, 2, 1, 1), (2, 10, 13, 5, 2, 4)],
 )
-def test_a_wide_convolution_is_torchs_in_float64(channels, height, width, outputs, edge, step):
+def test_wide_conv_matches_torch_in_float64(channels, height, width, outputs, edge, step):
     mine = WideConv(channels, outputs, edge, step)
     theirs = nn.Conv2d(channels, outputs, edge, step).double()
     theirs.load_state_dict({name: value.double() for name, value in mine.state_dict().items()})
@@ -100,7 +100,7 @@ def test_a_wide_convolution_is_torchs_in_float64(channels, height, width, output
 
 
 @pytest.mark.parametrize("wide", [False, True])
-def test_pictures_are_cut_out_of_the_columns_and_the_others_follow(wide):
+def test_vision_outputs_image_features_then_other_columns(wide):
     pictures = [{"start": 1, "shape": [2, 3, 4]}, {"start": 27, "shape": [1, 2, 2]}]
     spec = VisionSpec(pictures=pictures, channels=[3], kernels=[2], strides=[1])
     vision, obs = Vision(spec, nn.ReLU, wide=wide), torch.randn(5, 33)
@@ -112,7 +112,7 @@ def test_pictures_are_cut_out_of_the_columns_and_the_others_follow(wide):
     torch.testing.assert_close(seen, torch.cat([first, second, others], dim=1))
 
 
-def test_with_motion_older_steps_become_what_has_changed_since():
+def test_motion_replaces_older_images_by_differences():
     spec = VisionSpec(
         pictures=[{"start": 0, "shape": [6, 2, 3], "steps": 3}], channels=[5], kernels=[2], strides=[1], motion=4.0
     )
@@ -123,21 +123,21 @@ def test_with_motion_older_steps_become_what_has_changed_since():
     torch.testing.assert_close(vision(obs), plain(torch.cat([4.0 * (now - first), 4.0 * (now - second), now], dim=1)))
 
 
-def test_the_layout_says_where_the_picture_lies_and_the_policy_too(trainer_of):
-    trainer = trainer_of()
+def test_layout_and_policy_spec_describe_image_columns(make_trainer):
+    trainer = make_trainer()
     (action, image, time) = trainer.env.layout.observations["policy"]
     assert (image.shape, image.history, image.size) == ((1, 8, 16), 2, 256)
     assert (action.shape, time.shape) == ((), ())
     assert trainer.spec.kind == "gaussian-cnn"
     (picture,) = trainer.spec.vision.pictures
-    assert (picture.start, picture.shape) == (1, (2, 8, 16))  # behind one column; two steps are two channels
+    assert (picture.start, picture.shape) == (1, (2, 8, 16))  # after one column; two steps are two channels
     assert (picture.steps, trainer.spec.vision.motion) == (2, 5.0)
     record = trainer.env.layout.record()["observations"]["policy"]
     assert [term.get("shape") for term in record] == [None, [1, 8, 16], None]
 
 
-def test_the_channels_of_a_history_are_steps_the_oldest_first(trainer_of):
-    env = trainer_of().env
+def test_history_channels_start_with_oldest_step(make_trainer):
+    env = make_trainer().env
     env.reset(seed=1)
     before = env.step(torch.ones(16, 1)).obs["policy"][:, 1:257].unflatten(1, (2, 8, 16)).clone()
     after = env.step(torch.ones(16, 1)).obs["policy"][:, 1:257].unflatten(1, (2, 8, 16))
@@ -146,8 +146,8 @@ def test_the_channels_of_a_history_are_steps_the_oldest_first(trainer_of):
     torch.testing.assert_close(after[:, 1], 0.3 * env.sensors["camera"].image[..., 0], rtol=1e-6, atol=1e-6)
 
 
-def test_the_saved_policy_acts_as_the_learner_does(trainer_of):
-    trainer = trainer_of("agent.action_bound=null")
+def test_saved_policy_matches_learner(make_trainer):
+    trainer = make_trainer("agent.action_bound=null")
     trainer.iterate()
     with torch.no_grad():
         mean = trainer.networks.mean(trainer.collector.obs["policy"])
@@ -157,9 +157,9 @@ def test_the_saved_policy_acts_as_the_learner_does(trainer_of):
     assert torch.equal(one_by_one, policy(trainer.collector.obs["policy"]))
 
 
-def test_the_picture_moves_the_action(trainer_of):
-    """And its gradient reaches the first convolution."""
-    networks = trainer_of().networks
+def test_image_changes_the_action(make_trainer):
+    """The gradient reaches the first convolution."""
+    networks = make_trainer().networks
     obs = torch.rand(4, 258)
     changed = obs.clone()
     changed[:, 100] += 1.0
@@ -168,34 +168,34 @@ def test_the_picture_moves_the_action(trainer_of):
     assert networks.vision.pictures[0][0].weight.grad.abs().sum() > 0.0
 
 
-def test_actor_and_critic_have_eyes_of_their_own_and_a_critic_of_states_has_none(trainer_of):
-    both = trainer_of()
+def test_actor_and_critic_have_separate_cnns_only_for_images(make_trainer):
+    both = make_trainer()
     assert both.networks.critic_vision is not None
     assert not torch.equal(
         both.networks.vision.pictures[0][0].weight, both.networks.critic_vision.pictures[0][0].weight
     )
-    state = trainer_of(text=YAML.replace("\nevents", STATE))
+    state = make_trainer(text=YAML.replace("\nevents", STATE))
     assert state.networks.critic_vision is None
     assert state.networks.critic[0].in_features == 1
     assert state.networks.vision is not None
 
 
-def test_a_critic_of_pictures_and_states_sees_both(trainer_of):
-    trainer = trainer_of("agent.critic_obs=[critic,policy]", text=YAML.replace("\nevents", STATE))
+def test_critic_reads_images_and_states(make_trainer):
+    trainer = make_trainer("agent.critic_obs=[critic,policy]", text=YAML.replace("\nevents", STATE))
     (picture,) = trainer.networks.critic_vision.spec.pictures
     assert picture.start == 1 + 1
     trainer.iterate()
 
 
 @pytest.mark.parametrize(("critic", "tell"), [("", 0.0), (STATE, 0.0), (STATE, 0.5)])
-def test_a_state_loads_back_bit_for_bit(trainer_of, critic, tell):
+def test_state_restores_bit_for_bit(make_trainer, critic, tell):
     text = YAML.replace("\nevents", critic) if critic else YAML
-    trainer = trainer_of("agent.normalize_observations=true", f"agent.tell_coef={tell}", text=text)
+    trainer = make_trainer("agent.normalize_observations=true", f"agent.tell_coef={tell}", text=text)
     trainer.iterate()
     state = trainer.state()
     trainer.iterate()
     after = trainer.state()
-    other = trainer_of("agent.normalize_observations=true", f"agent.tell_coef={tell}", seed=98, env_seed=99)
+    other = make_trainer("agent.normalize_observations=true", f"agent.tell_coef={tell}", seed=98, env_seed=99)
     other.load(state)
     other.iterate()
     for part, tensors in after.tensors.items():
@@ -204,23 +204,25 @@ def test_a_state_loads_back_bit_for_bit(trainer_of, critic, tell):
 
 
 @pytest.mark.slow
-def test_an_actor_that_is_to_tell_what_the_critic_sees_learns_where_the_cart_stands(trainer_of):
-    trainer = trainer_of(
+def test_tell_coef_teaches_actor_the_cart_position(make_trainer):
+    trainer = make_trainer(
         "agent.tell_coef=1.0", "agent.learning_rate=2e-3", "agent.num_epochs=5", text=YAML.replace("\nevents", STATE)
     )
     for _ in range(30):
         trainer.iterate()
     networks, obs = trainer.networks, trainer.collector.obs
     with torch.no_grad():
-        told = networks.teller(networks.hidden(obs["policy"]))[:, 0]
-    assert torch.corrcoef(torch.stack([told, obs["critic"][:, 0]]))[0, 1] > 0.9
+        predicted = networks.teller(networks.hidden(obs["policy"]))[:, 0]
+    assert torch.corrcoef(torch.stack([predicted, obs["critic"][:, 0]]))[0, 1] > 0.9
     assert not any("teller" in name for name in trainer.state().tensors["policy"])
 
 
 @pytest.mark.slow
-def test_it_learns_what_only_the_picture_says(trainer_of):
-    """Reward is 1 for the right way and the way is a coin's: 0.5 without looking."""
-    trainer = trainer_of("agent.max_iterations=40", "agent.learning_rate=3e-3", "agent.gamma=0.0", "agent.num_epochs=5")
+def test_policy_learns_from_images(make_trainer):
+    """The reward is 1 for the right direction, which is random: 0.5 without the image."""
+    trainer = make_trainer(
+        "agent.max_iterations=40", "agent.learning_rate=3e-3", "agent.gamma=0.0", "agent.num_epochs=5"
+    )
     for _ in range(40):
         trainer.iterate()
     policy, right = trainer.policy(), []
@@ -233,19 +235,19 @@ def test_it_learns_what_only_the_picture_says(trainer_of):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "fragment"),
     [
-        (["agent.cnn.kernels=[9,2]"], "windows of 9 x 9 for 8 x 16 pixels"),
-        (["agent.cnn.kernels=[8,2]"], "layer 1 has windows of 2 x 2 for 1 x 5 pixels"),
-        (["agent.cnn.channels=[4]"], "have a number for each layer"),
-        (["agent.rnn={hidden: 4}"], "cnn and rnn cannot be had together"),
-        (["observations.policy.image=null"], "no term of the observation group 'policy' is a picture"),
+        (["agent.cnn.kernels=[9,2]"], "a kernel of 9 x 9 for an input of 8 x 16 pixels"),
+        (["agent.cnn.kernels=[8,2]"], "layer 1 has a kernel of 2 x 2 for an input of 1 x 5 pixels"),
+        (["agent.cnn.channels=[4]"], "must have one number for each layer"),
+        (["agent.rnn={hidden: 4}"], "cnn and rnn cannot be combined"),
+        (["observations.policy.image=null"], "no term of the observation group 'policy' is an image"),
     ],
 )
-def test_eyes_that_cannot_be_are_refused(trainer_of, overrides, said):
+def test_invalid_cnn_settings_are_config_errors(make_trainer, overrides, fragment):
     with pytest.raises(ConfigError) as refused:
-        trainer_of(*overrides)
-    assert said in str(refused.value.problems)
+        make_trainer(*overrides)
+    assert fragment in str(refused.value.problems)
 
 
 GOOD = {
@@ -272,7 +274,7 @@ GOOD = {
         {"channels": [2, 2]},
     ],
 )
-def test_a_file_that_describes_impossible_eyes_is_refused(change):
+def test_policy_spec_refuses_invalid_vision(change):
     PolicySpec.model_validate(GOOD)
     with pytest.raises(ValidationError):
         PolicySpec.model_validate({**GOOD, "vision": {**GOOD["vision"], **change}})
@@ -293,9 +295,9 @@ def command(tmp_path, monkeypatch, capfd):
 
 
 @pytest.mark.slow
-def test_a_run_that_sees_is_resumed_bit_for_bit_evaluated_and_played(seeing, command, tmp_path):
-    _, whole = command("train", seeing, "--runs-dir", "whole", "--logger", "none", "--max-iterations", "4")
-    _, parts = command("train", seeing, "--runs-dir", "parts", "--logger", "none", "--max-iterations", "2")
+def test_image_run_is_resumed_bit_for_bit_evaluated_and_played(image_task, command, tmp_path):
+    _, whole = command("train", image_task, "--runs-dir", "whole", "--logger", "none", "--max-iterations", "4")
+    _, parts = command("train", image_task, "--runs-dir", "parts", "--logger", "none", "--max-iterations", "2")
     code, parts = command("train", "--resume", parts["run"], "--max-iterations", "4")
     assert (code, parts["iteration"]) == (0, 4)
     for file in ("policy.safetensors", "trainer.safetensors"):
@@ -307,17 +309,19 @@ def test_a_run_that_sees_is_resumed_bit_for_bit_evaluated_and_played(seeing, com
 
 @pytest.mark.slow
 @pytest.mark.parametrize("activation", ["elu", "relu", "silu", "tanh"])
-def test_exported_files_see_the_same(seeing, command, tmp_path, activation):
-    about = [f"agent.actor.activation={activation}", "agent.normalize_observations=true"]
-    _, done = command("train", seeing, *about, "--runs-dir", "runs", "--logger", "none", "--max-iterations", "1")
+def test_exported_image_policies_match(image_task, command, tmp_path, activation):
+    overrides = [f"agent.actor.activation={activation}", "agent.normalize_observations=true"]
+    _, done = command(
+        "train", image_task, *overrides, "--runs-dir", "runs", "--logger", "none", "--max-iterations", "1"
+    )
     obs = torch.rand(5, 258)
     expected = open_checkpoint(Path(done["checkpoint"])).policy()(obs).numpy()
     for format_, suffix in (("onnx", "onnx"), ("numpy", "py"), ("torch", "pt2")):
         file = tmp_path / f"policy.{suffix}"
         to = ("--format", format_, "--output", str(file), "--verify")
-        code, said = command("export", "--checkpoint", done["run"], *to)
-        assert code == 0, said
-        assert [term["shape"] for term in said["metadata"]["observations"]] == [[], [1, 8, 16], []]
+        code, fragment = command("export", "--checkpoint", done["run"], *to)
+        assert code == 0, fragment
+        assert [term["shape"] for term in fragment["metadata"]["observations"]] == [[], [1, 8, 16], []]
         if format_ == "onnx":
             found = onnxruntime.InferenceSession(str(file)).run(["action"], {"obs": obs.numpy()})[0]
         elif format_ == "numpy":

@@ -1,4 +1,4 @@
-"""The built-in PPO from the command line: runs, exact resume, export and evaluation of what it saves."""
+"""Tests of the built-in PPO from the command line: runs, exact resume, export and evaluation."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ from rlcli.runs.restore import policy_of
 
 @pytest.fixture
 def cli(tmp_path, monkeypatch, capfd):
-    """Run a command in an empty folder; its JSON, if it succeeds."""
+    """Function that runs a command in an empty folder and returns its JSON."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("RLCLI_RUNS_DIR", raising=False)
 
@@ -40,7 +40,7 @@ def open_checkpoint_of(done):
     return open_checkpoint(Path(done["checkpoint"]))
 
 
-def test_a_resumed_run_ends_bit_for_bit_where_an_uninterrupted_one_does(cli):
+def test_resumed_run_matches_uninterrupted_run_bit_for_bit(cli):
     normalize = ("agent.normalize_observations=true", "agent.normalize_value=true", "agent.schedule=adaptive")
     whole = cli(*TRAIN, *normalize, "--max-iterations", "4", "--name", "whole")
     cli(*TRAIN, *normalize, "--max-iterations", "2", "--name", "parts")
@@ -51,7 +51,7 @@ def test_a_resumed_run_ends_bit_for_bit_where_an_uninterrupted_one_does(cli):
 
 
 @pytest.mark.parametrize("overrides", [(), ("agent.normalize_observations=true", "agent.std=scalar")])
-def test_an_exported_policy_is_the_trained_one(cli, overrides):
+def test_exported_policy_matches_trained_policy(cli, overrides):
     done = cli(*TRAIN, *overrides, "--max-iterations", "3")
     exported = cli("export", "--checkpoint", done["run"], "--output", "policy.onnx")
     assert exported["max_difference"] < 1e-5
@@ -62,7 +62,7 @@ def test_an_exported_policy_is_the_trained_one(cli, overrides):
     torch.testing.assert_close(torch.from_numpy(action), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_a_trained_policy_is_evaluated_and_taken_over_by_another_run(cli):
+def test_trained_policy_is_evaluated_and_initialises_a_run(cli):
     done = cli(*TRAIN, "--max-iterations", "2")
     assert cli("eval", "--checkpoint", done["run"], "--episodes", "4", "--num-envs", "4")["episodes"] == 4
     other = cli(*TRAIN, "--max-iterations", "1", "--init-from", done["run"], "agent.learning_rate=1e-9",
@@ -71,7 +71,7 @@ def test_a_trained_policy_is_evaluated_and_taken_over_by_another_run(cli):
     torch.testing.assert_close(left, right, rtol=0, atol=1e-6)
 
 
-def test_a_checkpoint_without_a_part_of_the_learner_is_refused(cli):
+def test_resume_refuses_checkpoint_without_value_normalizer(cli):
     done = cli(*TRAIN, "--max-iterations", "1", "--name", "plain")
     config = open_checkpoint_of(done).folder.parent.parent / "config.yaml"
     config.write_text(config.read_text().replace("normalize_value: false", "normalize_value: true"))
@@ -82,7 +82,7 @@ def test_a_checkpoint_without_a_part_of_the_learner_is_refused(cli):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
-def test_the_agent_solves_cartpole(task, seed):
+def test_agent_solves_cartpole(task, seed):
     resolved = resolve(find_task(task), agent="ppo", overrides=["scene.num_envs=512"])
     trainer = PpoTrainer(make_env(resolved, seed=seed), resolved.agent, seed=seed, device="cpu", torch_threads=1)
     trainer.start()

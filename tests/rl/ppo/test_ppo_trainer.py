@@ -1,4 +1,4 @@
-"""The built-in PPO: rollouts, advantages, minibatches, schedules, and a state that goes on exactly."""
+"""Tests of the built-in PPO: rollouts, advantages, minibatches, schedules and exact resume."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ ALL_STATE = (
 
 
 @pytest.fixture
-def own(scheduled: str) -> str:
+def ppo_task(scheduled: str) -> str:
     """The scheduled task with an agent of the built-in trainer."""
     file = Path(scheduled) / "task.yaml"
     file.write_text(file.read_text().partition("agents:")[0] + AGENTS)
@@ -37,12 +37,12 @@ def own(scheduled: str) -> str:
 
 
 @pytest.fixture
-def two_views(tmp_path: Path) -> str:
-    """A legged robot whose critic sees other things than its policy."""
+def asymmetric_task(tmp_path: Path) -> str:
+    """A legged robot whose critic has other observations than the actor."""
     return str(worlds.critter(tmp_path, worlds.CRITTER_TASK + AGENTS))
 
 
-def trainer_of(task, *overrides, seed=5, env_seed=3):
+def make_trainer(task, *overrides, seed=5, env_seed=3):
     resolved = resolve(find_task(task), agent="ppo", overrides=overrides)
     env = make_env(resolved, seed=env_seed)
     trainer = PpoTrainer(env, resolved.agent, seed=seed, device="cpu", torch_threads=1)
@@ -50,7 +50,7 @@ def trainer_of(task, *overrides, seed=5, env_seed=3):
     return trainer
 
 
-def rolled_out(trainer):
+def collect_rollout(trainer):
     trainer.collector.collect()
     trainer.collector.estimate_advantages()
     return trainer.collector.rollout
@@ -61,26 +61,26 @@ def value_of(trainer, *obs):
         return trainer.networks.value(torch.tensor([obs], dtype=torch.float32)).item()
 
 
-def same_tensors(left, right):
+def require_equal_tensors(left, right):
     for part, tensors in left.items():
         assert tensors.keys() == right[part].keys()
         for name, value in tensors.items():
             assert torch.equal(value.nan_to_num(), right[part][name].nan_to_num()), (part, name)
 
 
-def same_state(left, right):
-    same_tensors(left.tensors, right.tensors)
+def require_equal_state(left, right):
+    require_equal_tensors(left.tensors, right.tensors)
     assert left.values == right.values
 
 
 # --- rollouts and advantages ---
 
 
-def test_a_step_out_of_time_earns_the_value_of_its_true_last_observation_and_a_terminated_one_nothing(own):
-    trainer = trainer_of(own, "agent.lam=0.0", "agent.normalize_advantage=null", "agent.gamma=0.9")
-    rollout = rolled_out(trainer)
+def test_time_out_bootstraps_from_final_obs(ppo_task):
+    trainer = make_trainer(ppo_task, "agent.lam=0.0", "agent.normalize_advantage=null", "agent.gamma=0.9")
+    rollout = collect_rollout(trainer)
     samples = rollout.samples
-    # env 1 runs out of time at its third step, with a last observation of (3, 1); 2 is then terminated as well
+    # environment 1 has a time-out at its third step, with the last observation (3, 1); environment 2 terminates too
     assert samples.obs[2, 1].tolist() == [2.0, 1.0]
     assert samples.obs[3, 1].tolist() == [0.0, 1.0]
     expected = 13.0 + 0.9 * value_of(trainer, 3, 1)
@@ -90,28 +90,28 @@ def test_a_step_out_of_time_earns_the_value_of_its_true_last_observation_and_a_t
     assert abs(value_of(trainer, 3, 1) - value_of(trainer, 2, 1)) > 1e-3
 
 
-def test_a_bootstrap_before_the_step_is_the_value_of_the_observation_acted_on(own):
-    trainer = trainer_of(
-        own, "agent.lam=0.0", "agent.normalize_advantage=null", "agent.gamma=0.9", "agent.bootstrap=pre_step"
+def test_pre_step_bootstrap_uses_obs_before_the_step(ppo_task):
+    trainer = make_trainer(
+        ppo_task, "agent.lam=0.0", "agent.normalize_advantage=null", "agent.gamma=0.9", "agent.bootstrap=pre_step"
     )
-    samples = rolled_out(trainer).samples
+    samples = collect_rollout(trainer).samples
     assert samples.target[2, 1].item() == pytest.approx(13.0 + 0.9 * value_of(trainer, 2, 1), abs=1e-5)
     assert samples.target[2, 2].item() == pytest.approx(13.0, abs=1e-5)
 
 
-def test_reward_scale_scales_rewards_and_not_the_bootstrap(own):
+def test_reward_scale_scales_only_rewards(ppo_task):
     overrides = ("agent.lam=0.0", "agent.normalize_advantage=null")
     plain, scaled = (
-        rolled_out(trainer_of(own, *overrides, f"agent.reward_scale={s}")).samples.target for s in (1, 0.1)
+        collect_rollout(make_trainer(ppo_task, *overrides, f"agent.reward_scale={s}")).samples.target for s in (1, 0.1)
     )
     own_rewards = torch.tensor([[11.0, 11, 11, 11], [12, 12, 12, 11], [11, 13, 13, 11]])
     torch.testing.assert_close(scaled[:3] - 0.1 * own_rewards, plain[:3] - own_rewards, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("envs", [1, 7, 64])
-def test_advantages_are_sb3s(own, envs):
-    trainer = trainer_of(own, f"scene.num_envs={envs}", "agent.lam=0.93", "agent.normalize_advantage=null")
-    rollout = rolled_out(trainer)
+def test_advantages_match_sb3(ppo_task, envs):
+    trainer = make_trainer(ppo_task, f"scene.num_envs={envs}", "agent.lam=0.93", "agent.normalize_advantage=null")
+    rollout = collect_rollout(trainer)
     steps, samples = 8, rollout.samples
     stock = RolloutBuffer(
         steps, spaces.Box(-np.inf, np.inf, (2,)), spaces.Box(-1, 1, (1,)), device="cpu", gae_lambda=0.93,
@@ -136,45 +136,47 @@ def test_advantages_are_sb3s(own, envs):
 
 
 @pytest.mark.parametrize("bound", ["0.25", "null"])
-def test_actions_reach_the_environment_within_the_bound_and_are_learnt_from_as_drawn(own, bound):
-    trainer = trainer_of(own, f"agent.action_bound={bound}", "agent.init_std=5.0")
+def test_env_gets_clipped_and_learner_gets_sampled_actions(ppo_task, bound):
+    trainer = make_trainer(ppo_task, f"agent.action_bound={bound}", "agent.init_std=5.0")
     reached = []
     hook = trainer.env.task.pre_physics_step
     trainer.env.task.pre_physics_step = lambda actions: (reached.append(actions.clone()), hook(actions))
-    drawn = rolled_out(trainer).samples.action
+    drawn = collect_rollout(trainer).samples.action
     assert float(drawn.abs().max()) > 1.0
     expected = drawn if bound == "null" else drawn.clamp(-0.25, 0.25)
     torch.testing.assert_close(torch.stack(reached), expected, rtol=0, atol=0)
 
 
-def test_log_probabilities_are_those_of_the_distribution_drawn_from(own):
-    trainer = trainer_of(own, "agent.init_std=0.3")
-    samples = rolled_out(trainer).samples
+def test_log_prob_matches_torch_distribution(ppo_task):
+    trainer = make_trainer(ppo_task, "agent.init_std=0.3")
+    samples = collect_rollout(trainer).samples
     expected = torch.distributions.Normal(samples.mean, 0.3).log_prob(samples.action).sum(dim=-1)
     torch.testing.assert_close(samples.log_prob, expected, rtol=1e-5, atol=1e-5)
 
 
-def test_the_critic_sees_its_own_group_where_the_task_has_one(two_views):
-    trainer = trainer_of(two_views)
+def test_critic_reads_group_critic_if_the_task_has_it(asymmetric_task):
+    trainer = make_trainer(asymmetric_task)
     assert trainer.networks.critic[0].in_features == trainer.env.layout.size("critic")
-    samples = rolled_out(trainer).samples
+    samples = collect_rollout(trainer).samples
     first = trainer.env.reset(seed=3)
     torch.testing.assert_close(samples.critic_obs[0], first["critic"], rtol=0, atol=0)
     torch.testing.assert_close(samples.obs[0], first["policy"], rtol=0, atol=0)
 
 
-def test_the_critic_can_see_several_groups(two_views):
-    trainer = trainer_of(two_views, "agent.critic_obs=[policy, critic]")
-    samples = rolled_out(trainer).samples
+def test_critic_reads_several_groups(asymmetric_task):
+    trainer = make_trainer(asymmetric_task, "agent.critic_obs=[policy, critic]")
+    samples = collect_rollout(trainer).samples
     first = trainer.env.reset(seed=3)
     torch.testing.assert_close(samples.critic_obs[0], torch.cat([first["policy"], first["critic"]], dim=1))
 
 
-def test_the_normalizer_takes_in_a_rollout_at_its_end(own):
-    trainer = trainer_of(own, "agent.normalize_observations=true")
-    raw = rolled_out(trainer_of(own)).samples.obs
+def test_normalizer_is_updated_after_the_rollout(ppo_task):
+    trainer = make_trainer(ppo_task, "agent.normalize_observations=true")
+    raw = collect_rollout(make_trainer(ppo_task)).samples.obs
     trainer.collector.collect()
-    torch.testing.assert_close(trainer.collector.rollout.samples.obs, raw, rtol=0, atol=1e-6)  # nothing is known yet
+    torch.testing.assert_close(
+        trainer.collector.rollout.samples.obs, raw, rtol=0, atol=1e-6
+    )  # the normaliser has no samples yet
     trainer.learner.update()
     expected = Normalizer(2)
     expected.update(raw.flatten(0, 1))
@@ -184,9 +186,9 @@ def test_the_normalizer_takes_in_a_rollout_at_its_end(own):
     assert float(trainer.collector.rollout.samples.obs.mean().abs()) < 0.2
 
 
-def test_the_normalizer_takes_in_each_step_before_acting_if_asked_to(own):
-    trainer = trainer_of(own, "agent.normalize_observations=true", "agent.normalizer_update=step")
-    raw = rolled_out(trainer_of(own)).samples.obs
+def test_normalizer_update_step_updates_before_each_action(ppo_task):
+    trainer = make_trainer(ppo_task, "agent.normalize_observations=true", "agent.normalizer_update=step")
+    raw = collect_rollout(make_trainer(ppo_task)).samples.obs
     expected = Normalizer(2)
     trainer.collector.collect()
     for t in range(8):
@@ -200,9 +202,9 @@ def test_the_normalizer_takes_in_each_step_before_acting_if_asked_to(own):
 @pytest.mark.parametrize("envs", [1, 7, 64])
 @pytest.mark.parametrize("how", ["num_minibatches=1", "num_minibatches=3", "minibatch_size=5"])
 @pytest.mark.parametrize("shuffle", ["epoch", "update", "none"])
-def test_minibatches_hold_every_sample_once_and_whole(own, envs, how, shuffle):
-    trainer = trainer_of(own, f"scene.num_envs={envs}", f"agent.{how}", f"agent.shuffle={shuffle}")
-    rollout = rolled_out(trainer)
+def test_minibatches_contain_each_sample_once(ppo_task, envs, how, shuffle):
+    trainer = make_trainer(ppo_task, f"scene.num_envs={envs}", f"agent.{how}", f"agent.shuffle={shuffle}")
+    rollout = collect_rollout(trainer)
     rollout.fill_minibatches(trainer.learner.sample_order())
     every = torch.cat([part.log_prob for part in rollout.minibatches])
     torch.testing.assert_close(every.sort().values, rollout.samples.log_prob.flatten().sort().values, rtol=0, atol=0)
@@ -220,15 +222,15 @@ def test_minibatches_hold_every_sample_once_and_whole(own, envs, how, shuffle):
             torch.testing.assert_close(getattr(part, name), whole[at], rtol=0, atol=0)
 
 
-def test_unshuffled_minibatches_hold_whole_environments(own):
-    trainer = trainer_of(own, "agent.num_minibatches=2", "agent.shuffle=none")
-    rollout = rolled_out(trainer)
+def test_unshuffled_minibatches_contain_whole_environments(ppo_task):
+    trainer = make_trainer(ppo_task, "agent.num_minibatches=2", "agent.shuffle=none")
+    rollout = collect_rollout(trainer)
     rollout.fill_minibatches(trainer.learner.sample_order())
     for part, ids in zip(rollout.minibatches, ([0.0, 1.0], [2.0, 3.0]), strict=True):
         assert sorted(set(part.obs[:, 1].tolist())) == ids
 
 
-def order_of_epochs(trainer, monkeypatch):
+def record_orders(trainer, monkeypatch):
     orders, rollout = [], trainer.collector.rollout
     fill = rollout.fill_minibatches
     monkeypatch.setattr(rollout, "fill_minibatches", lambda order: (orders.append(order.clone()), fill(order)))
@@ -236,10 +238,10 @@ def order_of_epochs(trainer, monkeypatch):
     return orders
 
 
-def test_samples_are_shuffled_as_often_as_asked(own, monkeypatch):
-    each = order_of_epochs(trainer_of(own, "agent.shuffle=epoch", "agent.num_epochs=3"), monkeypatch)
+def test_shuffle_setting_gives_number_of_orders(ppo_task, monkeypatch):
+    each = record_orders(make_trainer(ppo_task, "agent.shuffle=epoch", "agent.num_epochs=3"), monkeypatch)
     assert len({tuple(order.tolist()) for order in each}) == 3
-    assert len(order_of_epochs(trainer_of(own, "agent.shuffle=update", "agent.num_epochs=3"), monkeypatch)) == 1
+    assert len(record_orders(make_trainer(ppo_task, "agent.shuffle=update", "agent.num_epochs=3"), monkeypatch)) == 1
 
 
 @pytest.mark.parametrize(
@@ -251,9 +253,9 @@ def test_samples_are_shuffled_as_often_as_asked(own, monkeypatch):
         (("agent.critic_obs=[critic]",), "no observation group 'critic'"),
     ],
 )
-def test_what_does_not_fit_the_environment_is_a_configuration_error(own, overrides, message):
+def test_settings_that_do_not_fit_the_env_are_config_errors(ppo_task, overrides, message):
     with pytest.raises(ConfigError, match=message):
-        trainer_of(own, *overrides)
+        make_trainer(ppo_task, *overrides)
 
 
 @pytest.mark.parametrize(
@@ -261,21 +263,21 @@ def test_what_does_not_fit_the_environment_is_a_configuration_error(own, overrid
     [
         (["agent.schedule=adaptive"], "desired_kl"),
         (["agent.desired_kl=0.01"], "desired_kl"),
-        (["agent.kl_from=last_pass"], "shuffle update or none"),
+        (["agent.kl_from=last_pass"], "set shuffle to update or none"),
         (["agent.learning_rate_range=[1e-2, 1e-5]"], "is above"),
         (["agent.dialect=rslrl"], "dialect"),
         (["agent.dialect=sb3", "agent.critic={hiden: [3]}"], "hiden"),
         (["agent.actor.hidden=[]"], "hidden"),
     ],
 )
-def test_settings_that_contradict_each_other_are_refused(own, overrides, message):
+def test_contradicting_settings_are_config_errors(ppo_task, overrides, message):
     with pytest.raises(ConfigError, match=message):
-        resolve(find_task(own), agent="ppo", overrides=overrides)
+        resolve(find_task(ppo_task), agent="ppo", overrides=overrides)
 
 
 @pytest.mark.parametrize("envs", [1, 3, 7])
-def test_any_number_of_environments_and_minibatches_trains(own, envs):
-    report = trainer_of(own, f"scene.num_envs={envs}", "agent.num_minibatches=5").iterate()
+def test_any_number_of_envs_and_minibatches_trains(ppo_task, envs):
+    report = make_trainer(ppo_task, f"scene.num_envs={envs}", "agent.num_minibatches=5").iterate()
     assert {"Loss/surrogate", "Loss/value", "Loss/kl", "Policy/mean_std"} <= report.metrics.keys()
 
 
@@ -286,58 +288,58 @@ def learning_rates(trainer, iterations):
     return [trainer.iterate().metrics["Loss/learning_rate"] for _ in range(iterations)]
 
 
-def test_a_constant_schedule_keeps_the_learning_rate(own):
-    assert learning_rates(trainer_of(own, "agent.learning_rate=2e-3"), 3) == pytest.approx([2e-3] * 3)
+def test_constant_schedule_keeps_learning_rate(ppo_task):
+    assert learning_rates(make_trainer(ppo_task, "agent.learning_rate=2e-3"), 3) == pytest.approx([2e-3] * 3)
 
 
-def test_a_linear_schedule_falls_to_zero_over_the_budget(own):
-    trainer = trainer_of(own, "agent.learning_rate=1e-3", "agent.schedule=linear", "agent.max_iterations=4")
+def test_linear_schedule_decreases_to_zero_over_the_budget(ppo_task):
+    trainer = make_trainer(ppo_task, "agent.learning_rate=1e-3", "agent.schedule=linear", "agent.max_iterations=4")
     assert learning_rates(trainer, 4) == pytest.approx([1e-3, 7.5e-4, 5e-4, 2.5e-4])
 
 
 @pytest.mark.parametrize(("grain", "changes"), [("minibatch", 4), ("epoch", 2), ("iteration", 1)])
 @pytest.mark.parametrize(("desired", "factor"), [("1e-9", 1 / 1.5), ("1e9", 1.5)])
-def test_an_adaptive_schedule_follows_the_divergence_at_its_grain(own, grain, changes, desired, factor):
-    trainer = trainer_of(
-        own, "agent.learning_rate=1e-3", "agent.schedule=adaptive", f"agent.desired_kl={desired}",
+def test_adaptive_schedule_follows_kl_at_its_grain(ppo_task, grain, changes, desired, factor):
+    trainer = make_trainer(
+        ppo_task, "agent.learning_rate=1e-3", "agent.schedule=adaptive", f"agent.desired_kl={desired}",
         f"agent.kl_grain={grain}", "agent.learning_rate_range=[1e-9, 1.0]",
     )  # fmt: skip
     trainer.collector.obs["policy"] += 1.0
     trainer.iterate()
     before = float(trainer.learner.learning_rate)
     after = trainer.iterate().metrics["Loss/learning_rate"]
-    # the first minibatch of an iteration finds next to no divergence, of either sign
+    # in the first minibatch of an iteration the KL divergence is about 0, with either sign
     assert after / before == pytest.approx(factor**changes) or (
         grain == "minibatch" and after / before == pytest.approx(factor ** (changes - 1))
     )
 
 
 @pytest.mark.parametrize(("desired", "limit"), [("1e-9", 5e-4), ("1e9", 2e-3)])
-def test_an_adaptive_schedule_stays_in_its_range(own, desired, limit):
-    trainer = trainer_of(
-        own, "agent.schedule=adaptive", f"agent.desired_kl={desired}", "agent.learning_rate_range=[5e-4, 2e-3]"
+def test_adaptive_schedule_stays_in_its_range(ppo_task, desired, limit):
+    trainer = make_trainer(
+        ppo_task, "agent.schedule=adaptive", f"agent.desired_kl={desired}", "agent.learning_rate_range=[5e-4, 2e-3]"
     )
     assert learning_rates(trainer, 3)[-1] == pytest.approx(limit)
 
 
-def test_an_adaptive_schedule_that_settles_stays_under_a_ceiling_that_falls_to_zero(own):
-    trainer = trainer_of(
-        own, "agent.schedule=adaptive_linear", "agent.desired_kl=1e9", "agent.learning_rate=1e-3",
+def test_adaptive_linear_schedule_stays_below_decreasing_limit(ppo_task):
+    trainer = make_trainer(
+        ppo_task, "agent.schedule=adaptive_linear", "agent.desired_kl=1e9", "agent.learning_rate=1e-3",
         "agent.learning_rate_range=[1e-5, 2e-3]", "agent.max_iterations=4",
     )  # fmt: skip
     assert learning_rates(trainer, 4) == pytest.approx([2e-3, 1.5e-3, 1e-3, 0.5e-3])
 
 
 @pytest.mark.parametrize("rate", ["1e10", "1e30"])
-def test_a_learner_that_turns_nonfinite_is_a_divergence(own, rate):
-    trainer = trainer_of(own, f"agent.learning_rate={rate}")
+def test_nan_in_learner_is_a_divergence(ppo_task, rate):
+    trainer = make_trainer(ppo_task, f"agent.learning_rate={rate}")
     with pytest.raises(DivergedError, match="not finite"):
         [trainer.iterate() for _ in range(4)]
 
 
 @pytest.mark.parametrize("scope", ["joint", "separate"])
-def test_gradients_are_clipped_jointly_or_apart(own, scope):
-    trainer = trainer_of(own, f"agent.clip_grad={scope}", "agent.max_grad_norm=0.5")
+def test_clip_grad_is_joint_or_separate(ppo_task, scope):
+    trainer = make_trainer(ppo_task, f"agent.clip_grad={scope}", "agent.max_grad_norm=0.5")
     gradient = trainer.learner.gradient
     end = len(gradient) - sum(p.numel() for n, p in trainer.networks.named_parameters() if n.startswith("critic"))
     gradient[:end], gradient[end:] = 0.001, 3.0
@@ -352,13 +354,13 @@ def test_gradients_are_clipped_jointly_or_apart(own, scope):
         torch.testing.assert_close(gradient / gradient.norm(), before / before.norm())
 
 
-# --- what a captured graph needs ---
+# --- conditions of a CUDA graph ---
 
 
-class Watch(TorchDispatchMode):
-    """Notes operations that would make the host wait for the device."""
+class SyncRecorder(TorchDispatchMode):
+    """Recorder of operations that synchronise host and device on a GPU."""
 
-    WAITING = ("_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "unique")
+    SYNCHRONISING = ("_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "unique")
 
     def __init__(self):
         super().__init__()
@@ -367,37 +369,39 @@ class Watch(TorchDispatchMode):
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         name = func.name().removeprefix("aten::").partition(".")[0]
         by_mask = name == "index" and any(i is not None and i.dtype == torch.bool for i in args[1])
-        if name in self.WAITING or by_mask:
+        if name in self.SYNCHRONISING or by_mask:
             self.seen.append(name)
         return func(*args, **(kwargs or {}))
 
 
-def test_the_watch_sees_what_would_wait():
+def test_sync_recorder_records_synchronising_operations():
     values = torch.tensor([1.0, 2.0])
-    with Watch() as watch:
+    with SyncRecorder() as recorder:
         bool(values.sum() > 0)
         values[values > 1.5]
         values.nonzero()
-    assert watch.seen == ["_local_scalar_dense", "index", "nonzero"]
+    assert recorder.seen == ["_local_scalar_dense", "index", "nonzero"]
 
 
 @pytest.mark.parametrize("setting", ["dialect=rsl_rl", "dialect=rl_games", "dialect=sb3", "rnn={hidden: 4}"])
-def test_the_update_asks_the_device_for_nothing(own, setting, monkeypatch):
-    trainer = trainer_of(own, f"agent.{setting}", "agent.normalize_observations=true", "agent.normalize_value=true")
+def test_update_forces_no_host_sync(ppo_task, setting, monkeypatch):
+    trainer = make_trainer(
+        ppo_task, f"agent.{setting}", "agent.normalize_observations=true", "agent.normalize_value=true"
+    )
     trainer.iterate()
     monkeypatch.setattr(
         trainer.collector, "_value_where", lambda mask, obs: torch.where(mask, trainer.collector._value(obs), 0.0)
     )  # as on a GPU
-    monkeypatch.setattr(trainer.collector, "checks_every_stage", False)  # and this
+    monkeypatch.setattr(trainer.collector, "checks_every_stage", False)  # as on a GPU
     trainer.collector.collect()
-    with Watch() as watch:
+    with SyncRecorder() as recorder:
         trainer.learner.update()
-    assert watch.seen == []
+    assert recorder.seen == []
 
 
-def test_all_values_where_masked_are_those_of_the_rows_alone(own):
-    trainer = trainer_of(own)
-    rollout = rolled_out(trainer)
+def test_value_where_matches_values_of_all_rows(ppo_task):
+    trainer = make_trainer(ppo_task)
+    rollout = collect_rollout(trainer)
     with torch.no_grad():
         rows = trainer.collector._value_where(rollout.time_out, rollout.final_obs)
         every = torch.where(rollout.time_out, trainer.collector._value(rollout.final_obs), 0.0)
@@ -405,7 +409,7 @@ def test_all_values_where_masked_are_those_of_the_rows_alone(own):
     torch.testing.assert_close(rows, every)
 
 
-def addresses(trainer):
+def tensor_addresses(trainer):
     held = {**trainer._learner_tensors(), **{f"obs.{k}": v for k, v in trainer.collector.obs.items()}}
     held |= {f"actor.{name}": value for name, value in trainer.networks.actor.named_parameters()}
     held["gradient"] = trainer.learner.weights.grad
@@ -414,42 +418,42 @@ def addresses(trainer):
     return {name: value.data_ptr() for name, value in held.items()}
 
 
-def test_everything_stays_where_it_is_in_memory(own):
-    trainer = trainer_of(own, *ALL_STATE)
-    before = addresses(trainer)
+def test_tensors_keep_their_addresses(ppo_task):
+    trainer = make_trainer(ppo_task, *ALL_STATE)
+    before = tensor_addresses(trainer)
     trainer.iterate()
     state = trainer.state()
     trainer.iterate()
     trainer.load(state)
     trainer.load_weights(state.tensors["policy"])
-    assert addresses(trainer) == before
+    assert tensor_addresses(trainer) == before
 
 
 # --- state ---
 
 
 @pytest.mark.parametrize("overrides", [(), ALL_STATE, (*ALL_STATE, "agent.normalizer_update=step")])
-def test_a_state_is_a_copy_and_loads_back_bit_for_bit(two_views, overrides):
+def test_state_is_a_copy_and_restores_bit_for_bit(asymmetric_task, overrides):
     overrides = (*overrides, "agent.num_steps=16")
-    trainer = trainer_of(two_views, *overrides)
+    trainer = make_trainer(asymmetric_task, *overrides)
     trainer.iterate()
     trainer.iterate()
     state = trainer.state()
     kept = {part: {name: v.clone() for name, v in tensors.items()} for part, tensors in state.tensors.items()}
     trainer.iterate()
     after = trainer.state()
-    same_tensors(kept, state.tensors)
-    other = trainer_of(two_views, *overrides, seed=98, env_seed=99)
+    require_equal_tensors(kept, state.tensors)
+    other = make_trainer(asymmetric_task, *overrides, seed=98, env_seed=99)
     other.load(state)
-    same_state(other.state(), state)
+    require_equal_state(other.state(), state)
     other.iterate()
-    same_state(other.state(), after)
+    require_equal_state(other.state(), after)
 
 
-def test_the_same_seed_gives_the_same_bits_and_another_seed_others(own):
+def test_seed_decides_the_bits(ppo_task):
     runs = []
     for seed in (5, 5, 6):
-        trainer = trainer_of(own, seed=seed)
+        trainer = make_trainer(ppo_task, seed=seed)
         trainer.iterate()
         runs.append(trainer.state().tensors["policy"]["actor.0.weight"])
     assert torch.equal(runs[0], runs[1])
@@ -457,8 +461,8 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_others(own):
 
 
 @pytest.mark.parametrize("overrides", [(), ALL_STATE])
-def test_the_deployable_policy_acts_as_the_learner_does(own, overrides):
-    trainer = trainer_of(own, *overrides)
+def test_deployable_policy_matches_learner(ppo_task, overrides):
+    trainer = make_trainer(ppo_task, *overrides)
     trainer.iterate()
     obs = torch.randn(50, 2) * 3
     with torch.no_grad():
@@ -468,8 +472,10 @@ def test_the_deployable_policy_acts_as_the_learner_does(own, overrides):
 
 
 @pytest.mark.parametrize("std", ["log", "scalar"])
-def test_weights_of_another_run_are_taken_without_its_critic(own, std):
-    donor, trainer = (trainer_of(own, "agent.normalize_observations=true", f"agent.std={std}", seed=s) for s in (1, 2))
+def test_load_weights_does_not_change_the_critic(ppo_task, std):
+    donor, trainer = (
+        make_trainer(ppo_task, "agent.normalize_observations=true", f"agent.std={std}", seed=s) for s in (1, 2)
+    )
     donor.iterate()
     critic = trainer.networks.critic[0].weight.clone()
     trainer.load_weights(donor.state().tensors["policy"])
@@ -490,8 +496,8 @@ def test_weights_of_another_run_are_taken_without_its_critic(own, std):
         ("orthogonal", lambda layer: not layer.bias.any()),
     ],
 )
-def test_initial_weights_are_as_asked(own, init, check):
-    networks = trainer_of(own, f"agent.init={init}", "agent.init_std=0.7", "agent.actor={hidden: [8]}").networks
+def test_init_setting_gives_initial_weights(ppo_task, init, check):
+    networks = make_trainer(ppo_task, f"agent.init={init}", "agent.init_std=0.7", "agent.actor={hidden: [8]}").networks
     for network in (networks.actor, networks.critic):
         assert all(check(layer) for layer in network if isinstance(layer, torch.nn.Linear))
     torch.testing.assert_close(networks.std.detach(), torch.tensor([0.7]))
@@ -502,13 +508,13 @@ def test_initial_weights_are_as_asked(own, init, check):
         assert networks.critic[-1].weight.norm().item() == pytest.approx(1.0, rel=1e-4)
 
 
-def test_a_dialect_gives_defaults_that_given_keys_replace(own):
+def test_dialect_defaults_are_replaced_by_given_keys(ppo_task):
     def agent(*overrides):
-        return resolve(find_task(own), agent="ppo", overrides=overrides).agent
+        return resolve(find_task(ppo_task), agent="ppo", overrides=overrides).agent
 
     plain, preset = agent(), agent("agent.dialect=sb3")
     assert (plain.normalize_advantage, preset.normalize_advantage) == ("batch", "minibatch")
-    assert preset.num_epochs == 2  # given by the task
+    assert preset.num_epochs == 2  # the task sets it
     assert preset.actor.activation == "tanh"
     replaced = agent("agent.dialect=sb3", "agent.actor={hidden: [7]}", "agent.max_grad_norm=9.0")
     assert (replaced.actor.hidden, replaced.actor.activation, replaced.max_grad_norm) == ((7,), "tanh", 9.0)

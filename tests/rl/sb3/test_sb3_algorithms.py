@@ -1,4 +1,4 @@
-"""SB3's algorithms behind the trainer: what is saved, what is stored, what is normalised."""
+"""Tests of the SB3 trainer: saved policies, replay buffers and normalisation."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ AGENTS = {
 }
 
 
-def make(tmp_path, algorithm, *, normalize=False, seed=3, extra="", task="cartpole"):
+def make_trainer(tmp_path, algorithm, *, normalize=False, seed=3, extra="", task="cartpole"):
     settings = f"{AGENTS[algorithm]}, max_iterations: 20, normalize_observations: {str(normalize).lower()}"
     settings += ", policy: {hidden: [16, 8], activation: elu}" + extra
     file = tmp_path / "agent.yaml"
@@ -31,24 +31,24 @@ def make(tmp_path, algorithm, *, normalize=False, seed=3, extra="", task="cartpo
     return Sb3Trainer(env, resolved.agent, seed=seed, device="cpu", torch_threads=1)
 
 
-def everything(trainer):
+def all_tensors(trainer):
     state = trainer.state()
     return {f"{part}.{name}": value for part, tensors in state.tensors.items() for name, value in tensors.items()}
 
 
 @pytest.mark.parametrize("normalize", [False, True])
 @pytest.mark.parametrize("algorithm", AGENTS)
-def test_going_on_from_a_saved_boundary_gives_the_same_bits(tmp_path, algorithm, normalize):
-    whole = make(tmp_path, algorithm, normalize=normalize)
+def test_resumed_training_matches_bit_for_bit(tmp_path, algorithm, normalize):
+    whole = make_trainer(tmp_path, algorithm, normalize=normalize)
     whole.start()
     for _ in range(3):
         whole.iterate()
     saved = whole.state()
     reports = [whole.iterate().metrics for _ in range(4)]
-    other = make(tmp_path, algorithm, normalize=normalize, seed=99)
+    other = make_trainer(tmp_path, algorithm, normalize=normalize, seed=99)
     other.load(saved)
     assert [other.iterate().metrics for _ in range(4)] == reports
-    wanted, found = everything(whole), everything(other)
+    wanted, found = all_tensors(whole), all_tensors(other)
     assert wanted.keys() == found.keys()
     different = [n for n in wanted if not torch.equal(wanted[n].nan_to_num(), found[n].nan_to_num())]
     assert different == []
@@ -56,8 +56,8 @@ def test_going_on_from_a_saved_boundary_gives_the_same_bits(tmp_path, algorithm,
 
 @pytest.mark.parametrize("normalize", [False, True])
 @pytest.mark.parametrize("algorithm", AGENTS)
-def test_the_saved_policy_acts_as_the_trained_one(tmp_path, algorithm, normalize):
-    trainer = make(tmp_path, algorithm, normalize=normalize, extra=", action_bound: 0.5")
+def test_saved_policy_matches_trained_policy(tmp_path, algorithm, normalize):
+    trainer = make_trainer(tmp_path, algorithm, normalize=normalize, extra=", action_bound: 0.5")
     trainer.start()
     for _ in range(8):
         trainer.iterate()
@@ -70,8 +70,8 @@ def test_the_saved_policy_acts_as_the_trained_one(tmp_path, algorithm, normalize
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
-def test_samples_of_the_saved_policy_have_the_trained_distribution(tmp_path, algorithm):
-    trainer = make(tmp_path, algorithm)
+def test_saved_policy_samples_from_trained_distribution(tmp_path, algorithm):
+    trainer = make_trainer(tmp_path, algorithm)
     trainer.start()
     for _ in range(8):
         trainer.iterate()
@@ -83,30 +83,30 @@ def test_samples_of_the_saved_policy_have_the_trained_distribution(tmp_path, alg
     assert ours.std().item() == pytest.approx(theirs.std().item(), abs=0.02)
 
 
-def test_a_deterministic_policy_samples_its_action(tmp_path):
-    policy = make(tmp_path, "td3").policy()
+def test_deterministic_policy_samples_its_action(tmp_path):
+    policy = make_trainer(tmp_path, "td3").policy()
     obs = torch.randn(7, 4)
     assert torch.equal(policy.sample(obs), policy(obs))
 
 
-def test_replayed_transitions_lead_to_the_true_last_observation(tmp_path):
-    trainer = make(tmp_path, "sac")
+def test_replay_buffer_stores_final_obs_at_time_outs(tmp_path):
+    trainer = make_trainer(tmp_path, "sac")
     trainer.start()
-    for _ in range(8):  # 32 steps: two ends of an episode of 12 steps
+    for _ in range(8):  # 32 steps: two episodes of 12 steps end
         trainer.iterate()
     replay = trainer.model.replay_buffer
     obs, following, done = replay.obs[: replay.pos], replay.next_obs[: replay.pos], replay.done[: replay.pos]
-    moved = (following - obs)[..., 1].abs()  # the pole's angle
+    moved = (following - obs)[..., 1].abs()  # angle of the pole [rad]
     speed = torch.maximum(obs[..., 3].abs(), following[..., 3].abs())
-    # over 1/60 s the angle follows the rate; a step onto a fresh state would not
+    # in 1/60 s the angle changes by rate / 60; a transition to a reset state would change it more
     assert bool((moved <= speed / 60.0 * 1.5 + 1e-3).all())
     restarts = (obs[1:] - following[:-1]).abs().amax(dim=2) > 1e-6
-    assert bool(restarts.any())  # otherwise nothing was shown
-    assert not bool(done[:-1][restarts].any())  # all of them ran out of time: the future counts
+    assert bool(restarts.any())  # else the test proves nothing
+    assert not bool(done[:-1][restarts].any())  # all ends are time-outs, which are stored as not done
 
 
-def test_actions_before_learning_starts_are_uniform_and_the_environment_gets_them_times_the_bound(tmp_path):
-    trainer = make(tmp_path, "td3", extra=", action_bound: 0.25")
+def test_random_actions_are_scaled_by_the_action_bound(tmp_path):
+    trainer = make_trainer(tmp_path, "td3", extra=", action_bound: 0.25")
     trainer.start()
     trainer.iterate()
     stored = trainer.model.replay_buffer.action[: trainer.model.replay_buffer.pos]
@@ -115,7 +115,7 @@ def test_actions_before_learning_starts_are_uniform_and_the_environment_gets_the
 
 
 def test_no_update_before_learning_starts(tmp_path):
-    trainer = make(tmp_path, "sac", extra="")
+    trainer = make_trainer(tmp_path, "sac", extra="")
     trainer.start()
     before = {name: value.clone() for name, value in trainer.model.policy.state_dict().items()}
     trainer.iterate()  # 24 steps, not more than learning_starts
@@ -124,8 +124,8 @@ def test_no_update_before_learning_starts(tmp_path):
     assert any(not torch.equal(before[name], value) for name, value in trainer.model.policy.state_dict().items())
 
 
-def test_the_ring_of_transitions_wraps(tmp_path):
-    trainer = make(tmp_path, "ddpg")
+def test_replay_buffer_wraps(tmp_path):
+    trainer = make_trainer(tmp_path, "ddpg")
     trainer.start()
     for _ in range(12):  # 48 steps into 256 // 6 = 42 rows
         trainer.iterate()
@@ -133,7 +133,7 @@ def test_the_ring_of_transitions_wraps(tmp_path):
     assert (replay.buffer_size, replay.pos, replay.full) == (42, 6, True)
 
 
-def test_normaliser_statistics_are_those_of_all_batches():
+def test_normalizer_merges_batches():
     batches = [torch.randn(n, 3) * torch.tensor([1.0, 5.0, 0.1]) + torch.tensor([0.0, 100.0, -3.0]) for n in (7, 1, 64)]
     normalizer = Normalizer(3)
     for batch in batches:
@@ -145,8 +145,8 @@ def test_normaliser_statistics_are_those_of_all_batches():
     assert normalizer(torch.full((1, 3), 1e6)).abs().max() == 10.0
 
 
-def test_normaliser_stands_still_when_the_policy_acts(tmp_path):
-    trainer = make(tmp_path, "ppo", normalize=True)
+def test_normalizer_does_not_change_when_the_policy_acts(tmp_path):
+    trainer = make_trainer(tmp_path, "ppo", normalize=True)
     trainer.start()
     trainer.iterate()
     policy = trainer.policy()
@@ -156,12 +156,12 @@ def test_normaliser_stands_still_when_the_policy_acts(tmp_path):
     assert not torch.equal(before, torch.zeros(4, dtype=torch.float64))
 
 
-def test_weights_alone_start_a_new_training(tmp_path):
-    trained = make(tmp_path, "td3", normalize=True)
+def test_load_weights_copies_actor_to_target(tmp_path):
+    trained = make_trainer(tmp_path, "td3", normalize=True)
     trained.start()
     for _ in range(8):
         trained.iterate()
-    fresh = make(tmp_path, "td3", normalize=True, seed=5)
+    fresh = make_trainer(tmp_path, "td3", normalize=True, seed=5)
     fresh.load_weights(trained.state().tensors["policy"])
     obs = torch.randn(20, 4)
     assert torch.equal(fresh.policy()(obs), trained.policy()(obs))
@@ -181,16 +181,16 @@ def test_weights_alone_start_a_new_training(tmp_path):
         ("algorithm: sac, policy: {hidden: []}", "hidden"),
     ],
 )
-def test_settings_that_do_not_fit_the_algorithm_are_refused(tmp_path, agent, message):
+def test_settings_that_do_not_fit_the_algorithm_are_config_errors(tmp_path, agent, message):
     file = tmp_path / "agent.yaml"
     file.write_text("agents: {x: {trainer: sb3, max_iterations: 1, " + agent + "}}\n")
     with pytest.raises(ConfigError, match=message):
         resolve(find_task("cartpole"), agent="x", config_file=file)
 
 
-def test_a_policy_of_every_kind_is_rebuilt_from_its_description(tmp_path):
+def test_policy_is_rebuilt_from_its_spec(tmp_path):
     for algorithm in AGENTS:
-        trainer = make(tmp_path, algorithm, normalize=True)
+        trainer = make_trainer(tmp_path, algorithm, normalize=True)
         trainer.start()
         state = trainer.state()
         rebuilt = Policy(trainer.spec)
