@@ -131,16 +131,16 @@ def base_heading_proj(env: ManagedEnv, *, entity: Entity = "robot", target: tupl
 
 
 def base_angle_to_target(env: ManagedEnv, *, entity: Entity = "robot", target: tuple[float, float, float]) -> Tensor:
-    """Angle from the root's heading to `target` about the vertical, in [-pi, pi] [rad]. (num_envs, 1)
+    """Angle from the root's heading to `target`, about the vertical [rad]. (num_envs, 1)
 
-    target: a point from the environment's origin [m].
+    In [-pi, pi]. target: a point from the environment's origin [m].
     """
     offset = _offset_xy(env, entity, target)
     return wrap_to_pi(atan2(offset[:, 1], offset[:, 0]) - entity.data.heading_w)[:, None]
 
 
 def body_pose_w(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
-    """Position [m] and quaternion (w, x, y, z) of each body, world frame. (num_envs, 7 k)
+    """Position in m and quaternion (w, x, y, z) of each body, world frame. (num_envs, 7 k)
 
     The position is relative to the environment's origin.
     """
