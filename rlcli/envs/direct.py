@@ -298,7 +298,7 @@ class DirectEnv(VecEnv):
         return reward, failed, truncated
 
     def _compute_dones(self) -> tuple[Tensor, Tensor]:
-        """Return where the task ended the episode, and where time did. (num_envs,) bool each"""
+        """Return where the task ended the episode, and where it timed out. (num_envs,) bool each"""
         failed = self.task.reset_buf != 0  # a copy, also of a bool buffer: time-outs set these flags later
         return failed, self.episode_length_buf >= self.max_episode_length
 

@@ -307,7 +307,7 @@ class DifferentialInverseKinematics(_ScaledJointAction):
     bodies: Bodies
     mode: Literal["position", "pose"] = "pose"
     relative: bool = False
-    scale: float = 1.0  # type: ignore[assignment]  (one number for all columns)
+    scale: float = 1.0
     damping: float = 0.01
     posture: float = 0.0
     offset_pos: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -14,7 +14,7 @@ from rlcli.sim.selection import Selection
 
 @dataclass(kw_only=True, eq=False)
 class Stages(Term):
-    """Set the number at `address` to each of the `values` when training reaches the step in `steps`.
+    """Schedule that sets the number at `address` to the next of the `values` at each of the `steps`.
 
     Before the first step the setting keeps its value. `steps` are environment steps since training began, in rising
     order. Isaac Lab: modify_reward_weight, modify_env_param, modify_term_cfg; mjlab: reward_curriculum,
@@ -43,9 +43,10 @@ class Stages(Term):
 
 @dataclass(kw_only=True, eq=False)
 class Interpolate(Term):
-    """Move the number at `address` linearly from its configured value to `to`, between the steps `begin` and `end`.
+    """Schedule that moves the number at `address` linearly from its configured value to `to`.
 
-    Lists are interpolated element by element. `begin` and `end` are environment steps since training began.
+    It moves between the steps `begin` and `end`, which are environment steps since training began. Lists are
+    interpolated element by element.
     """
 
     address: Address
@@ -69,11 +70,11 @@ class Interpolate(Term):
 
 @dataclass(kw_only=True, eq=False)
 class TerrainLevels(EntityTerm):
-    """Raise the terrain level of robots that walk far, and lower that of robots that fall short. -> levels (num_envs,)
+    """Terrain levels: up for robots that walk far, down for robots that fall short. -> levels (num_envs,)
 
     An episode that ends more than half a patch (along x) from the environment's origin moves up one level. It moves
-    down if it covers less than half of the distance of `command` (a velocity, x and y first); without a
-    command, less than `least` [m]. Above the last level follows a random one. Isaac Lab: terrain_levels_vel.
+    down if it covers less than half of the distance of `command` (a velocity, x and y first); without a command, less
+    than `least` [m]. Above the last level follows a random one. Isaac Lab: terrain_levels_vel.
     """
 
     command: Command | None = None

@@ -294,5 +294,5 @@ def _write_joints(entity: Entity, selection: Selection, joints: Joints, position
 
 
 def _rows(selection: Selection, values: Tensor) -> Tensor:
-    """Return the selected rows; values that all environments share have one row, which is returned. (rows or 1, k)"""
+    """Return the selected rows, or the single row of values that all environments share. (rows or 1, k)"""
     return values if values.shape[0] == 1 else selection.read_view(values)
