@@ -181,7 +181,11 @@ class Pipeline:
         return lambda selection: selection.read_view(zeros) + value
 
 
-_OPERATIONS = {"add": Tensor.add_, "scale": Tensor.mul_, "set": Tensor.copy_}
+_OPERATIONS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "add": Tensor.add_,
+    "scale": Tensor.mul_,
+    "set": Tensor.copy_,
+}
 
 
 class _Noise(Stage):

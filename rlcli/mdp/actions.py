@@ -200,7 +200,8 @@ class JointPositionToLimits(_ScaledJointAction):
         raw = action * self._scale
         if not self.rescale_to_limits:
             return raw.clamp(low, high)
-        return 0.5 * (raw.clamp(-1.0, 1.0) * (high - low) + high + low)
+        target: Tensor = 0.5 * (raw.clamp(-1.0, 1.0) * (high - low) + high + low)
+        return target
 
 
 @dataclass(kw_only=True, eq=False)
