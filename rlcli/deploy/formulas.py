@@ -378,14 +378,14 @@ def _clipped(action: Any, value: Formula) -> Formula:
 
 
 def _relative(action: Any, columns: list[int]) -> Formula:
-    positions = field("qpos", _joints(action._entity, action._joints)[0])
+    positions = field("qpos", _joints(action.entity, action.joints)[0])
     return _clipped(action, op("add", positions, _scaled(action, columns)))
 
 
 def _to_limits(action: Any, columns: list[int]) -> Formula:
-    low, high = action._entity.data.soft_joint_pos_limits[action._joints].unbind(-1)
+    low, high = action.entity.data.soft_joint_pos_limits[action.joints].unbind(-1)
     raw = _scaled(action, columns)
-    if not action._rescale:
+    if not action.rescale_to_limits:
         ends = (bound.nan_to_num(posinf=3e38, neginf=-3e38) for bound in (low, high))
         return _clipped(action, op("clip", raw, *map(numbers, ends)))
     stretched = op("mul", op("clip", raw, [-1.0], [1.0]), numbers(high - low))
@@ -395,7 +395,7 @@ def _to_limits(action: Any, columns: list[int]) -> Formula:
 
 def _binary(action: Any, columns: list[int]) -> Formula:
     return op(
-        "below", given("action", columns), [float(action._threshold)], numbers(action._close), numbers(action._open)
+        "below", given("action", columns), [float(action.threshold)], numbers(action._close), numbers(action._open)
     )
 
 

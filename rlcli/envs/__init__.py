@@ -1,1 +1,1 @@
-"""Environments: one step loop, and the two workflows that fill it."""
+"""Environments: the environment loop and its two workflows, managed and direct."""

@@ -1,4 +1,4 @@
-"""`ArticulationView`: the robots of all environments as tensors, with OmniIsaacGymEnvs' method names."""
+"""`ArticulationView`: the robots of all environments as tensors, with the method names of OmniIsaacGymEnvs."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 
 class ArticulationView:
-    """One entity in every environment. Register it with `scene.add`; it works once the simulation runs.
+    """View of one entity in all environments. Register it with `scene.add`; it works once the simulation runs.
 
-    Columns are the entity's hinge and slide joints in the model's order. `indices` picks environments, and values then
-    have one row each. Positions are in each environment's own frame. Unlike its model, a setter may be called any
-    number of times a step, and getters are never stale.
+    Columns are the hinge and slide joints of the entity, in the order of the model. `indices` selects environments;
+    values then have one row for each. Positions are relative to each environment's origin frame. Unlike in
+    OmniIsaacGymEnvs, a setter may be called several times in a step, and getters always return current values.
 
     Args:
         entity: name of the entity in the YAML's scene.
-        name: the view's own name, for dictionaries of observations.
+        name: name of the view, for dictionaries of observations.
     """
 
     def __init__(self, entity: str, name: str | None = None) -> None:
@@ -35,7 +35,7 @@ class ArticulationView:
         self.name = name or entity
 
     def bind(self, env: VecEnv) -> None:
-        """Connect to the running simulation; the framework calls it.
+        """Connect the view to the simulation; the environment calls this.
 
         Raises:
             TaskError: if the scene has no such entity.
@@ -49,27 +49,27 @@ class ArticulationView:
         self._qpos, self._ctrl = engine.field("qpos"), engine.field("ctrl")
         self._qpos_index = as_index(self._entity.qpos_columns.tolist(), engine.device)
         self._dof_index = as_index(self._entity.dof_columns.tolist(), engine.device)
-        driven = {joint for joint, _ in self._entity.actuators_of("motor")}
-        self._without_motor = [j for j in range(len(self._entity.joint_names)) if j not in driven]
-        self._actuators = {kind: _drive(self._entity, kind) for kind in ("motor", "position", "velocity")}
+        has_motor = {joint for joint, _ in self._entity.actuators_of("motor")}
+        self._without_motor = [j for j in range(len(self._entity.joint_names)) if j not in has_motor]
+        self._actuators = {kind: _make_drive(self._entity, kind) for kind in ("motor", "position", "velocity")}
 
     @property
     def count(self) -> int:
-        """Number of robots, one an environment."""
+        """Number of robots, one for each environment."""
         return self._env.num_envs
 
     @property
     def num_dof(self) -> int:
-        """Hinge and slide joints."""
+        """Number of hinge and slide joints."""
         return len(self._entity.joint_names)
 
     @property
     def dof_names(self) -> list[str]:
-        """Joint names, in column order."""
+        """Joint names, in the order of the columns."""
         return list(self._entity.joint_names)
 
     def get_dof_index(self, name: str) -> int:
-        """Column of a joint.
+        """Return the column of a joint.
 
         Raises:
             TaskError: if there is no such joint.
@@ -80,42 +80,44 @@ class ArticulationView:
         return self._entity.joint_names.index(name)
 
     def get_joint_positions(self, indices: Tensor | None = None, clone: bool = True) -> Tensor:
-        """Joint positions. (n, num_dof) [m or rad]; without clone a live view, to be read only."""
+        """Return joint positions. (n, num_dof) [m or rad]; without `clone` a live view, which is read-only."""
         return _rows(self._entity.data.joint_pos, indices, clone)
 
     def get_joint_velocities(self, indices: Tensor | None = None, clone: bool = True) -> Tensor:
-        """Joint velocities. (n, num_dof) [m/s or rad/s]; without clone a live view, to be read only."""
+        """Return joint velocities. (n, num_dof) [m/s or rad/s]; without `clone` a live view, which is read-only."""
         return _rows(self._entity.data.joint_vel, indices, clone)
 
     def get_dof_limits(self) -> Tensor:
-        """Lower and upper limits, infinite where a joint has none. (num_envs, num_dof, 2) [m or rad]"""
+        """Return lower and upper limits, infinite for a joint without limits. (num_envs, num_dof, 2) [m or rad]"""
         return self._entity.data.joint_pos_limits.expand(self.count, -1, -1)
 
     def get_world_poses(self, indices: Tensor | None = None, clone: bool = True) -> tuple[Tensor, Tensor]:
-        """Root positions [m] and orientations (w, x, y, z), in each environment's frame. (n, 3), (n, 4)"""
+        """Return root positions [m] and orientations (w, x, y, z), in each environment's frame. (n, 3), (n, 4)"""
         data = self._entity.data
         return _rows(data.root_pos_w, indices, clone), _rows(data.root_quat_w, indices, clone)
 
     def get_velocities(self, indices: Tensor | None = None, clone: bool = True) -> Tensor:
-        """Root velocities, world frame: linear [m/s], angular [rad/s]. (n, 6)"""
+        """Return root velocities, world frame: linear [m/s], then angular [rad/s]. (n, 6)"""
         data = self._entity.data
         return _rows(torch.cat([data.root_lin_vel_w, data.root_ang_vel_w], dim=1), indices, clone)
 
     def set_joint_positions(self, positions: Tensor, indices: Tensor | None = None) -> None:
-        """Set joint positions, and with them the targets of position actuators. (n, num_dof) [m or rad]"""
+        """Set joint positions, and the targets of position actuators to them. (n, num_dof) [m or rad]"""
         self._set("qpos", positions, indices, self._qpos_index)
         self._command("position", positions, indices)
 
     def set_joint_velocities(self, velocities: Tensor, indices: Tensor | None = None) -> None:
-        """Set joint velocities, and with them the targets of velocity actuators. (n, num_dof) [m/s or rad/s]"""
+        """Set joint velocities, and the targets of velocity actuators to them. (n, num_dof) [m/s or rad/s]"""
         self._set("qvel", velocities, indices, self._dof_index)
         self._command("velocity", velocities, indices)
 
     def set_joint_efforts(self, efforts: Tensor, indices: Tensor | None = None) -> None:
-        """Forces of the joints' motors until set again, under each motor's limit. (n, num_dof) [N or N m]
+        """Set the efforts of the joint motors; they last until the next call. (n, num_dof) [N or N m]
+
+        Each motor's limit still applies.
 
         Raises:
-            TaskError: for an effort on a joint that only has an actuator of another kind.
+            TaskError: for an effort on a joint without a motor.
         """
         if self._without_motor and bool(efforts[:, self._without_motor].any()):
             names = listing(self._entity.joint_names[j] for j in self._without_motor)
@@ -124,11 +126,11 @@ class ArticulationView:
         self._command("motor", efforts, indices)
 
     def set_joint_position_targets(self, positions: Tensor, indices: Tensor | None = None) -> None:
-        """Targets of position actuators. (n, num_dof) [m or rad]"""
+        """Set the targets of position actuators. (n, num_dof) [m or rad]"""
         self._command("position", positions, indices)
 
     def set_joint_velocity_targets(self, velocities: Tensor, indices: Tensor | None = None) -> None:
-        """Targets of velocity actuators. (n, num_dof) [m/s or rad/s]"""
+        """Set the targets of velocity actuators. (n, num_dof) [m/s or rad/s]"""
         self._command("velocity", velocities, indices)
 
     def set_world_poses(self, positions: Tensor, orientations: Tensor, indices: Tensor | None = None) -> None:
@@ -141,6 +143,7 @@ class ArticulationView:
         qpos, dof = self._entity.floating()
         rows = slice(None) if indices is None else indices.long()
         quat = self._qpos[rows][:, qpos + 3 : qpos + 7].float()
+        # MuJoCo: the angular velocity of a free joint is in the body frame
         local = torch.cat([velocities[:, :3], rotate_inverse(quat, velocities[:, 3:])], dim=1)
         self._set("qvel", local, indices, slice(dof, dof + 6))
 
@@ -151,20 +154,17 @@ class ArticulationView:
 
     def _set(self, name: str, values: Tensor, indices: Tensor | None, columns: Columns) -> None:
         self._write(self._env.engine.field(name), values, indices, columns)
-        self._write(getattr(self._env.sim, name), values, indices, columns)  # what getters read
+        self._write(getattr(self._env.sim, name), values, indices, columns)  # getters read this copy
         self._env.sim.stamp += 1
 
     def _write(self, field: Tensor, values: Tensor, indices: Tensor | None, columns: Columns) -> None:
-        if indices is None and isinstance(columns, slice):
-            field[:, columns] = values
-        elif indices is None:
-            field[:, columns] = values.to(field.dtype)
-        elif field.device.type == "cpu":
+        if indices is not None and field.device.type == "cpu":
             write_rows(field, indices.long().numpy(), values, columns)
-        elif isinstance(columns, slice):
-            field[indices.long(), columns] = values.to(field.dtype)
-        else:
-            field[indices.long()[:, None], columns] = values.to(field.dtype)
+            return
+        rows = slice(None) if indices is None else indices.long()
+        if not isinstance(columns, slice) and isinstance(rows, Tensor):
+            rows = rows[:, None]  # so that rows and columns span a grid
+        field[rows, columns] = values.to(field.dtype)
 
 
 def _rows(values: Tensor, indices: Tensor | None, clone: bool) -> Tensor:
@@ -175,25 +175,25 @@ def _rows(values: Tensor, indices: Tensor | None, clone: bool) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class _Drive:
-    """The actuators of one kind."""
+    """Actuators of one kind, and the joints that they drive."""
 
     joints: Columns | None
-    """Joint columns that have one; None: all, in order."""
+    """Columns of the driven joints; None: all joints, in order."""
     controls: Columns
-    """Their columns of the controls."""
+    """Columns of the actuators in the controls."""
     factor: Tensor | None
-    """What makes a control of a joint's value; None: nothing."""
+    """Factor from the value of a joint to the control; None: 1."""
 
     def controls_for(self, values: Tensor) -> Tensor:
-        """Controls that give the joints these values. (n, num_dof) -> (n, k)"""
-        own = values if self.joints is None else values[:, self.joints]
-        return own if self.factor is None else own * self.factor
+        """Return the controls for joint values. (n, num_dof) -> (n, k)"""
+        driven = values if self.joints is None else values[:, self.joints]
+        return driven if self.factor is None else driven * self.factor
 
 
-def _drive(entity: Entity, kind: str) -> _Drive | None:
-    """What drives the joints by this kind of command; None where nothing does.
+def _make_drive(entity: Entity, kind: str) -> _Drive | None:
+    """Return the actuators of this kind, or None if the entity has none.
 
-    A gear multiplies forces and lengths alike: so a joint's force is divided by it, a joint's target multiplied.
+    A gear multiplies forces and lengths: a joint's force is divided by the gear, a joint's target is multiplied by it.
     """
     columns = entity.actuators_of(kind)
     if not columns:

@@ -1,4 +1,4 @@
-"""Building the simulation of an environment: engine, entities, actuators, sensors, terrain, start state."""
+"""Construction of the simulation of an environment: engine, entities, actuators, sensors, terrain, start state."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from rlcli.sim.selection import Selection
 from rlcli.sim.state_cache import SimData
 
 __all__ = ["grid"]
-"""What is public; the rest is for `VecEnv`."""
+"""Public names; the others are for `VecEnv`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Simulation:
-    """The parts of an environment that are built from its compiled scene; `VecEnv` describes them."""
+    """Parts of an environment that are built from its compiled scene; `VecEnv` describes them."""
 
     engine: Engine
     data: SimData
@@ -41,23 +41,23 @@ class Simulation:
 
 
 def open_scene(resolved: Resolved) -> Scene:
-    """Return the scene of a task, not yet compiled."""
+    """Return the scene of a task, before it is compiled."""
     config, source = resolved.task, resolved.source
     return Scene(config.scene, config.sim, source.root, installed=source.distribution is not None)
 
 
 def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: int, shared_streams: int) -> Simulation:
-    """Compile a complete scene and build what simulates it, in its default state.
+    """Compile a scene and build its simulation, in the default state.
 
     Args:
         scene: the scene, with everything that the task adds.
         binder: collects the names that do not resolve.
-        device: of the engine.
-        seed: of the terrain's draws.
+        device: device of the engine.
+        seed: seed of the terrain's draws.
         shared_streams: see `VecEnv`.
 
     Raises:
-        ConfigError: if there is no model to look further names up in.
+        ConfigError: if there is no model in which further names could be looked up.
     """
     task = binder.resolved.task
     for problem in scene.problems:
@@ -84,7 +84,7 @@ def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: i
 
 
 def grid(num_envs: int, spacing: float) -> Tensor:
-    """Return origins of environments on a square grid about the world's origin. (num_envs, 3) [m]"""
+    """Return the origins of environments on a square grid around the world's origin. (num_envs, 3) [m]"""
     rows = math.ceil(math.sqrt(num_envs))
     index = torch.arange(num_envs)
     xy = torch.stack([index // rows, index % rows], dim=1).float() - (rows - 1) / 2
@@ -93,13 +93,13 @@ def grid(num_envs: int, spacing: float) -> Tensor:
 
 def _make_entities(scene: Scene, binder: Binder, engine: Engine, data: SimData) -> dict[str, Entity]:
     entities = {}
-    for name, config in scene.config.entities.items():  # a direct task may have added some
+    for name, config in scene.config.entities.items():  # with those that a direct task has added
         try:
             entities[name] = Entity(name, config, engine, data)
         except NameProblem as problem:
             binder.add_problem(("scene", "entities", name, "init"), str(problem), problem.hint)
-            blank = config.model_copy(update={"init": InitialStateConfig()})  # to go on to the other problems
-            entities[name] = Entity(name, blank, engine, data)
+            default = config.model_copy(update={"init": InitialStateConfig()})  # continue, to find further problems
+            entities[name] = Entity(name, default, engine, data)
     return entities
 
 
@@ -126,13 +126,13 @@ def _default_state(engine: Engine, entities: dict[str, Entity]) -> dict[str, Ten
         if entity.is_floating:
             _, dof = entity.floating()
             root = entity.data.default_root_state[:1].double().cpu()
-            local = rotate_inverse(root[:, 3:7], root[:, 10:])  # a free joint's is in the body's frame
+            local = rotate_inverse(root[:, 3:7], root[:, 10:])  # MuJoCo: in the body frame for a free joint
             qvel[dof : dof + 6] = torch.cat([root[:, 7:10], local], dim=1)[0]
     return {"qpos": qpos, "qvel": qvel}
 
 
 def _select_all(engine: Engine) -> Selection:
-    """Return a selection of all environments that must not draw."""
+    """Return a selection of all environments; it must not be used for draws."""
     mask = torch.ones(engine.num_envs, dtype=torch.bool, device=engine.device)
     counters = torch.zeros(engine.num_envs, dtype=torch.int64, device=engine.device)
     selection = engine.select(mask, 0, engine.as_field(counters))

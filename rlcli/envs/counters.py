@@ -1,4 +1,4 @@
-"""What the environment loop counts: steps, episodes, and steps in which the success condition holds."""
+"""Counters of the environment loop: steps, episodes, and steps in which the success condition holds."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from rlcli.sim.tensor_state import TensorState
 
 
 class EpisodeCounters(TensorState):
-    """Counters of all environments, each also as a field: the form that the engine's selections use at least cost."""
+    """Counters of all environments. Each is also a field: the form that selections read and write fastest."""
 
     def __init__(self, num_envs: int, device: torch.device) -> None:
         self.ids = torch.arange(num_envs, device=device)
         self.lengths = torch.zeros(num_envs, dtype=torch.int64, device=device)
-        # the first reset of a new environment begins episode 0, as a reset with a seed does
+        # -1: the first reset of a new environment begins episode 0, like a reset with a seed
         self.indices = torch.full((num_envs,), -1, dtype=torch.int64, device=device)
         self.success_steps = torch.zeros(num_envs, device=device)
-        """Steps in a row in which the success condition holds. (num_envs,)"""
+        """Number of consecutive steps in which the success condition holds. (num_envs,)"""
         self.common_step = torch.zeros((), dtype=torch.int64, device=device)
         self.success: Callable[[], Tensor] | None = None
         self._hold_steps = 0
 
     def attach(self, engine: Engine) -> None:
-        """Make the fields, once there is an engine."""
+        """Make the fields, once the engine exists."""
         self._as_field = engine.as_field
         self.id_field, self.length_field = engine.as_field(self.ids), engine.as_field(self.lengths)
         self.index_field, self._success_field = engine.as_field(self.indices), engine.as_field(self.success_steps)
         self._common_step = in_place(self.common_step)
 
     def set_success(self, term: BoundTerm, hold_s: float, step_dt: float) -> None:
-        """Count the steps of a success condition, which must hold for the last `hold_s` seconds of an episode."""
+        """Set the success condition; it must hold for the last `hold_s` seconds of an episode."""
         check_shape(term, first_value(term), tuple(self.ids.shape))
         self.success = term.call
         self._hold_steps = math.ceil(hold_s / step_dt - 1e-6)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return what goes into a checkpoint."""
+        """Return the counters that are saved in a checkpoint."""
         return {
             "episode_length": self.lengths,
             "episode_index": self.indices,
@@ -56,26 +56,26 @@ class EpisodeCounters(TensorState):
         self._common_step += 1
 
     def count_success(self) -> None:
-        """Count a step towards success where the condition holds; start over where it does not."""
+        """Count a step where the success condition holds, and restart the count where it does not."""
         if self.success is not None:
             self._success_field += 1.0
             self._success_field *= self._as_field(self.success())
 
     def succeeded(self, ended: Selection, timed_out: Tensor) -> Tensor | None:
-        """Return which of the episodes that end succeed; None without a condition. timed_out (n,) -> (n,) bool"""
+        """Return which of the ended episodes succeed; None without a condition. timed_out (n,) -> (n,) bool"""
         if self.success is None:
             return None
         return timed_out & (ended.read_view(self._success_field) >= self._hold_steps)
 
     def end(self, terminated: Tensor, truncated: Tensor) -> tuple[Field, Field]:
-        """Count the episodes that end, and return where one does and where one does by time alone."""
+        """Count the episodes that end. Return where an episode ends, and where it ends by time-out alone."""
         failed, late = self._as_field(terminated), self._as_field(truncated)
         finished = failed | late
-        self.index_field += finished  # before the selection: the next episode draws from its own counter
+        self.index_field += finished  # before the selection, which keys the draws of the next episode by this counter
         return finished, late > failed
 
     def reset(self, selection: Selection) -> None:
-        """Start to count new episodes."""
+        """Set the counters of new episodes to zero."""
         selection.write(self.length_field, 0)
         if self.success is not None:
             selection.write(self._success_field, 0.0)

@@ -1,4 +1,4 @@
-"""The direct workflow: one task class with OmniIsaacGymEnvs' hooks and buffers."""
+"""Direct workflow: one task class with the hooks and buffers of OmniIsaacGymEnvs."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ _RESET = stream("direct.reset")
 
 
 class DirectTask:
-    """Base of a direct task. The framework owns the buffers; the hooks fill them.
+    """Base class of a direct task. The framework owns the buffers; the hooks fill them.
 
     Order of a step: `pre_physics_step`, physics, `progress_buf += 1`, `get_observations`, `get_states`,
-    `calculate_metrics`, `is_done`; then `reset` (or `reset_idx`) for the environments that ended, and their
-    observations again.
+    `calculate_metrics`, `is_done`. Then `reset` (or `reset_idx`) runs for the environments whose episode ended, and
+    `get_observations` and `get_states` run again for them.
     """
 
     num_observations: ClassVar[int]
-    """Columns of obs_buf."""
+    """Number of columns of obs_buf."""
     num_actions: ClassVar[int]
-    """Columns of the action."""
+    """Number of columns of the action."""
     num_states: ClassVar[int] = 0
-    """Columns of states_buf, the critic's view; 0 for none."""
+    """Number of columns of states_buf, the observations of the critic; 0: none."""
     observation_names: ClassVar[tuple[str, ...]] = ()
     """Names of the columns of obs_buf, for messages and exports."""
     observation_units: ClassVar[tuple[str, ...]] = ()
-    """Their units."""
+    """Units of the columns of obs_buf."""
     action_names: ClassVar[tuple[str, ...]] = ()
-    """What the columns of the action drive, for messages and exports."""
+    """Names of what the columns of the action drive, for messages and exports."""
     action_limits: tuple[tuple[float, float], ...] = ()
-    """Lowest and highest of each column: the action space that other libraries see; empty: +-1."""
+    """Lowest and highest value of each column: the action space for other libraries; empty: +-1."""
     motors: ClassVar[bool] = True
-    """Give every joint without an actuator a motor, so that the task may set any effort."""
+    """Whether every joint without an actuator gets a motor, so that the task can set any effort."""
     Params: type[StrictModel] = StrictModel
-    """Model of the YAML's `params:`."""
+    """Model of `params:` in the YAML."""
 
     def __init__(self, env: DirectEnv, params: StrictModel) -> None:
         self.env = env
@@ -68,35 +68,44 @@ class DirectTask:
         self.rew_buf = torch.zeros(n, device=self.device)
         """(num_envs,)"""
         self.reset_buf = torch.ones(n, dtype=torch.int64, device=self.device)
-        """Raised where an episode ends, from `is_done` to the end of the next `pre_physics_step`. (num_envs,) int64"""
+        """1 where an episode ends, from `is_done` to the end of the next `pre_physics_step`. (num_envs,) int64"""
         self.progress_buf = torch.zeros(n, dtype=torch.int64, device=self.device)
         """Steps of the running episode. (num_envs,) int64"""
         self.extras: dict[str, Any] = {}
-        """Numbers and tensors to log, by name. `Task/<name>` in the metrics is their mean, once an iteration; `rlcli
-        eval` gives means over episodes of means over their steps, of tensors with a row for each environment."""
+        """Numbers and tensors to log, by name. The metric `Task/<name>` is their mean, once an iteration.
+
+        `rlcli eval` logs means over episodes, of the means over their steps, for tensors with one row for each
+        environment.
+        """
         self.episode_metrics: dict[str, Tensor] = {}
-        """Numbers of the running episodes, by name, (num_envs,) each: `Metrics/<name>` is their mean over the episodes
-        that end, as they were in the last step. Fill it in `post_reset`; write to the tensors in place."""
+        """Values of the running episodes, by name, (num_envs,) each.
+
+        `Metrics/<name>` is the mean over the episodes that end, of their values in the last step. Fill the dictionary
+        in `post_reset`, and write to the tensors in place.
+        """
 
     def set_up_scene(self, scene: Scene) -> None:
-        """Register views with `scene.add`; `scene.spec` is the MjSpec, still open."""
+        """Register views with `scene.add`. `scene.spec` is the MjSpec before compilation."""
 
     def post_reset(self) -> None:
-        """Called once, when the simulation runs: look up indices."""
+        """Look up indices; called once, when the simulation runs."""
 
     def reset(self, selection: Selection) -> None:
-        """Write start states; the environments are in their default state.
+        """Write start states; the selected environments are in their default state.
 
-        Draw from the selection, write through it: `entity.write_joint_positions(selection, ...)`,
-        `selection.write(...)`.
-        A GPU runs this form as part of the captured step. A task defines this hook or `reset_idx`, not both.
+        Draw from the selection and write through it: `entity.write_joint_positions(selection, ...)`,
+        `selection.write(...)`. A GPU captures this hook as part of the step. A task defines this hook or `reset_idx`,
+        not both.
         """
 
     def reset_idx(self, env_ids: Tensor) -> None:
-        """The same with ids, as OmniIsaacGymEnvs has it. env_ids (n,) int64, sorted"""
+        """Write start states like `reset`, with the indices of the environments. env_ids (n,) int64, sorted
+
+        This is the form of OmniIsaacGymEnvs.
+        """
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Apply the actions. (num_envs, num_actions)"""
+        """Apply the actions. actions (num_envs, num_actions)"""
         raise NotImplementedError
 
     def get_observations(self) -> Any:
@@ -104,29 +113,29 @@ class DirectTask:
         raise NotImplementedError
 
     def get_states(self) -> Any:
-        """Fill states_buf, if the task has one."""
+        """Fill states_buf, if the task has states."""
 
     def calculate_metrics(self) -> None:
         """Fill rew_buf."""
         raise NotImplementedError
 
     def is_done(self) -> None:
-        """Raise reset_buf where the task ended an episode; the framework adds the time-out."""
+        """Set reset_buf to 1 where the task ends an episode; the framework adds time-outs."""
         raise NotImplementedError
 
     def in_terms(self) -> dict[str, list[dict[str, Any]]] | None:
-        """The observation and the action in the vocabulary of `rlcli.mdp`, for exports that do without this code.
+        """Return the observation and the action as terms of `rlcli.mdp`, for exports without the code of the task.
 
-        `observations` and `actions` are lists of terms as a YAML has them (`func`, its parameters, `scale`, `clip`),
-        side by side in the order of the columns, before `clip_observations` and after `clip_actions`. None: only this
-        class knows. `rlcli export --verify` finds out if they are not what the hooks compute.
+        `observations` and `actions` are lists of terms like those of a YAML (`func`, its parameters, `scale`, `clip`),
+        in the order of the columns, before `clip_observations` and after `clip_actions`. None: there are no such terms.
+        `rlcli export --verify` compares them with what the hooks compute.
         """
         return None
 
     def draws(self, env_ids: Tensor, name: str = "reset") -> IdSelection:
-        """Random numbers for these environments' running episodes: `draws(ids).uniform(-1, 1, (k,))` is (n, k).
+        """Return random numbers for the running episodes: `draws(ids).uniform(-1, 1, (k,))` is (n, k).
 
-        They depend on the seed, the environment, its episode and `name`, and on nothing else.
+        They depend only on the seed, the environment, its episode and `name`.
         """
         ids, episodes = env_ids.cpu().numpy(), self.env.episode_index.cpu().numpy()
         device = None if self.device.type == "cpu" else self.device
@@ -134,10 +143,10 @@ class DirectTask:
         return IdSelection(ids, self.env.seed, episodes[ids], stream(f"direct.{name}"), device, streams)
 
     def selection(self, mask: Tensor, name: str) -> Selection | None:
-        """The environments where `mask` (num_envs,) holds, to draw for in the middle of an episode; None for nobody.
+        """Return the environments where `mask` (num_envs,) holds, to draw in the middle of an episode; None for none.
 
-        What is drawn depends on the seed, the environment, its episode, the step of that and `name`. A GPU, which
-        cannot know whether there is anybody, never gives None.
+        Draws depend only on the seed, the environment, its episode, the step in that episode and `name`. A GPU never
+        returns None, because a test of the mask would force a host sync.
         """
         env = self.env
         counters = env.episode_index * (self.max_episode_length + 1) + env.episode_length_buf
@@ -146,10 +155,10 @@ class DirectTask:
 
 
 class DirectEnv(VecEnv):
-    """Runs a `DirectTask` in the environment loop."""
+    """Environment of a `DirectTask`."""
 
     not_recorded: ClassVar[str | None] = None
-    """Why the steps of this class cannot be recorded on a GPU; None: they can."""
+    """Reason why a GPU cannot capture the steps of this class; None: it can."""
 
     def _prepare_scene(self, scene: Scene) -> None:
         task_class = self._task_class()
@@ -163,7 +172,7 @@ class DirectEnv(VecEnv):
             scene.joints.add_motors()
 
     def _task_class(self) -> type[DirectTask]:
-        """The task's class, imported."""
+        """Import and return the class of the task."""
         source = self.resolved.source
         assert source.task is not None
         try:
@@ -185,32 +194,32 @@ class DirectEnv(VecEnv):
         task = self.task
         self._returns = torch.zeros(self.num_envs, device=self.device)
         self._fresh = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        self._reset_in_step: Selection | None = None  # the same, as the step's resets selected them
+        self._reset_in_step: Selection | None = None  # the environments of `_fresh`, as one selection
         self._return_field, self._fresh_field = self.engine.as_field(self._returns), self.engine.as_field(self._fresh)
         self._resets_by_selection = type(task).reset is not DirectTask.reset
         self._resets_by_id = type(task).reset_idx is not DirectTask.reset_idx
         self._reset_hook = task.reset_idx
         task.reset_idx = self._reset_stale  # type: ignore[method-assign]
-        # three buffers in turn: consecutive observations share no memory
+        # three buffers in turn, so that consecutive observations share no memory
         self._obs = itertools.cycle([torch.zeros_like(task.obs_buf) for _ in range(3)])
         self._states = itertools.cycle([torch.zeros_like(task.states_buf) for _ in range(3)])
         self._rewards = itertools.cycle([torch.zeros_like(task.rew_buf) for _ in range(3)])
         self._final_obs = torch.zeros_like(task.obs_buf)
         self._final_states = torch.zeros_like(task.states_buf)
         self._obs_current = False
-        self._obs_restored = False  # a loaded state holds its second look already
+        self._obs_restored = False  # a loaded state has the observations after resets already
         self._episode_causes: dict[str, Tensor] = {}
         self._observation_columns = [f"obs_buf[{i}]" for i in range(task.num_observations)]
         if len(task.observation_names) == task.num_observations:
             self._observation_columns = list(task.observation_names)
         task.post_reset()
-        self._memory = TermState(task, other=("env", "cfg", "params"))
+        self._memory = TermState(task, excluded=("env", "cfg", "params"))
 
     def _make_layout(self) -> Layout:
         task = self.task
         names, size = task.observation_names, task.num_observations
         units = task.observation_units if len(task.observation_units) == size else ("",) * size
-        clip, action_clip = _around_zero(self.config.clip_observations), _around_zero(self.config.clip_actions)
+        clip, action_clip = _symmetric(self.config.clip_observations), _symmetric(self.config.clip_actions)
         action_clips = None if action_clip is None else (action_clip,) * task.num_actions
         terms: tuple[TermLayout, ...] = (TermLayout("obs_buf", size, clip=clip),)
         if len(names) == size:
@@ -218,24 +227,19 @@ class DirectEnv(VecEnv):
         groups = {"policy": terms}
         if task.num_states:
             groups["critic"] = (TermLayout("states_buf", task.num_states, clip=clip),)
-        return Layout(
-            groups,
-            (TermLayout("actions", task.num_actions, task.action_names, clip=action_clips),),
-            self.step_dt,
-            self.physics_dt,
-            self.config.decimation,
-        )
+        actions = (TermLayout("actions", task.num_actions, task.action_names, clip=action_clips),)
+        return Layout(groups, actions, self.step_dt, self.physics_dt, self.config.decimation)
 
     def stateful_objects(self) -> list[Any]:
-        """The task."""
+        """Return the task."""
         return [self.task]
 
     def _extras(self) -> dict[str, Any]:
-        """The task's `extras`, by name."""
+        """Return the task's `extras`, by name."""
         return self.task.extras
 
     def _task_metrics(self) -> dict[str, float]:
-        """The task's `extras`: numbers, and means of tensors."""
+        """Return the task's `extras`: numbers, and means of tensors."""
         found = {}
         for name, value in self._extras().items():
             if isinstance(value, Tensor) and value.numel():
@@ -245,7 +249,10 @@ class DirectEnv(VecEnv):
         return found
 
     def step_metrics(self) -> dict[str, Tensor]:
-        """The task's `extras`: of each environment where there is a row for each, else the same for all."""
+        """Return the task's `extras` with one row for each environment. (num_envs,) each
+
+        A tensor without such rows, or a number, gives the same value for all environments.
+        """
         found = {}
         for name, value in self._extras().items():
             if isinstance(value, Tensor) and value.numel():
@@ -256,7 +263,7 @@ class DirectEnv(VecEnv):
         return found
 
     def episode_dependencies(self) -> list[str]:
-        """The task: its class may remember anything, and draw from anywhere."""
+        """Return the task itself: its class may keep any state, and draw from any generator."""
         return [*super().episode_dependencies(), f"the class {type(self.task).__name__}"]
 
     def _before_full_reset(self) -> None:
@@ -283,7 +290,7 @@ class DirectEnv(VecEnv):
             failed = failed | diverged
             if self.config.divergence_reward is not None:
                 reward.masked_fill_(diverged, self.config.divergence_reward)
-            if not self.engine.asynchronous:  # a GPU finds out later, in `check`
+            if not self.engine.asynchronous:  # a GPU reports it later, in `check`
                 reward.masked_fill_(diverged & ~reward.isfinite(), 0.0)
         self._guard.require_finite(reward, "the reward")
         self._returns += reward
@@ -291,24 +298,18 @@ class DirectEnv(VecEnv):
         return reward, failed, truncated
 
     def _compute_dones(self) -> tuple[Tensor, Tensor]:
-        """Return where the task ended the episode, and where time did. (num_envs,) bool each"""
-        failed = self.task.reset_buf != 0  # a copy, even of a bool buffer: the flags are raised for time-outs too
+        """Return where the task ended the episode, and where it timed out. (num_envs,) bool each"""
+        failed = self.task.reset_buf != 0  # a copy, also of a bool buffer: time-outs set these flags later
         return failed, self.episode_length_buf >= self.max_episode_length
 
     def _compute_final_obs(self) -> dict[str, Tensor]:
         self._final_obs.copy_(self.task.obs_buf)
-        self._guard.require_finite(self._final_obs, "the last observation", self._observation_columns)
-        if self.task.num_states:
-            self._final_states.copy_(self.task.states_buf)
-            self._guard.require_finite(self._final_states, "the last state (states_buf)")
-        return self._group(self._final_obs, self._final_states)
+        self._final_states.copy_(self.task.states_buf)
+        return self._checked_group(self._final_obs, self._final_states, "last ")
 
     def _episode_returns_and_causes(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-        return (
-            ended.read(self._return_field),
-            {},
-            {name: ended.read_view(fired) for name, fired in self._episode_causes.items()},
-        )
+        causes = {name: ended.read_view(fired) for name, fired in self._episode_causes.items()}
+        return ended.read(self._return_field), {}, causes
 
     def _episode_metrics(self, ended: Selection) -> dict[str, Tensor]:
         return {name: ended.read(values).float() for name, values in self.task.episode_metrics.items()}
@@ -324,7 +325,7 @@ class DirectEnv(VecEnv):
         self._mark_reset(selection)
 
     def _mark_reset(self, selection: Selection) -> None:
-        """Note the episodes that begin."""
+        """Mark the environments that start a new episode."""
         selection.write(self.task.progress_buf, 0)
         selection.write(self.task.reset_buf, 1)
         selection.write(self._fresh_field, True)
@@ -332,23 +333,23 @@ class DirectEnv(VecEnv):
         self._reset_in_step = selection if self._reset_in_step is None else self._reset_in_step.union(selection)
 
     def _compute_observations(self) -> dict[str, Tensor]:
-        """Running environments keep what `_judge` observed; only those just reset take a second look."""
+        """Return the observations of the current state.
+
+        Running environments have theirs from `_compute_rewards_and_dones`; only those just reset are observed again.
+        """
         task, obs, states = self.task, next(self._obs), next(self._states)
         if not self._obs_current:
             self._fill_buffers()
-        looked = [(task.obs_buf, obs), (task.states_buf, states)][: 2 if task.num_states else 1]
-        for buffer, kept in looked:
-            kept.copy_(buffer)
+        pairs = [(task.obs_buf, obs), (task.states_buf, states)][: 2 if task.num_states else 1]
+        for buffer, result in pairs:
+            result.copy_(buffer)
         if self._reset_in_step is not None and self._obs_current and not self._obs_restored:
             self._fill_buffers()
-            for buffer, kept in looked:
-                self._reset_in_step.write(kept, self._reset_in_step.read_view(buffer))
-                buffer.copy_(kept)
+            for buffer, result in pairs:
+                self._reset_in_step.write(result, self._reset_in_step.read_view(buffer))
+                buffer.copy_(result)
         self._obs_current, self._obs_restored = False, False
-        self._guard.require_finite(obs, "the observation", self._observation_columns)
-        if task.num_states:
-            self._guard.require_finite(states, "the state (states_buf)")
-        return self._group(obs, states)
+        return self._checked_group(obs, states)
 
     def _fill_buffers(self) -> None:
         task, bound = self.task, self.config.clip_observations
@@ -359,14 +360,20 @@ class DirectEnv(VecEnv):
             if task.num_states:
                 task.states_buf.clamp_(-bound, bound)
 
+    def _checked_group(self, obs: Tensor, states: Tensor, which: str = "") -> dict[str, Tensor]:
+        self._guard.require_finite(obs, f"the {which}observation", self._observation_columns)
+        if self.task.num_states:
+            self._guard.require_finite(states, f"the {which}state (states_buf)")
+        return self._group(obs, states)
+
     def _group(self, obs: Tensor, states: Tensor) -> dict[str, Tensor]:
         return {"policy": obs, "critic": states} if self.task.num_states else {"policy": obs}
 
     def _reset_stale(self, env_ids: Tensor) -> None:
-        """What the task sees as its own `reset_idx`.
+        """Handle the task's own calls of `reset_idx`, which this method replaces.
 
-        Tasks in OIGE's style call it at the start of `pre_physics_step` for every raised flag. The framework has reset
-        those environments already, so for them it only lowers the flags.
+        Tasks in the style of OIGE call it at the start of `pre_physics_step` for every set flag. The framework has
+        reset those environments already, so the method only clears the flags for them.
         """
         stale = env_ids[~self._fresh[env_ids]]
         self.task.reset_buf[env_ids] = 0
@@ -376,7 +383,7 @@ class DirectEnv(VecEnv):
             self.episode_length_buf[stale] = 0
 
     def unsaved_state(self) -> list[str]:
-        """What the task keeps that cannot be saved."""
+        """Return the attributes of the task that cannot be saved."""
         return self._memory.unsaved()
 
     def _workflow_state(self) -> dict[str, Tensor]:
@@ -395,8 +402,8 @@ class DirectEnv(VecEnv):
 
 
 _BUFFERS = ("obs_buf", "states_buf", "rew_buf", "reset_buf", "progress_buf")
-"""What the loop reads of a task; what else it keeps may be of another shape tomorrow."""
+"""Buffers that the loop reads. Only their shapes are checked on load: other attributes may change their shapes."""
 
 
-def _around_zero(bound: float | None) -> tuple[float, float] | None:
+def _symmetric(bound: float | None) -> tuple[float, float] | None:
     return None if bound is None else (-bound, bound)

@@ -1,9 +1,9 @@
-"""What the environment loop does about simulations that diverge, and about numbers that are not finite.
+"""Handling of diverged simulations, and of numbers that are not finite, in the environment loop.
 
 A diverged environment returns to its last finite state, and its episode ends there as terminated. An environment that
 an event or a reset has put out of bounds is quarantined: it returns to a good state at once, and its episode ends with
-the next step. On a GPU each check would force a host sync: the engine checks on the device, and `check` reads what the
-device has found.
+the next step. On a GPU each check would force a host sync: the engine checks on the device, and `check` reads the
+results.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class DivergenceGuard:
-    """The checks and the recovery of one environment."""
+    """Checks and recovery of one vectorised environment."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
@@ -33,33 +33,29 @@ class DivergenceGuard:
         """Environments whose episode ends with the next step. (num_envs,) bool"""
         self._any_quarantined = False
         self._quarantine_causes: Counter[str] = Counter()
-        self._logged_causes: dict[str, int] = {}
+        self._logged_causes: Counter[str] = Counter()
 
     @property
-    def causes(self) -> dict[str, int]:
-        """Diverged environments since the start by cause."""
-        causes = dict(self._quarantine_causes)
-        for cause, count in self._env.engine.divergence_causes.items():
-            causes[cause] = causes.get(cause, 0) + count
-        return causes
+    def causes(self) -> Counter[str]:
+        """Number of diverged environments since the start, by cause."""
+        return self._quarantine_causes + Counter(self._env.engine.divergence_causes)
 
     def metrics(self) -> dict[str, float]:
-        """Return `Sim/diverged/CAUSE` -> diverged environments since the last call."""
-        causes, before = self.causes, self._logged_causes
-        self._logged_causes = causes
-        new = {cause: count - before.get(cause, 0) for cause, count in causes.items()}
-        return {f"Sim/diverged/{cause.replace(' ', '_')}": float(count) for cause, count in new.items() if count}
+        """Return `Sim/diverged/CAUSE` -> number of diverged environments since the last call."""
+        causes = self.causes
+        new, self._logged_causes = causes - self._logged_causes, causes
+        return {f"Sim/diverged/{cause.replace(' ', '_')}": float(count) for cause, count in new.items()}
 
     def load_quarantined(self, quarantined: Tensor | None) -> None:
-        """Restore `quarantined`; None: no environment is."""
+        """Restore `quarantined`; None: no environment is quarantined."""
         self.quarantined.zero_() if quarantined is None else self.quarantined.copy_(quarantined)
         self._any_quarantined = bool(self.quarantined.any())
 
     def check(self) -> None:
-        """Raise what a device has found in the steps since the last call; a CPU raises at once.
+        """Raise an error that a device has found in the steps since the last call; a CPU raises it in the step.
 
         Raises:
-            DivergedError: as `VecEnv.step`, or because the device ran out of room for contacts.
+            DivergedError: as `VecEnv.step`, or if the device had no memory left for contacts.
         """
         engine = self._env.engine
         not_finite = engine.report_nonfinite()
@@ -69,7 +65,7 @@ class DivergenceGuard:
             raise DivergedError(f"{what} is not finite, within the last steps before step {self._env.common_step}")
 
     def after_physics(self) -> Tensor | None:
-        """Copy the new state, and return diverged environments to a finite one.
+        """Refresh the state after physics, and return diverged environments to a finite one.
 
         Returns:
             Environments that diverged in this step or were quarantined before it, (num_envs,) bool; None: none.
@@ -95,10 +91,10 @@ class DivergenceGuard:
         return diverged
 
     def quarantine_out_of_bounds(self) -> None:
-        """Quarantine the environments that an event or a reset has put where physics cannot go on.
+        """Quarantine the environments that an event or a reset has put out of bounds.
 
-        Until their episode ends with the next step they are where they were before the event, or in the default state
-        if their episode has just begun. On a GPU the next step finds them: a check here would force a host sync.
+        Until their episode ends with the next step, they are in the state before the event, or in the default state if
+        their episode has just begun. On a GPU the next step finds them: a check here would force a host sync.
         """
         env = self._env
         if env.engine.asynchronous:
@@ -109,11 +105,11 @@ class DivergenceGuard:
         env.sim.save_good_state()
 
     def require_finite(self, values: Tensor, what: str, columns: Sequence[str] = ()) -> None:
-        """Check values of all environments; on a GPU `check` raises later.
+        """Check that values of all environments are finite; on a GPU `check` raises later.
 
         Args:
             values: (num_envs,) or (num_envs, n)
-            what: what they are, for the message.
+            what: name of the values, for the message.
             columns: names of the n columns.
 
         Raises:
@@ -137,13 +133,13 @@ class DivergenceGuard:
         )
 
     def _restore_diverged(self, selection: Selection) -> None:
-        """Return diverged environments to their last finite state: rewards are of that, not of MuJoCo's own reset."""
+        """Return diverged environments to their last finite state; MuJoCo's own reset would change their rewards."""
         engine = self._env.engine
         engine.reset(selection)
         self._env.sim.restore_rows(selection)
         try:
             engine.forward(selection)
-        except DivergedError:  # the engine cannot compute where they are, either
+        except DivergedError:  # the last finite state fails, too: use the default state
             engine.reset(selection)
             engine.forward(selection)
 
@@ -168,13 +164,13 @@ class DivergenceGuard:
         self._any_quarantined = True
 
     def _describe(self, number: int) -> Divergence:
-        """Return what an event or a reset has written out of bounds in one environment."""
+        """Return the first out-of-bounds value that an event or a reset has written in one environment."""
         env = self._env
         columns, field = env.sim.qpos[number], "qpos"
         if bool((columns.abs() <= STATE_LIMIT).all()):
             columns, field = env.sim.qvel[number], "qvel"
         index = int((~(columns.abs() <= STATE_LIMIT)).nonzero()[0, 0])
-        place = StateLayout(env.engine.model, {}).element_at(field, index)
+        element = StateLayout(env.engine.model, {}).element_at(field, index)
         writer = "a reset" if int(env.episode_length_buf[number]) == 0 else "an event"
         what = "out of bounds" if bool(columns.isfinite().all()) else "not finite"
-        return Divergence(number, f"{field} {what}", f"{place} = {float(columns[index]):g}, written by {writer}")
+        return Divergence(number, f"{field} {what}", f"{element} = {float(columns[index]):g}, written by {writer}")

@@ -1,4 +1,4 @@
-"""Which column of an observation or of an action is what: the contract between a policy and its environment."""
+"""Meaning of each column of an observation and of an action: the contract between a policy and its environment."""
 
 from __future__ import annotations
 
@@ -9,33 +9,37 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class TermLayout:
-    """Some columns of an observation group or of the action: where they come from."""
+    """Columns of one term in an observation group or in the action."""
 
     name: str
     size: int
     elements: tuple[str, ...] = ()
     unit: str = ""
     scale: tuple[float, ...] | None = None
-    """Factor of each column; None: not scaled, or (an action) in the task's own way."""
+    """Factor of each column; None: no scale, or an action that the task scales by code of its own."""
     clip: tuple[float, float] | tuple[tuple[float, float], ...] | None = None
-    """Limits: of an observation's columns before they are scaled; of an action's, each its own, after scale and
-    offset."""
+    """Limits of the columns.
+
+    Observation: one pair for all columns, before the scale. Action: a pair for each column, after scale and offset.
+    """
     offset: tuple[float, ...] | None = None
-    """What is added to each column of an action after scaling."""
+    """Number that is added to each column of an action after scaling."""
     limits: tuple[tuple[float, float], ...] | None = None
-    """What the actuator of each column of an action can take, infinite where it has no limit."""
+    """Limits of each action column's actuator, infinite for an actuator without a limit."""
     history: int = 1
-    """Steps that an observation holds, columns of the oldest first."""
+    """Number of steps that an observation contains; the columns of the oldest step come first."""
     shape: tuple[int, ...] = ()
-    """What the columns of one step of an observation are row by row, as (channels, rows, columns) of a picture; (): a
-    plain row."""
+    """Shape of one step of an observation, whose columns are in row-major order; (): a plain row.
+
+    An image has (channels, rows, columns).
+    """
     modifiers: tuple[dict[str, Any], ...] = ()
-    """What is done to an observation's value before it is clipped, as the YAML says it."""
+    """Modifiers of an observation before it is clipped, with their keys of the YAML."""
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The contract between a policy and its environment; a checkpoint keeps it."""
+    """Contract between a policy and its environment; a checkpoint contains it."""
 
     observations: dict[str, tuple[TermLayout, ...]]
     actions: tuple[TermLayout, ...]
@@ -44,12 +48,12 @@ class Layout:
     decimation: int
 
     def size(self, group: str = "policy") -> int:
-        """Columns of an observation group."""
+        """Return the number of columns of an observation group."""
         return sum(term.size for term in self.observations[group])
 
     @property
     def action_size(self) -> int:
-        """Columns of the action."""
+        """Number of columns of the action."""
         return sum(term.size for term in self.actions)
 
     def action_columns(self) -> list[str]:
@@ -91,5 +95,5 @@ class Layout:
 
 
 def _finite_pairs(pairs: tuple[tuple[float, float], ...] | None) -> list[list[float | None]] | None:
-    """As JSON, which has no infinity."""
+    """Return pairs for JSON, which has no infinity: None instead."""
     return [[x if math.isfinite(x) else None for x in pair] for pair in pairs or ()] or None

@@ -12,7 +12,7 @@ from rlcli.machine import collect_as_usual
 from rlcli.registry import load_object
 
 _MANAGED, _DIRECT = "rlcli.envs.managed:ManagedEnv", "rlcli.envs.direct:DirectEnv"
-"""The class of each workflow's environments, imported when it is needed."""
+"""Environment class of each workflow, imported on demand."""
 
 
 def make_env(
@@ -27,12 +27,12 @@ def make_env(
 
     Args:
         task: a resolved task, or a `TaskConfig` built in Python.
-        seed: of every random draw.
-        device: where the engine and all tensors live.
+        seed: seed of every random draw.
+        device: device of the engine and of all tensors.
         root: folder of the models of a `TaskConfig`; by default the working directory.
         shared_streams: see `VecEnv`.
     """
-    collect_as_usual()  # what is large has been imported; from here on a command runs
+    collect_as_usual()  # garbage collection was delayed while large libraries were imported
     resolved = task if isinstance(task, Resolved) else resolve(source_of(task, root))
     if resolved.source.task is not None and resolved.format is not None and resolved.format.spec.environment:
         env_class = resolved.format.load(resolved.format.spec.environment)

@@ -1,8 +1,9 @@
-"""The manager-based workflow: every concern of the MDP is a list of small terms, run by a manager."""
+"""Manager-based workflow: each part of the MDP is a list of small terms, run by a manager."""
 
 from __future__ import annotations
 
 import functools
+import itertools
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -19,7 +20,7 @@ from rlcli.managers.action import ActionManager, CommandMap
 from rlcli.managers.command import CommandManager
 from rlcli.managers.curriculum import CurriculumManager
 from rlcli.managers.event import EventManager
-from rlcli.managers.observation import ObservationManager, Watch
+from rlcli.managers.observation import ObservationManager
 from rlcli.managers.observation_pipeline import Pipeline
 from rlcli.managers.reward import RewardManager
 from rlcli.managers.term import BoundTerm
@@ -32,20 +33,20 @@ from rlcli.sim.selection import Selection
 from rlcli.sim.tensor_state import require_matching_tensors, substate
 
 _STATELESS = ("functools", "rlcli.mdp.")
-"""Modules of terms that begin alike in every episode."""
+"""Modules of terms whose episodes do not depend on earlier ones."""
 _UNIT = re.compile(r"\[([^\]]+)\]")
-"""The unit in the first line of a term's docstring."""
+"""Pattern of the unit in the first line of a term's docstring."""
 
 
 class ManagedEnv(VecEnv):
-    """A manager-based task.
+    """Environment of a manager-based task.
 
     A step: actions, physics, terminations, rewards, curriculum and resets, commands, interval events, observations.
     """
 
     def _prepare_scene(self, scene: Scene) -> None:
         scene.joints.add_actuators(self._actuator_needs())
-        if any(getattr(term, "reads_body_forces", False) for term in self._judging_terms()):
+        if any(getattr(term, "reads_body_forces", False) for term in self._result_terms()):
             add_body_forces(scene.spec)
         for config in self.config.events.values():
             assert config is not None
@@ -56,62 +57,51 @@ class ManagedEnv(VecEnv):
 
     def _bind_terms(self) -> None:
         binder = self._binder
-        self._commands = binder.bind_all("commands")  # first: terms of other sections refer to them
-        self._actions = binder.bind_all("actions")
-        self._events = binder.bind_all("events")
-        self._terminations = binder.bind_all("terminations")
-        self._rewards = binder.bind_all("rewards")
+        # commands first: terms of other sections use them
+        sections = ("commands", "actions", "events", "terminations", "rewards", "curriculum")
+        self._bound = {section: binder.bind_all(section) for section in sections}
         self._observations = {group: binder.bind_group(group) for group in self.config.observations}
-        self._curriculum = binder.bind_all("curriculum")
 
     def _build_workflow(self) -> None:
-        # in this order: a term's first value may use what stands before it
+        # in this order: the first value of a term may use a manager that is built before
         self._all_envs = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        n, device, tunable = self.num_envs, self.device, self._binder.tunable
-        self.command_manager = CommandManager(self._commands, n, self.step_dt, device, tunable)
-        self.action_manager = ActionManager(self._actions, n, device, self.engine.as_field)
-        self.termination_manager = TerminationManager(self._terminations, n, device)
-        self.event_manager = EventManager(self._events, n, self.step_dt, device, self.engine.set_constants)
+        n, device, tunable, bound = self.num_envs, self.device, self._binder.tunable, self._bound
+        self.command_manager = CommandManager(bound["commands"], n, self.step_dt, device, tunable)
+        self.action_manager = ActionManager(bound["actions"], n, device, self.engine.as_field)
+        self.termination_manager = TerminationManager(bound["terminations"], n, device)
+        self.event_manager = EventManager(bound["events"], n, self.step_dt, device, self.engine.set_constants)
         if self.event_manager.derives:
-            self.engine.set_constants()  # makes room for them; from here on all of them are derived in one way
+            self.engine.set_constants()  # allocates per-environment constants, and derives all of them in the same way
         self.event_manager.startup(self._select_all())
         reward_dt = self.step_dt if self.config.reward_dt_scaling else 1.0
         self.reward_manager = RewardManager(
-            self._rewards, n, reward_dt, device, tunable, self.engine.as_field, self.config.divergence_reward
+            bound["rewards"], n, reward_dt, device, tunable, self.engine.as_field, self.config.divergence_reward
         )
+        configs, select_all = self.config.observations, self._select_all_by_step
+        watch = self.engine.check_finite if self.engine.asynchronous else None
         self.observation_manager = ObservationManager(
-            self._observations,
-            self.config.observations,
-            n,
-            self.step_dt,
-            device,
-            self._select_all_by_step,
-            tunable,
-            self._watch(),
+            self._observations, configs, n, self.step_dt, device, select_all, tunable, watch
         )
-        self.curriculum_manager = CurriculumManager(self._curriculum, tunable, device)
+        self.curriculum_manager = CurriculumManager(bound["curriculum"], tunable, device)
 
     def stateful_objects(self) -> list[Any]:
         """Return the class terms."""
         return [term.instance for term in self._terms() if not isinstance(term.instance, functools.partial)]
 
     def _terms(self) -> list[BoundTerm]:
-        sections = (
-            self._actions,
-            self._events,
-            self._terminations,
-            self._rewards,
-            self._commands,
-            self._curriculum,
-            *self._observations.values(),
-        )
-        return [term for section in sections for term in section]
+        return [*itertools.chain(*self._bound.values(), *self._observations.values())]
 
     def episode_dependencies(self) -> list[str]:
-        """Whatever draws by the clock of all episodes, remembers beyond a reset, or may: objects of a task's own."""
+        """Return the terms that make an episode depend on earlier ones.
+
+        They draw by the step of training, keep state beyond a reset, or are classes of a task's own, which may do
+        either.
+        """
         found = [*super().episode_dependencies(), *(f"actuators.{name}" for name in self.actuators)]
-        found += [".".join(map(str, term.path)) for term in (*self._commands, *self._curriculum)]
-        for term in self._events:
+        found += [
+            ".".join(map(str, term.path)) for section in ("commands", "curriculum") for term in self._bound[section]
+        ]
+        for term in self._bound["events"]:
             config = term.config
             throttled = config.mode == "reset" and config.min_steps_between  # type: ignore[attr-defined]
             if config.mode == "interval" or throttled or hasattr(term.instance, "update"):  # type: ignore[attr-defined]
@@ -128,9 +118,6 @@ class ManagedEnv(VecEnv):
                 found.append(".".join(map(str, term.path)))
         return list(dict.fromkeys(found))
 
-    def _watch(self) -> Watch | None:
-        return self.engine.check_finite if self.engine.asynchronous else None
-
     def _make_layout(self) -> Layout:
         observations = {
             group: tuple(self._observation_layout(pipeline) for pipeline in self.observation_manager.pipelines(group))
@@ -144,15 +131,16 @@ class ManagedEnv(VecEnv):
         assert isinstance(config, ObservationConfig)
         signature = self.resolved.vocabulary.find("observations", config.func)
         unit = _UNIT.search(signature.summary) if signature is not None else None
-        scale = config.scale
+        scale = None
+        if config.scale is not None:
+            columns = config.scale if isinstance(config.scale, list) else [config.scale] * pipeline.width
+            scale = tuple(columns) * pipeline.history
         return TermLayout(
             term.name,
             pipeline.size,
             tuple(next(iter(term.elements.values()), [])),
             unit[1] if unit else "",
-            scale=None
-            if scale is None
-            else (tuple(scale) if isinstance(scale, list) else (scale,) * pipeline.width) * pipeline.history,
+            scale=scale,
             clip=config.clip,
             history=pipeline.history,
             shape=pipeline.shape if len(pipeline.shape) > 1 else (),
@@ -185,14 +173,14 @@ class ManagedEnv(VecEnv):
 
     @property
     def reward_names(self) -> list[str]:
-        """The terms of the reward."""
+        """Names of the reward terms."""
         return [term.name for term in self.reward_manager.terms]
 
     def _reward_terms(self) -> Tensor:
         return self.reward_manager.step_terms
 
     def _before_full_reset(self) -> None:
-        self.curriculum_manager.advance(self._counters.common_step)  # the clock may have been set back
+        self.curriculum_manager.advance(self._counters.common_step)  # a reset with a seed sets the step to 0
         self.event_manager.before_full_reset(self._select_all())
 
     def _episode_metrics(self, ended: Selection) -> dict[str, Tensor]:
@@ -202,6 +190,7 @@ class ManagedEnv(VecEnv):
         self.curriculum_manager.compute(ended)
 
     def _reset_workflow(self, selection: Selection) -> None:
+        # events first: they write the start states that commands and terms read
         self.event_manager.reset(selection, self._counters.common_step)
         self.action_manager.reset(selection)
         self.command_manager.reset(selection)
@@ -213,17 +202,17 @@ class ManagedEnv(VecEnv):
         self.curriculum_manager.advance(self._counters.common_step)
         if not self.event_manager.has_intervals and not self.command_manager.terms:
             return
-        running = (self.episode_length_buf > 0).long()  # no time has passed for those just reset
+        running = (self.episode_length_buf > 0).long()  # 0 where the episode has just begun
         self.command_manager.compute(self._select_by_step, running)
         self.event_manager.interval(self._select_by_step, running, self._after_interval_event)
 
     def _select_all_by_step(self) -> Selection:
-        everyone = self._select_by_step(self._all_envs)
-        assert everyone is not None
-        return everyone
+        selection = self._select_by_step(self._all_envs)
+        assert selection is not None
+        return selection
 
     def _select_by_step(self, mask: Tensor) -> Selection | None:
-        """A selection that draws from the step's own counter."""
+        """Return a selection whose draws are keyed by the step."""
         return self.engine.select(mask, self.seed, self._counters.common_step.expand(self.num_envs).contiguous())
 
     def _after_interval_event(self, selection: Selection) -> None:
@@ -235,22 +224,20 @@ class ManagedEnv(VecEnv):
         return self.observation_manager.compute()
 
     def _restore_observations(self) -> dict[str, Tensor]:
-        return self.observation_manager.again()
+        return self.observation_manager.recompute_last()
 
     def _task_metrics(self) -> dict[str, float]:
-        """What the curriculum's terms gave last."""
+        """Return the last values of the curriculum terms."""
         return self.curriculum_manager.values()
 
     def _workflow_state(self) -> dict[str, Tensor]:
-        state: dict[str, Tensor] = {}
-        for name, part in self._parts().items():
-            state.update({f"{name}.{key}": value for key, value in part.state_dict().items()})
-        return state
+        states = {name: part.state_dict() for name, part in self._parts().items()}
+        return {f"{name}.{key}": value for name, state in states.items() for key, value in state.items()}
 
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
         for name, part in self._parts().items():
             saved = substate(state, f"{name}.")
-            if not (isinstance(part, BoundTerm) and part.memory):  # an author's own tensors may come and go
+            if not (isinstance(part, BoundTerm) and part.memory):  # a task's own classes may add attributes
                 require_matching_tensors(saved, part.state_dict(), f"env: workflow.{name}")
             part.load_state_dict(saved)
 
@@ -266,16 +253,16 @@ class ManagedEnv(VecEnv):
         return {**parts, **{"term." + ".".join(map(str, term.path)): term for term in self._terms()}}
 
     def markers(self) -> list[Marker]:
-        """What the commands ask for."""
+        """Return the markers of the commands."""
         return self.command_manager.markers()
 
     def unsaved_state(self) -> list[str]:
-        """What class terms keep that cannot be saved."""
+        """Return the attributes of class terms that cannot be saved."""
         memories = [term.memory for term in self._terms() if term.memory]
-        return [what for memory in memories for what in memory.unsaved()]
+        return [attribute for memory in memories for attribute in memory.unsaved()]
 
-    def _judging_terms(self) -> Iterator[Any]:
-        """The functions and classes behind observations, rewards, terminations and success, before they are bound."""
+    def _result_terms(self) -> Iterator[Any]:
+        """Yield the functions and classes of observations, rewards, terminations and success, before they are bound."""
         task = self.config
         sections = {"rewards": task.rewards, "terminations": task.terminations, "success": {"success": task.success}}
         groups = [("observations", group.terms) for group in task.observations.values()]

@@ -1,4 +1,4 @@
-"""Observers of the environment loop: they watch a step and change nothing in it."""
+"""Observers of the environment loop. They read each step and change nothing in it."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ if TYPE_CHECKING:
 
 
 class StepObserver:
-    """Base class of an observer of environment steps; override the methods that are needed.
+    """Base class of observers of environment steps; override the methods that you need.
 
-    Add it with `env.observers.add(observer)`. A method that no observer overrides costs nothing in a step.
+    Add an observer with `env.observers.add(observer)`. A method that no observer overrides costs nothing in a step.
     """
 
     __slots__ = ()
 
     def before_step(self) -> None:
-        """Run before the step does anything; raise to prevent the step."""
+        """Run at the start of a step, before any change; an exception prevents the step."""
 
     def after_physics(self) -> None:
-        """Run on the state that rewards and terminations are computed from, before any reset."""
+        """Run on the state from which rewards and terminations are computed, before any reset."""
 
     def on_divergence(self, found: list[Divergence], pending: bool) -> None:
-        """Run when simulations have diverged, while `engine.trace` still shows their last calls.
+        """Run when simulations have diverged, while `engine.trace` still has their last calls.
 
         Args:
-            found: the first of the divergences.
-            pending: whether the next engine call is the one that fails: an event or a reset wrote the state.
+            found: the first divergences.
+            pending: whether the next engine call is the one that fails, because an event or a reset wrote bad values.
         """
 
     def on_step(self, record: StepRecord) -> None:
@@ -38,7 +38,7 @@ class StepObserver:
 
 
 class Observers:
-    """The observers of one environment, with the methods that they override in the order of `add`."""
+    """Observers of one environment, with the methods that they override, in the order of `add`."""
 
     def __init__(self) -> None:
         self._set(())
@@ -48,12 +48,12 @@ class Observers:
         self._set((*self._observers, observer))
 
     def remove(self, observer: StepObserver) -> None:
-        """Remove an observer, if it is there; it may remove itself while it is called."""
+        """Remove an observer if it is present. It may remove itself while it is called."""
         self._set(tuple(other for other in self._observers if other is not observer))
 
     @contextmanager
     def added(self, observer: StepObserver) -> Iterator[None]:
-        """Add an observer for the length of a `with` block."""
+        """Add an observer for the duration of a `with` block."""
         self.add(observer)
         try:
             yield
@@ -61,17 +61,17 @@ class Observers:
             self.remove(observer)
 
     def run_on_step(self, record: StepRecord) -> None:
-        """Call `on_step` of the observers that have it."""
+        """Call `on_step` of the observers that override it."""
         for on_step in self.on_step:
             on_step(record)
 
     def run_on_divergence(self, found: list[Divergence], *, pending: bool) -> None:
-        """Call `on_divergence` of the observers that have it."""
+        """Call `on_divergence` of the observers that override it."""
         for on_divergence in self.on_divergence:
             on_divergence(found, pending)
 
     def _set(self, observers: tuple[StepObserver, ...]) -> None:
-        # new tuples: a loop over the old ones goes on undisturbed
+        # new tuples, so that a loop over the old ones is not disturbed
         self._observers = observers
         self.before_step = tuple(o.before_step for o in observers if _overrides(o, "before_step"))
         self.after_physics = tuple(o.after_physics for o in observers if _overrides(o, "after_physics"))

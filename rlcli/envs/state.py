@@ -1,4 +1,4 @@
-"""The state of an environment at a step boundary: saved in checkpoints, recordings and crash dumps."""
+"""State of an environment at a step boundary, as saved in checkpoints, recordings and crash dumps."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def load_state(env: VecEnv, state: Mapping[str, Tensor]) -> None:
     """Restore the state returned by `save_state`.
 
     Raises:
-        KeyError: if something is missing.
-        ValueError: if a tensor has another shape or type, because it was saved from other environments.
+        KeyError: if a tensor is missing.
+        ValueError: if a tensor has another shape or type, because it was saved from a different environment.
     """
     require_matching_tensors(state, _own_state(env), "env")
     env._counters.load_state_dict(state)
@@ -53,7 +53,7 @@ def _own_state(env: VecEnv) -> dict[str, Tensor]:
 
 
 def _parts(env: VecEnv) -> dict[str, _Stateful]:
-    """Return the parts with a state of their own, besides the engine, by the prefix of their keys."""
+    """Return the parts with a state of their own, except the engine, by the prefix of their keys."""
     parts: dict[str, _Stateful] = {f"actuator.{name}.": model for name, model in env.actuators.items()}
     if env.terrain is not None:
         parts["terrain."] = env.terrain

@@ -1,84 +1,86 @@
-"""What a step of an environment gives."""
+"""Results of a step of an environment."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from torch import Tensor
 
 
 @dataclass(frozen=True, slots=True)
 class Episodes:
-    """Episodes that just ended, one a row."""
+    """Episodes that ended in a step, one in each row."""
 
     ids: Tensor
-    """Environments. (n,) int64"""
+    """Numbers of the environments. (n,) int64"""
     returns: Tensor
-    """Undiscounted sums of rewards. (n,)"""
+    """Undiscounted sums of the rewards. (n,)"""
     lengths: Tensor
-    """Environment steps. (n,) int64"""
+    """Lengths in environment steps. (n,) int64"""
     reward_terms: dict[str, Tensor]
-    """Term -> its share of the return, weight included. (n,) each"""
+    """Term -> its share of the return, with its weight. (n,) each"""
     causes: dict[str, Tensor]
     """Termination -> whether it fired at the end. (n,) bool each"""
     truncated: Tensor
-    """Ended by time alone. (n,) bool"""
+    """Whether the episode ended by time-out alone. (n,) bool"""
     success: Tensor | None
-    """Met the task's success condition; None where the task has none. (n,) bool"""
+    """Whether the episode met the task's success condition; None for a task without one. (n,) bool"""
     metrics: dict[str, Tensor] = field(default_factory=dict)
     """`command/metric` -> its mean over the episode. (n,) each"""
     mask: Tensor | None = None
-    """A GPU gives a row for every environment, valid until the next step, and which of them count. (num_envs,) bool;
-    None: all rows do."""
+    """Rows that are valid, on a GPU, which gives a row for every environment; None: all rows. (num_envs,) bool
+
+    The rows hold until the next step.
+    """
 
     def ended(self) -> Episodes:
-        """Only the rows that count; waits for the device."""
+        """Return only the valid rows; on a GPU this forces a host sync."""
         if self.mask is None:
             return self
-        rows = self.mask
-        return Episodes(
-            self.ids[rows],
-            self.returns[rows],
-            self.lengths[rows],
-            {name: values[rows] for name, values in self.reward_terms.items()},
-            {name: values[rows] for name, values in self.causes.items()},
-            self.truncated[rows],
-            None if self.success is None else self.success[rows],
-            {name: values[rows] for name, values in self.metrics.items()},
-        )
+
+        def rows(values: Any) -> Any:
+            if isinstance(values, dict):
+                return {name: rows(value) for name, value in values.items()}
+            return None if values is None else values[self.mask]
+
+        return Episodes(**{part.name: rows(getattr(self, part.name)) for part in fields(self) if part.name != "mask"})
 
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """What one step gave. Tensors are not written to again before the step after the next one."""
+    """Result of one step. Its tensors are not overwritten before the step after the next one."""
 
     obs: dict[str, Tensor]
-    """Group -> observations, of the new episode where one has just begun. (num_envs, d) float32"""
+    """Group -> observations; of the new episode where one has just begun. (num_envs, d) float32"""
     reward: Tensor
     """(num_envs,) float32"""
     terminated: Tensor
-    """The task ended the episode: its last state has no future. (num_envs,) bool"""
+    """Where the task ended the episode: the value of its last state is 0. (num_envs,) bool"""
     truncated: Tensor
-    """Time ran out: bootstrap from `final_obs`, unless it was terminated as well. (num_envs,) bool"""
+    """Where the episode timed out: bootstrap from `final_obs`, unless it was terminated as well. (num_envs,) bool"""
     final_obs: dict[str, Tensor] | None
-    """True last observations, full size; rows are valid where an episode ended (with `final_obs_of = "truncated"`:
-    where it ended by time). None if there is known to be no such row. Valid until the next step."""
+    """Last observations of the episodes that end, for all environments; None if there is certainly no valid row.
+
+    A row is valid where an episode ended (with `final_obs_of = "truncated"`: where it timed out). The tensors hold
+    until the next step.
+    """
     episodes: Episodes | None
-    """The episodes that ended; None if it is known that none did."""
+    """Episodes that ended; None if certainly none did."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """One step as observers get it. Tensors belong to the environment: copy what is kept."""
+    """Data of one step for observers. The tensors belong to the environment: copy those that you keep."""
 
     obs: Mapping[str, Tensor]
-    """Group -> observations that the action was taken for. (num_envs, d) float32"""
+    """Group -> observations from which the action was computed. (num_envs, d) float32"""
     action: Tensor
     """(num_envs, a) float32"""
     reward: Tensor
     """(num_envs,) float32"""
     reward_terms: Tensor
-    """What each term of `reward_names` paid. (terms, num_envs) float32"""
+    """Weighted value of each term of `reward_names`. (terms, num_envs) float32"""
     episodes: Episodes | None
-    """The episodes that end; None if none does."""
+    """Episodes that end; None if none does."""

@@ -1,4 +1,4 @@
-"""`python -m rlcli.envs.task_index GROUP FILE NAME...`: build tasks and print what they are.
+"""`python -m rlcli.envs.task_index GROUP FILE NAME...`: build tasks and write their descriptions.
 
 `--index DISTRIBUTION` prints the `index.json` that a distribution ships for `list-tasks`.
 """
@@ -28,7 +28,7 @@ from rlcli.trainers import TrainerSpec
 
 
 def describe(name: str) -> Details:
-    """Load a task and build one environment of it.
+    """Load a task, build one environment of it, and return its description.
 
     Raises:
         RlcliError: if it cannot be built.
@@ -51,7 +51,7 @@ def describe(name: str) -> Details:
 
 
 def try_trainer(name: str) -> Details:
-    """Load a trainer's record, the models of its settings and its class.
+    """Load a trainer's spec, the models of its settings and its class.
 
     Raises:
         RlcliError: if one of them cannot be loaded.
@@ -64,7 +64,7 @@ def try_trainer(name: str) -> Details:
 
 
 def try_format(name: str) -> Details:
-    """Load a format's record, and every part that it names.
+    """Load a format's spec, and every part that it names.
 
     Raises:
         RlcliError: if one of them cannot be loaded.
@@ -81,9 +81,9 @@ _LOADERS = {TASKS: describe, TRAINERS: try_trainer, FORMATS: try_format}
 
 
 def main(arguments: list[str]) -> None:
-    """Append a line of JSON to a file for each name, or print the index of a distribution."""
+    """Append one line of JSON to a file for each name, or print the index of a distribution."""
     parser = argparse.ArgumentParser(prog="python -m rlcli.envs.task_index", description=__doc__)
-    parser.add_argument("--index", metavar="DISTRIBUTION", help="print the index.json of this distribution, no more")
+    parser.add_argument("--index", metavar="DISTRIBUTION", help="print the index.json of this distribution")
     parser.add_argument("group", nargs="?", choices=_LOADERS)
     parser.add_argument("file", nargs="?")
     parser.add_argument("names", nargs="*")

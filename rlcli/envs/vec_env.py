@@ -1,7 +1,7 @@
-"""The one environment loop, for managed and direct tasks.
+"""Environment loop of managed and direct tasks.
 
 Autoreset is same-step: the observation returned with a finished episode is the first one of the next episode, and
-`final_obs` has the true last observation. `terminated` and `truncated` are two tensors everywhere.
+`final_obs` has the last observation. `terminated` and `truncated` are always separate tensors.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from rlcli.sim.selection import Field, Selection
 class VecEnv(Workflow):
     """`num_envs` copies of a task, stepped together.
 
-    Building one compiles the model and resolves every name of the configuration (phase 2 of validation).
+    The constructor compiles the model and resolves every name of the configuration (phase 2 of validation).
 
     Args:
         resolved: a validated configuration.
-        seed: of every random draw of the environment.
-        device: where the engine and all tensors live.
+        seed: seed of every random draw of the environment.
+        device: device of the engine and of all tensors.
         shared_streams: environments i and i % shared_streams draw the same random numbers; 0: every environment has its
             own stream.
 
     Raises:
         ConfigError: with everything that does not fit the compiled model.
-        DeviceError: for a device that is not there.
+        DeviceError: for a device that does not exist.
     """
 
     def __init__(self, resolved: Resolved, *, seed: int = 42, device: str = "cpu", shared_streams: int = 0) -> None:
@@ -54,19 +54,19 @@ class VecEnv(Workflow):
         self.seconds = {"physics": 0.0, "step": 0.0}
         self.observers = Observers()
         self.physics_override: Callable[[], None] | None = None
-        """Called to step the simulations in the engine's place; it leaves their states and derived fields there."""
+        """Called instead of the engine to step the simulations; it must write their states and derived fields."""
         self._playing = True
         self._last_obs: dict[str, Tensor] = {}
         self._counters = EpisodeCounters(self.num_envs, self.device)
         self.episode_length_buf = self._counters.lengths
-        """Steps of the running episode. (num_envs,)"""
+        """Steps of the running episode. (num_envs,) int64"""
         self.episode_index = self._counters.indices
-        """Episodes begun before the running one; random streams are keyed by it. (num_envs,)"""
+        """Number of episodes before the running one; random streams are keyed by it. (num_envs,) int64"""
         self._guard = DivergenceGuard(self)
         self._build(shared_streams)
 
     def _build(self, shared_streams: int) -> None:
-        """Build the simulation, then the workflow's terms upon it."""
+        """Build the simulation, then the terms of the workflow."""
         self._binder = Binder(self, self.resolved)
         scene = open_scene(self.resolved)
         self._prepare_scene(scene)
@@ -76,14 +76,14 @@ class VecEnv(Workflow):
         self.actuators = built.actuators
         """`entity.name` -> actuator model, in the order of the configuration."""
         self.sensors = built.sensors
-        """The sensors of `scene.sensors`, by name."""
+        """Sensors of `scene.sensors`, by name."""
         self.default_state = built.default_state
-        """The joint state that episodes start from, before resets draw. (nq,), (nv,)"""
+        """Joint state at the start of episodes, before reset events. qpos (nq,), qvel (nv,)"""
         self.terrain = built.terrain
         self.origins = built.origins
-        """Start place of each environment in its world: zeros without a terrain. (num_envs, 3) [m]"""
-        own = shared_streams or self.num_envs
-        self.env_origins = grid(own, self.config.scene.env_spacing).to(self.device)[self._counters.ids % own]
+        """Start position of each environment in its world: zeros without a terrain. (num_envs, 3) [m]"""
+        distinct = shared_streams or self.num_envs
+        self.env_origins = grid(distinct, self.config.scene.env_spacing).to(self.device)[self._counters.ids % distinct]
         self._counters.attach(self.engine)
         self._bind_terms()
         success = self._binder.success()
@@ -99,9 +99,9 @@ class VecEnv(Workflow):
         """Start a new episode everywhere, and return observations by group. (num_envs, d) float32
 
         Args:
-            seed: of every draw from now on, as in a new environment; None: the random streams go on.
-            episode: with a seed, the number of the episode that begins. What `episode_dependencies` names is not as it
-                would be after the episodes before it.
+            seed: seed of every draw from now on, as in a new environment; None: the random streams continue.
+            episode: with a seed, the number of the episode that begins. The state that earlier episodes would have left
+                in the terms of `episode_dependencies` is missing then.
         """
         if seed is not None:
             self.seed = seed
@@ -123,20 +123,20 @@ class VecEnv(Workflow):
         2. The action becomes controls; physics runs; diverged environments return to their last finite state.
         3. Observers run `after_physics`; counters and sensors advance.
         4. Terminations, rewards and the success condition are computed.
-        5. Episodes that end give their last observation and their row of `Episodes`.
+        5. Final observations and `Episodes` of the episodes that end are computed.
         6. Observers run `on_step`.
         7. Environments whose episode ended, and those of `restart`, are reset.
-        8. Commands and interval events run; what they or a reset put out of bounds is quarantined.
+        8. Commands and interval events run; environments that they or a reset put out of bounds are quarantined.
         9. Observations are computed.
 
         Args:
-            action: of every environment. (num_envs, a) float32
-            restart: environments that skip the step and go back to the start of their running episode, with reward 0.
+            action: one row for each environment. (num_envs, a) float32
+            restart: environments that skip the step and return to the start of their running episode, with reward 0.
                 (num_envs,) bool
 
         Raises:
-            DivergedError: for an action, observation or reward that is not finite; divergence of the simulation is not
-                an error, it ends the episode of that environment.
+            DivergedError: for an action, observation or reward that is not finite. A diverged simulation is no error:
+                it ends the episode of its environment.
         """
         if not self._playing:
             raise RuntimeError("the environment is paused")
@@ -218,14 +218,14 @@ class VecEnv(Workflow):
             self._reset_envs(ended)
         again = None if restart is None else self._select(restart)
         if again is not None:
-            self._reset_envs(again)  # the draws are those of the same episode: it begins alike
+            self._reset_envs(again)  # the episode index is unchanged, so the draws repeat
 
     def _reset_envs(self, selection: Selection) -> None:
         """Start the next episode of the selected environments."""
         self.engine.reset(selection)
         if self.terrain is not None:
             self.terrain.place_entities(self.entities.values(), selection)
-        self.sim.refresh_rows(selection)  # a reset event or reset_idx reads the default state, not the last episode's
+        self.sim.refresh_rows(selection)  # reset events then read the default state, not that of the last episode
         for actuator in self.actuators.values():
             actuator.reset(selection)
         self._reset_workflow(selection)
@@ -235,7 +235,7 @@ class VecEnv(Workflow):
             sensor.reset(selection)
 
     def _observe(self) -> dict[str, Tensor]:
-        """Update what changes between steps, and return the observations of the state after that."""
+        """Update commands and events, and return the observations of the resulting state."""
         self._update_commands_and_events()
         self.sim.forward_moved()
         self._guard.quarantine_out_of_bounds()
@@ -246,9 +246,9 @@ class VecEnv(Workflow):
         return self.engine.select(mask, self.seed, self._counters.index_field)
 
     def _select_all(self) -> Selection:
-        everything = self._select(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
-        assert everything is not None
-        return everything
+        selection = self._select(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
+        assert selection is not None
+        return selection
 
     def _may_be_any(self, mask: Field) -> bool:
         """Return whether a mask holds anywhere; True on a GPU, where reading the mask would force a host sync."""
@@ -260,48 +260,48 @@ class VecEnv(Workflow):
         return None if success is None else success()
 
     def check(self) -> None:
-        """Raise the `DivergedError` of the steps since the last call; a CPU has raised it in the step."""
+        """Raise the `DivergedError` of the steps since the last call; a CPU raises it in the step."""
         self._guard.check()
 
     @property
     def common_step(self) -> int:
-        """Steps since the start, the same in all environments."""
+        """Number of steps since the start, the same in all environments."""
         return int(self._counters.common_step)
 
     @property
     def divergences(self) -> int:
-        """Environments whose simulation diverged, ever."""
+        """Number of simulations that diverged since the start."""
         return sum(self.causes.values())
 
     @property
     def causes(self) -> dict[str, int]:
-        """The same by cause: MuJoCo's warning (`BADQACC`), `FIELD not finite`, `engine error`."""
-        return self._guard.causes
+        """Number of diverged simulations by cause: MuJoCo's warning (`BADQACC`), `FIELD not finite`, `engine error`."""
+        return dict(self._guard.causes)
 
     @property
     def calls_per_step(self) -> int:
-        """Calls of the engine in an environment step: one, or one a physics step with actuator models."""
+        """Number of engine calls in an environment step: 1, or `decimation` with actuator models."""
         return self.config.decimation if self.actuators else 1
 
     def compute_efforts(self) -> None:
-        """Let the actuator models write the controls of the coming physics step."""
+        """Write the controls of the actuator models for the next physics step."""
         for actuator in self.actuators.values():
             actuator.compute()
 
     def is_playing(self) -> bool:
-        """Return False while paused; no step runs then."""
+        """Return False while paused; then no step can run."""
         return self._playing
 
     def pause(self, paused: bool = True) -> None:
-        """Pause or go on."""
+        """Pause, or continue with `paused=False`."""
         self._playing = not paused
 
     def extras(self) -> dict[str, float]:
-        """Return further numbers to log: the task's as of the last step, divergences by cause since the last call."""
+        """Return further numbers to log: the task's values of the last step, and new divergences by cause."""
         return {**self._task_metrics(), **self._guard.metrics()}
 
     def close(self) -> None:
-        """Close the engine and the sensors that draw."""
+        """Close the engine and the sensors that render."""
         for sensor in self.sensors.values():
             sensor.close()
         self.engine.close()
@@ -318,8 +318,8 @@ class VecEnv(Workflow):
         """Restore the state returned by `state_dict()`, and return the observations of that moment.
 
         Raises:
-            KeyError: if something is missing.
-            ValueError: if a tensor has another shape or type, because it was saved from other environments.
+            KeyError: if a tensor is missing.
+            ValueError: if a tensor has another shape or type, because it was saved from a different environment.
         """
         load_state(self, state)
         self._last_obs = self._restore_observations()

@@ -1,4 +1,4 @@
-"""The hooks that a workflow (managed or direct) fills in for the environment loop, with their defaults."""
+"""Hooks of the environment loop that a workflow (managed or direct) implements, with their defaults."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from rlcli.sim.selection import Selection
 
 
 class Workflow(ABC):
-    """Base class of the environment loop: what differs between managed and direct tasks.
+    """Base class of the environment loop, with the parts that differ between managed and direct tasks.
 
-    `VecEnv` calls the hooks whose names begin with an underscore; the others are for callers of the environment.
+    `VecEnv` calls the hooks whose names begin with an underscore; the other methods are for users of the environment.
     """
 
     num_envs: int
@@ -37,11 +37,11 @@ class Workflow(ABC):
 
     @abstractmethod
     def _build_workflow(self) -> None:
-        """Make the managers, or start the task."""
+        """Build the managers, or start the task."""
 
     @abstractmethod
     def _make_layout(self) -> Layout:
-        """Return the observation and action columns."""
+        """Return the layout of the observation and action columns."""
 
     # --- a step, in this order ---
 
@@ -55,7 +55,7 @@ class Workflow(ABC):
 
     @abstractmethod
     def _compute_final_obs(self) -> dict[str, Tensor]:
-        """Return the true last observations, before anything is reset."""
+        """Return the last observations of the episodes, before any reset."""
 
     @abstractmethod
     def _episode_returns_and_causes(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
@@ -74,7 +74,7 @@ class Workflow(ABC):
 
     @abstractmethod
     def _reset_workflow(self, selection: Selection) -> None:
-        """Write the start states of new episodes and clear what belongs to the old ones."""
+        """Write the start states of new episodes, and clear the state of the old ones."""
 
     def _update_commands_and_events(self) -> None:
         """Update commands and run interval events, after resets and before observations."""
@@ -89,19 +89,19 @@ class Workflow(ABC):
         """Prepare for a reset of all environments."""
 
     def _raise_for_term(self, what: str) -> None:
-        """Raise a `DivergedError` that names the term behind a value that is not finite, if it can be named."""
+        """Raise a `DivergedError` that names the term of a value that is not finite, if it is known."""
 
     def _restore_observations(self) -> dict[str, Tensor]:
-        """Return the observations of the state that has just been loaded."""
+        """Return the observations of a state that has just been loaded."""
         return self._compute_observations()
 
     def _task_metrics(self) -> dict[str, float]:
-        """Return the task's own numbers to log, as of the last step."""
+        """Return the task's own numbers to log, of the last step."""
         return {}
 
     @abstractmethod
     def _workflow_state(self) -> dict[str, Tensor]:
-        """Return copies of what the workflow carries from step to step."""
+        """Return copies of the state that the workflow keeps from step to step."""
 
     @abstractmethod
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
@@ -112,25 +112,25 @@ class Workflow(ABC):
         return []
 
     def episode_dependencies(self) -> list[str]:
-        """Return what makes an episode depend on earlier ones, by its place in the configuration; empty: none known."""
+        """Return the parts of the configuration that make an episode depend on earlier ones; empty: none is known."""
         return ["scene.terrain"] if self.terrain is not None else []
 
     @property
     def reward_names(self) -> list[str]:
-        """The terms of the reward, in the order of `StepRecord.reward_terms`; empty for a task with one sum."""
+        """Names of the reward terms, in the order of `StepRecord.reward_terms`; empty for a task without terms."""
         return []
 
     def step_metrics(self) -> dict[str, Tensor]:
-        """Return the task's own numbers to log, of the state before resets, for `StepObserver.on_step`.
+        """Return the task's own numbers to log, for `StepObserver.on_step`. (num_envs,) each
 
-        `Episodes.metrics` has the metrics of commands, as means over episodes. (num_envs,) each
+        They are of the state before resets. `Episodes.metrics` has the metrics of commands, as means over episodes.
         """
         return {}
 
     def unsaved_state(self) -> list[str]:
-        """Return what the task carries from step to step that `state_dict` cannot hold; empty: it resumes exactly."""
+        """Return the state that `state_dict` cannot contain; empty: a resumed run continues exactly."""
         return []
 
     def markers(self) -> list[Marker]:
-        """Return the shapes to draw beside the bodies; viewers call it, no step does."""
+        """Return the shapes to draw beside the bodies. Viewers call it; a step does not."""
         return []

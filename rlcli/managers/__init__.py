@@ -1,1 +1,1 @@
-"""Managers: one MDP concern each, made of terms that are bound once, when the environment is built."""
+"""Managers of manager-based tasks. Each runs the terms of one section of the YAML."""

@@ -1,4 +1,4 @@
-"""Actions: the policy's vector is cut into terms, each turns its part into controls."""
+"""Actions: the policy's action is split into the columns of the terms. Each term turns its columns into controls."""
 
 from __future__ import annotations
 
@@ -17,54 +17,54 @@ from rlcli.sim.tensor_state import TensorState
 
 @dataclass(frozen=True, slots=True)
 class CommandMap:
-    """How a term turns its columns into commands: raw x scale + offset, then clip, then the actuators' own limits."""
+    """Formula of a term's commands: raw x scale + offset, then `clip`, then the limits of the actuators."""
 
     scale: tuple[float, ...]
-    """One a column."""
+    """One for each column."""
     offset: tuple[float, ...]
-    """One a column, in the command's unit."""
+    """One for each column, in the command's unit."""
     clip: tuple[tuple[float, float], ...] | None
-    """The term's own limits of each column, in the command's unit."""
+    """The term's own limits of each column, in the command's unit; None: no limits."""
     limits: tuple[tuple[float, float], ...]
-    """What each column's actuator can take, in the command's unit; infinite where it has no limit."""
+    """Limits of each column's actuator, in the command's unit; infinite for an actuator without a limit."""
 
 
 class ActionTerm(Protocol):
-    """An action term is a class `Name(env, *, ...)`.
+    """Interface of an action term: a class `Name(env, *, ...)`.
 
-    A term whose command is a scaled and clipped action says so in a method `command_map() -> CommandMap`; exported
-    policies then contain it.
+    A term whose command is a scaled and clipped action may have a method `command_map() -> CommandMap`. Exported
+    policies then contain the formula.
     """
 
     size: int
-    """Columns of the policy's vector that it takes."""
+    """Number of columns of the policy's action."""
     elements: tuple[str, ...]
-    """What the columns drive, in order."""
+    """Names of what the columns drive, in order."""
     unit: str
-    """Unit of the command that reaches the actuators."""
+    """Unit of the command to the actuators."""
 
     def process(self, action: Tensor) -> None:
-        """Take this step's columns and write the controls. (num_envs, size)"""
+        """Write the controls for this step's columns. action (num_envs, size)"""
         ...
 
 
 class ActionManager(TensorState):
-    """Keeps the raw actions of this step and the last, and hands each term its columns."""
+    """Manager of the action terms, with the raw actions of the current and the previous step."""
 
     def __init__(
         self, terms: list[BoundTerm], num_envs: int, device: torch.device, as_field: Callable[[Tensor], Field]
     ) -> None:
         self.terms = terms
-        _refuse_shared(terms)
+        _require_separate_actuators(terms)
         self.size = sum(term.instance.size for term in terms)
-        self._forget = resets(terms)
+        self._term_resets = resets(terms)
         both = torch.zeros(2, num_envs, self.size, device=device)
         self._both_by_env = as_field(both.transpose(0, 1))
         self.action = both[0]
         """The policy's action of this step. (num_envs, size)"""
         self.prev_action = both[1]
-        """That of the step before; zero at the start of an episode. (num_envs, size)"""
-        self._last, self._now = in_place(self.prev_action), in_place(self.action)
+        """The action of the previous step; zero at the start of an episode. (num_envs, size)"""
+        self._previous, self._current = in_place(self.prev_action), in_place(self.action)
         self._process = []
         start = 0
         for term in terms:
@@ -72,16 +72,16 @@ class ActionManager(TensorState):
             start += term.instance.size
 
     def process(self, action: Tensor) -> None:
-        """Take one step's action."""
-        self._last[...] = self._now
+        """Store the action of this step and let each term process its columns. action (num_envs, size)"""
+        self._previous[...] = self._current  # first: the current action is overwritten next
         self.action.copy_(action)
         for process, columns in self._process:
             process(columns)
 
     def reset(self, selection: Selection) -> None:
-        """New episodes begin without a past action."""
+        """Set the actions of new episodes to zero, and reset the terms."""
         selection.write(self._both_by_env, 0.0)
-        for reset in self._forget:
+        for reset in self._term_resets:
             reset(selection)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -89,11 +89,11 @@ class ActionManager(TensorState):
         return {"action": self.action, "prev_action": self.prev_action}
 
 
-def _refuse_shared(terms: list[BoundTerm]) -> None:
-    """Of two terms that write one actuator only the later would count.
+def _require_separate_actuators(terms: list[BoundTerm]) -> None:
+    """Check that no two terms write to the same actuator: the later one would overwrite the earlier.
 
     Raises:
-        ConfigError: naming both terms and what they share.
+        ConfigError: with both terms and the element that they share.
     """
     owner: dict[int | str, BoundTerm] = {}
     for term in terms:

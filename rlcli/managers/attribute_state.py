@@ -1,8 +1,8 @@
-"""What an object of a task's author remembers from step to step: found in its attributes, saved and put back.
+"""State of an object of a task: its attributes that change from step to step, saved in checkpoints and restored.
 
-Tensors and arrays are saved as they are, in dicts, lists and tuples too. Plain values, containers of them
-and random generators are saved once they have changed since the object was built. What else may change cannot be
-saved, and is named.
+Tensors and arrays are always saved, also in dicts, lists and tuples. Plain values, containers of them and random
+generators are saved once they differ from their first value. Other attributes that may change cannot be saved;
+`TermState.unsaved` lists them.
 """
 
 from __future__ import annotations
@@ -21,29 +21,31 @@ import torch
 from torch import Tensor
 
 _PLAIN = "plain"
-"""Key of everything that is not a tensor, as JSON in bytes."""
-_OURS = ("rlcli.", "torch.", "numpy.", "mujoco.")
+"""Key of all values that are not tensors, as JSON in bytes."""
+_SCALARS = (bool, int, float, str, type(None))
+_SEQUENCES = (list, tuple, set, collections.deque)
+_LIBRARIES = ("builtins.", "rlcli.", "torch.", "numpy.", "mujoco.")
 
 
-class Unsaved(TypeError):
-    """A value that cannot be written down."""
+class NotSerializableError(TypeError):
+    """A value that cannot be written as JSON."""
 
 
 class TermState:
-    """The attributes of an object, and of helper objects of its author's that they hold, which outlast a step.
+    """Saver of the attributes of an object, and of those of helper objects of the task's own classes.
 
     Args:
-        owner: the object, as it is before the first step.
-        other: names of attributes that are somebody else's to save.
+        owner: the object, before the first step.
+        excluded: names of attributes that are not part of its state.
     """
 
-    def __init__(self, owner: object, other: tuple[str, ...] = ()) -> None:
-        self._owner, self._other = owner, other
+    def __init__(self, owner: object, excluded: tuple[str, ...] = ()) -> None:
+        self._owner, self._excluded = owner, excluded
         self._first = dict(self._plain())
         self._changed: set[str] = set()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Copies of what is remembered now."""
+        """Return copies of the current values."""
         state = {path: value.clone() for slot, value in self._slots() for path, value in _tensors(slot, value)}
         values = dict(self._plain())
         self._changed |= {slot for slot, value in values.items() if value != self._first.get(slot)}
@@ -55,34 +57,34 @@ class TermState:
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Restore the state returned by `state_dict()`.
 
-        Existing tensors keep their place, so that views of them stay valid.
+        Tensors are written in place, so that views of them stay valid.
 
         Raises:
-            ValueError: if it does not belong to this object.
+            ValueError: if the state does not belong to this object.
         """
         kept = json.loads(bytes(state[_PLAIN].tolist())) if _PLAIN in state else {}
         for slot in self._changed | set(kept):
             written = kept.get(slot, self._first.get(slot))
             if written is not None:
-                self._put(slot, _read(json.loads(written)))
+                self._put(slot, _from_json(json.loads(written)))
         self._changed |= set(kept)
         for path, value in state.items():
             if path != _PLAIN:
                 self._put_tensor(path, value)
 
     def unsaved(self) -> list[str]:
-        """What may change and cannot be saved, with its type."""
+        """Return the attributes that may change and cannot be saved, with their types."""
         owner = type(self._owner).__name__
         return [f"{owner}.{slot} ({type(value).__name__})" for slot, value in self._slots() if _is_stateful(value)]
 
     def _slots(self) -> Iterator[tuple[str, Any]]:
-        """Attributes by their path: of the object, and of what is made of its author's classes."""
+        """Yield the attributes by their path: those of the object, and of objects of the task's own classes."""
         seen: set[int] = set()
 
         def visit(holder: object, path: str) -> Iterator[tuple[str, Any]]:
             seen.add(id(holder))
             for name, value in list(vars(holder).items()):
-                if path or name not in self._other:
+                if path or name not in self._excluded:
                     yield f"{path}{name}", value
                     if _is_helper(value) and id(value) not in seen:
                         yield from visit(value, f"{path}{name}.")
@@ -90,36 +92,36 @@ class TermState:
         yield from visit(self._owner, "")
 
     def _plain(self) -> Iterator[tuple[str, str]]:
-        """What can be written down, as JSON."""
+        """Yield the attributes that can be written as JSON."""
         for slot, value in self._slots():
-            with contextlib.suppress(Unsaved, RecursionError):
-                yield slot, json.dumps(_written(value))
+            with contextlib.suppress(NotSerializableError, RecursionError):
+                yield slot, json.dumps(_to_json(value))
 
     def _holder(self, slot: str) -> tuple[Any, str]:
-        """What a slot is an attribute of: only what is found there may be written to, whoever wrote the file."""
+        """Return the object and the attribute of a path; an untrusted file may name only attributes that are saved."""
         *path, name = slot.split(".")
         holder = self._owner
         for step in path:
             holder = vars(holder).get(step)
             if not _is_helper(holder):
-                raise ValueError(f"'{slot}' has no place in {type(self._owner).__name__}")
-        usual = getattr(type(holder), name, None)  # a method or a property is no memory
-        allowed = name.isidentifier() and not name.startswith("__") and (bool(path) or name not in self._other)
-        if not allowed or not _may_be_memory(usual) or not _may_be_memory(vars(holder).get(name)):
-            raise ValueError(f"'{slot}' is nothing that {type(self._owner).__name__} remembers")
+                raise ValueError(f"'{slot}' does not exist in {type(self._owner).__name__}")
+        on_class = getattr(type(holder), name, None)  # a method or a property is not state
+        allowed = name.isidentifier() and not name.startswith("__") and (bool(path) or name not in self._excluded)
+        if not allowed or not _is_saved_kind(on_class) or not _is_saved_kind(vars(holder).get(name)):
+            raise ValueError(f"'{slot}' is not a saved attribute of {type(self._owner).__name__}")
         return holder, name
 
     def _put(self, slot: str, value: Any) -> None:
         holder, name = self._holder(slot)
-        there = getattr(holder, name, None)
-        if isinstance(there, random.Random):
-            there.setstate(value)
-        elif isinstance(there, np.random.Generator):
-            _require_positions(value)
-            there.bit_generator.state = value
-        elif isinstance(there, list | dict | set | collections.deque) and type(there) is type(value):
-            there.clear()  # whoever else holds it sees the same
-            there.update(value) if isinstance(there, dict | set) else there.extend(value)
+        current = getattr(holder, name, None)
+        if isinstance(current, random.Random):
+            current.setstate(value)
+        elif isinstance(current, np.random.Generator):
+            _require_valid_position(value)
+            current.bit_generator.state = value
+        elif isinstance(current, list | dict | set | collections.deque) and type(current) is type(value):
+            current.clear()  # in place: other references to the container stay valid
+            current.update(value) if isinstance(current, dict | set) else current.extend(value)
         else:
             setattr(holder, name, value)
 
@@ -128,23 +130,23 @@ class TermState:
         holder, name = self._holder(slot)
         if not keys:
             if not _write_into(getattr(holder, name, None), value):
-                setattr(holder, name, value.clone())  # made, or made anew, in a step
+                setattr(holder, name, value.clone())  # a step creates or replaces this tensor
             return
         container = getattr(holder, name, None)
         for key in keys[:-1]:
             container = _item(container, key)
         key = keys[-1]
-        there = _item(container, key)
-        if _write_into(there, value):
+        current = _item(container, key)
+        if _write_into(current, value):
             return
-        if not (there is None or isinstance(there, Tensor | np.ndarray)):
-            raise ValueError(f"'{path}' is no tensor in {type(self._owner).__name__}")
+        if not (current is None or isinstance(current, Tensor | np.ndarray)):
+            raise ValueError(f"'{path}' is not a tensor in {type(self._owner).__name__}")
         if isinstance(container, dict):
             container[key] = value.clone()
         elif isinstance(container, list):
             container[int(key) : int(key) + 1] = [value.clone()]
         else:
-            raise ValueError(f"'{path}' has no place in {type(self._owner).__name__}")
+            raise ValueError(f"'{path}' does not exist in {type(self._owner).__name__}")
 
 
 def _item(container: object, key: str) -> Any:
@@ -155,21 +157,21 @@ def _item(container: object, key: str) -> Any:
     return None
 
 
-def _write_into(there: object, value: Tensor) -> bool:
-    """Write a value where it was, if that is the place for it."""
-    if isinstance(there, torch.Generator):
-        there.set_state(value)
-    elif isinstance(there, np.ndarray) and there.shape == tuple(value.shape):
-        there[...] = value.numpy()
-    elif isinstance(there, Tensor) and there.shape == value.shape and there.dtype == value.dtype:
-        there.copy_(value)
+def _write_into(target: object, value: Tensor) -> bool:
+    """Write a value into its target in place, and return whether type and shape fit."""
+    if isinstance(target, torch.Generator):
+        target.set_state(value)
+    elif isinstance(target, np.ndarray) and target.shape == tuple(value.shape):
+        target[...] = value.numpy()
+    elif isinstance(target, Tensor) and target.shape == value.shape and target.dtype == value.dtype:
+        target.copy_(value)
     else:
         return False
     return True
 
 
 def _tensors(path: str, value: object) -> Iterator[tuple[str, Tensor]]:
-    """Every tensor, array and torch generator in a value, by its path."""
+    """Yield the tensors, arrays and torch generators in a value, by their path."""
     if isinstance(value, Tensor):
         yield path, value.detach()
     elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
@@ -185,71 +187,64 @@ def _tensors(path: str, value: object) -> Iterator[tuple[str, Tensor]]:
             yield from _tensors(f"{path}/{index}", item)
 
 
-def _written(value: Any) -> Any:
-    """A value as JSON that `_read` understands."""
-    if value is None or isinstance(value, bool | int | float | str):
-        if type(value) in (bool, int, float, str, type(None)):
-            return value
-        raise Unsaved
+def _to_json(value: Any) -> Any:
+    """Return a value as JSON for `_from_json`."""
+    if type(value) in _SCALARS:
+        return value
     if isinstance(value, np.bool_ | np.integer | np.floating):
         return ["scalar", value.dtype.name, value.item()]
     if isinstance(value, random.Random):
-        return _written(value.getstate())
+        return _to_json(value.getstate())
     if isinstance(value, np.random.Generator):
-        return _written(value.bit_generator.state)
-    kinds: dict[type, str] = {list: "list", tuple: "tuple", set: "set", collections.deque: "deque"}
-    if type(value) in kinds:
+        return _to_json(value.bit_generator.state)
+    if type(value) in _SEQUENCES:
         items = sorted(value, key=repr) if isinstance(value, set) else value
-        return [kinds[type(value)], [_written(item) for item in items]]
+        return [type(value).__name__, [_to_json(item) for item in items]]
     if type(value) is dict:
-        return ["dict", [[_written(key), _written(item)] for key, item in value.items()]]
-    raise Unsaved
+        return ["dict", [[_to_json(key), _to_json(item)] for key, item in value.items()]]
+    raise NotSerializableError
 
 
-def _read(written: object) -> Any:
+def _from_json(written: object) -> Any:
     if not isinstance(written, list):
         return written
     kind, *content = written
     if kind == "scalar":
         dtype = np.dtype(content[0])
         if dtype.kind not in "biuf":
-            raise ValueError(f"'{content[0]}' is no kind of number")
+            raise ValueError(f"'{content[0]}' is not a numeric type")
         return dtype.type(content[1])
     if kind == "dict":
-        return {_read(key): _read(item) for key, item in content[0]}
-    make = {"list": list, "tuple": tuple, "set": set, "deque": collections.deque}[kind]
-    return make(_read(item) for item in content[0])
+        return {_from_json(key): _from_json(item) for key, item in content[0]}
+    make = {sequence.__name__: sequence for sequence in _SEQUENCES}[kind]
+    return make(_from_json(item) for item in content[0])
 
 
-def _may_be_memory(value: object) -> bool:
-    """Whether something is of a kind that is saved."""
+def _is_saved_kind(value: object) -> bool:
+    """Return whether values of this type are saved."""
     generators = torch.Generator | np.random.Generator | random.Random
-    plain = type(value) in (bool, int, float, str, type(None), list, tuple, dict, set, collections.deque)
-    return plain or isinstance(value, Tensor | np.ndarray | np.generic | generators)
+    plain = (*_SCALARS, *_SEQUENCES, dict)
+    return type(value) in plain or isinstance(value, Tensor | np.ndarray | np.generic | generators)
 
 
-def _require_positions(state: Mapping[str, Any]) -> None:
-    """Where a generator goes on in its table: numpy does not look whether that is inside."""
+def _require_valid_position(state: Mapping[str, Any]) -> None:
+    """Check the position of a generator in its table: numpy does not check it, and would read outside."""
     inner = state.get("state")
     pos = inner.get("pos", 0) if isinstance(inner, dict) else 0
     if not 0 <= int(pos) <= 624 or not 0 <= int(state.get("buffer_pos", 0)) <= 4:
-        raise ValueError("a generator of numpy would go on outside of its table")
+        raise ValueError("the position of a numpy generator is outside of its table")
 
 
 def _is_helper(value: object) -> bool:
-    """Whether a value is made of a class of the author's, whose attributes are looked through as well."""
+    """Return whether a value is an object of the task's own class, whose attributes are saved as well."""
     bases = [kind.__module__ for kind in type(value).__mro__[:-1]]
-    if (
-        not bases
-        or isinstance(value, type)
-        or any(f"{base}.".startswith(_OURS) or base == "builtins" for base in bases)
-    ):
+    if not bases or isinstance(value, type) or any(f"{base}.".startswith(_LIBRARIES) for base in bases):
         return False
     return hasattr(value, "__dict__") and not isinstance(value, types.ModuleType) and not callable(value)
 
 
 def _is_stateful(value: object) -> bool:
-    """Whether a value has a state of its own that cannot be written down: a generator, a stream, a file."""
+    """Return whether a value has a state that cannot be saved: a generator, a stream, a file."""
     if isinstance(value, Iterator | np.random.RandomState | threading.Thread):
         return True
     odd = isinstance(value, dict) and any(isinstance(v, Tensor) and not isinstance(k, str) for k, v in value.items())

@@ -1,4 +1,4 @@
-"""Commands: what the policy is asked to do. Each environment draws its own, at the start of an episode and in time."""
+"""Commands: goals for the policy. Each environment draws its own at the start of an episode and at intervals."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ from rlcli.sim.tensor_state import TensorState
 
 Select = Callable[[Tensor], Selection | None]
 _COLUMNS = {"start": 3, "end": 3, "center": 3, "position": 3, "quat": 4}
-"""Of what a marker says in every environment."""
+"""Columns of a marker's fields that have one row for each environment."""
 
 
 class CommandTerm(Protocol):
-    """A command term is a class `Name(env, *, ...)`.
+    """Interface of a command term: a class `Name(env, *, ...)`.
 
-    It may have a method `metrics() -> dict[str, Tensor]` (num_envs,) of how well the command is followed; their means
-    over an episode are logged. And `reset(selection)`, `state_dict`, `load_state_dict` for what else it carries;
-    `elements`, names of the columns of `command` that a person may set ("" for the others), and `limits`, the [low,
-    high] that they usually have.
+    Optional members: `metrics() -> dict[str, Tensor]`, errors of following the command, (num_envs,) each, whose means
+    over an episode are logged. `reset(selection)`, `state_dict` and `load_state_dict` for further state. `elements`,
+    names of the columns of `command` that a person may set ("" for other columns). `limits`, their usual [low, high].
 
-    A method `markers() -> list[Marker]` gives what is asked as arrows, spheres and frames (`rlcli.sim.markers`), with
-    places in the world as `entity.data.root_pos_w` is, (num_envs, 3) [m], and orientations (w, x, y, z), (num_envs, 4).
-    It is called once a picture, never in a step. It changes nothing. It reads the state of roots and joints, and beyond
-    that only what `metrics` or `update` reads too: the engine computes other fields from the first look at them on.
+    `markers() -> list[Marker]` returns the command as arrows, spheres and frames (`rlcli.sim.markers`): positions in
+    the world frame (num_envs, 3) [m], like `entity.data.root_pos_w`, and quaternions (w, x, y, z), (num_envs, 4). It is
+    called once for each picture, never in a step, and must change nothing. It may read the state of roots and joints,
+    and the fields that `metrics` or `update` read: a first read of another field makes the engine compute that field in
+    each step.
     """
 
     command: Tensor
-    """What is asked, in a tensor that stays the same. (num_envs, k)"""
+    """The command, always the same tensor. (num_envs, k)"""
 
     def resample(self, selection: Selection) -> None:
         """Draw new commands for the selected environments."""
         ...
 
     def update(self) -> None:
-        """Called once a step, after resampling: let the command follow the state (a heading, a frame)."""
+        """Update the command from the state (a heading, a frame); called once a step, after resampling."""
         ...
 
 
@@ -55,7 +55,7 @@ class Knob:
     """A column of a command that a person may set."""
 
     name: str
-    """`ELEMENT`, or `TERM.ELEMENT` where several terms have such an element."""
+    """`ELEMENT`, or `TERM.ELEMENT` if several terms have an element of this name."""
     term: str
     column: int
     low: float
@@ -63,20 +63,20 @@ class Knob:
 
 
 class CommandManager(TensorState):
-    """Keeps the timers, and the sums of the metrics over an episode."""
+    """Manager of the command terms, with their timers and the sums of their metrics over an episode."""
 
     def __init__(
         self, terms: list[BoundTerm], num_envs: int, step_dt: float, device: torch.device, tunable: TunableValues
     ) -> None:
         self.terms = terms
-        self._forget = [resets([term]) for term in terms]
+        self._term_resets = [resets([term]) for term in terms]
         self._by_name = {term.name: term for term in terms}
         self._step_dt = step_dt
         self._times = [
             tunable.get((*term.path, "resampling_time_s"), term.config.resampling_time_s)  # type: ignore[attr-defined]
             for term in terms
         ]
-        # counted in whole steps: subtracting step_dt again and again drifts
+        # whole steps: repeated subtraction of step_dt would accumulate rounding errors
         self._steps_left = torch.zeros(len(terms), num_envs, dtype=torch.int64, device=device)
         self._measured = [
             (f"{term.name}/{name}", term, name)
@@ -87,11 +87,11 @@ class CommandManager(TensorState):
         self._sums = torch.zeros(num_envs, len(self._measured), device=device)
         self._steps = torch.zeros(num_envs, device=device)
         self.held: dict[str, float] = {}
-        """What a person asks in every environment instead of the terms, by the knob's name."""
-        self._holds: dict[str, Knob] = {}
+        """Values that replace those of the terms in every environment, by the name of the knob."""
+        self._held_knobs: dict[str, Knob] = {}
 
     def knobs(self) -> list[Knob]:
-        """What a person may set."""
+        """Return the columns that a person may set."""
         found = []
         for term in self.terms:
             width = term.instance.command.shape[1]
@@ -102,14 +102,14 @@ class CommandManager(TensorState):
                 low, high = (float(low), float(high)) if float(high) > float(low) else (-1.0, 1.0)
                 if name:
                     found.append(Knob(name, term.name, column, low, high))
-        many = Counter(knob.name for knob in found)
-        return [replace(knob, name=f"{knob.term}.{knob.name}") if many[knob.name] > 1 else knob for knob in found]
+        counts = Counter(knob.name for knob in found)
+        return [replace(knob, name=f"{knob.term}.{knob.name}") if counts[knob.name] > 1 else knob for knob in found]
 
     def hold(self, name: str, value: float | None) -> None:
-        """Ask a value of the policy from the next step on, whatever the term draws; None: what the term draws.
+        """Set a column of the commands from the next step on; None: return to the term's own values.
 
         Raises:
-            UsageError: for a name that there is not, or a value that is not finite.
+            UsageError: for an unknown name, or a value that is not finite.
         """
         knobs = {name: knob for knob in self.knobs() for name in (f"{knob.term}.{knob.name}", knob.name)}
         if name not in knobs:
@@ -122,35 +122,35 @@ class CommandManager(TensorState):
         knob = knobs[name]
         if value is None:
             self.held.pop(knob.name, None)
-            self._holds.pop(knob.name, None)
+            self._held_knobs.pop(knob.name, None)
         else:
-            self.held[knob.name], self._holds[knob.name] = value, knob
+            self.held[knob.name], self._held_knobs[knob.name] = value, knob
 
     def markers(self) -> list[Marker]:
-        """What the terms ask for, to be drawn.
+        """Return the markers of all terms.
 
         Raises:
-            ConfigError: for what is no marker of every environment.
+            ConfigError: for a value that is not a marker with one row for each environment.
         """
         found: list[Marker] = []
         for term in self.terms:
-            given = list(term.instance.markers()) if hasattr(term.instance, "markers") else []
-            for marker in given:
-                _require_rows(term, marker, len(self._steps))
-            found += given
+            markers = list(term.instance.markers()) if hasattr(term.instance, "markers") else []
+            for marker in markers:
+                _require_marker(term, marker, len(self._steps))
+            found += markers
         return found
 
     def get_command(self, name: str) -> Tensor:
-        """The command of a term. (num_envs, k)"""
+        """Return the command of a term. (num_envs, k)"""
         return self.get_term(name).command
 
     def get_term(self, name: str) -> CommandTerm:
-        """A command term."""
+        """Return a command term."""
         term: CommandTerm = self._by_name[name].instance
         return term
 
     def measure(self) -> None:
-        """Add up how well this step followed its commands, before anything is drawn anew."""
+        """Add the metrics of this step to the sums, before commands are resampled."""
         if not self._measured:
             return
         metrics = {id(term): term.instance.metrics() for _, term, _ in self._measured}
@@ -158,31 +158,31 @@ class CommandManager(TensorState):
         self._steps += 1.0
 
     def episode(self, ended: Selection) -> dict[str, Tensor]:
-        """Means of the metrics over the episodes that end. (n,) each"""
+        """Return the means of the metrics over the episodes that end. (n,) each"""
         if not self._measured:
             return {}
         means = ended.read_view(self._sums) / ended.read_view(self._steps).clamp(min=1.0)[:, None]
         return {name: column for (name, _, _), column in zip(self._measured, means.unbind(1), strict=True)}
 
-    def so_far(self, term: CommandTerm, metric: str) -> Tensor:
-        """Mean of a metric of a term over the running episode, 0 before its first step. (num_envs,)"""
+    def running_mean(self, term: CommandTerm, metric: str) -> Tensor:
+        """Return the mean of a metric over the running episode, 0 before its first step. (num_envs,)"""
         column = [(other.instance, name) for _, other, name in self._measured].index((term, metric))
         return self._sums[:, column] / self._steps.clamp(min=1.0)
 
     def reset(self, selection: Selection) -> None:
-        """New episodes begin with new commands."""
+        """Draw the first commands of new episodes."""
         if self._measured:
             selection.write(self._sums, 0.0)
             selection.write(self._steps, 0.0)
-        for number, term_resets in enumerate(self._forget):
+        for number, term_resets in enumerate(self._term_resets):
             for reset in term_resets:
                 reset(selection)
             self._resample(number, selection, _FIRST)
 
     def compute(self, select: Select, running: Tensor) -> None:
-        """Let one step pass where an episode is `running` (1 or 0), and draw anew where time is up.
+        """Count one step where an episode is `running` (1 or 0), resample what is due, and update all commands.
 
-        `select` draws from the step's own counter.
+        `select` selects environments, with draws keyed by the step.
         """
         for number, term in enumerate(self.terms):
             left = self._steps_left[number]
@@ -191,11 +191,11 @@ class CommandManager(TensorState):
             if due is not None:
                 self._resample(number, due, _NEXT)
             term.instance.update()
-        for name, knob in self._holds.items():
+        for name, knob in self._held_knobs.items():
             self._by_name[knob.term].instance.command[:, knob.column] = self.held[name]
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return timers, sums, and the commands."""
+        """Return timers, sums and commands."""
         commands = {f"command.{term.name}": term.instance.command for term in self.terms}
         return {"steps_left": self._steps_left, "sums": self._sums, "steps": self._steps, **commands}
 
@@ -203,20 +203,21 @@ class CommandManager(TensorState):
         term, (low, high) = self.terms[number], self._times[number]
         drawn = selection.stream(term.stream ^ when)
         steps = drawn.uniform(low, high).double() / self._step_dt
+        # the slack absorbs rounding: 0.1 s at 0.02 s are 5 steps
         selection.write(self._steps_left[number], (steps * (1.0 - 1e-6)).ceil_().long())
         term.instance.resample(drawn)
 
 
-def _require_rows(term: BoundTerm, marker: Marker, num_envs: int) -> None:
+def _require_marker(term: BoundTerm, marker: Marker, num_envs: int) -> None:
     if not isinstance(marker, Arrow | Sphere | Frame):
         raise term.error(f"markers() gave a {type(marker).__name__}, expected an Arrow, a Sphere or a Frame")
     for name, value in marker._asdict().items():
         expected = (num_envs, _COLUMNS.get(name, 0))
         if name in _COLUMNS and (not isinstance(value, Tensor) or value.shape != expected):
             found = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
-            what = f"{type(marker).__name__}.{name}"
-            raise term.error(f"markers() gave {what} {found}, expected a tensor of shape {expected}")
+            field = f"{type(marker).__name__}.{name}"
+            raise term.error(f"markers() gave {field} {found}, expected a tensor of shape {expected}")
 
 
-# Two streams: an episode's first command is drawn by the episode's number, the later ones by the step's.
+# Two streams: the first command of an episode is keyed by the episode's number, later ones by the step's.
 _FIRST, _NEXT = np.uint64(0x434D_4446_5253), np.uint64(0x434D_444E_5854)

@@ -1,4 +1,4 @@
-"""Events: what happens to some environments at the start, at each reset, or at intervals."""
+"""Events: changes of some environments at startup, at each reset, or at intervals."""
 
 from __future__ import annotations
 
@@ -13,77 +13,72 @@ from rlcli.sim.selection import Selection
 from rlcli.sim.tensor_state import TensorState
 
 Select = Callable[[Tensor], Selection | None]
-SetConstants = Callable[[Selection], None]
+Callback = Callable[[Selection], None]
 
 
 class EventManager(TensorState):
-    """Fires events; interval timers run an environment each and start anew with its episode, unless they are global.
+    """Manager of the event terms. Each environment has its own interval timers, unless the event is global.
 
     Args:
         terms: the events.
-        num_envs: environments.
+        num_envs: number of environments.
         step_dt: control period [s].
-        device: of the timers.
-        set_constants: called once after a firing that wrote something from which the engine derives constants.
+        device: device of the timers.
+        set_constants: called after events that change an input of the constants that the engine derives from the model.
     """
 
     def __init__(
-        self,
-        terms: list[BoundTerm],
-        num_envs: int,
-        step_dt: float,
-        device: torch.device,
-        set_constants: SetConstants = lambda _: None,
+        self, terms: list[BoundTerm], num_envs: int, step_dt: float, device: torch.device, set_constants: Callback
     ) -> None:
         by_mode: dict[str, list[BoundTerm]] = {"startup": [], "reset": [], "interval": []}
         for term in terms:
             by_mode[term.config.mode].append(term)  # type: ignore[attr-defined]
         self.terms = terms
         self._startup, self._reset, self._interval = by_mode["startup"], by_mode["reset"], by_mode["interval"]
-        self._lasting = [term.instance for term in terms if hasattr(term.instance, "update")]
+        self._updating = [term.instance for term in terms if hasattr(term.instance, "update")]
         self._step_dt = step_dt
         self._set_constants = set_constants
-        # counted in whole steps: subtracting step_dt again and again drifts
+        # whole steps: repeated subtraction of step_dt would accumulate rounding errors
         self._steps_left = torch.zeros(len(self._interval), num_envs, dtype=torch.int64, device=device)
         self._fired_at = torch.full((len(self._reset), num_envs), _NEVER, dtype=torch.int64, device=device)
         self._resets = list(zip(self._reset, self._fired_at.unbind(0), strict=True))
         self._intervals = list(zip(self._interval, self._steps_left.unbind(0), strict=True))
         self._resets_derive = any(map(_derives, self._reset))
-        self._forget = resets(terms)
+        self._term_resets = resets(terms)
 
     @property
     def derives(self) -> bool:
-        """Whether some event changes what the engine derives constants from."""
+        """Whether any event changes an input of the constants that the engine derives from the model."""
         return any(map(_derives, self.terms))
 
     @property
     def has_intervals(self) -> bool:
-        """Whether anything happens between resets."""
-        return bool(self._interval or self._lasting)
+        """Whether any event acts between resets."""
+        return bool(self._interval or self._updating)
 
-    def startup(self, everyone: Selection) -> None:
+    def startup(self, all_envs: Selection) -> None:
         """Fire the startup events, once."""
         for term in self._startup:
-            term.call(everyone.stream(term.stream))
-        self._after(self._startup, everyone)
+            term.call(all_envs.stream(term.stream))
+        self._derive_constants(self._startup, all_envs)
 
-    def before_full_reset(self, everyone: Selection) -> None:
-        """Clear what has fired, before all environments are reset."""
+    def before_full_reset(self, all_envs: Selection) -> None:
+        """Forget when reset events fired, and draw the global timers, before all environments are reset."""
         self._fired_at.fill_(_NEVER)
         for term, left in self._intervals:
             if _is_global(term):
-                everyone.write(left, self._draw(term, everyone, _FIRST)[:1])
+                all_envs.write(left, self._draw(term, all_envs, _FIRST)[:1])
 
     def reset(self, selection: Selection, step: Tensor) -> None:
-        """Fire the reset events of new episodes at a `step` since the start, and start their interval timers."""
-        for reset in self._forget:
+        """Fire the reset events of new episodes at a `step` of training, and start their interval timers."""
+        for reset in self._term_resets:
             reset(selection)
         for term, fired_at in self._resets:
-            apart = term.config.min_steps_between  # type: ignore[attr-defined]
-            due = selection.where(step - fired_at >= apart) if apart else selection
+            min_steps = term.config.min_steps_between  # type: ignore[attr-defined]
+            due = selection.where(step - fired_at >= min_steps) if min_steps else selection
             if due is not None:
                 term.call(due.stream(term.stream))
-                if apart:
+                if min_steps:
                     due.write(fired_at, step.expand(1))
         if self._resets_derive:
             self._set_constants(selection)
@@ -91,33 +86,34 @@ class EventManager(TensorState):
             if not _is_global(term):
                 selection.write(left, self._draw(term, selection, _FIRST))
 
-    def interval(self, select: Select, running: Tensor, fired: Callable[[Selection], None]) -> None:
-        """Let one step pass where an episode is `running` (1 or 0) and fire what is due, telling `fired` after each.
+    def interval(self, select: Select, running: Tensor, fired: Callback) -> None:
+        """Count one step where an episode is `running` (1 or 0), and fire the events that are due.
 
-        `select` draws from the step's own counter. Global timers run everywhere.
+        `select` selects environments, with draws keyed by the step. `fired` is called after each event with its
+        environments. Global timers also run where no episode does.
         """
-        for lasting in self._lasting:
-            lasting.update(select, running)
+        for instance in self._updating:
+            instance.update(select, running)
         for term, left in self._intervals:
             is_global = _is_global(term)
             left -= 1 if is_global else running
             due = select(left <= 0)
             if due is not None:
                 term.call(due.stream(term.stream))
-                self._after([term], due)
+                self._derive_constants([term], due)
                 steps = self._draw(term, due, _NEXT)
                 due.write(left, steps[:1] if is_global else steps)
                 fired(due)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the interval timers, and when reset events fired."""
+        """Return the interval timers, and the steps at which reset events fired."""
         return {"steps_left": self._steps_left, "fired_at": self._fired_at}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore the state returned by `state_dict()`; older checkpoints lack `fired_at`."""
+        """Restore the state returned by `state_dict()`; older checkpoints have no `fired_at`."""
         super().load_state_dict({"fired_at": self._fired_at, **state})
 
-    def _after(self, fired: Sequence[BoundTerm], selection: Selection) -> None:
+    def _derive_constants(self, fired: Sequence[BoundTerm], selection: Selection) -> None:
         if any(map(_derives, fired)):
             self._set_constants(selection)
 
@@ -136,5 +132,5 @@ def _is_global(term: BoundTerm) -> bool:
 
 
 _NEVER = -(1 << 62)
-# Two streams: an episode's first interval is drawn by the episode's number, the later ones by the step's.
+# Two streams: the first interval of an episode is keyed by the episode's number, later ones by the step's.
 _FIRST, _NEXT = np.uint64(0x5449_4D45_5231), np.uint64(0x5449_4D45_5232)

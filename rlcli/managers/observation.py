@@ -1,7 +1,8 @@
-"""Observations: groups of terms side by side, each run through its pipeline of noise, clip, scale, delay, history."""
+"""Observations: groups of terms. Each term runs through its pipeline of noise, clip, scale, delay and history."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -27,22 +28,24 @@ class _Group:
 
 
 Watch = Callable[[Tensor, str], None]
-"""Notes, without waiting for a device, if values are not finite: (values, what they are)."""
+"""Callback that notes values that are not finite, without a host sync: (values, their name)."""
 
 _FINAL = np.uint64(0x46494E414C)
-"""The last observation of an episode draws apart, so that the first of the next one is not seen with its noise."""
+"""Stream of the last observation of an episode: the first one of the next episode has other noise."""
 
 
 class ObservationManager(TensorState):
-    """Computes every group into one of three buffers in turn, so that consecutive observations share no memory.
+    """Manager of the observation terms. Each group has three buffers in turn: consecutive observations share no memory.
 
     Args:
         groups: the bound terms of each group.
-        configs: the groups' settings.
+        configs: the settings of the groups.
+        num_envs: number of environments.
         step_dt: control period [s].
-        now: gives all environments, drawing by the step's counter.
-        tunable: what a curriculum moves.
-        watch: notes what is not finite; None checks at once.
+        device: device of the buffers.
+        select_all: returns a selection of all environments, with draws keyed by the step.
+        tunable: the settings that a curriculum changes.
+        watch: notes values that are not finite; None: check them at once.
     """
 
     def __init__(
@@ -52,22 +55,23 @@ class ObservationManager(TensorState):
         num_envs: int,
         step_dt: float,
         device: torch.device,
-        now: Callable[[], Selection],
+        select_all: Callable[[], Selection],
         tunable: TunableValues,
         watch: Watch | None = None,
     ) -> None:
         self.num_envs = num_envs
-        self._device, self._step_dt, self._tunable, self._now, self._watch = device, step_dt, tunable, now, watch
+        self._device, self._step_dt, self._tunable = device, step_dt, tunable
+        self._select_all, self._watch = select_all, watch
         self.groups = {name: self._group(terms, configs[name]) for name, terms in groups.items()}
         self._final = {name: torch.zeros_like(group.buffers[0]) for name, group in self.groups.items()}
         self._final_views = {name: _split(self._final[name], group.pipelines) for name, group in self.groups.items()}
         self._fresh: Selection | None = None
-        self._forget = [
+        self._term_resets = [
             reset for group in self.groups.values() for pipeline in group.pipelines for reset in pipeline.resets
         ]
 
     def compute(self) -> dict[str, Tensor]:
-        """Observations of the state as it is. (num_envs, d) each"""
+        """Return the observations of the current state by group. (num_envs, d) each"""
         result, draws = {}, self._draws(np.uint64(0))
         for name, group in self.groups.items():
             group.next = (group.next + 1) % len(group.buffers)
@@ -78,15 +82,15 @@ class ObservationManager(TensorState):
         return result
 
     def compute_final(self) -> dict[str, Tensor]:
-        """The same into a buffer of its own; nothing that has a memory moves on."""
+        """Return the observations in separate buffers; histories, delays and filters do not advance."""
         draws = self._draws(_FINAL)
         for name, group in self.groups.items():
             self._fill(group, self._final_views[name], draws, advance=False)
             self._require_finite(name, group, self._final[name])
         return self._final
 
-    def again(self) -> dict[str, Tensor]:
-        """The observations that `compute` gave last, after `load_state_dict`."""
+    def recompute_last(self) -> dict[str, Tensor]:
+        """Return the last result of `compute`, after `load_state_dict`."""
         result, draws = {}, self._draws(np.uint64(0))
         for name, group in self.groups.items():
             if not _has_memory(group):
@@ -95,17 +99,17 @@ class ObservationManager(TensorState):
         return result
 
     def reset(self, selection: Selection) -> None:
-        """New episodes begin: histories and delays start from their first value."""
+        """Start new episodes: histories and delays start at their first value."""
         self._fresh = selection
-        for reset in self._forget:
+        for reset in self._term_resets:
             reset(selection)
 
     def pipelines(self, group: str) -> list[Pipeline]:
-        """The terms of a group with what is done to them."""
+        """Return the pipelines of the terms of a group."""
         return self.groups[group].pipelines
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return what pipelines carry from step to step, and the last observations of the groups that do."""
+        """Return the state of the pipelines, and the last observations of the groups that have one."""
         tensors = {
             f"{name}.{pipeline.term.name}.{key}": tensor
             for name, group in self.groups.items()
@@ -121,14 +125,8 @@ class ObservationManager(TensorState):
         self._fresh = None
 
     def _draws(self, salt: np.uint64) -> Draws:
-        everyone: list[Selection] = []  # made when somebody draws, once a step
-
-        def draws(stream: np.uint64) -> Selection:
-            if not everyone:
-                everyone.append(self._now())
-            return everyone[0].stream(stream ^ salt)
-
-        return draws
+        all_envs = functools.cache(self._select_all)  # made at the first draw of a step
+        return lambda stream: all_envs().stream(stream ^ salt)
 
     def _fill(self, group: _Group, views: list[Tensor], draws: Draws, *, advance: bool) -> None:
         for pipeline, view in zip(group.pipelines, views, strict=True):
@@ -139,7 +137,7 @@ class ObservationManager(TensorState):
         for term in terms:
             value = first_value(term)
             dims = value.dim() if isinstance(value, Tensor) else 0
-            shape = tuple(value.shape[1:]) if dims in (2, 4) else (1,)  # columns, or a picture
+            shape = tuple(value.shape[1:]) if dims in (2, 4) else (1,)  # columns, or an image
             check_shape(term, value, (self.num_envs, *shape))
             pipelines.append(Pipeline(term, shape, config, self.num_envs, self._step_dt, self._device, self._tunable))
         size = sum(pipeline.size for pipeline in pipelines)

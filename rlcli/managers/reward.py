@@ -1,4 +1,4 @@
-"""Rewards: weight x value x step_dt a term, summed; the sums of an episode are kept term by term."""
+"""Rewards: the sum of weight x value x step_dt over the terms, with sums over the episode for each term."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from rlcli.sim.tensor_state import TensorState
 
 
 class RewardManager(TensorState):
-    """Terms whose weight is 0 and stays so are not called.
+    """Manager of the reward terms. Terms with a constant weight of 0 are not called.
 
-    Where a `divergence_reward` is configured, what it paid is kept as a term of its own.
+    The `divergence_reward`, if configured, is logged as a term of its own.
     """
 
     def __init__(
@@ -32,10 +32,10 @@ class RewardManager(TensorState):
         divergence_reward: float | None = None,
     ) -> None:
         self.terms = terms
-        self._forget = resets(terms)
+        self._term_resets = resets(terms)
         self._dt = dt
         weights = [tunable.get((*term.path, "weight"), term.config.weight) for term in terms]  # type: ignore[attr-defined]
-        # for one environment a second column: numpy adds the only one up in another order than it does several
+        # at least two columns: numpy sums a single column in another order than several
         table = torch.zeros(len(terms), max(num_envs, 2), device=device)
         self._values = table[:, :num_envs]
         self._sums = torch.zeros(len(terms), num_envs, device=device)
@@ -68,14 +68,13 @@ class RewardManager(TensorState):
                 check_shape(term, first_value(term), (num_envs,))
 
     def compute(self, diverged: Tensor | None = None, terminated: Tensor | None = None) -> Tensor:
-        """This step's reward; `add_to_episodes` takes it into the episode's sums. (num_envs,)
+        """Return the reward of this step; `add_to_episodes` adds it to the sums of the episodes. (num_envs,)
 
-        Where it `terminated`, terms with `while_alive` pay nothing.
+        Terms with `while_alive` give 0 where the episode `terminated`. On a CPU a term that is not finite gives 0 where
+        the simulation diverged.
 
-        On a CPU a term that is not finite where the simulation diverged pays nothing there.
-
-        On a CPU the terms are added one after the other: torch's own sum over rows rounds differently for different
-        numbers of environments, and numpy's where there is one. On a GPU nothing is bit-identical.
+        On a CPU terms are added one after the other, so that the result does not depend on the number of environments:
+        the rounding of torch's sum over rows does. On a GPU results are not bit-identical anyway.
         """
         for call, row in self._active:
             row.copy_(call())
@@ -95,20 +94,20 @@ class RewardManager(TensorState):
         return total
 
     def add_to_episodes(self) -> None:
-        """Take the step's terms into the sums of the running episodes."""
+        """Add this step's terms to the sums of the running episodes."""
         self._episode_terms += self._step_terms
 
     @property
     def step_terms(self) -> Tensor:
-        """What each term paid in the last step, weight included, live. (terms, num_envs)"""
+        """Weighted value of each term in the last step, without a copy. (terms, num_envs)"""
         return self._values
 
     def values(self) -> dict[str, Tensor]:
-        """Term -> what it paid in the last step, weight included; zeros where it is not called. (num_envs,) each"""
+        """Return the weighted value of each term in the last step, 0 for a term that is not called. (num_envs,) each"""
         return {term.name: row for term, row in zip(self.terms, self._rows, strict=True)}
 
     def replace_diverged(self, diverged: Tensor, total: Tensor) -> None:
-        """Pay the `divergence_reward`, if there is one, instead of this step's terms."""
+        """Give the `divergence_reward`, if configured, instead of this step's terms."""
         if self._divergence_reward is None:
             return
         self._sums -= torch.where(diverged, self._values, 0.0)
@@ -116,8 +115,8 @@ class RewardManager(TensorState):
         total.masked_fill_(diverged, self._divergence_reward)
 
     def episode(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return of the episode so far, and each term's share of it, where selected. (n,) each"""
-        sums = ended.read(self._sums_by_env).contiguous()  # a row's sum then rounds alike however many there are
+        """Return the returns of the selected episodes, and the share of each term. (n,) each"""
+        sums = ended.read(self._sums_by_env).contiguous()  # so that rounding does not depend on the number of rows
         shares = {term.name: column for term, column in zip(self.terms, sums.unbind(1), strict=True)}
         returns = sums.sum(dim=1)
         if self._divergence_reward is not None:
@@ -126,27 +125,27 @@ class RewardManager(TensorState):
         return returns, shares
 
     def require_finite_terms(self) -> None:
-        """Name the term behind a reward that is not finite.
+        """Check that the terms of the last step are finite.
 
         Raises:
-            DivergedError: if there is one.
+            DivergedError: with the first term that is not.
         """
         for term, row in zip(self.terms, self._rows, strict=True):
             term.require_finite(row, f"reward term '{term.name}'")
 
     def reset(self, selection: Selection) -> None:
-        """Episode sums start at zero."""
+        """Set the episode sums of new episodes to zero."""
         selection.write(self._sums_by_env, 0.0)
         if self._divergence_reward is not None:
             selection.write(self._divergence_sums, 0.0)
-        for reset in self._forget:
+        for reset in self._term_resets:
             reset(selection)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the running sums."""
+        """Return the episode sums."""
         return {"sums": self._sums, "divergence_sums": self._divergence_sums}
 
 
 def _is_tunable(weight: float | Tensor) -> bool:
-    """Whether a curriculum changes a weight."""
+    """Return whether a curriculum changes a weight."""
     return isinstance(weight, Tensor)

@@ -1,4 +1,4 @@
-"""Binding terms: names in the YAML become objects and ids once, when the environment is built."""
+"""Binding of terms: names in the YAML become objects and indices once, when the environment is built."""
 
 from __future__ import annotations
 
@@ -29,37 +29,37 @@ if TYPE_CHECKING:
 
 
 SENSORS = {"ContactSensor": "contact", "RaySensor": "rays", "CameraSensor": "camera"}
-"""Alias of `rlcli.task` -> kind of the sensor that it names."""
+"""Type alias of `rlcli.task` -> kind of its sensors in `scene.sensors`."""
 
 
 @dataclass(frozen=True, slots=True)
 class BoundTerm:
-    """A term with its parameters resolved. `call` takes what the manager gives: nothing, or a selection."""
+    """A term with its parameters resolved. Managers call `call()`, or `call(selection)` for events and curricula."""
 
     name: str
     path: Path
     config: TermConfig
     resolved: Resolved
-    """The configuration that the term is of."""
+    """The configuration of the task."""
     call: Callable[..., Any]
     elements: dict[str, list[str]]
-    """Selector parameter -> the names it resolved to."""
+    """Selector parameter -> the names of the selected elements."""
     stream: np.uint64
-    """The term's random stream."""
+    """Number of the term's random stream."""
     memory: TermState | None = None
-    """What a class term of a task's own carries from step to step, if it does not say so itself."""
+    """State of a class term of a task's own, if the class has no `state_dict`."""
 
     @property
     def instance(self) -> Any:
-        """The object of a class term; the function of a function term."""
+        """Object of a class term, or the function of a function term."""
         return self.call
 
     def error(self, message: str, *keys: str) -> ShapeError:
-        """What is wrong with what the term gives, or with a key of it that must fit that."""
+        """Return an error about a value of the term, or about one of its keys that does not fit the value."""
         return ShapeError([self.resolved.problem((*self.path, *keys), message)])
 
     def require_finite(self, values: Tensor, what: str) -> None:
-        """Raise if a value of the term is not finite. values (num_envs, ...)
+        """Check that values of the term are finite. values (num_envs, ...)
 
         Raises:
             DivergedError: with the number of environments and the first of them.
@@ -72,7 +72,7 @@ class BoundTerm:
             )
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What a term with memory carries from step to step."""
+        """Return the state of a term with a memory."""
         if hasattr(self.call, "state_dict"):
             state: dict[str, Tensor] = self.call.state_dict()
             return state
@@ -87,23 +87,23 @@ class BoundTerm:
 
 
 class TermEnv(Protocol):
-    """What a binder needs of an environment; terms get the same object as their `env`."""
+    """Interface that a binder needs of an environment. Terms get the same object as `env`."""
 
     device: torch.device
 
     @property
     def entities(self) -> Mapping[str, Entity]:
-        """The entities of the scene by name."""
+        """Entities of the scene by name."""
         ...
 
     @property
     def sensors(self) -> Mapping[str, Sensor]:
-        """The sensors of the scene by name."""
+        """Sensors of the scene by name."""
         ...
 
 
 class Binder:
-    """Binds the terms of one environment, and collects every problem before any is raised."""
+    """Binder of the terms of one environment. It collects all problems before it raises them."""
 
     def __init__(self, env: TermEnv, resolved: Resolved) -> None:
         self.env = env
@@ -114,7 +114,7 @@ class Binder:
         self._open_addresses()
 
     def bind(self, section: str, path: Path, config: TermConfig) -> BoundTerm | None:
-        """A bound term, or None if something in it does not resolve."""
+        """Return a bound term, or None if a name in it does not resolve."""
         signature = self.signature(section, config)
         params, elements = self._resolve(signature, path, config)
         if params is None:
@@ -138,27 +138,27 @@ class Binder:
         return signature
 
     def bind_all(self, section: str) -> list[BoundTerm]:
-        """The terms of a section, in order."""
-        configs = getattr(self.resolved.task, section)
-        bound = [self.bind(section, (section, name), config) for name, config in configs.items()]
-        terms = [term for term in bound if term is not None]
+        """Return the bound terms of a section, in order."""
+        terms = self._bind_each(section, (section,), getattr(self.resolved.task, section))
         if section == "commands":
             self._commands = {term.name: term for term in terms}
         return terms
 
     def bind_group(self, group: str) -> list[BoundTerm]:
-        """The terms of an observation group, in order."""
-        configs = self.resolved.task.observations[group].terms
-        bound = [self.bind("observations", ("observations", group, name), c) for name, c in configs.items() if c]
+        """Return the bound terms of an observation group, in order."""
+        return self._bind_each("observations", ("observations", group), self.resolved.task.observations[group].terms)
+
+    def _bind_each(self, section: str, path: Path, configs: Mapping[str, TermConfig | None]) -> list[BoundTerm]:
+        bound = [self.bind(section, (*path, name), config) for name, config in configs.items() if config is not None]
         return [term for term in bound if term is not None]
 
     def success(self) -> BoundTerm | None:
-        """The task's success condition."""
+        """Return the task's success condition, bound."""
         config = self.resolved.task.success
         return self.bind("success", ("success",), config) if config is not None else None
 
     def load(self, signature: Signature) -> Any:
-        """Import a term.
+        """Import a term and return its function or class.
 
         Raises:
             TaskError: if its module does not import.
@@ -175,14 +175,14 @@ class Binder:
         return getattr(importlib.import_module(signature.module), signature.attribute)
 
     def add_problem(self, path: Path, message: str, hint: str | None = None) -> None:
-        """Note what does not fit at a place of the configuration."""
+        """Add a problem at a path of the configuration."""
         self.problems.append(self.resolved.problem(path, message, hint))
 
     def raise_problems(self) -> None:
-        """Report everything at once.
+        """Raise all problems at once.
 
         Raises:
-            ConfigError: if anything did not resolve.
+            ConfigError: if there are any.
         """
         if self.problems:
             raise ConfigError(self.problems)
@@ -192,7 +192,7 @@ class Binder:
     ) -> tuple[dict[str, Any] | None, dict[str, list[str]]]:
         params = config.params
         elements: dict[str, list[str]] = {}
-        good = True
+        resolved = True
         for parameter in signature.parameters:
             if parameter.alias == "Entity":
                 name = params[parameter.name]
@@ -206,14 +206,14 @@ class Binder:
             name = parameter.name
             if parameter.alias == "Command" and params[name] is not None:
                 params[name] = self._command(path, name, params[name])
-                good = good and params[name] is not None
+                resolved = resolved and params[name] is not None
             elif parameter.alias == "Address":
                 params[name] = self._opened.get((*path, name))
-                good = good and params[name] is not None
+                resolved = resolved and params[name] is not None
             elif parameter.alias in SENSORS:
                 if params[name] is not None:
                     params[name] = self._sensor(path, name, params[name], SENSORS[parameter.alias])
-                    good = good and params[name] is not None
+                    resolved = resolved and params[name] is not None
             else:
                 params[name] = self.tunable.get((*path, name), params[name])
         for parameter in signature.parameters:
@@ -222,16 +222,16 @@ class Binder:
                     index, names = params["entity"].select(parameter.alias, params[parameter.name])
                 except NameProblem as problem:
                     self.add_problem((*path, parameter.name), str(problem), problem.hint)
-                    good = False
+                    resolved = False
                     continue
                 params[parameter.name], elements[parameter.name] = index, names
-        return (params if good else None), elements
+        return (params if resolved else None), elements
 
     def _sensor(self, path: Path, parameter: str, name: str, kind: str) -> Sensor | None:
         configs = self.resolved.task.scene.sensors
         found = configs.get(name)
         if found is not None and found.kind == kind:
-            return self.env.sensors.get(name)  # absent if the scene refused it, and has said so
+            return self.env.sensors.get(name)  # absent after an error of the scene, which is reported already
         names = [other for other, config in configs.items() if config.kind == kind]
         message = f"no sensor '{name}' of kind {kind} in scene.sensors"
         if found is not None:
@@ -241,7 +241,7 @@ class Binder:
         return None
 
     def _open_addresses(self) -> None:
-        """Find what the curriculum changes before anybody binds to it."""
+        """Make the tensors that the curriculum changes, before any term is bound to them."""
         self._opened: dict[Path, Tensor] = {}
         for name, config in self.resolved.task.curriculum.items():
             signature = self.resolved.vocabulary.find("curriculum", config.func) if config is not None else None
@@ -258,22 +258,22 @@ class Binder:
         if name in self._commands:
             return self._commands[name].instance
         names = [command for command, config in self.resolved.task.commands.items() if config is not None]
-        if name not in names:  # else its own problem has been said
-            have = f"commands: {listing(names)}" if names else "the task has no commands: section"
-            self.add_problem((*path, parameter), f"no command '{name}'", did_you_mean(name, names) or have)
+        if name not in names:  # else the problem of the command itself is reported already
+            hint = f"commands: {listing(names)}" if names else "the task has no commands: section"
+            self.add_problem((*path, parameter), f"no command '{name}'", did_you_mean(name, names) or hint)
         return None
 
 
 def resets(terms: Iterable[BoundTerm]) -> list[Callable[[Any], None]]:
-    """What to call with the environments that start a new episode: the `reset` of every term that has one."""
+    """Return the `reset` methods of the terms that have one; call them with the environments of new episodes."""
     return [term.instance.reset for term in terms if hasattr(term.instance, "reset")]
 
 
 def first_value(term: BoundTerm) -> Any:
-    """Call a term once, when the environment is built.
+    """Call a term for the first time, when the environment is built.
 
     Raises:
-        ShapeError: if it refuses its parameters with a ValueError.
+        ShapeError: if the term raises a ValueError about its parameters.
     """
     try:
         return term.call()
@@ -282,10 +282,10 @@ def first_value(term: BoundTerm) -> Any:
 
 
 def check_shape(term: BoundTerm, value: object, expected: tuple[int, ...]) -> None:
-    """A term's first value must be a tensor of the expected shape.
+    """Check that a term's first value is a tensor of the expected shape.
 
     Raises:
-        ShapeError: with the term's place, what was found and what was expected.
+        ShapeError: with the term's path in the configuration, the value found and the shape expected.
     """
     shape = tuple(value.shape) if isinstance(value, Tensor) else None
     if shape == expected:

@@ -1,4 +1,4 @@
-"""Terminations: which episodes end, whether because of the task or of the clock, and which terms said so."""
+"""Terminations: which episodes end, by failure or by time-out, and which terms fired."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from rlcli.managers.term import BoundTerm, check_shape, first_value, resets
 from rlcli.sim.selection import Selection
 
 DIVERGED = "diverged"
-"""Name under which a diverged simulation is logged as a cause."""
+"""Name of a diverged simulation among the logged causes."""
 
 
 class TerminationManager:
-    """`terminated` and `time_outs` are those of the current step; a state may be both."""
+    """Manager of the termination terms. A state may be both terminated and timed out."""
 
     def __init__(self, terms: list[BoundTerm], num_envs: int, device: torch.device) -> None:
         self.terms = terms
         self._none = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.terminated = self._none.clone()
-        """(num_envs,) bool"""
+        """Where this step terminated the episode. (num_envs,) bool"""
         self.time_outs = self._none.clone()
-        """(num_envs,) bool"""
+        """Where the episode timed out in this step. (num_envs,) bool"""
         self.fired: dict[str, Tensor] = {term.name: self._none for term in terms}
         """Term -> where it fired in this step. (num_envs,) bool each"""
-        self._forget = resets(terms)
+        self._term_resets = resets(terms)
         self._calls = [(term, bool(term.config.time_out)) for term in terms]  # type: ignore[attr-defined]
         for term in terms:
             check_shape(term, first_value(term), (num_envs,))
 
     def compute(self, diverged: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Judge this step. (num_envs,) bool each"""
+        """Return where this step terminates episodes, and where they time out. (num_envs,) bool each"""
         self.fired = {} if diverged is None else {DIVERGED: diverged}
         failed: list[Tensor] = list(self.fired.values())
         timed_out: list[Tensor] = []
@@ -43,15 +43,15 @@ class TerminationManager:
         return self.terminated, self.time_outs
 
     def _any(self, masks: list[Tensor]) -> Tensor:
-        if len(masks) < 2:  # a copy: a term may keep its own tensor from step to step
+        if len(masks) < 2:  # copy: a term may return the same tensor in each step
             return masks[0].clone() if masks else self._none.clone()
         return functools.reduce(torch.logical_or, masks)
 
     def causes(self, ended: Selection) -> dict[str, Tensor]:
-        """Term -> whether it fired where episodes ended. (n,) bool each"""
+        """Return for each term whether it fired in the episodes that end. (n,) bool each"""
         return {name: ended.read_view(fired) for name, fired in self.fired.items()}
 
     def reset(self, selection: Selection) -> None:
-        """Tell terms with memory."""
-        for reset in self._forget:
+        """Reset the terms with a memory."""
+        for reset in self._term_resets:
             reset(selection)

@@ -1,6 +1,6 @@
-"""Numbers of the configuration that change while training goes on: each lives in a tensor that its reader keeps.
+"""Numbers of the configuration that a curriculum changes: each is a tensor that the code reads at each use.
 
-So a curriculum changes a weight, a range or a limit on the device, within a recorded step, and nobody has to be told.
+A curriculum can so change a weight, a range or a limit on the device, within a captured step.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _FIXED = {
     "interval_range_s",
     "resampling_time_s",
 }
-"""Settings of terms that are read once."""
+"""Settings of terms that are read only once."""
 
 
 class TunableValues:
-    """The tensors by the path of the setting they stand for."""
+    """Tensors of the changing settings, by the path of the setting."""
 
     def __init__(self, task: TaskConfig, device: torch.device) -> None:
         self._task, self._device = task, device
@@ -44,14 +44,14 @@ class TunableValues:
         return path in self._tensors
 
     def get(self, path: Path, default: object = None) -> Any:
-        """The tensor of a setting that may change, else `default`."""
+        """Return the tensor of a setting that may change, else `default`."""
         return self._tensors.get(path, default)
 
     def open(self, address: str) -> Tensor:
-        """The tensor at a dotted address, of the shape that stands there; from now on its reader reads it.
+        """Return the tensor of the setting at a dotted address, in the shape of the setting. Terms bound later read it.
 
         Raises:
-            NameProblem: if the address leads to no number that may change.
+            NameProblem: if the address is not a number that may change.
         """
         path = parse_address(address)
         value: Any = self._task
@@ -65,17 +65,17 @@ class TunableValues:
                 where = f"'{'.'.join(path[:depth])}' has" if depth else "the task has"
                 names = [name for name in names if _may_change(_member(value, name))]
                 near = did_you_mean(key, names)
-                have = f"what may change there: {listing(names)}" if names else None
+                have = f"settings that may change there: {listing(names)}" if names else None
                 hint = f"{near}; {have}" if near and have else near or have
-                raise NameProblem(f"address '{address}' leads nowhere: {where} no '{key}'", hint)
+                raise NameProblem(f"address '{address}' does not exist: {where} no '{key}'", hint)
             value = _member(value, key)
             if _is_number(value):
                 try:
                     return self._opened(path[: depth + 1], value)[tuple(int(index) for index in path[depth + 1 :])]
                 except (ValueError, IndexError):
                     rest = ".".join(path[depth + 1 :])
-                    raise NameProblem(f"address '{address}' leads nowhere: '{rest}' is no index there") from None
-        raise NameProblem(f"address '{address}' leads to no number, or list of numbers")
+                    raise NameProblem(f"address '{address}' does not exist: '{rest}' is not an index there") from None
+        raise NameProblem(f"address '{address}' is not a number or a list of numbers")
 
     def _opened(self, path: Path, value: object) -> Tensor:
         if path not in self._tensors:
@@ -98,12 +98,12 @@ def _member(value: Any, key: str) -> Any:
 
 
 def _may_change(value: object) -> bool:
-    """Whether a number is there, or further below."""
+    """Return whether a value is a number or contains one."""
     return _is_number(value) or any(_may_change(_member(value, name)) for name in _names(value))
 
 
 def _is_number(value: object) -> bool:
-    """Whether it is a number, or a list of such."""
+    """Return whether a value is a number or a list of numbers."""
     if isinstance(value, list | tuple):
         return bool(value) and all(_is_number(item) for item in value)
     return isinstance(value, int | float) and not isinstance(value, bool)

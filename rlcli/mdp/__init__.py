@@ -1,5 +1,5 @@
-"""The vocabulary of manager-based tasks: plain functions of the environment, one module a section of the YAML.
+"""Terms of manager-based tasks. Each section of the YAML has one module of functions and classes.
 
-Shapes are given after each summary; joint quantities are in m and rad, efforts in N and N m. Names and meanings follow
-Isaac Lab's `mdp` module.
+Each docstring ends its summary with the shape of the result. Joint quantities are in m (slide) or rad (hinge), efforts
+in N or N m. Names and meanings follow Isaac Lab's `mdp` module.
 """

@@ -1,112 +1,110 @@
-"""Curriculum terms: by the clock of training (classes with `advance`), or by the episodes that end (functions)."""
+"""Curriculum terms: schedules by training steps (classes with `advance`), and terms that use the ended episodes."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from rlcli.mdp.parameters import Address, Command, Entity
-
-if TYPE_CHECKING:
-    from rlcli.envs.managed import ManagedEnv
-    from rlcli.sim.selection import Selection
+from rlcli.mdp.parameters import Address, Command
+from rlcli.mdp.term import EntityTerm, Term
+from rlcli.sim.selection import Selection
 
 
-class Stages:
-    """The number at `address` takes each value once its step has come; before the first it is what the task says.
+@dataclass(kw_only=True, eq=False)
+class Stages(Term):
+    """Schedule that sets the number at `address` to the next of the `values` at each of the `steps`.
 
-    `steps` are environment steps since training began, in rising order. Isaac Lab: modify_reward_weight,
-    modify_env_param, modify_term_cfg; mjlab: reward_curriculum, termination_curriculum, commands_vel.
+    Before the first step the setting keeps its value. `steps` are environment steps since training began, in rising
+    order. Isaac Lab: modify_reward_weight, modify_env_param, modify_term_cfg; mjlab: reward_curriculum,
+    termination_curriculum, commands_vel.
     """
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        address: Address,
-        steps: list[int],
-        values: list[float] | list[list[float]] | list[list[list[float]]],
-    ) -> None:
-        if len(steps) != len(values) or not steps or sorted(steps) != steps:
-            raise ValueError("steps and values are lists of equal length, steps in rising order")
-        self._live = address
-        self._steps = torch.tensor(steps, device=env.device)
-        table = torch.tensor(values, dtype=torch.float32, device=env.device)
-        if table.shape[1:] != address.shape:
-            raise ValueError(f"each value has shape {tuple(table.shape[1:])}, at the address is {tuple(address.shape)}")
-        self._values = torch.cat([address[None].clone(), table])
+    address: Address
+    steps: list[int]
+    values: list[float] | list[list[float]] | list[list[list[float]]]
+
+    def __post_init__(self) -> None:
+        if len(self.steps) != len(self.values) or not self.steps or sorted(self.steps) != self.steps:
+            raise ValueError("steps and values must be lists of equal length, with steps in rising order")
+        self._steps = torch.tensor(self.steps, device=self.env.device)
+        table = torch.tensor(self.values, dtype=torch.float32, device=self.env.device)
+        _require_shape("each value", table.shape[1:], self.address)
+        self._values = torch.cat([self.address[None].clone(), table])
 
     def advance(self, step: Tensor) -> Tensor:
-        """Set the value of this step. -> the value"""
+        """Set and return the value at this step. step () int64"""
         number = torch.bucketize(step, self._steps, right=True)
-        self._live.copy_(self._values.index_select(0, number[None])[0])
-        return self._live
+        # index_select: indexing with a tensor would read the number on the host
+        self.address.copy_(self._values.index_select(0, number[None])[0])
+        return self.address
 
 
-class Interpolate:
-    """The number at `address` moves linearly to `to` between two steps, from what the task says. Lists do so item-wise.
+@dataclass(kw_only=True, eq=False)
+class Interpolate(Term):
+    """Schedule that moves the number at `address` linearly from its configured value to `to`.
 
-    `begin` and `end` are environment steps since training began.
+    It moves between the steps `begin` and `end`, which are environment steps since training began. Lists are
+    interpolated element by element.
     """
 
-    def __init__(
-        self,
-        env: ManagedEnv,
-        *,
-        address: Address,
-        to: float | list[float] | list[list[float]],
-        begin: int = 0,
-        end: int,
-    ) -> None:
-        if end <= begin:
+    address: Address
+    to: float | list[float] | list[list[float]]
+    begin: int = 0
+    end: int
+
+    def __post_init__(self) -> None:
+        if self.end <= self.begin:
             raise ValueError("end must be above begin")
-        target = torch.tensor(to, dtype=torch.float32, device=env.device)
-        if target.shape != address.shape:
-            raise ValueError(f"'to' has shape {tuple(target.shape)}, at the address is {tuple(address.shape)}")
-        self._live, self._from, self._to = address, address.clone(), target
-        self._begin, self._end = begin, end
+        self._from = self.address.clone()
+        self._to = torch.tensor(self.to, dtype=torch.float32, device=self.env.device)
+        _require_shape("'to'", self._to.shape, self.address)
 
     def advance(self, step: Tensor) -> Tensor:
-        """Set the value of this step. -> the value"""
-        share = ((step - self._begin).float() / (self._end - self._begin)).clamp(0.0, 1.0)
-        self._live.copy_(self._from + share * (self._to - self._from))
-        return self._live
+        """Set and return the value at this step. step () int64"""
+        fraction = ((step - self.begin).float() / (self.end - self.begin)).clamp(0.0, 1.0)
+        self.address.copy_(self._from + fraction * (self._to - self._from))
+        return self.address
 
 
-class TerrainLevels:
-    """A level up for who got off the middle half of its patch, down for who got less far than it should. -> the levels
+@dataclass(kw_only=True, eq=False)
+class TerrainLevels(EntityTerm):
+    """Terrain levels: up for robots that walk far, down for robots that fall short. -> levels (num_envs,)
 
-    Far is half a patch along x. An episode should have covered half of what its `command` (a velocity, x and y first)
-    asked for; without a command, `least` [m]. Past the last level comes a random one. Isaac Lab: terrain_levels_vel.
+    An episode that ends more than half a patch (along x) from the environment's origin moves up one level. It moves
+    down if it covers less than half of the distance of `command` (a velocity, x and y first); without a command, less
+    than `least` [m]. Above the last level follows a random one. Isaac Lab: terrain_levels_vel.
     """
 
-    def __init__(
-        self, env: ManagedEnv, *, entity: Entity = "robot", command: Command | None = None, least: float = 0.0
-    ) -> None:
-        if env.terrain is None:
+    command: Command | None = None
+    least: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.env.terrain is None:
             raise ValueError("the scene has no terrain; add scene.terrain")
-        self._env, self._entity, self._command, self._least = env, entity, command, least
-        self._far = 0.5 * env.terrain.patch[0]
-        self._asked = 0.5 * env.max_episode_length * env.step_dt
+        self._terrain = self.env.terrain
+        self._half_patch = 0.5 * self._terrain.patch[0]
+        self._half_episode = 0.5 * self.env.max_episode_length * self.env.step_dt
 
     def __call__(self, selection: Selection) -> Tensor:
-        """Move the environments whose episode ends. -> (num_envs,)"""
-        terrain = self._env.terrain
-        assert terrain is not None
-        way = selection.read_view(self._entity.data.root_pos_w) - selection.read_view(self._env.origins)
-        distance = _length(way)
-        up = distance > self._far
-        if self._command is None:
-            down = distance < self._least
+        """Change the levels of the selected environments, whose episodes end. -> levels (num_envs,)"""
+        offset = selection.read_view(self.entity.data.root_pos_w) - selection.read_view(self.env.origins)
+        distance = _length_xy(offset)
+        up = distance > self._half_patch
+        if self.command is None:
+            down = distance < self.least
         else:
-            down = distance < _length(selection.read_view(self._command.command)) * self._asked
-        terrain.move(selection, up, down)
-        return terrain.levels
+            down = distance < _length_xy(selection.read_view(self.command.command)) * self._half_episode
+        self._terrain.move(selection, up, down)
+        return self._terrain.levels
 
 
-def _length(vector: Tensor) -> Tensor:
-    """Of the first two components."""
+def _require_shape(what: str, shape: torch.Size, address: Tensor) -> None:
+    if shape != address.shape:
+        raise ValueError(f"{what} has shape {tuple(shape)}, the setting at the address has {tuple(address.shape)}")
+
+
+def _length_xy(vector: Tensor) -> Tensor:
     x, y = vector[:, 0], vector[:, 1]
     return (x * x + y * y).sqrt()

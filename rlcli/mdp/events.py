@@ -1,28 +1,24 @@
-"""Event terms: each acts on a `Selection` of environments, whose draws depend on nothing but seed, term and episode."""
+"""Event terms. Each acts on a `Selection` of environments; draws depend only on seed, term, environment and episode."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from rlcli.errors import listing
-from rlcli.mdp.parameters import Entity
+from rlcli.mdp.parameters import Entity, ManagedEnv
 from rlcli.mdp.randomization_base import element_names
 from rlcli.mdp.ranges import Pair, Ranges
-from rlcli.mdp.term import BodyTerm, JointTerm
+from rlcli.mdp.term import BodyTerm, JointTerm, Term
 from rlcli.scene.names import NameProblem
 from rlcli.sim.rotations import from_euler, multiply, random_quaternion
 from rlcli.sim.selection import Selection
 from rlcli.sim.tensor_state import TensorState
 from rlcli.task import Bodies, Joints, Range
-
-if TYPE_CHECKING:
-    from rlcli.envs.managed import ManagedEnv
 
 
 def reset_joints_by_offset(
@@ -34,7 +30,10 @@ def reset_joints_by_offset(
     position: Range = (0.0, 0.0),
     velocity: Range = (0.0, 0.0),
 ) -> None:
-    """Default joint state plus uniform offsets [m or rad, m/s or rad/s], positions kept within the soft limits."""
+    """Reset joints to their default state plus uniform offsets [m or rad, m/s or rad/s].
+
+    Positions are clipped to the soft limits.
+    """
     default_pos, default_vel = entity.data.read_default_joints(selection, joints)
     offset = selection.uniform(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
     _write_joints(entity, selection, joints, default_pos + offset[:, 0], default_vel + offset[:, 1])
@@ -49,7 +48,10 @@ def reset_joints_by_scale(
     position: Range = (1.0, 1.0),
     velocity: Range = (1.0, 1.0),
 ) -> None:
-    """Default joint state times uniform factors, positions kept within the soft limits."""
+    """Reset joints to their default state times uniform factors.
+
+    Positions are clipped to the soft limits.
+    """
     default_pos, default_vel = entity.data.read_default_joints(selection, joints)
     factor = selection.uniform(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
     _write_joints(entity, selection, joints, default_pos * factor[:, 0], default_vel * factor[:, 1])
@@ -64,7 +66,10 @@ def reset_joints_by_gaussian(
     position: tuple[float, float] = (0.0, 0.0),
     velocity: tuple[float, float] = (0.0, 0.0),
 ) -> None:
-    """Default joint state plus gaussian offsets [mean, std] [m or rad, m/s or rad/s], within the soft limits."""
+    """Reset joints to their default state plus gaussian offsets [m or rad, m/s or rad/s].
+
+    position, velocity: [mean, std]. Positions are clipped to the soft limits.
+    """
     default_pos, default_vel = entity.data.read_default_joints(selection, joints)
     offset = selection.normal(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
     _write_joints(entity, selection, joints, default_pos + offset[:, 0], default_vel + offset[:, 1])
@@ -72,7 +77,10 @@ def reset_joints_by_gaussian(
 
 @dataclass(kw_only=True, eq=False)
 class ResetJointsWithinLimits(JointTerm):
-    """Joint positions between the soft limits: 0 is the lower one, 1 the upper; velocities drawn [m/s or rad/s]."""
+    """Reset of joints to uniform positions between their soft limits, and to uniform velocities [m/s or rad/s].
+
+    position: range between the limits; 0 is the lower limit, 1 the upper.
+    """
 
     position: Range = (0.0, 1.0)
     velocity: Range = (0.0, 0.0)
@@ -81,8 +89,8 @@ class ResetJointsWithinLimits(JointTerm):
         finite = self.entity.data.joint_limits()[0][0].isfinite()[self.joints].tolist()
         names = element_names(self.entity, "Joints", self.joints)
         if not all(finite):
-            without = [name for name, limited in zip(names, finite, strict=True) if not limited]
-            raise NameProblem(f"{listing(without)}: no limits to reset within", "choose joints that have a range")
+            unlimited = [name for name, limited in zip(names, finite, strict=True) if not limited]
+            raise NameProblem(f"{listing(unlimited)}: no limits to reset within", "choose joints that have a range")
         self._count = len(names)
 
     def __call__(self, selection: Selection) -> None:
@@ -107,7 +115,11 @@ def reset_root_state_uniform(
     linear_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006 (read, never written)
     angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
 ) -> None:
-    """Default root state at the environment's origin plus uniform offsets [m, rad, m/s, rad/s], world frame."""
+    """Reset the root to its default state plus uniform offsets, world frame.
+
+    The position is relative to the environment's origin. x, y, z [m], roll, pitch, yaw [rad], linear_velocity [m/s] and
+    angular_velocity [rad/s] are ranges, the velocities one for each axis.
+    """
     default = selection.read(entity.data.default_root_state)
     offset = selection.uniform(*_bounds(env, x, y, z), (3, 1)).squeeze(2)
     turn = from_euler(*selection.uniform(*_bounds(env, roll, pitch, yaw), (3, 1)).squeeze(2).unbind(1))
@@ -128,7 +140,11 @@ def reset_root_state_with_random_orientation(
     linear_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
     angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
 ) -> None:
-    """The same with every attitude as likely as any other [m, m/s, rad/s], world frame."""
+    """Reset the root to a uniformly random orientation, with uniform offsets of position and velocity, world frame.
+
+    The position is relative to the environment's origin. x, y, z [m], linear_velocity [m/s] and angular_velocity
+    [rad/s] are ranges, the velocities one for each axis.
+    """
     default = selection.read(entity.data.default_root_state)
     offset = selection.uniform(*_bounds(env, x, y, z), (3, 1)).squeeze(2)
     velocity = selection.uniform(*_bounds(env, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
@@ -138,7 +154,7 @@ def reset_root_state_with_random_orientation(
 
 
 def reset_scene_to_default(env: ManagedEnv, selection: Selection) -> None:
-    """Every entity to its default state, at its environment's origin."""
+    """Reset every entity to its default state, relative to its environment's origin."""
     for entity in env.entities.values():
         data = entity.data
         if entity.joint_names:
@@ -151,16 +167,17 @@ def reset_scene_to_default(env: ManagedEnv, selection: Selection) -> None:
             entity.write_root_velocity(selection, root[:, 7:10], root[:, 10:])
 
 
-class RandomizeTerrainLevel:
-    """A random level of the terrain for each episode, on the environment's own kind of ground.
+@dataclass(eq=False)
+class RandomizeTerrainLevel(Term):
+    """Random terrain level for each episode, on the environment's own terrain type.
 
-    It stands before the event that places the robot. mjlab: `randomize_terrain`, which draws the kind of ground, too.
+    Declare it before the event that places the robot. mjlab: `randomize_terrain`, which draws the terrain type, too.
     """
 
-    def __init__(self, env: ManagedEnv) -> None:
-        if env.terrain is None:
+    def __post_init__(self) -> None:
+        if self.env.terrain is None:
             raise ValueError("the scene has no terrain; add scene.terrain")
-        self._terrain = env.terrain
+        self._terrain = self.env.terrain
 
     def __call__(self, selection: Selection) -> None:
         """Draw the levels of the selected environments."""
@@ -175,7 +192,7 @@ def push_by_setting_velocity(
     linear_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
     angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
 ) -> None:
-    """Add a uniform draw to the root's velocity, world frame [m/s, rad/s]."""
+    """Add uniform draws to the root's velocity, world frame [m/s, rad/s]: one range for each axis."""
     push = selection.uniform(*_bounds(env, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
     linear, angular = entity.read_root_velocity(selection)
     entity.write_root_velocity(selection, linear + push[:, :3], angular + push[:, 3:])
@@ -190,7 +207,10 @@ def apply_external_force_torque(
     force: Range = (0.0, 0.0),
     torque: Range = (0.0, 0.0),
 ) -> None:
-    """A uniform wrench on bodies, world frame, each component drawn [N, N m]; it lasts until changed or reset."""
+    """Apply a constant force [N] and torque [N m] to bodies, world frame.
+
+    Each component is drawn from the range. The wrench lasts until the next draw or reset.
+    """
     wrench = entity.engine.field("xfrc_applied").view(env.num_envs, -1)
     columns = _wrench_columns(entity, bodies)
     selection.write(wrench, _drawn_wrench(env, selection, len(columns) // 6, force, torque), columns)
@@ -198,7 +218,10 @@ def apply_external_force_torque(
 
 @dataclass(kw_only=True, eq=False)
 class ApplyBodyImpulse(BodyTerm, TensorState):
-    """A uniform wrench on bodies for a while, world frame, each component drawn [N, N m]; it ends by itself [s]."""
+    """Force [N] and torque [N m] on bodies for a limited time, world frame.
+
+    Each component is drawn from its range, and the duration from `duration_s` [s].
+    """
 
     force: Range = (0.0, 0.0)
     torque: Range = (0.0, 0.0)
@@ -210,7 +233,7 @@ class ApplyBodyImpulse(BodyTerm, TensorState):
         self._steps_left = torch.zeros(self.env.num_envs, dtype=torch.int64, device=self.env.device)
 
     def __call__(self, selection: Selection) -> None:
-        """Begin to act on the selected environments."""
+        """Start to push the selected environments."""
         drawn = _drawn_wrench(self.env, selection, len(self._columns) // 6, self.force, self.torque)
         selection.write(self._wrench, drawn, self._columns)
         low, high = _bounds(self.env, self.duration_s)
@@ -218,7 +241,7 @@ class ApplyBodyImpulse(BodyTerm, TensorState):
         selection.write(self._steps_left, (steps * (1.0 - 1e-6)).ceil_().long())
 
     def update(self, select: Callable[[Tensor], Selection | None], running: Tensor) -> None:
-        """Let one step pass where an episode is `running`, and end what is over."""
+        """Count one step where an episode is `running` (1 or 0), and remove the wrenches whose time is over."""
         acting = self._steps_left > 0
         self._steps_left -= running * acting
         over = select(acting & (self._steps_left <= 0))
@@ -226,11 +249,11 @@ class ApplyBodyImpulse(BodyTerm, TensorState):
             over.write(self._wrench, 0.0, self._columns)
 
     def reset(self, selection: Selection) -> None:
-        """A new episode begins without."""
+        """Clear the timers of new episodes; the engine has cleared the wrenches."""
         selection.write(self._steps_left, 0)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return how long the wrenches act yet."""
+        """Return the remaining steps of the wrenches."""
         return {"steps_left": self._steps_left}
 
 
@@ -240,7 +263,7 @@ def _drawn_wrench(env: ManagedEnv, selection: Selection, bodies: int, force: Pai
 
 
 def _bounds(env: ManagedEnv, *pairs: Pair) -> tuple[Tensor, Tensor]:
-    """Lower and upper ends of several ranges, for draws of shape (rows, ranges, k). (ranges, 1) each"""
+    """Return the lower and upper ends of ranges, for draws of shape (rows, ranges, k). (ranges, 1) each"""
     for pair in pairs:
         if isinstance(pair, Tensor):
             low, high = Ranges(env.device, *pairs).now()
@@ -255,7 +278,7 @@ def _fixed_bounds(device: torch.device, *pairs: tuple[float, float]) -> tuple[Te
 
 
 def _wrench_columns(entity: Entity, bodies: Bodies) -> Tensor:
-    """Where the wrenches of bodies lie in `xfrc_applied`, a row of it flattened. (6 k,)"""
+    """Return the columns of the wrenches of bodies in a flattened row of `xfrc_applied`. (6 k,)"""
     cache: dict[int, tuple[Bodies, Tensor]] = entity.__dict__.setdefault("_wrench_columns", {})
     if id(bodies) not in cache:
         device = entity.engine.device
@@ -271,5 +294,5 @@ def _write_joints(entity: Entity, selection: Selection, joints: Joints, position
 
 
 def _rows(selection: Selection, values: Tensor) -> Tensor:
-    """The selected rows of what may be the same for all environments and then has one row. (rows or 1, k)"""
+    """Return the selected rows, or the single row of values that all environments share. (rows or 1, k)"""
     return values if values.shape[0] == 1 else selection.read_view(values)

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
-from rlcli.mdp.parameters import CameraSensor, Command, ContactSensor, Entity, RaySensor
-from rlcli.mdp.term_helpers import HandleTerm, only, vector
+from rlcli.mdp.parameters import CameraSensor, Command, ContactSensor, Entity, ManagedEnv, RaySensor
+from rlcli.mdp.term_helpers import HandleTerm, constant, single
 from rlcli.sim.rotations import atan2, conjugate, length, multiply, roll_pitch_yaw, rotate_inverse, unique, wrap_to_pi
 from rlcli.task import Bodies, Joints, Sensors, Sites, reads_body_forces
-
-if TYPE_CHECKING:
-    from rlcli.envs.managed import ManagedEnv
 
 
 def joint_pos(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
@@ -27,30 +22,30 @@ def joint_vel(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*
 
 
 def joint_pos_rel(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Joint positions less their defaults [m or rad]. (num_envs, k)"""
+    """Joint positions minus their defaults [m or rad]. (num_envs, k)"""
     return entity.data.joint_pos_of(joints) - entity.data.default_joint_pos_of(joints)
 
 
 def joint_vel_rel(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Joint velocities less their defaults [m/s or rad/s]. (num_envs, k)"""
+    """Joint velocities minus their defaults [m/s or rad/s]. (num_envs, k)"""
     return entity.data.joint_vel_of(joints) - entity.data.default_joint_vel_of(joints)
 
 
 def joint_angle(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Joint positions wrapped to [-pi, pi], for hinges that turn all the way round [rad]. (num_envs, k)"""
+    """Joint positions wrapped to [-pi, pi], for hinges without limits [rad]. (num_envs, k)"""
     return entity.data.joint_angle_of(joints)
 
 
 def joint_angle_sum(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints) -> Tensor:
-    """Sum of joint positions, wrapped to [-pi, pi]: how far the last link of a planar chain is turned [rad].
+    """Sum of joint positions, wrapped to [-pi, pi]: the angle of the last link of a planar chain [rad].
 
     (num_envs, 1)
     """
     position = entity.data.joint_pos_of(joints)
-    total = position[:, :1]
-    for column in position.split(1, dim=1)[1:]:  # one after the other: a sum rounds differently for other sizes
-        total = total + column
-    return wrap_to_pi(total)
+    angle = position[:, :1]
+    for column in position.split(1, dim=1)[1:]:  # one by one: the rounding of `sum` depends on num_envs
+        angle = angle + column
+    return wrap_to_pi(angle)
 
 
 def joint_pos_limit_normalized(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
@@ -61,7 +56,7 @@ def joint_pos_limit_normalized(env: ManagedEnv, *, entity: Entity = "robot", joi
 
 
 def joint_effort(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Efforts of the actuators on the joints over the last substep, after their limits [N or N m]. (num_envs, k)"""
+    """Efforts of the actuators on the joints in the last substep, after their limits [N or N m]. (num_envs, k)"""
     return entity.data.applied_effort[:, joints]
 
 
@@ -81,7 +76,7 @@ def base_ang_vel(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
 
 
 def projected_gravity(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
-    """Direction of gravity in the root's frame, length 1. (num_envs, 3)"""
+    """Direction of gravity in the root's frame, a unit vector. (num_envs, 3)"""
     return entity.data.projected_gravity_b
 
 
@@ -91,7 +86,10 @@ def root_pos_w(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
 
 
 def root_quat_w(env: ManagedEnv, *, entity: Entity = "robot", make_quat_unique: bool = False) -> Tensor:
-    """Attitude of the root, a quaternion (w, x, y, z), world frame; made unique it has w >= 0. (num_envs, 4)"""
+    """Orientation of the root, quaternion (w, x, y, z), world frame. (num_envs, 4)
+
+    make_quat_unique: use the quaternion with w >= 0.
+    """
     quat = entity.data.root_quat_w
     return unique(quat) if make_quat_unique else quat
 
@@ -119,42 +117,49 @@ def base_roll_pitch(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
 
 
 def base_up_proj(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
-    """Cosine between the root's up axis and the way up: 1 upright, -1 on its head. (num_envs, 1)"""
+    """Cosine between the root's up axis and the world's: 1 upright, -1 upside down. (num_envs, 1)"""
     return -entity.data.projected_gravity_b[:, 2:3]
 
 
 def base_heading_proj(env: ManagedEnv, *, entity: Entity = "robot", target: tuple[float, float, float]) -> Tensor:
-    """Part of the root's forward axis that points to `target`, horizontally: 1 where it faces it. (num_envs, 1)
+    """Horizontal part of the root's forward axis in the direction of `target`: 1 where it faces it. (num_envs, 1)
 
-    target: a point [m] from the environment's origin.
+    target: a point from the environment's origin [m].
     """
-    way = vector(target, env.device)[:2] + env.origins[:, :2] - entity.data.root_pos_w[:, :2]
-    return (entity.data.forward_w[:, :2] * way).sum(dim=1, keepdim=True) / length(way).clamp_(min=1e-9)[:, None]
+    offset = _offset_xy(env, entity, target)
+    return (entity.data.forward_w[:, :2] * offset).sum(dim=1, keepdim=True) / length(offset).clamp_(min=1e-9)[:, None]
 
 
 def base_angle_to_target(env: ManagedEnv, *, entity: Entity = "robot", target: tuple[float, float, float]) -> Tensor:
     """Angle from the root's heading to `target`, about the vertical [rad]. (num_envs, 1)
 
-    In [-pi, pi]; target: a point [m] from the environment's origin.
+    In [-pi, pi]. target: a point from the environment's origin [m].
     """
-    way = vector(target, env.device)[:2] + env.origins[:, :2] - entity.data.root_pos_w[:, :2]
-    return wrap_to_pi(atan2(way[:, 1], way[:, 0]) - entity.data.heading_w)[:, None]
+    offset = _offset_xy(env, entity, target)
+    return wrap_to_pi(atan2(offset[:, 1], offset[:, 0]) - entity.data.heading_w)[:, None]
 
 
 def body_pose_w(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
-    """Position from the environment's origin, in m, and quaternion (w, x, y, z) of each body. (num_envs, 7 k)"""
+    """Position in m and quaternion (w, x, y, z) of each body, world frame. (num_envs, 7 k)
+
+    The position is relative to the environment's origin.
+    """
     position = entity.data.body_pos_w[:, bodies] - env.origins[:, None]
     return torch.cat([position, entity.data.body_quat_w[:, bodies]], dim=2).flatten(1)
 
 
 def body_projected_gravity_b(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
-    """Direction of gravity in each body's frame, length 1. (num_envs, 3 k)"""
+    """Direction of gravity in each body's frame, unit vectors. (num_envs, 3 k)"""
     quat = entity.data.body_quat_w[:, bodies]
     return rotate_inverse(quat, entity.data.down_w[:, None].expand(-1, quat.shape[1], -1)).flatten(1)
 
 
 def body_state_b(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
-    """Position, quaternion, linear and angular velocity of each body, from the root, in its frame. (num_envs, 13 k)"""
+    """State of each body relative to the root's position, in the root's frame. (num_envs, 13 k)
+
+    Position in m, quaternion (w, x, y, z), linear velocity in m/s, angular velocity in rad/s. The velocities are those
+    in the world, turned into the root's frame.
+    """
     data = entity.data
     position = data.body_pos_w[:, bodies] - data.root_pos_w[:, None]
     quat = data.root_quat_w[:, None].expand(-1, position.shape[1], -1)
@@ -169,76 +174,77 @@ def body_state_b(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = 
 
 @reads_body_forces
 def body_incoming_wrench(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
-    """Force and torque by which its parent holds each body, at its origin, in its frame [N, N m]. (num_envs, 6 k)
+    """Force and torque of the parent on each body, at the body's origin, in its frame [N, N m]. (num_envs, 6 k)
 
-    Of the last substep. Isaac Lab: `body_incoming_wrench`.
+    Values of the last substep. Isaac Lab: `body_incoming_wrench`.
     """
     return entity.data.body_incoming_wrench_b[:, bodies].flatten(1)
 
 
 def last_action(env: ManagedEnv) -> Tensor:
-    """The policy's last action, before scaling; zero at the start of an episode. (num_envs, a)"""
+    """Last action of the policy, before scaling; zero at the start of an episode. (num_envs, a)"""
     return env.action_manager.action
 
 
 def generated_commands(env: ManagedEnv, *, command: Command) -> Tensor:
-    """What the policy is asked to do, as the term of `commands:` gives it. (num_envs, k)"""
+    """Command of a term of `commands:`. (num_envs, k)"""
     return command.command
 
 
 def current_time_s(env: ManagedEnv) -> Tensor:
-    """Time since the episode began [s]. (num_envs, 1)"""
+    """Time since the start of the episode [s]. (num_envs, 1)"""
     return env.episode_length_buf[:, None] * env.step_dt
 
 
 def remaining_time_s(env: ManagedEnv) -> Tensor:
-    """Time until the episode is cut off [s]. (num_envs, 1)"""
+    """Time until the time-out of the episode [s]. (num_envs, 1)"""
     return (env.max_episode_length - env.episode_length_buf)[:, None] * env.step_dt
 
 
 def sensor_data(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
-    """Readings of sensors of the MJCF, each in its own unit, one after the other. (num_envs, k)
+    """Sensor readings of the MJCF, one after the other, each in its own unit. (num_envs, k)
 
-    Those of forces and accelerations are of the last substep. mjlab: `builtin_sensor`.
+    Forces and accelerations are those of the last substep. mjlab: `builtin_sensor`.
     """
     return entity.data.sensordata[:, sensors]
 
 
 def imu_orientation(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
-    """Attitude that a `framequat` sensor of the MJCF reads, (w, x, y, z), world frame. (num_envs, 4)"""
+    """Orientation of a `framequat` sensor in the MJCF, quaternion (w, x, y, z), world frame. (num_envs, 4)"""
     return _reading(entity, sensors, 4, "framequat")
 
 
 def imu_projected_gravity(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
-    """Direction of gravity in the frame of a `framequat` sensor of the MJCF, length 1. (num_envs, 3)"""
+    """Direction of gravity in the frame of a `framequat` sensor in the MJCF, a unit vector. (num_envs, 3)"""
     return rotate_inverse(_reading(entity, sensors, 4, "framequat"), entity.data.down_w)
 
 
 def imu_ang_vel(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
-    """Angular velocity that a `gyro` of the MJCF reads, in its own frame [rad/s]. (num_envs, 3)"""
+    """Angular velocity of a `gyro` sensor in the MJCF, in its own frame [rad/s]. (num_envs, 3)"""
     return _reading(entity, sensors, 3, "gyro")
 
 
 def imu_lin_acc(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
-    """Acceleration that an `accelerometer` of the MJCF reads, in its own frame [m/s^2]. (num_envs, 3)
+    """Acceleration of an `accelerometer` sensor in the MJCF, in its own frame [m/s^2]. (num_envs, 3)
 
-    Of the last substep; as of a real one: g upwards at rest, 0 in free fall.
+    Value of the last substep. Like a real sensor it reads g upwards at rest, and 0 in free fall.
     """
     return _reading(entity, sensors, 3, "accelerometer")
 
 
 def height_scan(env: ManagedEnv, *, sensor: RaySensor, offset: float = 0.5) -> Tensor:
-    """Height of the sensor above what each ray hits, less `offset` [m]. (num_envs, r)
+    """Height of the sensor above the point that each ray hits, minus `offset` [m]. (num_envs, r)
 
-    A ray that hits nothing counts as having hit at its full length. Isaac Lab: infinite there.
+    A ray without a hit counts as a hit at its full length. Isaac Lab: infinite there.
     """
     return sensor.position[:, 2:3] - sensor.hits[:, :, 2] - offset
 
 
 def image(env: ManagedEnv, *, sensor: CameraSensor, normalize: bool = True) -> Tensor:
-    """Picture of a camera, rows from the top: colours, or distances [m], 0 where nothing is seen. (num_envs, c, h, w)
+    """Image of a camera, rows from the top: colours, or distances [m]. (num_envs, c, h, w)
 
-    Colours are 0 to 255; normalised they are 0 to 1, less the picture's mean of each. Isaac Lab: channels last.
+    A distance is 0 where nothing is visible. Colours are 0 to 255. With `normalize` they are 0 to 1, minus the mean of
+    each channel of the image. Isaac Lab: channels last.
     """
     picture = sensor.image.movedim(-1, 1).float().contiguous()
     if sensor.config.data != "rgb" or not normalize:
@@ -248,22 +254,22 @@ def image(env: ManagedEnv, *, sensor: CameraSensor, normalize: bool = True) -> T
 
 
 def foot_height(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> Tensor:
-    """Height of sites above their environment's origin [m]. (num_envs, k)  mjlab: `foot_height`."""
+    """Heights of sites above their environment's origin [m]. (num_envs, k)  mjlab: `foot_height`."""
     return entity.data.site_pos_w[:, sites, 2] - env.origins[:, 2:3]
 
 
 def foot_air_time(env: ManagedEnv, *, sensor: ContactSensor) -> Tensor:
-    """How long each body of the sensor has been in the air [s]. (num_envs, k)  mjlab: `foot_air_time`."""
+    """Time for which each body of the sensor has been in the air [s]. (num_envs, k)  mjlab: `foot_air_time`."""
     return sensor.air_time
 
 
 def foot_contact(env: ManagedEnv, *, sensor: ContactSensor) -> Tensor:
-    """1 where a body of the sensor is in contact. (num_envs, k)  mjlab: `foot_contact`."""
+    """1 for each body of the sensor that is in contact. (num_envs, k)  mjlab: `foot_contact`."""
     return sensor.found.float()
 
 
 def foot_contact_forces(env: ManagedEnv, *, sensor: ContactSensor) -> Tensor:
-    """Contact forces F, world frame, compressed to sign(F) log(1 + |F|) with F in N. (num_envs, 3 k)
+    """Contact forces F in N, compressed to sign(F) log(1 + |F|), world frame. (num_envs, 3 k)
 
     mjlab: `foot_contact_forces`.
     """
@@ -278,18 +284,21 @@ def fingers_contact_force_b(env: ManagedEnv, *, entity: Entity = "robot", sensor
 
 
 def ee_pos(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> Tensor:
-    """Position of sites from the environment's origin, world frame [m]. (num_envs, 3 k)  Also `ee_frame_pos`."""
+    """Positions of sites from the environment's origin, world frame [m]. (num_envs, 3 k)  Also `ee_frame_pos`."""
     return (entity.data.site_pos_w[:, sites] - env.origins[:, None]).flatten(1)
 
 
 def ee_quat(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites, make_quat_unique: bool = True) -> Tensor:
-    """Attitude of sites (w, x, y, z), world frame; made unique they have w >= 0. (num_envs, 4 k)"""
+    """Orientations of sites, quaternions (w, x, y, z), world frame. (num_envs, 4 k)
+
+    make_quat_unique: use the quaternions with w >= 0.
+    """
     quat = entity.data.site_quat_w[:, sites]
     return (unique(quat) if make_quat_unique else quat).flatten(1)
 
 
 def ee_velocity(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> Tensor:
-    """Velocity of sites, in the root's frame [m/s]. (num_envs, 3 k)  mjlab: `ee_velocity`."""
+    """Velocities of sites, in the root's frame [m/s]. (num_envs, 3 k)  mjlab: `ee_velocity`."""
     velocity = entity.data.site_lin_vel_w[:, sites]
     return rotate_inverse(entity.data.root_quat_w[:, None].expand(-1, velocity.shape[1], -1), velocity).flatten(1)
 
@@ -297,62 +306,65 @@ def ee_velocity(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> T
 def object_position_in_robot_root_frame(
     env: ManagedEnv, *, entity: Entity = "robot", object: Entity = "object"
 ) -> Tensor:
-    """Position of an object from the root of `entity`, in its frame [m]. (num_envs, 3)  Also `object_pos_b`."""
-    way = object.data.root_pos_w - entity.data.root_pos_w
-    return rotate_inverse(entity.data.root_quat_w, way)
+    """Position of an object relative to the root of `entity`, in its frame [m]. (num_envs, 3)  Also `object_pos_b`."""
+    return rotate_inverse(entity.data.root_quat_w, object.data.root_pos_w - entity.data.root_pos_w)
 
 
 def object_quat_b(env: ManagedEnv, *, entity: Entity = "robot", object: Entity = "object") -> Tensor:
-    """Attitude of an object in the frame of the root of `entity` (w, x, y, z). (num_envs, 4)"""
+    """Orientation of an object relative to the root of `entity`, quaternion (w, x, y, z). (num_envs, 4)"""
     return multiply(conjugate(entity.data.root_quat_w), object.data.root_quat_w)
 
 
 def rel_ee_object_distance(
     env: ManagedEnv, *, entity: Entity = "robot", sites: Sites, object: Entity = "object"
 ) -> Tensor:
-    """Way from a site of `entity` to the root of an object, world frame [m]. (num_envs, 3)"""
-    return object.data.root_pos_w - only(entity.data.site_pos_w[:, sites], "site")
+    """Vector from a site of `entity` to the root of an object, world frame [m]. (num_envs, 3)"""
+    return object.data.root_pos_w - single(entity.data.site_pos_w[:, sites], "site")
 
 
 def ee_to_object_distance(
     env: ManagedEnv, *, entity: Entity = "robot", sites: Sites, object: Entity = "object"
 ) -> Tensor:
-    """Way from a site of `entity` to the root of an object, in the frame of the root of `entity` [m]. (num_envs, 3)
+    """Vector from a site of `entity` to the root of an object, in the frame of the root of `entity` [m]. (num_envs, 3)
 
     mjlab: `ee_to_object_distance`.
     """
-    way = object.data.root_pos_w - only(entity.data.site_pos_w[:, sites], "site")
-    return rotate_inverse(entity.data.root_quat_w, way)
+    offset = rel_ee_object_distance(env, entity=entity, sites=sites, object=object)
+    return rotate_inverse(entity.data.root_quat_w, offset)
 
 
 class RelEeDrawerDistance(HandleTerm):
-    """Way from a site of `entity` to a site, `handle`, of another entity, world frame [m]. (num_envs, 3)"""
+    """Vector from a site of `entity` to the site `handle` of `cabinet`, world frame [m]. (num_envs, 3)"""
 
     def __call__(self) -> Tensor:
-        """(num_envs, 3)"""
-        return self.way_to_handle()
+        """Return the vector. (num_envs, 3)"""
+        return self.offset_to_handle()
 
 
 def object_to_goal_distance(
     env: ManagedEnv, *, entity: Entity = "robot", object: Entity = "object", command: Command
 ) -> Tensor:
-    """Way from an object to the goal of a pose command of `entity`, in its root's frame [m]. (num_envs, 3)
+    """Vector from an object to the goal of a pose command of `entity`, in its root's frame [m]. (num_envs, 3)
 
     mjlab: `object_to_goal_distance`.
     """
-    position = rotate_inverse(entity.data.root_quat_w, object.data.root_pos_w - entity.data.root_pos_w)
-    return command.command[:, :3] - position
+    return command.command[:, :3] - object_position_in_robot_root_frame(env, entity=entity, object=object)
 
 
 def goal_quat_diff(
     env: ManagedEnv, *, object: Entity = "object", command: Command, make_quat_unique: bool = False
 ) -> Tensor:
-    """Turn from the goal's attitude to the object's, world frame (w, x, y, z). (num_envs, 4)
+    """Rotation from the goal's orientation to the object's, quaternion (w, x, y, z), world frame. (num_envs, 4)
 
-    The goal is columns 3 to 6 of the command, in the world frame.
+    The goal is in columns 3 to 6 of the command, world frame. make_quat_unique: use the quaternion with w >= 0.
     """
     quat = multiply(object.data.root_quat_w, conjugate(command.command[:, 3:7]))
     return unique(quat) if make_quat_unique else quat
+
+
+def _offset_xy(env: ManagedEnv, entity: Entity, target: tuple[float, float, float]) -> Tensor:
+    """Return the horizontal vector from the root to a point from the environment's origin [m]. (num_envs, 2)"""
+    return constant(target, env.device)[:2] + env.origins[:, :2] - entity.data.root_pos_w[:, :2]
 
 
 def _reading(entity: Entity, sensors: Sensors, size: int, kind: str) -> Tensor:

@@ -1,7 +1,8 @@
-"""Types of the objects that the terms of this package receive for names. No terms.
+"""Types of the parameters of terms: the environment, and the objects that terms receive for the names in the YAML.
 
-As in `rlcli.task`, a default is the name ("robot") and the function body uses the object, so each is `Any` as well;
-beside it stands the object's class, by which a type checker checks the body.
+As in `rlcli.task`, the default of an object is a name ("robot"), and the function body uses the object with that name.
+So each type is `Any`, together with the object's class, which a type checker uses for the body. The types are strings:
+importing this module imports no environment.
 """
 
 from __future__ import annotations
@@ -11,9 +12,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from rlcli.envs import managed, vec_env
     from rlcli.managers.command import CommandTerm
     from rlcli.scene import camera, entity, sensors
 
+ManagedEnv: TypeAlias = "managed.ManagedEnv"
+VecEnv: TypeAlias = "vec_env.VecEnv"
 Entity: TypeAlias = "Any | entity.Entity"
 ContactSensor: TypeAlias = "Any | sensors.ContactSensor"
 RaySensor: TypeAlias = "Any | sensors.RaySensor"

@@ -1,10 +1,10 @@
-"""What terms of randomisation have in common: values drawn about the original ones, and where they go."""
+"""Base classes of randomisation terms: values are drawn relative to the original ones and written to the model."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -13,49 +13,45 @@ from rlcli.errors import listing
 from rlcli.mdp.parameters import Entity
 from rlcli.mdp.ranges import Pair, Ranges
 from rlcli.mdp.term import Term
+from rlcli.mdp.term_helpers import column_numbers
 from rlcli.scene.model_fields import ModelField
 from rlcli.scene.names import NameProblem, match
 from rlcli.sim.rotations import from_euler, multiply
 from rlcli.sim.selection import Columns, Selection
-
-if TYPE_CHECKING:
-    from rlcli.envs.managed import ManagedEnv
 
 SMALLEST = 1e-9
 """Lower bound of quantities that must be positive."""
 
 
 class Draw:
-    """Values about the original ones, by distribution and operation.
+    """Sampler of new values: a distribution, and how a sample combines with the original value.
+
+    Args:
+        term: gives the keys `distribution`, `operation` and `shared`.
+        range: one pair for all axes, or one pair for each: [low, high], or [mean, std] of a gaussian.
+        shape: elements and axes of the values.
+        lowest: lower bound of the new values.
 
     Raises:
-        ValueError: for a range that the distribution cannot have.
+        ValueError: for a range that does not fit the distribution.
     """
 
     def __init__(
-        self,
-        env: ManagedEnv,
-        range: Pair | Sequence[Pair],
-        distribution: str,
-        operation: str,
-        shape: tuple[int, int],
-        *,
-        shared: bool = False,
-        lowest: float | None = None,
+        self, term: DrawingTerm, range: Pair | Sequence[Pair], shape: tuple[int, int], lowest: float | None = None
     ) -> None:
         many = range.dim() == 2 if isinstance(range, Tensor) else isinstance(range, list)
         pairs: list[Pair] = list(range) if many else [range]  # type: ignore
         if len(pairs) not in (1, shape[1]):
             raise NameProblem(f"range has {len(pairs)} pairs for {shape[1]} axes", "one pair for all, or one for each")
-        _check(pairs, distribution)
-        self._ranges = Ranges(env.device, *pairs)
-        self._distribution, self._operation = distribution, operation
+        _check(pairs, term.distribution)
+        self._ranges = Ranges(term.env.device, *pairs)
+        self._distribution, self._operation = term.distribution, term.operation
         self._shape = shape
-        self._drawn = (1 if shared else shape[0], shape[1])
+        self._sample_shape = (1 if term.shared else shape[0], shape[1])
         self._lowest = lowest
 
     def __call__(self, selection: Selection, original: Tensor) -> Tensor:
-        """New values of the selected environments. original (elements, axes) -> (rows, elements, axes)"""
+        """Return new values of the selected environments. original (elements, axes) -> (rows, elements, axes)"""
         drawn = self.sample(selection)
         if self._operation == "set":
             new = drawn.expand(-1, *self._shape)
@@ -64,19 +60,19 @@ class Draw:
         return new if self._lowest is None else new.clamp(min=self._lowest)
 
     def sample(self, selection: Selection) -> Tensor:
-        """The draws alone. (rows, elements or 1, axes)"""
+        """Return samples of the distribution. (rows, elements or 1, axes)"""
         first, second = self._ranges.now()
         if self._distribution == "gaussian":
-            return selection.normal(first, second, self._drawn)
+            return selection.normal(first, second, self._sample_shape)
         if self._distribution == "uniform":
-            return selection.uniform(first, second, self._drawn)
-        return torch.exp(selection.uniform(torch.log(first), torch.log(second), self._drawn))
+            return selection.uniform(first, second, self._sample_shape)
+        return torch.exp(selection.uniform(torch.log(first), torch.log(second), self._sample_shape))
 
 
 class DrawingTerm(Term):
-    """Base of terms that draw values about the original ones.
+    """Base class of terms that draw values relative to the original ones.
 
-    A term is a dataclass whose fields are the keys to draw by; a key that it does not have keeps the value below.
+    A term is a dataclass; these are its keys. A term without one of these keys uses the value below.
     """
 
     entity: Entity
@@ -84,20 +80,16 @@ class DrawingTerm(Term):
     operation: str = "scale"
     shared: bool = False
 
-    def new_draw(self, range: Pair | Sequence[Pair], shape: tuple[int, int], lowest: float | None = None) -> Draw:
-        """Return the draw of values of a shape (elements, axes), as the keys of the term say."""
-        return Draw(self.env, range, self.distribution, self.operation, shape, shared=self.shared, lowest=lowest)
-
 
 class FieldRandomization(DrawingTerm):
-    """Base of terms that draw for some elements of one model field."""
+    """Base class of terms that draw values of one model field for the selected elements."""
 
     model_field: str
-    """The model's field."""
+    """Name of the field in MjModel."""
     lowest: float | None = None
     """Lower bound of the new values."""
     same_for_axes: bool = False
-    """Whether all axes of an element get one draw."""
+    """Whether all axes of an element get the same sample."""
 
     axes: list[int] | None = None
     range: Any
@@ -107,44 +99,48 @@ class FieldRandomization(DrawingTerm):
         self.derives = self.target.derives
         count, axes = self.target.shape
         shape = (count, 1 if self.same_for_axes else axes)
-        self.draw = self.new_draw(self.range, shape, self.lowest)
+        self.draw = Draw(self, self.range, shape, self.lowest)
 
     def __call__(self, selection: Selection) -> None:
-        """Draw anew for the selected environments."""
+        """Draw new values for the selected environments."""
         self.target.write(selection, self.draw(selection, self.target.original))
 
 
 @dataclass(kw_only=True, eq=False)
-class RangeKeys(DrawingTerm):
-    """The keys of a draw with one range."""
+class DrawKeys(DrawingTerm):
+    """Base class of terms with the three keys of a draw."""
 
-    range: tuple[float, float]
     distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform"
     operation: Literal["add", "scale", "set"] = "scale"
     shared: bool = False
 
 
+@dataclass(kw_only=True, eq=False)
+class RangeKeys(DrawKeys):
+    """Base class of terms that draw from one range."""
+
+    range: tuple[float, float]
+
+
 class Randomization(RangeKeys, FieldRandomization):
-    """Base of terms that draw one number, or several by the same range, for each element."""
+    """Base class of terms that draw all numbers of an element from one range."""
 
 
 @dataclass(kw_only=True, eq=False)
-class AxisRandomization(FieldRandomization):
-    """Base of terms that draw for the axes of each element, by one range or by one for each axis."""
+class AxisRandomization(DrawKeys, FieldRandomization):
+    """Base class of terms that draw some axes of an element, from one range or from one range for each axis."""
 
     axes: list[int] | None = None
     range: tuple[float, float] | list[tuple[float, float]]
-    distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform"
     operation: Literal["add", "scale", "set"] = "add"
-    shared: bool = False
 
 
 @dataclass(kw_only=True, eq=False)
 class OrientationRandomization(DrawingTerm):
-    """Base of terms that draw for some elements of a field of quaternions."""
+    """Base class of terms that turn the quaternions of a model field."""
 
     model_field: ClassVar[str]
-    """The model's field."""
+    """Name of the field in MjModel."""
     operation = "set"
 
     roll: tuple[float, float] = (0.0, 0.0)
@@ -156,56 +152,56 @@ class OrientationRandomization(DrawingTerm):
     def __post_init__(self) -> None:
         self.target = ModelField(self.entity, self.model_field, self.selected())
         self.derives = self.target.derives
-        self._draw = self.new_draw([self.roll, self.pitch, self.yaw], (self.target.shape[0], 3))
+        self._draw = Draw(self, [self.roll, self.pitch, self.yaw], (self.target.shape[0], 3))
 
     def __call__(self, selection: Selection) -> None:
-        """Draw anew for the selected environments."""
+        """Draw new orientations for the selected environments."""
         turn = from_euler(*self._draw.sample(selection).to(self.target.original.dtype).unbind(2))
         original = self.target.original.expand(len(turn), -1, -1)
+        # the original comes first: the element turns about its own axes
         self.target.write(selection, multiply(original, turn.expand(-1, original.shape[1], -1)))
 
 
-def matching_elements(elements: list[Any], params: dict[str, Any], key: str, what: str) -> list[Any]:
-    """Return the elements of the scene that a term's patterns match, or none: binding the term reports the problem."""
+def matching_elements(elements: list[Any], params: dict[str, Any], key: str, kind: str) -> list[Any]:
+    """Return the MJCF elements that match a term's patterns; none if a pattern is wrong, which binding reports."""
     prefix = f"{params['entity']}/"
     of_entity = [element for element in elements if element.name.startswith(prefix)]
     try:
-        found = match(params[key], [element.name.removeprefix(prefix) for element in of_entity], what)
+        found = match(params[key], [element.name.removeprefix(prefix) for element in of_entity], kind)
     except NameProblem:
         return []
     return [of_entity[position] for position in found]
 
 
-def on_host(index: Columns) -> Columns:
-    """Return an index of elements that tensors on the CPU can be read with."""
-    return index.cpu() if isinstance(index, Tensor) else index
-
-
 def element_names(entity: Any, kind: str, index: Columns) -> list[str]:
     """Return the names of the selected elements."""
     names = entity.names[kind]
-    return [names[i] for i in torch.arange(len(names))[on_host(index)].tolist()]
+    return [names[number] for number in column_numbers(index, len(names))]
 
 
-def require_able(entity: Entity, kind: str, index: Columns, good: list[bool], problem: str, hint: str) -> None:
+def require_supported(
+    entity: Entity, kind: str, index: Columns, supported: list[bool], problem: str, hint: str
+) -> None:
     """Check that every selected element can be randomised.
 
     Raises:
-        NameProblem: with the names of the elements that cannot.
+        NameProblem: with the names of the elements that cannot, and of those that can.
     """
-    able = dict(zip(entity.names[kind], good, strict=True))
+    able = dict(zip(entity.names[kind], supported, strict=True))
     bad = [name for name in element_names(entity, kind, index) if not able[name]]
     if bad:
         can = [name for name, fine in able.items() if fine]
-        raise NameProblem(f"{listing(bad)} {problem}", f"{hint}; of '{entity.name}' these do: {listing(can) or 'none'}")
+        raise NameProblem(
+            f"{listing(bad)} {problem}", f"{hint}; elements of '{entity.name}' that work: {listing(can) or 'none'}"
+        )
 
 
 def _check(pairs: list[Pair], distribution: str) -> None:
-    for pair in (pair.tolist() if isinstance(pair, Tensor) else pair for pair in pairs):
-        for first, second in (pair,):
-            if distribution == "gaussian" and second < 0:
-                raise NameProblem(f"gaussian: the standard deviation {second:g} is negative", "range is [mean, std]")
-            if distribution != "gaussian" and first > second:
-                raise NameProblem(f"the lower end {first:g} is above the upper end {second:g}", "range is [low, high]")
-            if distribution == "loguniform" and first <= 0:
-                raise NameProblem(f"loguniform needs a range above 0, not one from {first:g}", "uniform takes any")
+    for pair in pairs:
+        first, second = pair.tolist() if isinstance(pair, Tensor) else pair
+        if distribution == "gaussian" and second < 0:
+            raise NameProblem(f"gaussian: the standard deviation {second:g} is negative", "range is [mean, std]")
+        if distribution != "gaussian" and first > second:
+            raise NameProblem(f"the lower end {first:g} is above the upper end {second:g}", "range is [low, high]")
+        if distribution == "loguniform" and first <= 0:
+            raise NameProblem(f"loguniform needs a range above 0, found {first:g}", "use uniform for other ranges")

@@ -1,4 +1,4 @@
-"""Ranges of numbers as tensors; those that a curriculum moves are tensors already, and are read when they are used."""
+"""Ranges of numbers as tensors. A range that a curriculum changes is a tensor already, and is read at each use."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ Pair: TypeAlias = Sequence[float] | Tensor
 
 
 class Ranges:
-    """The lower and the upper ends of several ranges."""
+    """Lower and upper ends of several ranges."""
 
     def __init__(self, device: torch.device, *pairs: Pair) -> None:
         self._fixed = _table(device, *((0.0, 0.0) if isinstance(pair, Tensor) else tuple(pair) for pair in pairs))
-        self._live = [pair if isinstance(pair, Tensor) else None for pair in pairs]
-        self._any_live = any(pair is not None for pair in self._live)
+        self._tunable = [pair if isinstance(pair, Tensor) else None for pair in pairs]
+        self._any_tunable = any(pair is not None for pair in self._tunable)
 
     def now(self) -> tuple[Tensor, Tensor]:
-        """The ends as they are at the moment. (ranges,) float32 each"""
+        """Return the current ends. (ranges,) float32 each"""
         ends = self._fixed
-        if self._any_live:
-            rows = zip(self._fixed, self._live, strict=True)
-            ends = torch.stack([row if live is None else live for row, live in rows])
+        if self._any_tunable:
+            rows = zip(self._fixed, self._tunable, strict=True)
+            ends = torch.stack([row if tunable is None else tunable for row, tunable in rows])
         return ends[:, 0], ends[:, 1]
 
 
 @functools.lru_cache(maxsize=1024)
 def _table(device: torch.device, *pairs: tuple[float, float]) -> Tensor:
-    """The numbers on the device, made once: a step that is recorded must not make tensors of numbers. (ranges, 2)"""
+    """Return the numbers on the device; cached, as a captured step must not make new tensors. (ranges, 2)"""
     return torch.tensor(pairs, dtype=torch.float32, device=device)

@@ -1,6 +1,6 @@
-"""The clauses of a step's contract, each with every manager at work: commands, noise, history, ...
+"""Contract of a step, with all managers at work: commands, noise, history, ...
 
-One task has all of them. Environments are made to end at times of the test's choosing.
+One task has all of them. The tests end episodes at chosen times.
 """
 
 import mujoco
@@ -23,7 +23,7 @@ from torch import Tensor
 from rlcli.task import Entity
 
 class Log:
-    """0; notes bodies' positions and joints' as this step's judges see them."""
+    """0; records the positions of bodies and joints that the terms of this step read."""
 
     def __init__(self, env, *, name: str, entity: Entity = "robot") -> None:
         self._env, self._name = env, name
@@ -58,7 +58,7 @@ def never_called(env) -> Tensor:
 
 
 class Beats:
-    """Adds up how often it fired, and when, in whole steps of the episode."""
+    """Event that counts its calls, and adds up the steps of the episode at which it fires."""
 
     def __init__(self, env, *, entity: Entity = "robot") -> None:
         self._env = env
@@ -73,8 +73,8 @@ class Beats:
 '''
 
 
-def whole(**changes):
-    """The critter's task with something of every manager."""
+def full_task(**changes):
+    """Return the critter's task with some terms of every manager."""
     task = yaml.safe_load(CRITTER_TASK)
     task["commands"] = {
         "walk": {"func": "uniform_velocity", "resampling_time_s": [0.06, 0.2], "lin_vel_x": [-1.0, 1.0],
@@ -97,8 +97,8 @@ def whole(**changes):
     return task
 
 
-def made(tmp_path, num_envs, task=None, *overrides, seed=42):
-    folder = write(tmp_path / "whole", dump(task or whole()), critter_xml=CRITTER, terms_py=TERMS)
+def make(tmp_path, num_envs, task=None, *overrides, seed=42):
+    folder = write(tmp_path / "whole", dump(task or full_task()), critter_xml=CRITTER, terms_py=TERMS)
     return build(folder, num_envs, *overrides, seed=seed)
 
 
@@ -119,12 +119,12 @@ def end_now(env, *ids):
     env.episode_length_buf[list(ids)] = env.max_episode_length - 1
 
 
-def test_the_terminating_step_is_paid_from_the_terminal_state_with_alive_0_and_terminating_1(tmp_path):
-    task = whole(curriculum={"rate": None})
+def test_terminating_step_rewards_terminal_state(tmp_path):
+    task = full_task(curriculum={"rate": None})
     task["rewards"] = {"alive": {"func": "is_alive", "weight": 1.0}, "fell": {"func": "is_terminated", "weight": -5.0},
                        "height": {"func": "height", "weight": 100.0}}  # fmt: skip
     task["reward_dt_scaling"] = False
-    env = made(tmp_path, 4, task)
+    env = make(tmp_path, 4, task)
     env.reset()
     env.engine.field("qpos")[2, 2:7] = torch.tensor([1.0, 0.0, 1.0, 0.0, 0.0], dtype=torch.float64)  # on its back
     result = env.step(idle(env))
@@ -138,11 +138,11 @@ def test_the_terminating_step_is_paid_from_the_terminal_state_with_alive_0_and_t
         assert float(result.reward[i]) == pytest.approx(1.0 + 100.0 * float(height[i]), rel=1e-6)
 
 
-def test_a_time_out_counts_as_alive(tmp_path):
-    task = whole(curriculum={"rate": None})
+def test_time_out_counts_as_alive(tmp_path):
+    task = full_task(curriculum={"rate": None})
     task["rewards"] = {"alive": {"func": "is_alive", "weight": 1.0}, "fell": {"func": "is_terminated", "weight": -5.0}}
     task["reward_dt_scaling"] = False
-    env = made(tmp_path, 4, task)
+    env = make(tmp_path, 4, task)
     env.reset()
     end_now(env, 1)
     result = env.step(idle(env))
@@ -150,9 +150,9 @@ def test_a_time_out_counts_as_alive(tmp_path):
     assert result.reward.tolist() == [1.0] * 4
 
 
-def test_after_a_same_step_reset_everything_is_the_new_episodes(tmp_path):
-    """Counters, actions, and observations of the new state; history filled with it; delays and commands begun anew."""
-    env = made(tmp_path, 4)
+def test_autoreset_returns_state_of_new_episode(tmp_path):
+    """Counters, actions, observations, history, delays and commands belong to the new episode."""
+    env = make(tmp_path, 4)
     env.reset()
     for _ in range(5):
         before = env.step(torch.full((4, 4), 0.3))
@@ -186,13 +186,13 @@ def test_after_a_same_step_reset_everything_is_the_new_episodes(tmp_path):
 
 @pytest.mark.parametrize(("dt", "decimation", "every", "steps"), [
     (0.005, 4, 0.1, 5), ("1/120", 2, 0.05, 3), (0.0083, 3, 0.0747, 3), (0.003, 7, 0.084, 4)])  # fmt: skip
-def test_interval_timers_count_whole_steps_however_the_step_rounds(tmp_path, dt, decimation, every, steps):
-    task = whole()
+def test_interval_timers_count_whole_steps(tmp_path, dt, decimation, every, steps):
+    task = full_task()
     task["sim"], task["decimation"] = {"dt": dt}, decimation
     task["episode_length_s"] = 10.0
     task["terminations"] = {"time_out": {"func": "time_out", "time_out": True}}
     task["events"]["beat"] = {"func": "beats", "mode": "interval", "interval_range_s": [every, every]}
-    env = made(tmp_path, 2, task)
+    env = make(tmp_path, 2, task)
     env.reset()
     for _ in range(8 * steps + 1):
         env.step(idle(env))
@@ -200,11 +200,11 @@ def test_interval_timers_count_whole_steps_however_the_step_rounds(tmp_path, dt,
     assert env.beat_steps[0] == [steps * k for k in range(1, 9)]
 
 
-def test_an_interval_timer_begins_anew_with_its_episode_alone(tmp_path):
-    task = whole()
+def test_interval_timer_restarts_only_with_its_episode(tmp_path):
+    task = full_task()
     task["terminations"] = {"time_out": {"func": "time_out", "time_out": True}}
     task["events"]["beat"] = {"func": "beats", "mode": "interval", "interval_range_s": [0.1, 0.1]}
-    env = made(tmp_path, 2, task)
+    env = make(tmp_path, 2, task)
     env.reset()
     for step in range(12):
         if step == 3:
@@ -213,14 +213,14 @@ def test_an_interval_timer_begins_anew_with_its_episode_alone(tmp_path):
     assert env.beat_steps == [[5, 10], [5]]
 
 
-def test_a_group_without_corruption_sees_what_one_without_any_noise_would(tmp_path):
-    quiet = whole()
+def test_group_without_corruption_has_no_noise(tmp_path):
+    quiet = full_task()
     for group in quiet["observations"].values():
         for term in group.values():
             if isinstance(term, dict):
                 for key in ("noise", "bias", "delay"):
                     term.pop(key, None)
-    noisy, plain = made(tmp_path / "a", 3), made(tmp_path / "b", 3, quiet)
+    noisy, plain = make(tmp_path / "a", 3), make(tmp_path / "b", 3, quiet)
     first = [env.reset() for env in (noisy, plain)]
     assert torch.equal(first[0]["clean"], first[1]["clean"])
     for step in range(40):
@@ -232,23 +232,23 @@ def test_a_group_without_corruption_sees_what_one_without_any_noise_would(tmp_pa
         assert not torch.equal(results[0].obs["policy"], results[1].obs["policy"])
 
 
-def test_a_reward_of_weight_0_is_not_called(tmp_path):
-    env = made(tmp_path, 2, whole(rewards={"never": {"func": "never_called", "weight": 0.0}}))
+def test_zero_weight_reward_is_not_called(tmp_path):
+    env = make(tmp_path, 2, full_task(rewards={"never": {"func": "never_called", "weight": 0.0}}))
     env.reset()
     for _ in range(35):
         result = env.step(idle(env))
     assert result.reward.isfinite().all()
     with pytest.raises(AssertionError, match="weight 0"):
-        made(tmp_path / "called", 2, whole(rewards={"never": {"func": "never_called", "weight": 0.1}}))
+        make(tmp_path / "called", 2, full_task(rewards={"never": {"func": "never_called", "weight": 0.1}}))
 
 
 @pytest.mark.parametrize("engine", ["batch", "warp"])
-def test_judges_see_the_kinematics_of_the_state_that_is_returned(tmp_path, engine):
-    """Positions of bodies that rewards, terminations and success read are those of the final joint positions."""
-    task = whole(rewards={"log": {"func": "log", "weight": 1.0, "name": "reward"}},
+def test_terms_read_kinematics_of_returned_state(tmp_path, engine):
+    """Rewards, terminations and success read body positions of the final joint positions."""
+    task = full_task(rewards={"log": {"func": "log", "weight": 1.0, "name": "reward"}},
                  terminations={"log": {"func": "log_end", "name": "termination"}})  # fmt: skip
     task["success"] = {"func": "log_end", "name": "success"}
-    env = made(tmp_path, 3, task, f"sim.engine={engine}", "episode_length_s=0.1")
+    env = make(tmp_path, 3, task, f"sim.engine={engine}", "episode_length_s=0.1")
     env.reset()
     data, near = mujoco.MjData(env.engine.model), 1e-12 if engine == "batch" else 2e-6
     for step in range(12):
@@ -261,9 +261,9 @@ def test_judges_see_the_kinematics_of_the_state_that_is_returned(tmp_path, engin
                 np.testing.assert_allclose(
                     seen_xpos[i].numpy(), data.xpos, rtol=0, atol=1e-12 if engine == "batch" else 2e-6
                 )
-        if step % 5 != 4:  # no episode has ended: that is the state returned
+        if step % 5 != 4:  # no episode has ended: this is the returned state
             assert torch.equal(seen_qpos, env.engine.field("qpos"))
-        # and after a reset, the new state's
+        # after a reset: kinematics of the new state
         for i in range(3):
             data.qpos[:] = env.engine.field("qpos")[i].numpy()
             mujoco.mj_kinematics(env.engine.model, data)
@@ -272,29 +272,29 @@ def test_judges_see_the_kinematics_of_the_state_that_is_returned(tmp_path, engin
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory):
-    """Two equal environments in which nothing ends by itself."""
+    """Two equal environments in which no episode ends by itself."""
     folder = tmp_path_factory.mktemp("pair")
-    task = whole()
+    task = full_task()
     task["terminations"] = {"time_out": {"func": "time_out", "time_out": True}}
     task["episode_length_s"] = 4.0
-    return [made(folder / name, 5, task) for name in ("a", "b")]
+    return [make(folder / name, 5, task) for name in ("a", "b")]
 
 
 def carried(env):
-    """All that an environment carries on, a row each."""
+    """Return the whole state of the environments, one row for each."""
     rows = {}
     for name, value in env.state_dict().items():
         if value.dim() and value.shape[0] == 5:
             rows[name] = value
-        elif value.dim() > 1 and value.shape[1] == 5:  # one row a term
+        elif value.dim() > 1 and value.shape[1] == 5:  # one row for each term
             rows[name] = value.transpose(0, 1)
     return rows
 
 
 @settings(max_examples=25, deadline=None)
 @given(ending=st.sets(st.integers(0, 4), max_size=4), at=st.integers(1, 6), seed=st.integers(0, 1000))
-def test_a_partial_reset_leaves_every_other_environment_bit_identical(pair, ending, at, seed):
-    """State, observations with their history and delays, timers, commands, sums: nothing of the others moves."""
+def test_partial_reset_keeps_other_envs_bit_identical(pair, ending, at, seed):
+    """State, observations, histories, delays, timers, commands and sums of the others stay."""
     others = [i for i in range(5) if i not in ending]
     generator = torch.Generator().manual_seed(seed)
     actions = torch.rand(at + 3, 5, 4, generator=generator) - 0.5

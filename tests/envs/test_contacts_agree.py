@@ -1,6 +1,7 @@
-"""Contacts in both engines: from the same state, a control step of a direct task with contacts comes out the same.
+"""Both engines compute the same control step with contacts, from the same state.
 
-Over many steps it cannot: a hand that handles a cube magnifies rounding. So each step begins from the CPU's state.
+They cannot agree over many steps: contacts of a hand with a cube magnify rounding. So each step starts from the state
+of the CPU engine.
 """
 
 from collections import Counter
@@ -22,14 +23,14 @@ def pair(task):
 
 
 def follow(device, host):
-    """Put the device's worlds where the host's are."""
+    """Copy the state of the host's environments to the device."""
     for name in STATE:
         device.engine.field(name).copy_(host.engine.field(name).float())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "velocity"), [("hand-reorient", 0.02), ("ant-direct", 0.002)])
-def test_a_step_with_contacts_comes_out_the_same(task, velocity):
+def test_engines_agree_on_step_with_contacts(task, velocity):
     host, device = pair(task)
     touching = 0
     for number, action in enumerate(actions(STEPS, N, host.layout.action_size)):
@@ -50,15 +51,15 @@ def test_a_step_with_contacts_comes_out_the_same(task, velocity):
 
 
 def contacts(env):
-    """Of each world of the GPU's engine, how many contacts each pair of geoms has."""
+    """Return the number of contacts of each pair of geoms, for each world of the GPU engine."""
     engine = env.engine
     count = int(engine._data.nacon.numpy()[0])
     worlds, geoms = engine._data.contact.worldid.numpy()[:count], engine._data.contact.geom.numpy()[:count]
     return [Counter(frozenset(map(int, pair)) for pair in geoms[worlds == world]) for world in range(N)]
 
 
-def test_both_engines_find_the_same_contacts_on_a_hand():
-    """Not so between two boxes, where they report different points: the palm is made of round bars for that reason."""
+def test_engines_find_same_contacts_on_hand():
+    """Contacts of two boxes differ: the engines report other points. So the palm consists of round bars."""
     host, device = pair("hand-reorient")
     for action in actions(15, N, 16):
         host.step(0.7 * action)
@@ -73,8 +74,8 @@ def test_both_engines_find_the_same_contacts_on_a_hand():
             assert found == Counter(frozenset(map(int, pair)) for pair in data.contact.geom)
 
 
-def test_the_solver_converges_in_the_iterations_it_has():
-    """Where it did not, fingers were off by several rad/s, and the two engines disagreed."""
+def test_solver_converges_in_its_iterations():
+    """Without convergence the fingers were off by several rad/s, and the engines disagreed."""
     host, _ = pair("hand-reorient")
     for action in actions(25, N, 16):
         host.step(0.7 * action)

@@ -16,7 +16,7 @@ def steps_of(name):
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_first_environment_is_bit_identical_for_any_number_of_environments_and_threads(name, place):
+def test_first_env_is_bit_identical_for_any_num_envs_and_threads(name, place):
     task, steps = place(name), steps_of(name)
     reference = run(build(task, 1, "sim.engine_threads=1", "episode_length_s=0.6"), steps)
     ended = sum(bool(r.terminated[0] | r.truncated[0]) for r in reference)
@@ -36,13 +36,13 @@ def test_equal_seeds_repeat_and_other_seeds_differ(name, place):
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_environments_of_one_run_live_different_lives(name, place):
+def test_environments_of_one_run_differ(name, place):
     results = run(build(place(name), 4), 5)
     assert not same(life(results, 0), life(results, 1))
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_reset_with_a_seed_starts_over_as_a_new_environment_of_that_seed(name, place):
+def test_reset_with_seed_equals_new_environment(name, place):
     task = place(name)
     used = build(task, 4, seed=1)
     run(used, 30)
@@ -51,18 +51,18 @@ def test_reset_with_a_seed_starts_over_as_a_new_environment_of_that_seed(name, p
     assert same(life(run(used, 30, reset=False), 2), life(run(fresh, 30), 2))
 
 
-def test_a_second_reset_without_seed_begins_other_episodes(place):
+def test_reset_without_seed_begins_other_episodes(place):
     env = build("cartpole", 4)
     first = env.reset()["policy"].clone()
     assert not first.equal(env.reset()["policy"])
 
 
-def test_a_life_does_not_depend_on_whether_others_reset(place):
+def test_episodes_independent_of_resets_of_others(place):
     task = place("critter")
     reference = run(build(task, 8), 60)
     env = build(task, 8)
     env.reset()
-    env.episode_length_buf[[0, 2, 5, 6]] = 17  # others time out at other moments
+    env.episode_length_buf[[0, 2, 5, 6]] = 17  # the others time out at different times
     disturbed = run(env, 60, reset=False)
     ends = [[bool(r.truncated[i]) for r in results] for results in (reference, disturbed) for i in (0,)]
     assert ends[0] != ends[1]
@@ -70,7 +70,7 @@ def test_a_life_does_not_depend_on_whether_others_reset(place):
         assert same(life(disturbed, i), life(reference, i))
 
 
-def test_a_life_does_not_depend_on_which_other_events_exist(tmp_path):
+def test_episodes_independent_of_other_events(tmp_path):
     """An event that draws but changes nothing, before the others, shifts no other draw."""
     idle = {
         f"idle_{mode}": {"func": "apply_external_force_torque", "mode": mode, "bodies": ["leg_fl"]}
@@ -84,13 +84,13 @@ def test_a_life_does_not_depend_on_which_other_events_exist(tmp_path):
     assert same(life(results, 7), life(reference, 7))
 
 
-def test_the_draws_of_an_interval_event_do_not_depend_on_other_environments(tmp_path):
+def test_interval_event_draws_independent_of_other_envs(tmp_path):
     task = critter(tmp_path, edited(CRITTER_TASK, episode_length_s=5.0))
     few, many = run(build(task, 2), 60), run(build(task, 16), 60)
     assert same(life(few, 1), life(many, 1))
 
 
-def test_a_long_sum_of_rewards_is_added_alike_for_one_environment_and_for_several(tmp_path):
+def test_reward_sum_is_equal_for_any_num_envs(tmp_path):
     hips = ("hip_fl", "hip_fr", "hip_bl", "hip_br")
     many = {
         f"term_{n}": {"func": "joint_vel_l1", "weight": (-1) ** n * 3.0 ** (n % 7), "joints": [hips[n % 4]]}

@@ -1,4 +1,4 @@
-"""The direct workflow: OmniIsaacGymEnvs' hooks, buffers and views."""
+"""Direct workflow: hooks, buffers and views of OmniIsaacGymEnvs."""
 
 import math
 import re
@@ -92,7 +92,7 @@ def hooks(task):
 IDLE = torch.zeros(3, 1)
 
 
-def test_hooks_are_called_in_the_documented_order(tmp_path):
+def test_hooks_run_in_documented_order(tmp_path):
     env = build(direct(tmp_path))
     task = env.task
     assert hooks(task) == ["__init__", "set_up_scene", "post_reset"]
@@ -111,7 +111,7 @@ def test_hooks_are_called_in_the_documented_order(tmp_path):
     assert task.calls[5] == ("reset_idx", [1], torch.int64)
 
 
-def test_progress_and_rewards_are_those_of_the_step_just_taken(tmp_path):
+def test_progress_and_reward_belong_to_current_step(tmp_path):
     env = build(direct(tmp_path))
     env.reset()
     for step in (1, 2, 3):
@@ -121,7 +121,7 @@ def test_progress_and_rewards_are_those_of_the_step_just_taken(tmp_path):
         assert env.task.progress_buf.tolist() == [step] * 3
 
 
-def test_a_finished_environment_gets_a_fresh_observation_and_keeps_the_true_last_one(tmp_path):
+def test_ended_env_gets_new_obs_and_final_obs(tmp_path):
     env = build(direct(tmp_path))
     env.reset()
     env.step(IDLE)
@@ -138,7 +138,7 @@ def test_a_finished_environment_gets_a_fresh_observation_and_keeps_the_true_last
     assert env.episode_length_buf.tolist() == [2, 0, 2]
 
 
-def test_the_reset_flag_stays_raised_through_the_next_pre_physics_step(tmp_path):
+def test_reset_buf_stays_set_until_next_pre_physics_step(tmp_path):
     env = build(direct(tmp_path))
     env.reset()
     env.step(IDLE)
@@ -150,7 +150,7 @@ def test_the_reset_flag_stays_raised_through_the_next_pre_physics_step(tmp_path)
     assert env.task.reset_buf.tolist() == [0, 0, 0]
 
 
-def test_the_framework_adds_the_time_out_as_truncation(tmp_path):
+def test_time_out_is_added_as_truncation(tmp_path):
     env = build(direct(tmp_path))
     results = run(env, 20)
     assert [bool(r.truncated[0]) for r in results] == [step in (10, 20) for step in range(1, 21)]
@@ -172,7 +172,7 @@ OIGE = RECORDING.replace(
 )
 
 
-def test_a_task_that_resets_in_pre_physics_step_as_in_oige_does_not_reset_twice(tmp_path):
+def test_oige_style_reset_does_not_reset_twice(tmp_path):
     plain, own = build(direct(tmp_path / "a")), build(direct(tmp_path / "b", OIGE))
     for env in (plain, own):
         env.reset()
@@ -189,11 +189,11 @@ def test_a_task_that_resets_in_pre_physics_step_as_in_oige_does_not_reset_twice(
     assert len([c for c in own.task.calls if c[0] == "reset_idx"]) > 3
 
 
-def test_a_task_that_resets_a_running_environment_itself_really_resets_it(tmp_path):
+def test_task_can_reset_running_env(tmp_path):
     code = RECORDING.replace('''        self.flags.append(''', '''        if self.progress_buf[2] == 4:
             self.reset_idx(torch.tensor([2]))
         self.flags.append(''')  # fmt: skip
-    # the hook is then called on a state that the framework has not put back
+    # the hook then runs on a state that the framework has not reset
     code = re.sub(r"        assert not self.robots.get_joint_positions.*\n", "", code)
     env = build(direct(tmp_path, code))
     env.reset()
@@ -205,7 +205,7 @@ def test_a_task_that_resets_a_running_environment_itself_really_resets_it(tmp_pa
     assert env.episode_length_buf.tolist() == [5, 5, 1]
 
 
-def test_actions_are_clamped_before_the_task_sees_them_and_observations_after(tmp_path):
+def test_actions_and_observations_are_clipped(tmp_path):
     env = build(direct(tmp_path, clip_actions=0.5, clip_observations=1.5))
     env.reset()
     for _ in range(2):
@@ -225,8 +225,8 @@ RESTLESS = RECORDING.replace(
 )
 
 
-def test_the_second_look_after_a_reset_leaves_running_rows_alone(tmp_path):
-    """Even of a task whose observation changes each time it is asked for."""
+def test_obs_after_reset_keeps_rows_of_running_envs(tmp_path):
+    """This also holds for a task whose observation changes at each call."""
     env = build(direct(tmp_path, RESTLESS))
     env.reset()
     env.step(IDLE)
@@ -236,7 +236,7 @@ def test_the_second_look_after_a_reset_leaves_running_rows_alone(tmp_path):
     assert env.task.obs_buf[:, 1].tolist() == [3.0, 4.0, 3.0]
 
 
-def test_draws_depend_on_environment_and_episode_not_on_who_else_resets(tmp_path):
+def test_draws_depend_only_on_env_and_episode(tmp_path):
     code = RECORDING.replace(
         "        self.robots.set_joint_positions(torch.full((len(env_ids), 1), 0.25), indices=env_ids)\n"
         "        assert (self.robots.get_joint_positions(env_ids) == 0.25).all()\n",
@@ -252,7 +252,7 @@ def test_draws_depend_on_environment_and_episode_not_on_who_else_resets(tmp_path
     assert a[1, 0] != first[1, 0]
 
 
-def test_parameters_are_validated_by_the_tasks_own_model(tmp_path):
+def test_params_are_validated_by_params_model(tmp_path):
     params = "    class Params(StrictModel):\n        gain: float = 2.0\n\n"
     code = RECORDING.replace("    num_observations = 2\n", params + "    num_observations = 2\n")
     assert build(direct(tmp_path, code)).task.params.gain == 2.0
@@ -261,13 +261,13 @@ def test_parameters_are_validated_by_the_tasks_own_model(tmp_path):
         build(direct(tmp_path / "c", code, params={"gian": 3.5}))
 
 
-def test_a_view_of_an_unknown_entity_names_those_there_are(tmp_path):
+def test_view_of_unknown_entity_lists_entities(tmp_path):
     with pytest.raises(TaskError, match=r"ArticulationView\('robto'\): no such entity") as caught:
         build(direct(tmp_path, RECORDING.replace('ArticulationView("robot")', 'ArticulationView("robto")')))
     assert "robot" in caught.value.hint
 
 
-def test_a_module_without_a_direct_task_is_a_broken_task(tmp_path):
+def test_module_without_direct_task_raises_task_error(tmp_path):
     with pytest.raises(TaskError, match="is not a DirectTask"):
         build(direct(tmp_path, "class Task:\n    pass\n"))
     with pytest.raises(TaskError, match="ZeroDivisionError"):
@@ -279,7 +279,7 @@ FLOATING = (
     + '''
 
 class Task(DirectTask):
-    """Does what the test tells it."""
+    """Task that applies the actions as joint efforts."""
 
     num_observations = 1
     num_actions = 4
@@ -309,7 +309,7 @@ def floating(tmp_path, robot=None, xml=CRITTER):
     return env, env.task.robots
 
 
-def test_a_view_knows_its_joints(tmp_path):
+def test_view_has_joint_names_and_indices(tmp_path):
     env, view = floating(tmp_path)
     assert (view.count, view.num_dof) == (4, 4)
     assert view.dof_names == ["hip_fl", "hip_fr", "hip_bl", "hip_br"]
@@ -322,7 +322,7 @@ def test_a_view_knows_its_joints(tmp_path):
     assert env.num_envs == 4
 
 
-def test_joint_setters_and_getters_with_and_without_indices(tmp_path):
+def test_joint_setters_and_getters_accept_indices(tmp_path):
     env, view = floating(tmp_path)
     values = torch.arange(16.0).view(4, 4) / 100
     view.set_joint_positions(values)
@@ -340,17 +340,17 @@ def test_joint_setters_and_getters_with_and_without_indices(tmp_path):
     assert torch.equal(view.get_joint_velocities(indices=rows), values[:2])
 
 
-def test_clone_gives_a_copy_and_without_it_a_live_view(tmp_path):
+def test_clone_false_returns_live_view(tmp_path):
     _, view = floating(tmp_path)
-    copy, live = view.get_joint_positions(), view.get_joint_positions(clone=False)
+    copy, live_view = view.get_joint_positions(), view.get_joint_positions(clone=False)
     view.set_joint_positions(torch.full((4, 4), 0.5))
     assert not copy.any()
-    assert (live == 0.5).all()
+    assert (live_view == 0.5).all()
     copy[:] = 9.0
     assert (view.get_joint_positions() == 0.5).all()
 
 
-def test_root_poses_and_velocities_of_a_floating_robot_round_trip_in_the_world_frame(tmp_path):
+def test_root_pose_and_velocity_round_trip_in_world_frame(tmp_path):
     env, view = floating(tmp_path)
     assert view.get_world_poses()[0][0].tolist() == pytest.approx([0, 0, 0.35])
     half = math.sqrt(0.5)
@@ -361,20 +361,20 @@ def test_root_poses_and_velocities_of_a_floating_robot_round_trip_in_the_world_f
     assert position.tolist() == [[1, 2, 3], [4, 5, 6]]
     assert quat[0].tolist() == pytest.approx([half, 0, 0, half])
     assert view.get_velocities(rows)[1].tolist() == pytest.approx([1, 0, 0, 0.5, 0, 0], abs=1e-6)
-    # yawed by 90 degrees, a world rate about x is one about the body's -y
+    # with a yaw of 90 degrees, the world's x axis is the body's -y axis
     assert env.engine.field("qvel")[2, :6].tolist() == pytest.approx([1, 0, 0, 0, -0.5, 0], abs=1e-6)
     assert view.get_world_poses()[0][1].tolist() == pytest.approx([0, 0, 0.35]), "others stay"
 
 
-def test_a_world_rate_turns_the_robot_about_the_worlds_axis(tmp_path):
+def test_set_velocities_turns_about_world_axis(tmp_path):
     env, view = floating(tmp_path)
-    turn = torch.tensor([[math.cos(0.4), 0, math.sin(0.4), 0]]).expand(4, 4)  # pitched by 0.8 rad
+    turn = torch.tensor([[math.cos(0.4), 0, math.sin(0.4), 0]]).expand(4, 4)  # a pitch of 0.8 rad
     view.set_world_poses(torch.zeros(4, 3), turn)
     view.set_velocities(torch.tensor([[0.0, 0, 0, 0, 0, 0.5]]).expand(4, 6))
     before = view.get_world_poses()[1]
     env.step(torch.zeros(4, 4))
     after = view.get_world_poses()[1]
-    # the rotation between the two, in the world frame: after * conj(before)
+    # rotation between the two, world frame: after * conj(before)
     w, x, y, z = after[0].tolist()
     a, b, c, d = (before[0] * torch.tensor([1.0, -1, -1, -1])).tolist()
     axis = [w * b + x * a + y * d - z * c, w * c - x * d + y * a + z * b, w * d + x * c - y * b + z * a]
@@ -383,7 +383,7 @@ def test_a_world_rate_turns_the_robot_about_the_worlds_axis(tmp_path):
     assert abs(axis[1]) < 0.1 * axis[2]
 
 
-def test_efforts_reach_the_joints_under_their_limits(tmp_path):
+def test_joint_efforts_are_limited(tmp_path):
     env, view = floating(tmp_path, {"joints": {"hip_fl": {"effort_limit": 2.0}}})
     force = env.engine.field("qfrc_actuator")
     env.step(torch.tensor([[5.0, 5.0, -1.0, 0.0]]).expand(4, 4))
@@ -393,7 +393,7 @@ def test_efforts_reach_the_joints_under_their_limits(tmp_path):
     assert env.engine.field("ctrl")[0].tolist() == [5.0, 5.0, -1.0, 0.0]
 
 
-def test_efforts_are_the_joints_whatever_the_gear(tmp_path):
+def test_joint_efforts_account_for_gear(tmp_path):
     geared = '<actuator><motor joint="hip_fr" gear="40"/></actuator></mujoco>'
     env, _ = floating(tmp_path, {"joints": {"hip_fr": {"effort_limit": 3.0}}}, CRITTER.replace("</mujoco>", geared))
     force = env.engine.field("qfrc_actuator")
@@ -403,7 +403,7 @@ def test_efforts_are_the_joints_whatever_the_gear(tmp_path):
     assert force[0, 7].item() == pytest.approx(3.0)
 
 
-def test_setting_positions_and_velocities_sets_the_targets_with_them(tmp_path):
+def test_joint_setters_set_actuator_targets(tmp_path):
     servo = '<actuator><position joint="hip_bl" kp="5" gear="2"/><velocity joint="hip_br" kv="3"/></actuator></mujoco>'
     env, view = floating(tmp_path, xml=CRITTER.replace("</mujoco>", servo))
     servo_column, velocity_column = 0, 1
@@ -418,7 +418,7 @@ def test_setting_positions_and_velocities_sets_the_targets_with_them(tmp_path):
     assert float(ctrl[0, servo_column]) == pytest.approx(0.6)
 
 
-def test_a_fixed_robot_cannot_be_moved(tmp_path):
+def test_set_world_poses_rejects_fixed_robot(tmp_path):
     env = build("cartpole-direct", 2)
     env.reset()
     with pytest.raises(TaskError, match="fixed to the world"):
@@ -427,7 +427,7 @@ def test_a_fixed_robot_cannot_be_moved(tmp_path):
     assert not env.task.cartpoles.get_velocities().any()
 
 
-def test_views_of_observations_that_a_caller_keeps_stay_as_they_were(tmp_path):
+def test_kept_observation_views_do_not_change(tmp_path):
     env = build("cartpole-direct", 4)
     env.reset()
     first, second = (env.step(a) for a in actions(2, 4, 1))

@@ -1,4 +1,4 @@
-"""Direct tasks that draw in the middle of an episode, and that count something over one."""
+"""Direct tasks that draw in the middle of an episode, and that compute a metric of an episode."""
 
 import pytest
 import torch
@@ -58,7 +58,7 @@ def task(tmp_path):
     return write(tmp_path / "goals", TASK, pendulum_xml=PENDULUM, task_py=CODE)
 
 
-def live(task, num_envs, steps=25, *overrides, seed=3):
+def rollout(task, num_envs, steps=25, *overrides, seed=3):
     env = build(task, num_envs, *overrides, seed=seed)
     env.reset()
     return env, [clone(env.step(torch.zeros(num_envs, 1))) for _ in range(steps)]
@@ -68,42 +68,42 @@ def goals(results, env):
     return [float(result.obs["policy"][env, 0]) for result in results]
 
 
-def test_only_those_selected_draw_and_each_step_draws_anew(task):
-    _, results = live(task, 4)
+def test_selection_draws_for_selected_envs_in_each_step(task):
+    _, results = rollout(task, 4)
     even, odd = goals(results, 0), goals(results, 1)
     assert len(set(even[:9])) == 1, "one episode, one goal"
-    # what is drawn in steps 3 and 6 is observed one step later; step 10 begins a new episode
+    # draws of steps 3 and 6 are observed one step later; step 10 begins a new episode
     assert [odd[i] != odd[i + 1] for i in range(9)] == [False, False, True, False, False, True, False, False, True]
 
 
-def test_draws_of_two_names_and_two_environments_and_two_episodes_differ(task):
-    env, results = live(task, 4)
+def test_draws_differ_by_name_env_and_episode(task):
+    env, results = rollout(task, 4)
     drawn = {value for row in (1, 3) for value in goals(results, row)}
     assert len(drawn) == 2 * (3 + 3 + 2), "each environment sees three goals an episode, and two of the third"
     assert not torch.equal(env.task.goal[env.task.odd], env.task.other[env.task.odd])
 
 
-def test_what_an_environment_draws_does_not_depend_on_the_others(task):
-    few, many = live(task, 2)[1], live(task, 7)[1]
+def test_draws_independent_of_other_envs(task):
+    few, many = rollout(task, 2)[1], rollout(task, 7)[1]
     assert goals(few, 1) == goals(many, 1)
-    assert goals(live(task, 2, seed=4)[1], 1) != goals(few, 1)
+    assert goals(rollout(task, 2, seed=4)[1], 1) != goals(few, 1)
 
 
-def test_an_episode_draws_the_same_when_it_is_lived_again(task):
-    env, results = live(task, 2, 20)
+def test_repeated_episode_draws_the_same(task):
+    env, results = rollout(task, 2, 20)
     env.reset(seed=3, episode=1)
     again = [clone(env.step(torch.zeros(2, 1))) for _ in range(9)]
     assert goals(again, 1) == goals(results[10:], 1)[:9]
 
 
-def test_a_gpu_draws_what_a_cpu_draws(task):
-    host, device = (live(task, 5, 25, f"sim.engine={engine}")[1] for engine in ("batch", "warp"))
+def test_gpu_and_cpu_draw_the_same(task):
+    host, device = (rollout(task, 5, 25, f"sim.engine={engine}")[1] for engine in ("batch", "warp"))
     for row in range(5):
         torch.testing.assert_close(goals(host, row), goals(device, row), atol=1e-6, rtol=0)
 
 
-def test_a_saved_environment_goes_on_drawing_as_it_would_have(task):
-    env, _ = live(task, 3, 4)
+def test_state_dict_restores_draws(task):
+    env, _ = rollout(task, 3, 4)
     saved = env.state_dict()
     expected = [clone(env.step(torch.zeros(3, 1))) for _ in range(20)]
     fresh = build(task, 3, seed=8)
@@ -113,8 +113,8 @@ def test_a_saved_environment_goes_on_drawing_as_it_would_have(task):
 
 
 @pytest.mark.parametrize("engine", ["batch", "warp"])
-def test_numbers_of_episodes_are_those_of_their_last_step(task, engine):
-    env, results = live(task, 4, 10, f"sim.engine={engine}")
+def test_episode_metrics_are_values_of_last_step(task, engine):
+    env, results = rollout(task, 4, 10, f"sim.engine={engine}")
     ended = results[-1].episodes.ended()
     assert ended.ids.tolist() == [0, 1, 2, 3]
     assert ended.metrics["drawn"].tolist() == [0.0, 3.0, 0.0, 3.0]

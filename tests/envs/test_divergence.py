@@ -1,4 +1,4 @@
-"""A simulation that diverges ends the episode of its environment, and nothing else happens."""
+"""A diverged simulation ends only the episode of its own environment."""
 
 import math
 
@@ -39,14 +39,14 @@ POISONS = ["nan qpos", "inf qpos", "1e12 qpos", "nan qvel", "inf qvel", "1e12 qv
            "nan timestep"]  # fmt: skip
 
 
-@pytest.mark.parametrize("who", [0, 2, N - 1])
+@pytest.mark.parametrize("number", [0, 2, N - 1])
 @pytest.mark.parametrize("what", POISONS)
-def test_divergence_terminates_that_environment_at_once_and_leaves_the_others_alone(tmp_path, what, who):
+def test_divergence_terminates_only_its_env(tmp_path, what, number):
     task = critter(tmp_path)
-    # under a mass of nan no acceleration is finite, of whatever state: a term that reads one is an error of its own
+    # with a mass of nan no acceleration is finite in any state: a term that reads one raises its own error
     changes = (*QUIET, "rewards.acc=null") if what == "nan mass" else QUIET
     sound, sick = build(task, N, *changes), build(task, N, *changes)
-    if what in ("nan mass", "nan timestep"):  # an expanded model is another path through the engine
+    if what in ("nan mass", "nan timestep"):  # an expanded model takes another path through the engine
         for env in (sound, sick):
             env.engine.expand("body_mass" if what == "nan mass" else "opt.timestep")
     action = torch.full((N, 4), 0.2)
@@ -54,17 +54,17 @@ def test_divergence_terminates_that_environment_at_once_and_leaves_the_others_al
         env.reset()
         for _ in range(3):
             env.step(action)
-    last_finite = sick.sim.qpos[who].clone(), sick.sim.qvel[who].clone()
-    poison(sick, what, who)
+    last_finite = sick.sim.qpos[number].clone(), sick.sim.qvel[number].clone()
+    poison(sick, what, number)
     expected, found = clone(sound.step(action)), clone(sick.step(action))
-    assert found.terminated.tolist() == [i == who for i in range(N)]
+    assert found.terminated.tolist() == [i == number for i in range(N)]
     assert not found.truncated.any()
-    assert found.episodes.ids.tolist() == [who]
+    assert found.episodes.ids.tolist() == [number]
     assert found.episodes.causes["diverged"].tolist() == [True]
     assert sick.divergences == 1
-    assert torch.equal(found.final_obs["critic"][who], torch.cat([last_finite[0][7:], last_finite[1][6:]]))
-    rest = [i for i in range(N) if i != who]
-    cure(sick, what, who)
+    assert torch.equal(found.final_obs["critic"][number], torch.cat([last_finite[0][7:], last_finite[1][6:]]))
+    rest = [i for i in range(N) if i != number]
+    cure(sick, what, number)
     results = [(expected, found)]
     results += [(clone(sound.step(action)), clone(sick.step(action))) for _ in range(15)]
     for i in rest:
@@ -74,7 +74,7 @@ def test_divergence_terminates_that_environment_at_once_and_leaves_the_others_al
     assert sick.divergences == 1
 
 
-PAID = '''
+TERMS = '''
 from rlcli.task import Entity
 
 
@@ -94,15 +94,15 @@ def broken_row(env, *, entity: Entity = "robot"):
 '''
 
 
-def paying(tmp_path, **changes):
+def rewarded(tmp_path, **changes):
     base = {"reward_dt_scaling": False, "sim": {"gravity": [0.0, 0.0, 0.0]}, "episode_length_s": 5.0,
             "rewards": {"angle": {"func": "angle", "weight": 100.0}}}  # fmt: skip
-    return pendulum(tmp_path, edited(PENDULUM_TASK, **{**base, **changes}), terms_py=PAID)
+    return pendulum(tmp_path, edited(PENDULUM_TASK, **{**base, **changes}), terms_py=TERMS)
 
 
 @pytest.mark.parametrize("what", ["nan qpos", "nan qvel", "nan timestep"])
-def test_a_diverged_environment_is_paid_for_its_last_finite_state_as_terminated(tmp_path, what):
-    env = build(paying(tmp_path))
+def test_diverged_env_gets_reward_of_last_finite_state(tmp_path, what):
+    env = build(rewarded(tmp_path))
     env.reset()
     env.engine.field("qpos")[1, 0] = 0.5
     env.sim.refresh()
@@ -113,8 +113,8 @@ def test_a_diverged_environment_is_paid_for_its_last_finite_state_as_terminated(
     assert result.episodes.returns.tolist() == pytest.approx([51.0 + 40.0])
 
 
-def test_a_divergence_reward_replaces_it_and_is_part_of_the_return(tmp_path):
-    env = build(paying(tmp_path, divergence_reward=-7.0))
+def test_divergence_reward_replaces_reward_and_counts_in_return(tmp_path):
+    env = build(rewarded(tmp_path, divergence_reward=-7.0))
     env.reset()
     env.engine.field("qpos")[:, 0] = 0.5
     env.step(torch.zeros(3, 1))
@@ -126,7 +126,7 @@ def test_a_divergence_reward_replaces_it_and_is_part_of_the_return(tmp_path):
     assert terms == pytest.approx({"alive": 1.0, "terminating": 0.0, "angle": 50.0, "diverged": -7.0})
 
 
-def test_a_direct_task_gets_the_divergence_reward_too(tmp_path):
+def test_divergence_reward_applies_to_direct_task(tmp_path):
     env = build("cartpole-direct", 3, "divergence_reward=-3.0")
     env.reset()
     poison(env, "nan qpos", 1)
@@ -136,7 +136,7 @@ def test_a_direct_task_gets_the_divergence_reward_too(tmp_path):
     assert result.obs["policy"].isfinite().all()
 
 
-def test_a_second_divergence_of_the_same_environment_is_found_again(tmp_path):
+def test_second_divergence_of_same_env_is_found(tmp_path):
     env = build(critter(tmp_path), 3, *QUIET)
     env.reset()
     for count in (1, 2, 3):
@@ -146,7 +146,7 @@ def test_a_second_divergence_of_the_same_environment_is_found_again(tmp_path):
         assert not env.step(torch.zeros(3, 4)).terminated.any()
 
 
-def test_two_environments_that_diverge_together_are_both_found(tmp_path):
+def test_two_simultaneous_divergences_are_found(tmp_path):
     env = build(critter(tmp_path), 4, *QUIET)
     env.reset()
     poison(env, "nan qpos", 0)
@@ -154,14 +154,14 @@ def test_two_environments_that_diverge_together_are_both_found(tmp_path):
     assert env.step(torch.zeros(4, 4)).terminated.tolist() == [True, False, False, True]
 
 
-def test_nan_controls_that_a_term_writes_are_a_divergence(tmp_path):
+def test_nan_controls_are_a_divergence(tmp_path):
     terms = '''
 import torch
 from rlcli.task import Entity
 
 
 class Poisoned:
-    """Writes what it is told."""
+    """Action term that writes the action to the controls."""
 
     def __init__(self, env, *, entity: Entity = "robot") -> None:
         self.size, self.elements, self.unit = 1, ("swing",), ""
@@ -179,7 +179,7 @@ class Poisoned:
     assert not env.step(torch.zeros(3, 1)).terminated.any()
 
 
-def test_an_action_that_is_not_finite_names_the_policy_and_the_environment(tmp_path):
+def test_nonfinite_action_error_names_policy_and_env(tmp_path):
     env = build(critter(tmp_path), 3)
     env.reset()
     before = env.engine.state_dict()["state"]
@@ -188,17 +188,17 @@ def test_an_action_that_is_not_finite_names_the_policy_and_the_environment(tmp_p
     assert torch.equal(before, env.engine.state_dict()["state"]), "nothing moved"
 
 
-def test_a_reward_term_that_is_not_finite_is_named_with_its_environment(tmp_path):
-    env = build(paying(tmp_path, rewards={"bad": {"func": "broken", "weight": 1.0}}))
+def test_nonfinite_reward_error_names_term_and_env(tmp_path):
+    env = build(rewarded(tmp_path, rewards={"bad": {"func": "broken", "weight": 1.0}}))
     env.reset()
     env.engine.field("qpos")[1:, 0] = 1.0
     with pytest.raises(DivergedError, match=r"reward term 'bad' \(broken\) is not finite in 2 .*environment 1"):
         env.step(torch.zeros(3, 1))
 
 
-def test_an_observation_term_that_is_not_finite_is_named_with_its_environment(tmp_path):
+def test_nonfinite_observation_error_names_term_and_env(tmp_path):
     env = build(
-        paying(tmp_path, observations={"policy": {"pos": {"func": "joint_pos"}, "odd": {"func": "broken_row"}}})
+        rewarded(tmp_path, observations={"policy": {"pos": {"func": "joint_pos"}, "odd": {"func": "broken_row"}}})
     )
     env.reset()
     env.engine.field("qpos")[2, 0] = 1.0
@@ -206,7 +206,7 @@ def test_an_observation_term_that_is_not_finite_is_named_with_its_environment(tm
         env.step(torch.zeros(3, 1))
 
 
-def test_no_log_file_of_mujoco_appears(tmp_path, monkeypatch):
+def test_mujoco_writes_no_log_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     env = build(critter(tmp_path), 2)
     env.reset()

@@ -1,4 +1,4 @@
-"""The GPU engine, on Warp's CPU device, lives the life of the CPU engine: step by step, and over many episodes."""
+"""The GPU engine, on Warp's CPU device, agrees with the CPU engine: in each step, and over many episodes."""
 
 import math
 
@@ -7,7 +7,7 @@ import torch
 from support.worlds import actions, build, critter, pendulum
 
 STEPS, N = 50, 8
-SHORT = {  # episodes end and begin within the run, by time
+SHORT = {  # episodes time out within the run
     "cartpole": ("episode_length_s=0.25",),
     "cartpole-direct": ("episode_length_s=0.25",),
     "ant-direct": ("episode_length_s=0.2",),
@@ -18,7 +18,7 @@ SHORT = {  # episodes end and begin within the run, by time
 }
 TOLERANCE = {"cartpole": 2e-5, "cartpole-direct": 2e-5, "ant-direct": 2e-3, "quadcopter": 2e-4, "crazyflie": 2e-5,
              "ingenuity": 2e-5, "humanoid": 2e-3}  # fmt: skip
-"""float32 rounding, grown over the steps of one episode; contacts make it grow faster."""
+"""float32 rounding errors after the steps of one episode; they grow faster with contacts."""
 
 
 def pair(task, num_envs=N, *overrides, seed=3):
@@ -58,7 +58,7 @@ def assert_same_step(host, device, tolerance, where):
 
 
 def follow(host, device, tolerance, steps=STEPS, strength=0.5):
-    """Step both under the same actions; how many episodes ended."""
+    """Step both under the same actions, and return the number of ended episodes."""
     first = [env.reset(seed=5) for env in (host, device)]
     for group, values in first[0].items():
         torch.testing.assert_close(values, first[1][group], rtol=tolerance, atol=tolerance)
@@ -74,14 +74,14 @@ def follow(host, device, tolerance, steps=STEPS, strength=0.5):
 
 
 @pytest.mark.parametrize("task", SHORT)
-def test_they_agree_step_by_step_through_resets(task):
+def test_engines_agree_through_resets(task):
     host, device = pair(task, N, *SHORT[task])
     ended = follow(host, device, TOLERANCE[task])
     assert ended >= 2 * N
 
 
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
-def test_they_agree_step_by_step_through_terminations(task):
+def test_engines_agree_through_terminations(task):
     host, device = pair(task, N)
     states = [env.reset(seed=5) for env in (host, device)]
     assert torch.equal(states[0]["policy"].isfinite(), states[1]["policy"].isfinite())
@@ -96,17 +96,17 @@ def test_they_agree_step_by_step_through_terminations(task):
     device.check()
 
 
-def test_they_agree_where_every_kind_of_term_is_used(tmp_path):
-    """Position actuators, root resets, pushes and wrenches at intervals, terms of forces; in free fall.
+def test_engines_agree_with_every_kind_of_term(tmp_path):
+    """Position actuators, root resets, pushes, wrenches at intervals and force terms, in free fall.
 
-    Feet that strike the ground would be chaos: there a millionth grows to a hundredth within three steps.
+    Feet that hit the ground are chaotic: an error of 1e-6 grows to 1e-2 within three steps.
     """
     host, device = pair(critter(tmp_path), 6, "scene.ground=null")
     ended = follow(host, device, 2e-5, steps=40, strength=0.3)
     assert ended >= 12
 
 
-def test_they_agree_on_environments_that_end_at_different_times(tmp_path):
+def test_engines_agree_when_episodes_end_at_different_times(tmp_path):
     host, device = pair(pendulum(tmp_path), 5)
     for env in (host, device):
         env.reset(seed=5)
@@ -121,7 +121,7 @@ def test_they_agree_on_environments_that_end_at_different_times(tmp_path):
 
 
 def gather(env, episodes):
-    """Returns and lengths of each environment's first episode under a random policy."""
+    """Return the returns and lengths of each environment's first episode under a random policy."""
     env.reset(seed=11)
     generator = torch.Generator().manual_seed(env.num_envs)
     returns, lengths = torch.full((env.num_envs,), math.nan), torch.zeros(env.num_envs)
@@ -137,8 +137,8 @@ def gather(env, episodes):
 
 
 @pytest.mark.parametrize("task", ["cartpole", "ant-direct"])
-def test_they_agree_in_distribution_over_episodes(task):
-    """Other start states and other actions on each side: only the distributions can be equal."""
+def test_engines_agree_in_distribution_of_episodes(task):
+    """Both sides have other start states and actions, so only the distributions can be equal."""
     overrides = {"cartpole": ("episode_length_s=1.5",), "ant-direct": ("episode_length_s=0.5",)}[task]
     host = build(task, 256, "sim.engine=batch", *overrides, seed=1)
     device = build(task, 256, "sim.engine=warp", *overrides, seed=2)

@@ -1,4 +1,4 @@
-"""A step on the GPU engine asks the host nothing: no value is read back, no size depends on one."""
+"""A step on the GPU engine forces no host sync: the host reads no value, and no size depends on one."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from rlcli.testing.host_sync import HostSyncError, HostSyncGuard
 
 
 def every_term():
-    """The critter's task with what it lacks of the vocabulary."""
+    """Return the critter's task with the remaining terms of the library."""
     task = yaml.safe_load(CRITTER_TASK)
     task["sim"]["engine"] = "warp"
     task["success"] = {"func": "joints_near", "tolerance": 0.5, "hold_s": 0.1}
@@ -65,7 +65,7 @@ def every_term():
                  "velocity_limit": 20.0},
     }  # fmt: skip
     task["rewards"]["target"] = {"func": "joint_pos_target_l2", "weight": -0.1, "target": 0.0}
-    task["rewards"].pop("power")  # one joint a column of the action: here two actions drive the same joint
+    task["rewards"].pop("power")  # it needs one joint a column; two actions drive the same joint
     task["terminations"] |= {
         "manual": {"func": "joint_pos_out_of_manual_limit", "bounds": [-2.0, 2.0]},
         "soft": {"func": "joint_pos_out_of_limit"},
@@ -75,7 +75,7 @@ def every_term():
 
 
 def watched_steps(env, steps):
-    """Steps with resets among them; how many episodes ended."""
+    """Run steps with resets, and return the number of ended episodes."""
     action = 0.3 * torch.ones(env.num_envs, env.layout.action_size)
     env.reset()
     env.step(action)
@@ -88,12 +88,12 @@ def watched_steps(env, steps):
 
 
 @pytest.mark.parametrize("task", ["cartpole", "ant-direct"])
-def test_a_step_of_a_built_in_task_reads_nothing_back(task):
+def test_built_in_task_step_has_no_host_sync(task):
     env = build(task, 4, "sim.engine=warp", "episode_length_s=0.1")
     assert watched_steps(env, 14) >= 4
 
 
-def test_a_step_of_a_task_with_every_kind_of_term_reads_nothing_back(tmp_path):
+def test_step_with_every_kind_of_term_has_no_host_sync(tmp_path):
     folder = write(tmp_path / "critter", every_term(), critter_xml=CRITTER)
     env = build(folder, 4, "episode_length_s=0.1", "sim.forces_after_reset=true")
     assert watched_steps(env, 14) >= 4
@@ -104,8 +104,8 @@ def test_a_step_of_a_task_with_every_kind_of_term_reads_nothing_back(tmp_path):
     assert env.divergences == 1
 
 
-@pytest.mark.slow  # kernels for height fields take a minute to compile
-def test_a_step_on_a_terrain_with_sensors_reads_nothing_back(tmp_path):
+@pytest.mark.slow  # kernels for height fields compile for a minute
+def test_step_with_terrain_and_sensors_has_no_host_sync(tmp_path):
     task = yaml.safe_load(every_term())
     sub_terrains = {"hills": {"kind": "noise"}, "stairs": {"kind": "stairs", "boxes": True}}
     task["scene"]["terrain"] = {"kind": "generator", "rows": 2, "columns": 2, "sub_terrains": sub_terrains}
@@ -121,7 +121,7 @@ import torch
 from rlcli.task import ContactSensor, RaySensor
 
 def sensed(env, *, feet: ContactSensor = "feet", scan: RaySensor = "scan"):
-    \"\"\"What both sensors say. (num_envs, k)\"\"\"
+    \"\"\"Readings of both sensors. (num_envs, k)\"\"\"
     return torch.cat([feet.force_history.flatten(1), feet.air_time, feet.first_contact.float(), scan.distance], dim=1)
 """
     folder = write(tmp_path / "critter", dump(task), critter_xml=CRITTER, terms_py=terms)
@@ -129,7 +129,7 @@ def sensed(env, *, feet: ContactSensor = "feet", scan: RaySensor = "scan"):
     assert watched_steps(env, 14) >= 4
 
 
-def test_the_detector_sees_a_mask_and_a_number_read_back():
+def test_detector_finds_mask_and_number_reads():
     values = torch.arange(4.0)
     for reading in (lambda: values[values > 1], lambda: float(values.sum()), lambda: (values > 1).nonzero()):
         with pytest.raises(HostSyncError), HostSyncGuard():

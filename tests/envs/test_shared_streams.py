@@ -1,4 +1,4 @@
-"""Environments that live each other's lives: what they draw is the same, so that they differ only where made to."""
+"""`shared_streams`: groups of environments draw the same random numbers."""
 
 import pytest
 import torch
@@ -49,7 +49,7 @@ def noisy(tmp_path):
     return str(folder)
 
 
-def lived(task, *overrides, shared_streams=0, steps=50):
+def rollout(task, *overrides, shared_streams=0, steps=50):
     """Observations and rewards of every step. (steps, num_envs, k)"""
     env = make_env(resolve(find_task(task), overrides=overrides), seed=5, shared_streams=shared_streams)
     seen = [env.reset(seed=5)["policy"].clone()]
@@ -61,28 +61,28 @@ def lived(task, *overrides, shared_streams=0, steps=50):
 
 
 @pytest.mark.parametrize("engine", ["batch", "warp"])
-def test_environments_of_one_life_are_equal_and_live_as_in_a_smaller_set(noisy, engine):
+def test_shared_streams_repeat_those_of_fewer_envs(noisy, engine):
     steps = 50 if engine == "batch" else 22
     setting = f"sim.engine={engine}"
-    folded = lived(noisy, setting, shared_streams=2, steps=steps)
+    folded = rollout(noisy, setting, shared_streams=2, steps=steps)
     torch.testing.assert_close(folded[:, 0:2], folded[:, 2:4], rtol=0, atol=0)
     torch.testing.assert_close(folded[:, 0:2], folded[:, 4:6], rtol=0, atol=0)
     assert not torch.equal(folded[:, 0], folded[:, 1])
-    torch.testing.assert_close(lived(noisy, setting, "scene.num_envs=2", steps=steps), folded[:, 0:2], rtol=0, atol=0)
+    torch.testing.assert_close(rollout(noisy, setting, "scene.num_envs=2", steps=steps), folded[:, 0:2], rtol=0, atol=0)
 
 
-def test_without_it_every_environment_lives_its_own_life(noisy):
-    seen = lived(noisy, steps=2)
+def test_without_shared_streams_envs_differ(noisy):
+    seen = rollout(noisy, steps=2)
     assert len({float(x) for x in seen[0, :, 0]}) == 6
 
 
-def test_direct_tasks_draw_alike():
-    folded = lived("cartpole-direct", "scene.num_envs=4", shared_streams=2)
+def test_shared_streams_hold_for_direct_tasks():
+    folded = rollout("cartpole-direct", "scene.num_envs=4", shared_streams=2)
     torch.testing.assert_close(folded[:, 0:2], folded[:, 2:4], rtol=0, atol=0)
-    torch.testing.assert_close(lived("cartpole-direct", "scene.num_envs=2"), folded[:, 0:2], rtol=0, atol=0)
+    torch.testing.assert_close(rollout("cartpole-direct", "scene.num_envs=2"), folded[:, 0:2], rtol=0, atol=0)
 
 
-def test_on_a_terrain_they_stand_on_the_same_ground(noisy):
+def test_shared_streams_use_same_terrain_patch(noisy):
     terrain = (
         "scene.terrain={kind: generator, rows: 3, columns: 5, patch: [4.0, 4.0], sub_terrains: {flat: {kind: flat}}}"
     )

@@ -1,4 +1,4 @@
-"""Saving and going on: the same steps bit for bit in a fresh environment."""
+"""Saved states: a new environment repeats the same steps bit for bit."""
 
 import pytest
 import torch
@@ -14,26 +14,26 @@ def place(tmp_path):
 
 @pytest.mark.parametrize("moment", [20, 30, 31])
 @pytest.mark.parametrize("name", TASKS)
-def test_a_restored_environment_takes_the_same_steps_bit_for_bit(name, place, moment):
-    """At a quiet moment, in the step in which all time out, and right after it."""
+def test_load_state_dict_repeats_steps_bit_for_bit(name, place, moment):
+    """Saved in the middle of episodes, in the step in which all time out, and right after it."""
     task, n = place(name), 6
     length = "episode_length_s=0.6" if name != "cartpole-direct" else "episode_length_s=0.498"
     env = build(task, n, length, "sim.engine_threads=2", seed=3)
     assert env.max_episode_length in (30, 36)
-    given = actions(moment + 45, n, env.layout.action_size, seed=4)
+    action_list = actions(moment + 45, n, env.layout.action_size, seed=4)
     env.reset()
-    for action in given[:moment]:
+    for action in action_list[:moment]:
         last = clone(env.step(action))
     saved = env.state_dict()
     kept = {name: value.clone() for name, value in saved.items()}
-    expected = [clone(env.step(action)) for action in given[moment:]]
+    expected = [clone(env.step(action)) for action in action_list[moment:]]
     assert all(torch.equal(saved[name], kept[name]) for name in saved), "a state dict is a copy"
 
     fresh = build(task, n, length, "sim.engine_threads=1", seed=99)
     obs = fresh.load_state_dict(saved)
     for group, value in last.obs.items():
         assert torch.equal(obs[group], value), "the observation of that moment"
-    found = [clone(fresh.step(action)) for action in given[moment:]]
+    found = [clone(fresh.step(action)) for action in action_list[moment:]]
     for i in range(n):
         assert same(life(found, i), life(expected, i))
     for a, b in zip(expected, found, strict=True):
@@ -47,7 +47,7 @@ def test_a_restored_environment_takes_the_same_steps_bit_for_bit(name, place, mo
         assert torch.equal(value, other[key]), key
 
 
-def test_loading_into_a_used_environment_leaves_nothing_of_its_past(place):
+def test_load_state_dict_overwrites_all_state(place):
     task = place("critter")
     env, used = build(task, 4), build(task, 4, seed=8)
     for e, steps in ((env, 12), (used, 33)):
@@ -61,7 +61,7 @@ def test_loading_into_a_used_environment_leaves_nothing_of_its_past(place):
         assert torch.equal(a.reward, b.reward)
 
 
-def test_an_observed_acceleration_is_restored_too(tmp_path):
+def test_load_state_dict_restores_observed_acceleration(tmp_path):
     terms = '''
 from rlcli.task import Entity, Joints
 
@@ -79,7 +79,7 @@ def joint_acc(env, *, entity: Entity = "robot", joints: Joints = ".*"):
     assert torch.equal(build(task, 3).load_state_dict(env.state_dict())["policy"], obs)
 
 
-def test_model_fields_of_each_environment_travel_with_the_state(place):
+def test_state_dict_contains_randomized_model_fields(place):
     task = place("critter")
     env = build(task, 3)
     env.engine.expand("body_mass")[:, 1] = torch.tensor([2.0, 3.0, 4.0], dtype=torch.float64)

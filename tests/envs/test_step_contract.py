@@ -1,4 +1,4 @@
-"""The step contract of manager-based environments, point by point."""
+"""Contract of a step of manager-based environments, point by point."""
 
 import itertools
 
@@ -34,7 +34,7 @@ def explosive(env) -> torch.Tensor:
 
 
 def note(env, selection, *, tag: str) -> None:
-    """Remember who fired when."""
+    """Record the environments and the steps in which the event fires."""
     env.notes = [*getattr(env, "notes", []), (tag, env.common_step, selection.read(env._counters.ids).tolist())]
 
 
@@ -61,19 +61,19 @@ def set_angle(env, ids, value):
 BEYOND = {"time_out": {"func": "time_out", "time_out": True}, "beyond": {"func": "beyond", "limit": 1.0}}
 
 
-def test_rewards_are_weight_times_value_times_step_dt(tmp_path):
+def test_reward_is_weight_times_value_times_step_dt(tmp_path):
     env = build(world(tmp_path))
     env.reset()
     assert env.step(idle(env)).reward.tolist() == pytest.approx([0.02] * 3)
 
 
-def test_reward_dt_scaling_can_be_switched_off(tmp_path):
+def test_reward_dt_scaling_false_omits_step_dt(tmp_path):
     env = build(world(tmp_path, reward_dt_scaling=False))
     env.reset()
     assert env.step(idle(env)).reward.tolist() == [1.0] * 3
 
 
-def test_the_terminating_step_is_paid_from_the_terminal_state_with_alive_0_and_terminating_1(tmp_path):
+def test_terminating_step_rewards_terminal_state(tmp_path):
     env = build(world(
         tmp_path,
         reward_dt_scaling=False,
@@ -91,7 +91,7 @@ def test_the_terminating_step_is_paid_from_the_terminal_state_with_alive_0_and_t
     assert float(result.reward[0]) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_time_out_at_exactly_the_episode_length_is_truncation_with_alive_1(tmp_path):
+def test_time_out_is_truncation_and_counts_as_alive(tmp_path):
     env = build(world(tmp_path, reward_dt_scaling=False))
     assert env.max_episode_length == 10
     results = run(env, 20)
@@ -109,16 +109,14 @@ def test_a_time_out_at_exactly_the_episode_length_is_truncation_with_alive_1(tmp
     ("length", "dt", "decimation", "steps"),
     [(5.0, "1/120", 2, 300), (8.3, 0.0083, 2, 500), (1.0, 0.01, 3, 34), (0.06, 0.02, 3, 1)],
 )
-def test_the_number_of_steps_of_an_episode_is_rounded_up_without_rounding_errors(
-    tmp_path, length, dt, decimation, steps
-):
+def test_max_episode_length_rounds_up_exactly(tmp_path, length, dt, decimation, steps):
     assert (
         build(world(tmp_path, episode_length_s=length, sim={"dt": dt}, decimation=decimation)).max_episode_length
         == steps
     )
 
 
-def test_a_state_may_be_terminated_and_truncated_and_is_then_no_time_out(tmp_path):
+def test_terminated_and_truncated_is_not_a_time_out(tmp_path):
     env = build(world(tmp_path, terminations=BEYOND))
     env.reset()
     for _ in range(9):
@@ -131,7 +129,7 @@ def test_a_state_may_be_terminated_and_truncated_and_is_then_no_time_out(tmp_pat
     assert result.episodes.causes["beyond"].tolist() == [True, False, False]
 
 
-def test_after_a_same_step_reset_counters_are_zero_and_the_observation_is_the_new_state(tmp_path):
+def test_autoreset_clears_counters_and_returns_new_obs(tmp_path):
     env = build(critter(tmp_path), 4)
     env.reset()
     before = [env.step(torch.full((4, 4), 0.3)) for _ in range(2)][-1].obs["policy"].clone()
@@ -153,8 +151,8 @@ def test_after_a_same_step_reset_counters_are_zero_and_the_observation_is_the_ne
     assert env.action_manager.action[1].all()
 
 
-def test_final_obs_is_the_observation_an_endless_episode_would_have_had(tmp_path):
-    """The last observation of a time-out is that of the state, not of the reset, bit for bit."""
+def test_final_obs_matches_endless_episode(tmp_path):
+    """The final observation of a time-out is that of the state before the reset, bit for bit."""
     short = build(critter(tmp_path), 3, "episode_length_s=0.1", "events.push=null", "events.shove=null")
     long = build(critter(tmp_path), 3, "episode_length_s=9.0", "events.push=null", "events.shove=null")
     ended, goes_on = run(short, 5)[-1], run(long, 5)[-1]
@@ -165,7 +163,7 @@ def test_final_obs_is_the_observation_an_endless_episode_would_have_had(tmp_path
 
 
 @pytest.mark.parametrize("kind", ["pendulum", "cartpole-direct"])
-def test_final_obs_of_truncated_is_none_when_nothing_was_truncated(tmp_path, kind):
+def test_final_obs_of_truncated_is_none_without_truncation(tmp_path, kind):
     env = build(world(tmp_path, terminations=BEYOND) if kind == "pendulum" else kind, 3)
     env.reset()
     env.final_obs_of = "truncated"
@@ -180,7 +178,7 @@ def test_final_obs_of_truncated_is_none_when_nothing_was_truncated(tmp_path, kin
     assert float(result.final_obs["policy"][1].abs().max()) > 0.2
 
 
-def test_no_final_obs_and_no_episodes_while_all_go_on(tmp_path):
+def test_final_obs_and_episodes_are_none_without_ends(tmp_path):
     env = build(world(tmp_path))
     env.reset()
     result = env.step(idle(env))
@@ -188,30 +186,30 @@ def test_no_final_obs_and_no_episodes_while_all_go_on(tmp_path):
     assert result.episodes is None
 
 
-def test_a_reward_of_weight_0_is_not_called_at_all(tmp_path):
+def test_zero_weight_reward_is_never_called(tmp_path):
     env = build(world(tmp_path, rewards={"off": {"func": "explosive", "weight": 0.0}}))
     results = run(env, 11)
     assert results[9].episodes.reward_terms["off"].tolist() == [0.0] * 3
 
 
-def test_reward_terms_add_up_to_the_return_and_the_return_to_the_rewards(tmp_path):
+def test_reward_terms_sum_to_return(tmp_path):
     env = build(critter(tmp_path), 8)
-    paid = torch.zeros(8, dtype=torch.float64)
+    returns = torch.zeros(8, dtype=torch.float64)
     seen = 0
     for result in run(env, 70):
-        paid += result.reward.double()
+        returns += result.reward.double()
         if result.episodes is not None:
             ended = result.episodes
             seen += len(ended.ids)
             terms = sum(v.double() for v in ended.reward_terms.values())
             assert torch.allclose(terms, ended.returns.double(), rtol=1e-6, atol=1e-6)
-            assert torch.allclose(paid[ended.ids], ended.returns.double(), rtol=1e-5, atol=1e-5)
-            paid[ended.ids] = 0.0
+            assert torch.allclose(returns[ended.ids], ended.returns.double(), rtol=1e-5, atol=1e-5)
+            returns[ended.ids] = 0.0
     assert seen > 10
 
 
 @pytest.mark.parametrize("name", ["ant-direct", "cartpole", "cartpole-direct", "critter"])
-def test_consecutive_observations_and_rewards_share_no_memory(tmp_path, name):
+def test_consecutive_results_share_no_memory(tmp_path, name):
     env = build(critter(tmp_path) if name == "critter" else name, 4)
     previous = env.reset()["policy"]
     kept = previous.clone()
@@ -227,7 +225,7 @@ def test_consecutive_observations_and_rewards_share_no_memory(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["ant-direct", "cartpole", "cartpole-direct", "critter"])
-def test_partial_reset_leaves_other_envs_untouched(tmp_path, name):
+def test_partial_reset_keeps_other_envs(tmp_path, name):
     task = critter(tmp_path) if name == "critter" else name
     twins = [build(task, 6) for _ in range(2)]
     for env in twins:
@@ -246,7 +244,7 @@ def test_partial_reset_leaves_other_envs_untouched(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["ant-direct", "cartpole", "cartpole-direct", "critter"])
-def test_who_sits_a_step_out_begins_alike_and_the_others_do_not_notice(tmp_path, name):
+def test_restart_repeats_start_and_keeps_other_envs(tmp_path, name):
     task = critter(tmp_path) if name == "critter" else name
     waiting, plain = (build(task, 6) for _ in range(2))
     for env in (waiting, plain):
@@ -266,7 +264,7 @@ def test_who_sits_a_step_out_begins_alike_and_the_others_do_not_notice(tmp_path,
     assert not (sat.terminated | sat.truncated)[begin].any()
     assert torch.equal(waiting.episode_index, index)
     assert waiting.episode_length_buf[begin].tolist() == [0, 0]
-    if name != "critter":  # whose observations are noisy, and whose commands are drawn by the step
+    if name != "critter":  # its observations have noise, and its commands are keyed by the step
         assert torch.equal(sat.obs["policy"][begin], first)
 
 
@@ -274,7 +272,7 @@ def events(env, tag):
     return [(step, ids) for t, step, ids in getattr(env, "notes", []) if t == tag]
 
 
-def test_startup_events_fire_once_and_reset_events_at_every_episode(tmp_path):
+def test_startup_and_reset_events_fire_on_time(tmp_path):
     env = build(world(tmp_path, events={
         "first": {"func": "note", "mode": "startup", "tag": "startup"},
         "each": {"func": "note", "mode": "reset", "tag": "reset"},
@@ -304,17 +302,17 @@ def fired_steps(tmp_path, interval, dt, decimation, steps, length=1000.0):
     ("interval", "dt", "decimation", "every"),
     [(0.1, 0.01, 2, 5), (5.0, "1/120", 2, 300), (2.0, 0.01, 1, 200), (0.05, 0.02, 1, 3), (0.001, 0.02, 1, 1)],
 )
-def test_interval_events_keep_their_period_without_drift(tmp_path, interval, dt, decimation, every):
+def test_interval_events_do_not_drift(tmp_path, interval, dt, decimation, every):
     steps = 3 * every + every // 2
     assert fired_steps(tmp_path, interval, dt, decimation, steps) == [every, 2 * every, 3 * every]
 
 
-def test_interval_timers_start_anew_with_an_episode_and_no_time_passes_at_its_reset(tmp_path):
-    # episodes of 8 steps, an event every 5: at 5, then 5 steps into the second episode
+def test_interval_timers_restart_with_episode(tmp_path):
+    # episodes of 8 steps, an event every 5 steps: in step 5, then in step 5 of the second episode
     assert fired_steps(tmp_path, 0.1, 0.01, 2, 24, length=0.16) == [5, 13, 21]
 
 
-def test_interval_times_are_drawn_an_environment_within_their_bounds(tmp_path):
+def test_interval_times_are_drawn_per_env_within_range(tmp_path):
     env = build(world(tmp_path, episode_length_s=100.0, events={
         "tick": {"func": "note", "mode": "interval", "interval_range_s": [0.1, 0.2], "tag": "tick"},
     }), 16)  # fmt: skip
@@ -329,7 +327,7 @@ def test_interval_times_are_drawn_an_environment_within_their_bounds(tmp_path):
     assert len(gaps) >= 4
 
 
-def test_the_observation_after_an_interval_event_shows_what_it_did(tmp_path):
+def test_observation_includes_interval_event(tmp_path):
     env = build(critter(tmp_path, edited(CRITTER_TASK, episode_length_s=5.0)), 4)
     env.reset()
     for _ in range(30):
@@ -339,7 +337,7 @@ def test_the_observation_after_an_interval_event_shows_what_it_did(tmp_path):
         assert torch.allclose(obs[:, 4:7], 0.25 * velocity[:, 3:6])
 
 
-def test_two_pushes_in_one_step_add_up_and_a_push_at_reset_starts_from_the_reset_state(tmp_path):
+def test_pushes_add_up_and_start_from_reset_state(tmp_path):
     push = {"func": "push_by_setting_velocity", "linear_velocity": [[1.0, 1.0], [0.0, 0.0], [0.0, 0.0]]}
     both = {**push, "mode": "interval", "interval_range_s": [0.02, 0.02]}
     changes = {"root": None, "joints": None, "shove": None, "push": None}
@@ -354,7 +352,7 @@ def test_two_pushes_in_one_step_add_up_and_a_push_at_reset_starts_from_the_reset
         env.reset()
 
 
-def test_only_finite_actions_of_the_right_shape_are_taken(tmp_path):
+def test_step_rejects_nonfinite_or_misshaped_actions(tmp_path):
     env = build(world(tmp_path))
     env.reset()
     with pytest.raises(ValueError, match=r"action has shape \(3,\), expected \(3, 1\)"):
@@ -367,7 +365,7 @@ def test_only_finite_actions_of_the_right_shape_are_taken(tmp_path):
     env.step(idle(env))
 
 
-def test_success_needs_the_condition_held_to_a_time_out(tmp_path):
+def test_success_requires_condition_until_time_out(tmp_path):
     task = world(tmp_path, terminations=BEYOND,
                  success={"func": "joints_near", "target": 0.0, "tolerance": 0.5, "hold_s": 0.1})  # fmt: skip
     env = build(task, 4)
@@ -381,7 +379,7 @@ def test_success_needs_the_condition_held_to_a_time_out(tmp_path):
     assert result.episodes.success.tolist() == [True, True, False, False]
 
 
-def test_an_environment_on_a_device_that_is_not_there_is_refused(tmp_path):
+def test_missing_device_raises_device_error(tmp_path):
     resolved = resolve(find_task(str(pendulum(tmp_path))))
     with pytest.raises(DeviceError, match="device 'cuda:99' is not available"):
         make_env(resolved, device="cuda:99")

@@ -1,4 +1,4 @@
-"""A managed YAML with OmniIsaacGymEnvs' cartpole terms pays and ends as `cartpole-direct` does."""
+"""A managed task with the cartpole terms of OmniIsaacGymEnvs has the rewards and ends of `cartpole-direct`."""
 
 from pathlib import Path
 
@@ -47,7 +47,7 @@ def while_alive_l1(env, *, entity: Entity = "robot", joints: Joints = ".*"):
 '''
 
 
-def test_from_equal_states_and_actions_rewards_and_ends_agree(tmp_path):
+def test_workflows_agree_from_equal_states_and_actions(tmp_path):
     xml = (Path(rlcli_tasks.cartpole.__file__).parent / "cartpole.xml").read_text()
     managed = build(write(tmp_path / "oige", TASK, cartpole_xml=xml, terms_py=TERMS), 1000)
     direct = build("cartpole-direct", 1000)

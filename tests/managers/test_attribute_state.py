@@ -1,4 +1,4 @@
-"""What a task's own objects remember is found, saved and put back."""
+"""`TermState`: the state of a task's own objects is found, saved and restored."""
 
 import collections
 import itertools
@@ -32,7 +32,7 @@ class Owner:
         self.numpy = np.random.default_rng(2)
         self.python = random.Random(3)
         self.helper = Helper()
-        self.helper.owner = self  # a cycle ends the search
+        self.helper.owner = self  # a cycle of references
 
     def change(self):
         self.vector += 1.0
@@ -64,7 +64,7 @@ def through_a_file(state):
     return {name: value.clone() for name, value in state.items()}
 
 
-def test_another_object_goes_on_where_the_first_was():
+def test_term_state_restores_another_object():
     first, second = Owner(), Owner()
     memory, other = TermState(first), TermState(second)
     first.change()
@@ -74,7 +74,7 @@ def test_another_object_goes_on_where_the_first_was():
     assert snapshot(first) == snapshot(second)
 
 
-def test_an_object_goes_back_also_to_what_it_was_at_first():
+def test_term_state_restores_first_state():
     owner = Owner()
     memory = TermState(owner)
     begin = through_a_file(memory.state_dict())
@@ -82,11 +82,11 @@ def test_an_object_goes_back_also_to_what_it_was_at_first():
     owner.change()
     memory.state_dict()
     memory.load_state_dict(begin)
-    del owner.made  # made later; nobody reads it then
+    del owner.made  # an attribute that did not exist at first
     assert snapshot(owner) == snapshot(fresh)
 
 
-def test_what_others_hold_stays_the_same_object():
+def test_load_state_dict_writes_in_place():
     owner = Owner()
     memory = TermState(owner)
     view, window = owner.vector[:2], owner.window
@@ -100,7 +100,7 @@ def test_what_others_hold_stays_the_same_object():
     assert list(window) == [1.0, float("inf")]
 
 
-def test_a_copy_is_not_changed_by_later_steps():
+def test_state_dict_is_a_copy():
     owner = Owner()
     state = TermState(owner).state_dict()
     owner.change()
@@ -108,7 +108,7 @@ def test_a_copy_is_not_changed_by_later_steps():
     assert state["tables/b/1"].tolist() == [0.0]
 
 
-def test_constants_are_not_written_down():
+def test_state_dict_omits_constants():
     owner = Owner()
     memory = TermState(owner)
     assert "plain" not in memory.state_dict()
@@ -120,7 +120,7 @@ def test_constants_are_not_written_down():
     ("value", "kind"),
     [(itertools.count(), "count"), ((n for n in range(3)), "generator"), (np.random.RandomState(1), "RandomState")],
 )
-def test_what_cannot_be_saved_is_named(value, kind):
+def test_unsaved_lists_attributes_with_types(value, kind):
     owner = SimpleNamespace(fine=1.0)
     memory = TermState(owner)
     assert memory.unsaved() == []
@@ -128,8 +128,8 @@ def test_what_cannot_be_saved_is_named(value, kind):
     assert memory.unsaved() == [f"SimpleNamespace.odd ({kind})"]
 
 
-def test_a_state_of_something_else_is_refused():
-    with pytest.raises(ValueError, match="has no place"):
+def test_load_state_dict_rejects_state_of_other_object():
+    with pytest.raises(ValueError, match="does not exist"):
         TermState(SimpleNamespace()).load_state_dict({"helper.table": torch.zeros(2)})
 
 
@@ -156,7 +156,7 @@ def state_with(**slots):
         ("numpy", ["dict", [["bit_generator", "Philox"], ["buffer_pos", -9]]]),
     ],
 )
-def test_what_is_no_memory_of_the_object_is_not_written(slot, value):
+def test_load_state_dict_rejects_other_attributes(slot, value):
     owner = Owner()
     memory, was = TermState(owner), torch.zeros
     with pytest.raises((ValueError, TypeError)):
@@ -169,7 +169,7 @@ def test_what_is_no_memory_of_the_object_is_not_written(slot, value):
 @pytest.mark.parametrize(
     "path", ["change", "helper", "__class__", "helper.__class__", "tables/b", "name/x", "missing.x"]
 )
-def test_a_tensor_does_not_take_the_place_of_something_else(path):
+def test_load_state_dict_rejects_tensor_for_other_type(path):
     owner = Owner()
     with pytest.raises(ValueError, match=path.partition("/")[0].partition(".")[0]):
         TermState(owner).load_state_dict({path: torch.zeros(7)})

@@ -1,4 +1,4 @@
-"""Commands and the curriculum: timers, draws, metrics, and numbers that change by their address."""
+"""Commands and curriculum: timers, draws, metrics, and settings that change by address."""
 
 import itertools
 import math
@@ -32,7 +32,7 @@ def walker(tmp_path, num_envs=4, *overrides, curriculum=None, events=None, **com
 
 
 def commands(env, steps):
-    """The commands that the policy acts under, in each step. (steps, num_envs, 3)"""
+    """Return the commands in each step. (steps, num_envs, 3)"""
     env.reset()
     seen = []
     for _ in range(steps):
@@ -41,7 +41,7 @@ def commands(env, steps):
     return torch.stack(seen)
 
 
-def test_commands_are_drawn_within_their_ranges_and_held_between_draws(tmp_path):
+def test_commands_stay_in_range_and_hold_between_draws(tmp_path):
     env = walker(tmp_path, 64)
     seen = commands(env, 29)
     for column, (low, high) in enumerate([(-1.0, 1.0), (-0.5, 0.5), (-2.0, 2.0)]):
@@ -57,7 +57,7 @@ def test_commands_are_drawn_within_their_ranges_and_held_between_draws(tmp_path)
         assert all(5 <= gap <= 10 for gap in gaps)  # 0.1 to 0.2 s at 0.02 s
 
 
-def test_an_episode_begins_with_a_new_command_and_its_timer_with_it(tmp_path):
+def test_reset_draws_command_and_restarts_timer(tmp_path):
     env = walker(tmp_path, 8, "commands.velocity.resampling_time_s=[100,100]")
     seen = commands(env, 61)  # an episode lasts 30 steps
     assert torch.equal(seen[0], seen[29])
@@ -65,17 +65,17 @@ def test_an_episode_begins_with_a_new_command_and_its_timer_with_it(tmp_path):
     assert torch.equal(seen[30], seen[59])
 
 
-def test_commands_do_not_depend_on_the_number_of_environments(tmp_path):
+def test_commands_independent_of_num_envs(tmp_path):
     few, many = commands(walker(tmp_path / "a", 3), 50), commands(walker(tmp_path / "b", 9), 50)
     assert torch.equal(few, many[:, :3])
 
 
-def test_who_stands_is_asked_for_nothing(tmp_path):
+def test_standing_environments_have_zero_command(tmp_path):
     seen = commands(walker(tmp_path, 400, rel_standing=0.25), 3)[2]
     assert float((seen == 0).all(dim=1).float().mean()) == pytest.approx(0.25, abs=0.07)
 
 
-def test_a_heading_is_approached_at_a_rate_within_the_range(tmp_path):
+def test_heading_control_clips_yaw_rate(tmp_path):
     env = walker(tmp_path, 16, heading=[-3.0, 3.0], heading_stiffness=0.5, ang_vel_z=[-0.4, 0.4])
     env.reset()
     for _ in range(3):
@@ -88,31 +88,31 @@ def test_a_heading_is_approached_at_a_rate_within_the_range(tmp_path):
         assert float(term.command[env_id, 2]) == pytest.approx(max(-0.4, min(0.4, 0.5 * error)), abs=1e-5)
 
 
-def test_metrics_are_means_over_the_episode(tmp_path):
+def test_command_metrics_are_episode_means(tmp_path):
     env = walker(tmp_path, 3, events={"push": None, "shove": None})
     env.reset()
     errors = []
     for _ in range(30):
-        asked = env.command_manager.get_command("velocity").clone()
+        commanded = env.command_manager.get_command("velocity").clone()
         result = env.step(torch.zeros(3, env.layout.action_size))
         seen = result.obs["policy"] if result.final_obs is None else result.final_obs["policy"]
-        errors.append((asked[:, :2] - seen[:, 1:3]).norm(dim=1))
+        errors.append((commanded[:, :2] - seen[:, 1:3]).norm(dim=1))
     found = result.episodes.ended().metrics["velocity/error_vel_xy"]
     assert torch.allclose(found, torch.stack(errors).mean(dim=0), rtol=1e-5)
 
 
-def test_a_velocity_counts_as_tracked_by_the_means_of_the_episode_so_far(tmp_path):
+def test_velocity_tracked_on_average_uses_running_means(tmp_path):
     env = walker(tmp_path, 8, events={"push": None, "shove": None})
     env.reset()
     velocity = env.command_manager.get_term("velocity")
     linear, angular = [], []
     for _ in range(29):
-        env.step(torch.zeros(8, env.layout.action_size))  # what is asked is measured before it is drawn anew
-        lin, ang = (env.command_manager.so_far(velocity, name) for name in ("error_vel_xy", "error_vel_yaw"))
+        env.step(torch.zeros(8, env.layout.action_size))  # metrics use the command before it is resampled
+        lin, ang = (env.command_manager.running_mean(velocity, name) for name in ("error_vel_xy", "error_vel_yaw"))
         linear.append(lin)
         angular.append(ang)
     limits = {"linear_tolerance": float(lin.sort()[0][5]), "angular_tolerance": float(ang.sort()[0][4])}
-    limits = {name: value + 1e-4 for name, value in limits.items()}  # six are near enough, and five turn well enough
+    limits = {name: value + 1e-4 for name, value in limits.items()}  # six and five within tolerance
     tracked = velocity_tracked_on_average(env, command=velocity, **limits)
     expected = [
         a < limits["linear_tolerance"] and b < limits["angular_tolerance"] for a, b in zip(lin, ang, strict=True)
@@ -123,10 +123,12 @@ def test_a_velocity_counts_as_tracked_by_the_means_of_the_episode_so_far(tmp_pat
     assert (steps > 0).all()  # each step adds its error
     metrics = env.step(torch.zeros(8, env.layout.action_size)).episodes.ended().metrics
     assert torch.allclose(metrics["velocity/error_vel_yaw"], ang, atol=0.2)
-    assert env.command_manager.so_far(velocity, "error_vel_xy").tolist() == [0.0] * 8  # the next episode has begun
+    assert (
+        env.command_manager.running_mean(velocity, "error_vel_xy").tolist() == [0.0] * 8
+    )  # the next episode has begun
 
 
-def test_a_saved_state_goes_on_with_the_same_commands(tmp_path):
+def test_state_dict_restores_commands(tmp_path):
     env, other = (walker(tmp_path / name, 4, heading=[-3.0, 3.0], rel_standing=0.2) for name in "ab")
     run(env, 17)
     other.reset(seed=3)
@@ -135,7 +137,7 @@ def test_a_saved_state_goes_on_with_the_same_commands(tmp_path):
         assert torch.equal(ours.obs["policy"], theirs.obs["policy"])
 
 
-def test_a_pose_is_asked_in_the_roots_frame(tmp_path):
+def test_uniform_pose_is_in_root_frame(tmp_path):
     task = yaml.safe_load(CRITTER_TASK)
     task["commands"] = {"pose": {"func": "uniform_pose", "resampling_time_s": [9.0, 9.0], "bodies": ["leg_fl"],
                                  "x": [0.1, 0.4], "y": [0.0, 0.0], "z": [-0.3, -0.1], "yaw": [-1.0, 1.0]}}  # fmt: skip
@@ -153,25 +155,25 @@ def test_a_pose_is_asked_in_the_roots_frame(tmp_path):
         turn = torch.tensor([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
                              [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
                              [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])  # fmt: skip
-        asked = data.root_pos_w[i].double() + turn.double() @ pose[i, :3].double()
-        distance = float((asked - data.body_pos_w[i, index]).norm())
+        commanded = data.root_pos_w[i].double() + turn.double() @ pose[i, :3].double()
+        distance = float((commanded - data.body_pos_w[i, index]).norm())
         assert float(metrics["position_error"][i]) == pytest.approx(distance, rel=1e-4)
 
 
 @pytest.mark.parametrize("curriculum", [
     {"func": "stages", "address": "rewards.alive.weight", "steps": [5, 8], "values": [2.0, 0.0]},
 ])  # fmt: skip
-def test_a_reward_weight_changes_at_its_step(tmp_path, curriculum):
+def test_stages_changes_reward_weight_at_step(tmp_path, curriculum):
     task = yaml.safe_load(PENDULUM_TASK)
     task["curriculum"] = {"more": curriculum}
     env = build(pendulum(tmp_path, dump(task)), 2)
     rewards = [float(result.reward[0]) for result in run(env, 10)]
-    # the weight of step 5 is the one that stands when five steps have passed
+    # the weight changes after five steps
     assert rewards == pytest.approx([0.02] * 5 + [0.04] * 3 + [0.0] * 2)
     assert env.extras() == {"Curriculum/more": 0.0}
 
 
-def test_a_number_may_move_linearly(tmp_path):
+def test_interpolate_moves_number_linearly(tmp_path):
     curriculum = {"wider": {"func": "interpolate", "address": "commands.velocity.lin_vel_x", "to": [0.0, 4.0],
                             "begin": 2, "end": 12}}  # fmt: skip
     env = walker(tmp_path, 2, "commands.velocity.lin_vel_x=[0,0]", curriculum=curriculum)
@@ -185,7 +187,7 @@ def test_a_number_may_move_linearly(tmp_path):
     assert wide.max() > 3.0
 
 
-def test_the_end_of_an_events_range_may_move(tmp_path):
+def test_interpolate_changes_event_range(tmp_path):
     events = {"joints": {"func": "reset_joints_by_offset", "mode": "reset", "position": [0.0, 0.0]}}
     curriculum = {"harder": {"func": "stages", "address": "events.joints.position.1", "steps": [10], "values": [0.5]}}
     env = walker(tmp_path, 32, curriculum=curriculum, events=events)
@@ -198,7 +200,7 @@ def test_the_end_of_an_events_range_may_move(tmp_path):
     assert (position - default).min() >= -1e-6
 
 
-def test_a_noise_may_grow(tmp_path):
+def test_interpolate_changes_noise(tmp_path):
     task = yaml.safe_load(PENDULUM_TASK)
     task["observations"]["policy"]["pos"]["noise"] = {"kind": "uniform", "low": 0.0, "high": 0.0}
     task["observations"]["critic"] = {"pos": {"func": "joint_pos"}}
@@ -210,7 +212,7 @@ def test_a_noise_may_grow(tmp_path):
     assert min(noise[3:]) > 0.5
 
 
-def test_a_curriculum_goes_on_from_a_saved_state(tmp_path):
+def test_state_dict_restores_curriculum(tmp_path):
     task = yaml.safe_load(PENDULUM_TASK)
     task["curriculum"] = {"m": {"func": "interpolate", "address": "rewards.alive.weight", "to": 5.0, "end": 30}}
     env, other = (build(pendulum(tmp_path / name, dump(task)), 3) for name in "ab")
@@ -222,27 +224,27 @@ def test_a_curriculum_goes_on_from_a_saved_state(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("address", "says"),
+    ("address", "message"),
     [
         ("rewards.alife.weight", "'rewards' has no 'alife'"),
         ("reward.alive.weight", "did you mean 'rewards'"),
         ("rewards.alive.func", "'rewards.alive' has no 'func'"),
-        ("rewards.alive", "leads to no number"),
-        ("rewards.alive.weight.0", "leads nowhere"),
+        ("rewards.alive", "is not a number"),
+        ("rewards.alive.weight.0", "does not exist"),
         ("sim.dt", "the task has no 'sim'"),
         ("terminations.time_out.time_out", "has no 'time_out'"),
     ],
 )
-def test_an_address_that_leads_nowhere_is_refused(tmp_path, address, says):
+def test_curriculum_rejects_unknown_address(tmp_path, address, message):
     task = yaml.safe_load(PENDULUM_TASK)
     task["curriculum"] = {"more": {"func": "stages", "address": address, "steps": [5], "values": [2.0]}}
     with pytest.raises(ConfigError) as refusal:
         build(pendulum(tmp_path, dump(task)), 2)
-    assert says in str(refusal.value) + str([p.hint for p in refusal.value.problems])
+    assert message in str(refusal.value) + str([p.hint for p in refusal.value.problems])
     assert refusal.value.problems[0].path == "curriculum.more.address"
 
 
-def test_values_must_have_the_shape_of_what_they_replace(tmp_path):
+def test_curriculum_rejects_values_of_other_shape(tmp_path):
     task = yaml.safe_load(PENDULUM_TASK)
     task["curriculum"] = {"more": {"func": "stages", "address": "rewards.alive.weight", "steps": [5],
                                    "values": [[1.0, 2.0]]}}  # fmt: skip
@@ -250,7 +252,7 @@ def test_values_must_have_the_shape_of_what_they_replace(tmp_path):
         build(pendulum(tmp_path, dump(task)), 2)
 
 
-def test_a_command_that_nobody_declares_is_refused_with_those_that_exist(tmp_path):
+def test_unknown_command_error_lists_commands(tmp_path):
     with pytest.raises(ConfigError) as refusal:
         walker(tmp_path, 2, "observations.policy.asked.command=velocty")
     (problem,) = refusal.value.problems
@@ -258,10 +260,10 @@ def test_a_command_that_nobody_declares_is_refused_with_those_that_exist(tmp_pat
     assert "velocity" in problem.hint
 
 
-def test_a_reset_with_a_seed_sets_schedules_back_to_their_start(tmp_path):
+def test_reset_with_seed_restarts_schedules(tmp_path):
     ramp = {"func": "interpolate", "address": "commands.velocity.lin_vel_x", "end": 5, "to": [5.0, 6.0]}
     env = walker(tmp_path, 4, curriculum={"ramp": ramp})
     first = env.reset(seed=3)["policy"].clone()
     run(env, 8)
-    assert env.reset()["policy"][:, -3].min() > 4.0  # the episode is new, the training is not
+    assert env.reset()["policy"][:, -3].min() > 4.0  # a new episode, but the same training
     assert torch.equal(env.reset(seed=3)["policy"], first)

@@ -1,4 +1,4 @@
-"""When events fire, what a curriculum makes of their ranges, and that a partial reset touches nobody else."""
+"""Events: when they fire, curricula of their ranges, and partial resets."""
 
 import itertools
 import math
@@ -15,7 +15,7 @@ from rlcli.errors import ConfigError
 from rlcli.registry import find_task
 
 ENGINES = ["batch", "warp"]
-LONG = ["batch", pytest.param("warp", marks=pytest.mark.slow)]  # it is slow without a GPU
+LONG = ["batch", pytest.param("warp", marks=pytest.mark.slow)]  # slow without a GPU
 DAMPING = {"func": "randomize_joint_damping", "operation": "set"}
 
 
@@ -36,7 +36,7 @@ def damping(env):
 
 
 @pytest.mark.parametrize("engine", LONG)
-def test_a_throttled_reset_event_fires_first_and_then_not_before_its_steps_have_passed(tmp_path, engine):
+def test_min_steps_between_throttles_reset_event(tmp_path, engine):
     event = {**DAMPING, "mode": "reset", "range": [1.0, 2.0], "min_steps_between": 25}
     env = swinging(tmp_path, engine=engine, it=event)  # an episode is 10 steps
     first = damping(env)
@@ -52,7 +52,7 @@ def test_a_throttled_reset_event_fires_first_and_then_not_before_its_steps_have_
     assert not (damping(env) == second).any(), "a reset of everything always fires"
 
 
-def test_a_throttle_counts_for_each_environment(tmp_path):
+def test_min_steps_between_counts_per_environment(tmp_path):
     event = {**DAMPING, "mode": "reset", "range": [1.0, 2.0], "min_steps_between": 6}
     env = swinging(tmp_path, it=event)
     step(env, 7)
@@ -60,12 +60,12 @@ def test_a_throttle_counts_for_each_environment(tmp_path):
     env.episode_index[0] += 1
     env._reset_envs(env.engine.select(torch.tensor([True, False, False, False]), env.seed, env.episode_index))
     assert (damping(env) != before).tolist() == [True, False, False, False]
-    step(env, 3)  # the episodes of the others end, 10 steps after they fired; that of the first goes on
+    step(env, 3)  # the other episodes end, 10 steps after their event; the first one continues
     assert (damping(env) != before).all()
 
 
 @pytest.mark.parametrize("engine", LONG)
-def test_a_global_timer_fires_everywhere_at_once_and_resets_do_not_restart_it(tmp_path, engine):
+def test_global_timer_fires_everywhere_despite_resets(tmp_path, engine):
     event = {**DAMPING, "mode": "interval", "range": [1.0, 2.0], "interval_range_s": [0.26, 0.5], "global_time": True}
     env = swinging(tmp_path, engine=engine, it=event)
     now, fired = damping(env), []
@@ -81,20 +81,20 @@ def test_a_global_timer_fires_everywhere_at_once_and_resets_do_not_restart_it(tm
     assert all(13 <= gap <= 25 for gap in gaps), "longer than an episode of 10 steps"
 
 
-def test_a_global_timer_does_not_depend_on_how_many_environments_there_are(tmp_path):
+def test_global_timer_independent_of_num_envs(tmp_path):
     event = {**DAMPING, "mode": "interval", "range": [1.0, 2.0], "interval_range_s": [0.04, 0.3], "global_time": True}
-    lives = []
+    histories = []
     for n in (2, 9):
         env = swinging(tmp_path / str(n), n, it=event)
-        life = []
+        history = []
         for _ in range(40):
             step(env)
-            life.append(damping(env)[:2].tolist())
-        lives.append(life)
-    assert lives[0] == lives[1]
+            history.append(damping(env)[:2].tolist())
+        histories.append(history)
+    assert histories[0] == histories[1]
 
 
-def test_a_curriculum_may_move_the_range_of_a_randomisation(tmp_path):
+def test_curriculum_changes_randomization_range(tmp_path):
     stages = {"func": "stages", "address": "events.it.range", "steps": [15], "values": [[4.0, 5.0]]}
     task = pendulum(
         tmp_path,
@@ -118,7 +118,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("event", "message"), BAD, ids=[message for _, message in BAD])
-def test_a_wrong_timer_is_refused_before_anything_is_built(tmp_path, event, message):
+def test_validation_rejects_wrong_timer(tmp_path, event, message):
     task = pendulum(tmp_path, edited(PENDULUM_TASK, events={"it": event}))
     with pytest.raises(ConfigError) as error:
         resolve(find_task(str(task)))
@@ -126,7 +126,7 @@ def test_a_wrong_timer_is_refused_before_anything_is_built(tmp_path, event, mess
 
 
 @pytest.mark.parametrize("engine", LONG)
-def test_an_impulse_acts_for_its_duration_and_ends(tmp_path, engine):
+def test_impulse_acts_for_its_duration(tmp_path, engine):
     push = {"func": "apply_body_impulse", "mode": "interval", "interval_range_s": [0.06, 0.06], "bodies": "arm",
             "force": [1.0, 2.0], "duration_s": [0.04, 0.04]}  # fmt: skip
     env = swinging(tmp_path, engine=engine, it=push)
@@ -141,7 +141,7 @@ def test_an_impulse_acts_for_its_duration_and_ends(tmp_path, engine):
     assert acting == [False, False, True, True, False, True, True, False, True, False, False, False]
 
 
-def test_an_impulse_travels_with_the_state(tmp_path):
+def test_state_dict_contains_impulse(tmp_path):
     push = {"func": "apply_body_impulse", "mode": "reset", "bodies": "arm", "force": [1.0, 2.0],
             "duration_s": [0.08, 0.08]}  # fmt: skip
     env = swinging(tmp_path, it=push)
@@ -156,18 +156,18 @@ def test_an_impulse_travels_with_the_state(tmp_path):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_random_orientations_are_rotations_that_point_everywhere(tmp_path, engine):
+def test_random_orientation_is_uniform(tmp_path, engine):
     events = {"root": {"func": "reset_root_state_with_random_orientation", "mode": "reset", "z": [1.0, 1.0]},
               "joints": None, "push": None, "shove": None}  # fmt: skip
     env = build(critter(tmp_path, edited(CRITTER_TASK, events=events)), 600, f"sim.engine={engine}")
     env.reset()
     quat = env.entities["robot"].data.root_quat_w
     assert torch.allclose(quat.norm(dim=1), torch.ones(600), atol=1e-5)
-    assert (quat.mean(dim=0).abs() < 0.1).all()  # of uniform ones, each component has mean 0 and variance 1/4
+    assert (quat.mean(dim=0).abs() < 0.1).all()  # components of uniform quaternions have mean 0 and variance 1/4
     assert (quat.square().mean(dim=0) - 0.25).abs().max() < 0.04
 
 
-def test_joints_within_limits_take_their_share_of_the_soft_range(tmp_path):
+def test_reset_joints_within_limits_fills_soft_range(tmp_path):
     joints = {"func": "reset_joints_within_limits", "mode": "reset", "position": [0.5, 1.0], "velocity": [1.0, 1.0]}
     task = critter(tmp_path, edited(CRITTER_TASK, events={"joints": joints, "push": None, "shove": None}))
     env = build(task, 50)
@@ -179,7 +179,7 @@ def test_joints_within_limits_take_their_share_of_the_soft_range(tmp_path):
     assert (data.joint_vel == 1.0).all()
 
 
-def test_gaussian_joint_offsets_are_about_the_default(tmp_path):
+def test_reset_joints_by_gaussian_is_about_default(tmp_path):
     joints = {"func": "reset_joints_by_gaussian", "mode": "reset", "position": [0.1, 0.05], "velocity": [0.0, 0.5]}
     task = critter(tmp_path, edited(CRITTER_TASK, events={"joints": joints, "push": None, "shove": None}))
     env = build(task, 400)
@@ -195,7 +195,7 @@ def test_gaussian_joint_offsets_are_about_the_default(tmp_path):
 # --- a partial reset ---
 
 N = 9
-"""No other dimension of any tensor of the state is 9."""
+"""A number of environments that no other dimension of a state tensor has."""
 RANDOMISED = {
     "mass": {"func": "randomize_body_mass", "mode": "reset", "range": [0.5, 1.5]},
     "friction": {"func": "randomize_geom_friction", "mode": "reset", "range": [0.5, 1.5], "min_steps_between": 5},
@@ -233,7 +233,7 @@ def crowd_on_warp(tmp_path_factory):
 
 
 def rows_of(state, keep):
-    """Of every tensor the rows of some environments, along the dimension that counts them; the whole of others."""
+    """Return the rows of some environments of every tensor, and tensors without such rows as a whole."""
     kept = {}
     for name, value in state.items():
         dims = [d for d, size in enumerate(value.shape) if size == N]
@@ -275,12 +275,12 @@ CASES = {"chosen": st.lists(st.booleans(), min_size=N, max_size=N), "warm_up": s
 
 @settings(max_examples=500, deadline=None)
 @given(**CASES)
-def test_a_partial_reset_leaves_every_other_environment_bit_identical(crowd, chosen, warm_up, seed):
+def test_partial_reset_keeps_other_envs_bit_identical(crowd, chosen, warm_up, seed):
     check_partial_reset(crowd, chosen, warm_up, seed)
 
 
-@pytest.mark.slow  # a step of Warp's CPU device takes a tenth of a second
+@pytest.mark.slow  # a step on Warp's CPU device takes 0.1 s
 @settings(max_examples=30, deadline=None)
 @given(**CASES)
-def test_a_partial_reset_leaves_every_other_environment_alone_on_warp(crowd_on_warp, chosen, warm_up, seed):
+def test_partial_reset_keeps_other_envs_on_warp(crowd_on_warp, chosen, warm_up, seed):
     check_partial_reset(crowd_on_warp, chosen, warm_up % 3, seed % 3)

@@ -1,4 +1,4 @@
-"""Binding of terms, and what each manager makes of its terms."""
+"""Binding of terms, and the results of each manager."""
 
 import re
 
@@ -19,7 +19,7 @@ def observed(tmp_path, **terms):
     return env, env.step(torch.rand(3, 4)).obs["policy"]
 
 
-def test_columns_are_in_exactly_the_order_written(tmp_path):
+def test_observation_columns_keep_written_order(tmp_path):
     order = ["hip_br", "hip_fl", "hip_bl", "hip_fr"]
     env, obs = observed(tmp_path, pos={"func": "joint_pos", "joints": order}, all={"func": "joint_pos"})
     assert torch.equal(obs[:, :4], obs[:, 4:][:, [JOINTS.index(name) for name in order]])
@@ -27,13 +27,13 @@ def test_columns_are_in_exactly_the_order_written(tmp_path):
     assert env.layout.observations["policy"][1].elements == tuple(JOINTS)
 
 
-def test_a_regex_expands_in_the_models_order_and_patterns_in_theirs(tmp_path):
+def test_patterns_expand_in_written_then_model_order(tmp_path):
     env, obs = observed(tmp_path, pos={"func": "joint_pos", "joints": ["hip_b.", "hip_f."]}, all={"func": "joint_pos"})
     assert env.layout.observations["policy"][0].elements == ("hip_bl", "hip_br", "hip_fl", "hip_fr")
     assert torch.equal(obs[:, :4], obs[:, 4:][:, [2, 3, 0, 1]])
 
 
-def test_actions_drive_the_joints_in_exactly_the_order_written(tmp_path):
+def test_actions_drive_joints_in_written_order(tmp_path):
     env = build(critter(tmp_path), 2)
     env.reset()
     env.step(torch.tensor([[1.0, 2.0, 3.0, 4.0]] * 2))
@@ -45,7 +45,7 @@ def test_actions_drive_the_joints_in_exactly_the_order_written(tmp_path):
     assert target == pytest.approx({"hip_br": 0.5 - 0.1, "hip_fl": 1.0 + 0.1, "hip_bl": 1.5 + 0.1, "hip_fr": 2.0 - 0.1})
 
 
-def test_an_action_is_scaled_then_offset_then_clipped(tmp_path):
+def test_action_is_scaled_then_offset_then_clipped(tmp_path):
     term = {"func": "joint_effort", "scale": 3.0, "offset": 1.0, "clip": [-2.0, 5.0]}
     env = build(pendulum(tmp_path, edited(PENDULUM_TASK, actions={"torque": term})))
     env.reset()
@@ -54,7 +54,7 @@ def test_an_action_is_scaled_then_offset_then_clipped(tmp_path):
     assert env.action_manager.action[:, 0].tolist() == [1.0, 2.0, -3.0]
 
 
-def test_the_default_offset_of_a_position_action_can_be_left_out(tmp_path):
+def test_position_action_without_default_offset(tmp_path):
     legs = {"func": "joint_position", "use_default_offset": False, "offset": 0.25}
     env = build(critter(tmp_path, edited(CRITTER_TASK, actions={"legs": legs})), 1)
     env.reset()
@@ -62,7 +62,7 @@ def test_the_default_offset_of_a_position_action_can_be_left_out(tmp_path):
     assert env.engine.field("ctrl")[0].tolist() == [0.25] * 4
 
 
-def test_several_action_terms_take_their_columns_in_order(tmp_path):
+def test_action_terms_take_columns_in_order(tmp_path):
     split = {"legs": {"func": "joint_position", "joints": ["hip_b."], "use_default_offset": False},
              "front": {"func": "joint_effort", "joints": ["hip_fr"], "scale": 2.0}}  # fmt: skip
     env = build(critter(tmp_path, edited(CRITTER_TASK, actions=split, rewards={"power": None})), 1)
@@ -75,7 +75,7 @@ def test_several_action_terms_take_their_columns_in_order(tmp_path):
     assert [float(ctrl[position[2]]), float(ctrl[position[3]]), float(ctrl[motor[1]])] == pytest.approx([0.1, 0.2, 0.6])
 
 
-def test_previous_and_present_action_of_the_policy_are_kept(tmp_path):
+def test_action_manager_keeps_current_and_previous_action(tmp_path):
     env = build(pendulum(tmp_path))
     env.reset()
     env.step(torch.full((3, 1), 0.5))
@@ -84,7 +84,7 @@ def test_previous_and_present_action_of_the_policy_are_kept(tmp_path):
     assert env.action_manager.action[:, 0].tolist() == [0.75] * 3
 
 
-def test_an_observation_is_clipped_then_scaled(tmp_path):
+def test_observation_is_clipped_then_scaled(tmp_path):
     _, obs = observed(
         tmp_path,
         raw={"func": "joint_vel"},
@@ -97,14 +97,14 @@ def test_an_observation_is_clipped_then_scaled(tmp_path):
     assert raw.abs().max() > 0.5
 
 
-def test_groups_are_observed_apart(tmp_path):
+def test_observation_groups_are_separate(tmp_path):
     env = build(critter(tmp_path), 3)
     obs = env.reset()
     assert {group: tuple(value.shape) for group, value in obs.items()} == {"policy": (3, 22), "critic": (3, 8)}
     assert (env.layout.size(), env.layout.size("critic"), env.layout.action_size) == (22, 8, 4)
 
 
-def test_final_observations_do_not_disturb_the_next_ones(tmp_path):
+def test_final_obs_does_not_change_next_obs(tmp_path):
     env = build(critter(tmp_path), 3)
     for result in run(env, 35):
         if result.truncated.any():
@@ -163,13 +163,13 @@ class Fussy:
         ),
     ],
 )
-def test_a_term_of_the_wrong_shape_is_named_with_its_place_and_what_was_expected(tmp_path, changes, message):
-    said = re.escape(message.replace("{}", "a tensor of shape "))
-    with pytest.raises(ConfigError, match=rf"task\.yaml:\d+:\d+: {said}"):
+def test_shape_error_names_term_and_expected_shape(tmp_path, changes, message):
+    pattern = re.escape(message.replace("{}", "a tensor of shape "))
+    with pytest.raises(ConfigError, match=rf"task\.yaml:\d+:\d+: {pattern}"):
         build(pendulum(tmp_path, edited(PENDULUM_TASK, **changes), terms_py=SHAPES))
 
 
-def test_a_value_that_a_term_refuses_is_reported_at_its_place(tmp_path):
+def test_parameter_error_names_its_path(tmp_path):
     task = edited(PENDULUM_TASK, rewards={"bad": {"func": "fussy", "weight": 1.0, "size": 5}})
     with pytest.raises(ConfigError, match=r"task.yaml:\d+:\d+: rewards.bad: size 5 is more than 3"):
         build(pendulum(tmp_path, task, terms_py=SHAPES))
@@ -187,7 +187,7 @@ def test_a_value_that_a_term_refuses_is_reported_at_its_place(tmp_path):
     ],
 )
 @pytest.mark.parametrize("section", ["observations", "rewards"])
-def test_joints_that_do_not_resolve_are_reported_at_their_place(tmp_path, section, joints, message):
+def test_unknown_joint_error_names_its_path(tmp_path, section, joints, message):
     term = {"func": "joint_pos", "joints": joints} if section == "observations" else {
         "func": "joint_vel_l2", "weight": 1.0, "joints": joints}  # fmt: skip
     changes = {"observations": {"policy": {"x": term}}} if section == "observations" else {"rewards": {"x": term}}
@@ -196,7 +196,7 @@ def test_joints_that_do_not_resolve_are_reported_at_their_place(tmp_path, sectio
     assert "task.yaml:" in str(caught.value)
 
 
-def test_all_names_that_do_not_resolve_are_reported_at_once(tmp_path):
+def test_all_unknown_names_are_reported_at_once(tmp_path):
     changes = {
         "observations": {"policy": {"x": {"func": "joint_pos", "joints": ["a"]}}},
         "rewards": {"x": {"func": "joint_vel_l2", "weight": 1.0, "joints": ["b"]},
@@ -213,7 +213,7 @@ def test_all_names_that_do_not_resolve_are_reported_at_once(tmp_path):
     assert "did you mean 'robot'" in text
 
 
-def test_a_terms_file_that_does_not_import_is_a_broken_task(tmp_path):
+def test_broken_terms_file_raises_task_error(tmp_path):
     code = 'import no_such_module\n\n\ndef mine(env):\n    """(num_envs,)"""\n    return env.x\n'
     task = edited(PENDULUM_TASK, rewards={"x": {"func": "mine", "weight": 1.0}})
     with pytest.raises(TaskError, match=r"terms.py: cannot be imported: ModuleNotFoundError"):
@@ -240,7 +240,7 @@ class StepsAlive:
 
 
 class Seen:
-    """How often it was asked, as an observation."""
+    """Number of calls so far, as an observation."""
 
     def __init__(self, env) -> None:
         self.count = torch.zeros(env.num_envs, 1)
@@ -253,18 +253,18 @@ class Seen:
 '''
 
 
-def test_a_reward_term_with_memory_is_reset_with_its_environment(tmp_path):
+def test_stateful_reward_is_reset_with_its_env(tmp_path):
     task = edited(PENDULUM_TASK, reward_dt_scaling=False, rewards={
         "alive": None, "terminating": None, "count": {"func": "steps_alive", "weight": 1.0}})  # fmt: skip
     env = build(pendulum(tmp_path, task, terms_py=MEMORY))
     env.reset()
     env.episode_length_buf[1] = 6
-    paid = [env.step(torch.zeros(3, 1)).reward.tolist() for _ in range(6)]
-    assert [row[0] for row in paid] == [1, 2, 3, 4, 5, 6]
-    assert [row[1] for row in paid] == [1, 2, 3, 4, 1, 2]
+    rewards = [env.step(torch.zeros(3, 1)).reward.tolist() for _ in range(6)]
+    assert [row[0] for row in rewards] == [1, 2, 3, 4, 5, 6]
+    assert [row[1] for row in rewards] == [1, 2, 3, 4, 1, 2]
 
 
-def test_an_observation_term_with_memory_is_reset_with_its_environment(tmp_path):
+def test_stateful_observation_is_reset_with_its_env(tmp_path):
     task = edited(PENDULUM_TASK, observations={"policy": {"seen": {"func": "seen"}}})
     env = build(pendulum(tmp_path, task, terms_py=MEMORY))
     assert env.reset()["policy"][:, 0].tolist() == [1, 1, 1]
@@ -272,7 +272,7 @@ def test_an_observation_term_with_memory_is_reset_with_its_environment(tmp_path)
     assert env.step(torch.zeros(3, 1)).obs["policy"][:, 0].tolist() == [1, 2, 1]
 
 
-def test_a_term_that_pays_while_alive_pays_nothing_in_the_step_of_a_failure(tmp_path):
+def test_while_alive_reward_is_zero_on_termination(tmp_path):
     rewards = {name: None for name in CRITTER_REWARDS}
     rewards |= {
         "always": {"func": "base_height_l2", "weight": 1.0, "target_height": 10.0},
@@ -285,13 +285,13 @@ def test_a_term_that_pays_while_alive_pays_nothing_in_the_step_of_a_failure(tmp_
     result = env.step(torch.zeros(3, 4))
     assert result.terminated.tolist() == [False, True, False]
     assert result.truncated.tolist() == [False, False, True]
-    paid = env.reward_manager.values()
-    assert paid["alive"].tolist() == [float(paid["always"][0]), 0.0, float(paid["always"][2])]
-    assert (paid["always"] > 50.0).all()
-    assert torch.equal(result.reward, paid["always"] + paid["alive"])
+    rewards = env.reward_manager.values()
+    assert rewards["alive"].tolist() == [float(rewards["always"][0]), 0.0, float(rewards["always"][2])]
+    assert (rewards["always"] > 50.0).all()
+    assert torch.equal(result.reward, rewards["always"] + rewards["alive"])
 
 
-def test_causes_name_every_termination_that_fired(tmp_path):
+def test_causes_name_all_fired_terminations(tmp_path):
     changes = {"terminations": {"also": {"func": "root_height_below_minimum", "minimum_height": 0.2}}}
     env = build(critter(tmp_path, edited(CRITTER_TASK, **changes)), 2)
     env.reset()
@@ -302,19 +302,19 @@ def test_causes_name_every_termination_that_fired(tmp_path):
     assert not ended.causes["time_out"][0]
 
 
-def test_a_removed_term_is_gone(tmp_path):
+def test_null_removes_a_term(tmp_path):
     env = build(critter(tmp_path), 2, "rewards.power=null", "observations.policy.action=null", "events.push=null")
     assert "power" not in [t.name for t in env.reward_manager.terms]
     assert env.layout.size() == 18
 
 
-def test_two_actions_that_drive_one_actuator_are_refused(tmp_path):
+def test_two_actions_on_one_actuator_are_rejected(tmp_path):
     twice = {"legs": {"func": "joint_position"}, "more": {"func": "joint_position", "joints": ["hip_fl"]}}
     with pytest.raises(RlcliError, match=r"actions.more.*'hip_fl'.*legs"):
         build(critter(tmp_path, edited(CRITTER_TASK, actions=twice, rewards={"power": None})))
 
 
-def test_power_of_other_joints_than_the_driven_ones_is_refused(tmp_path):
+def test_power_consumption_rejects_other_joints(tmp_path):
     with pytest.raises(RlcliError, match=r"rewards.power.*2 joints.*4"):
         build(critter(tmp_path, edited(CRITTER_TASK, rewards={
             "power": {"func": "power_consumption", "weight": 1.0, "joints": ["hip_f."]}})))  # fmt: skip

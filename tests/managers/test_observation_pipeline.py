@@ -1,4 +1,4 @@
-"""What is done to an observation between a term and the policy: modifiers, noise, bias, clip, scale, delay, history."""
+"""Pipeline of an observation: modifiers, noise, bias, clip, scale, delay, history."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from rlcli.errors import ConfigError
 
 
 def environment(tmp_path, num_envs=3, *overrides, seed=42, group=None, **term):
-    """A swinging pendulum whose group `policy` sees its angle through `term`, and `critic` sees it as it is."""
+    """Return a swinging pendulum: group `policy` observes the angle through `term`, `critic` observes it unchanged."""
     settings = {**(group or {}), "pos": {"func": "joint_pos", **term}}
     task = yaml.safe_load(PENDULUM_TASK)
     task["observations"] = {"policy": settings, "critic": {"pos": {"func": "joint_pos"}}}
@@ -19,7 +19,7 @@ def environment(tmp_path, num_envs=3, *overrides, seed=42, group=None, **term):
 
 
 def seen_and_true(env, steps):
-    """(steps + 1, num_envs, columns) each, of a reset and the steps after it."""
+    """Return processed and raw observations of a reset and the steps after it. (steps + 1, num_envs, columns) each"""
     obs = env.reset()
     both = [(obs["policy"].clone(), obs["critic"].clone())]
     for _ in range(steps):
@@ -28,7 +28,7 @@ def seen_and_true(env, steps):
     return (torch.stack(column) for column in zip(*both, strict=True))
 
 
-def test_history_holds_the_last_values_the_oldest_first(tmp_path):
+def test_history_has_oldest_value_first(tmp_path):
     env = environment(tmp_path, history=3)
     assert env.layout.observations["policy"][0].history == 3
     seen, true = seen_and_true(env, 6)
@@ -36,15 +36,15 @@ def test_history_holds_the_last_values_the_oldest_first(tmp_path):
         assert torch.equal(seen[t], torch.cat([true[t - 2], true[t - 1], true[t]], dim=1))
 
 
-def test_history_begins_with_the_episodes_first_value(tmp_path):
+def test_history_starts_with_first_value_of_episode(tmp_path):
     env = environment(tmp_path, history=4)
-    seen, true = seen_and_true(env, 10)  # an episode lasts 10 steps: the last of these begins a new one
+    seen, true = seen_and_true(env, 10)  # an episode lasts 10 steps, so the last step begins a new one
     assert torch.equal(seen[0], true[0].repeat(1, 4))
     assert torch.equal(seen[10], true[10].repeat(1, 4))
     assert not torch.equal(seen[9], true[9].repeat(1, 4))
 
 
-def test_history_is_laid_out_term_by_term(tmp_path):
+def test_history_columns_are_grouped_by_term(tmp_path):
     terms = {"history": 2, "pos": {"func": "joint_pos"}, "vel": {"func": "joint_vel"}}
     env = build(pendulum(tmp_path, edited(PENDULUM_TASK, observations={"policy": terms})), 2)
     first = env.reset()["policy"].clone()
@@ -52,7 +52,7 @@ def test_history_is_laid_out_term_by_term(tmp_path):
     assert torch.equal(second, torch.stack([first[:, 1], second[:, 1], first[:, 3], second[:, 3]], dim=1))
 
 
-def test_the_last_observation_of_an_episode_has_its_own_history(tmp_path):
+def test_final_obs_has_history_of_its_episode(tmp_path):
     env = environment(tmp_path, history=2)
     env.reset()
     for _ in range(9):
@@ -62,14 +62,14 @@ def test_the_last_observation_of_an_episode_has_its_own_history(tmp_path):
 
 
 @pytest.mark.parametrize("steps", [[1, 1], [3, 3]])
-def test_a_delayed_value_is_that_many_steps_old(tmp_path, steps):
+def test_delay_returns_value_of_earlier_step(tmp_path, steps):
     seen, true = seen_and_true(environment(tmp_path, delay={"steps": steps}), 9)
     lag = steps[0]
     for t in range(10):
         assert torch.equal(seen[t], true[max(0, t - lag)])
 
 
-def test_each_environment_draws_its_delay_for_an_episode(tmp_path):
+def test_delay_is_drawn_per_env_and_episode(tmp_path):
     seen, true = seen_and_true(environment(tmp_path, 64, delay={"steps": [0, 3]}), 9)
     lags = []
     for env in range(64):
@@ -79,7 +79,7 @@ def test_each_environment_draws_its_delay_for_an_episode(tmp_path):
     assert set(lags) == {0, 1, 2, 3}
 
 
-def test_a_delay_may_be_drawn_anew_in_every_step(tmp_path):
+def test_delay_redraw_in_each_step(tmp_path):
     seen, true = seen_and_true(environment(tmp_path, 16, delay={"steps": [0, 2], "redraw": 1.0}), 9)
     lags = torch.stack([(seen[t] == true[t - k]).any(dim=1) * k for t in range(2, 10) for k in range(3)])
     assert len(set(lags[:, 0].tolist())) == 3
@@ -93,7 +93,7 @@ def test_a_delay_may_be_drawn_anew_in_every_step(tmp_path):
         ({"kind": "gaussian", "mean": 1.0, "std": 0.01}, 0.94, 1.06),
     ],
 )
-def test_noise_is_added_within_its_distribution_and_new_in_every_step(tmp_path, noise, low, high):
+def test_noise_is_drawn_in_each_step_within_bounds(tmp_path, noise, low, high):
     seen, true = seen_and_true(environment(tmp_path, 256, noise=noise), 8)
     added = seen - true
     assert added.min() >= low - 1e-6
@@ -104,7 +104,7 @@ def test_noise_is_added_within_its_distribution_and_new_in_every_step(tmp_path, 
         assert added.std() > 0.005
 
 
-def test_noise_may_scale_or_replace(tmp_path):
+def test_noise_operations_scale_and_set(tmp_path):
     constant = {"kind": "constant", "value": 2.0}
     seen, true = seen_and_true(environment(tmp_path / "a", noise={**constant, "operation": "scale"}), 3)
     assert torch.equal(seen, 2.0 * true)
@@ -112,7 +112,7 @@ def test_noise_may_scale_or_replace(tmp_path):
     assert torch.equal(seen, torch.full_like(seen, 2.0))
 
 
-def test_a_bias_holds_for_an_episode_and_does_not_drift(tmp_path):
+def test_bias_is_constant_within_episode(tmp_path):
     seen, true = seen_and_true(environment(tmp_path, 32, bias={"kind": "uniform", "low": -0.1, "high": 0.1}), 400)
     bias = (seen - true)[:, :, 0]
     episodes = bias[:400].view(40, 10, 32)
@@ -122,7 +122,7 @@ def test_a_bias_holds_for_an_episode_and_does_not_drift(tmp_path):
     assert len({round(float(x), 5) for x in episodes[:, 0, 0]}) > 35
 
 
-def test_clip_comes_before_scale_and_after_noise(tmp_path):
+def test_clip_runs_after_noise_and_before_scale(tmp_path):
     term = {"noise": {"kind": "constant", "value": 10.0}, "clip": [-1.0, 2.0], "scale": 3.0}
     seen, _ = seen_and_true(environment(tmp_path, **term), 2)
     assert torch.equal(seen, torch.full_like(seen, 6.0))
@@ -135,7 +135,7 @@ def test_modifiers_run_in_order_before_noise(tmp_path):
     assert torch.allclose(seen, (2.0 * true + 1.0).clamp(0.0, 2.5))
 
 
-def test_a_digital_filter_is_the_difference_equation(tmp_path):
+def test_digital_filter_matches_difference_equation(tmp_path):
     modifiers = [{"kind": "digital_filter", "a": [0.5, -0.25], "b": [0.2, 0.3]}]
     seen, true = seen_and_true(environment(tmp_path, modifiers=modifiers), 9)
     x, y = true[:, 0, 0].tolist(), []
@@ -145,7 +145,7 @@ def test_a_digital_filter_is_the_difference_equation(tmp_path):
     assert seen[:, 0, 0].tolist() == pytest.approx(y, rel=1e-5)
 
 
-def test_an_integrator_is_the_trapezoidal_rule(tmp_path):
+def test_integrator_matches_trapezoidal_rule(tmp_path):
     seen, true = seen_and_true(environment(tmp_path, modifiers=[{"kind": "integrator"}]), 9)
     x, area = true[:, 0, 0].tolist(), 0.0
     for t in range(10):
@@ -153,7 +153,7 @@ def test_an_integrator_is_the_trapezoidal_rule(tmp_path):
         assert float(seen[t, 0, 0]) == pytest.approx(area, rel=1e-5)
 
 
-def test_a_group_without_corruption_is_as_if_nothing_were_configured(tmp_path):
+def test_group_without_corruption_ignores_noise(tmp_path):
     corrupted = {"noise": {"kind": "uniform"}, "bias": {"kind": "gaussian"}, "delay": {"steps": [1, 2]}}
     env = environment(tmp_path, group={"enable_corruption": False}, **corrupted)
     seen, true = seen_and_true(env, 5)
@@ -169,14 +169,14 @@ ALL = {
 }
 
 
-def test_what_an_environment_sees_does_not_depend_on_how_many_there_are(tmp_path):
+def test_observations_independent_of_num_envs(tmp_path):
     few = [r.obs["policy"] for r in run(environment(tmp_path / "a", 3, **ALL), 25)]
     many = [r.obs["policy"] for r in run(environment(tmp_path / "b", 17, **ALL), 25)]
     for a, b in zip(few, many, strict=True):
         assert torch.equal(a, b[:3])
 
 
-def test_a_saved_state_goes_on_with_the_same_bits_and_gives_the_same_observation(tmp_path):
+def test_state_dict_restores_observations_bit_for_bit(tmp_path):
     env, other = (environment(tmp_path / name, 4, **ALL) for name in "ab")
     last = run(env, 13)[-1].obs["policy"]
     state = env.state_dict()
@@ -187,19 +187,19 @@ def test_a_saved_state_goes_on_with_the_same_bits_and_gives_the_same_observation
         assert ours.final_obs is None or torch.equal(ours.final_obs["policy"], theirs.final_obs["policy"])
 
 
-def test_computing_a_last_observation_moves_nothing_on(tmp_path):
-    plain, asked = (environment(tmp_path / name, 4, "episode_length_s=0.1", **ALL) for name in "ab")
-    asked.reset()
+def test_final_obs_does_not_advance_memory(tmp_path):
+    plain, with_final = (environment(tmp_path / name, 4, "episode_length_s=0.1", **ALL) for name in "ab")
+    with_final.reset()
     plain.reset()
     for _ in range(12):
         action = torch.zeros(4, 1)
-        asked.observation_manager.compute_final()
-        ours, theirs = clone(plain.step(action)), asked.step(action)
+        with_final.observation_manager.compute_final()
+        ours, theirs = clone(plain.step(action)), with_final.step(action)
         assert torch.equal(ours.obs["policy"], theirs.obs["policy"])
 
 
 @pytest.mark.parametrize(
-    ("term", "says"),
+    ("term", "message"),
     [
         ({"noise": {"kind": "uniform", "low": [0.0, 0.0], "high": 1.0}}, "noise.low: has 2 values for 1 columns"),
         ({"scale": [1.0, 2.0]}, "scale: has 2 values for 1 columns"),
@@ -210,13 +210,13 @@ def test_computing_a_last_observation_moves_nothing_on(tmp_path):
         ({"modifiers": [{"kind": "digital_filter", "b": []}]}, "modifiers.0"),
     ],
 )
-def test_a_setting_that_makes_no_sense_is_refused_by_its_key(tmp_path, term, says):
+def test_invalid_setting_error_names_key(tmp_path, term, message):
     with pytest.raises(ConfigError) as refusal:
         environment(tmp_path, **term)
-    assert says in refusal.value.message
+    assert message in refusal.value.message
 
 
-def test_columns_of_noise_are_each_terms_own(tmp_path):
+def test_noise_columns_differ_between_terms(tmp_path):
     vel = {"func": "joint_vel_rel", "noise": {"kind": "constant", "value": [1.0, 2.0, 3.0, 4.0]}}
     task = edited(CRITTER_TASK, observations={"policy": {"vel": vel}, "critic": {"vel": {"func": "joint_vel_rel"}}})
     env = build(critter(tmp_path, task), 2)

@@ -1,4 +1,4 @@
-"""Joint actions and actuator models, against the arithmetic that their documentation states."""
+"""Joint actions and actuator models, compared with the formulas in their documentation."""
 
 import math
 
@@ -67,20 +67,20 @@ def arm(tmp_path, action, *overrides, actuators=None, num_envs=3, **changes):
 
 
 def command_after(env, action):
-    """(joint positions before, command) of one step."""
+    """Return the joint positions before a step, and its command."""
     env.reset()
     before = env.entities["robot"].data.joint_pos.clone()
     env.step(action)
     return before, env.action_manager.terms[0].instance.command.clone()
 
 
-def test_scale_offset_and_clip_are_given_by_joint(tmp_path):
+def test_scale_offset_and_clip_accept_joint_mappings(tmp_path):
     term = {"func": "joint_effort", "joints": ["elbow", "shoulder", "wrist"], "scale": {"elbow": 2.0, "w.*": 3.0},
             "offset": {"shoulder": 0.5}, "clip": {"wrist": [-1.0, 1.0]}}  # fmt: skip
     env = arm(tmp_path, term)
     action = torch.tensor([[1.0, 2.0, 3.0], [-1.0, -2.0, -3.0], [0.1, 0.2, 0.3]])
     _, command = command_after(env, action)
-    # elbow 2 a, shoulder a + 0.5 (no scale of its own: 1), wrist 3 a within +-1
+    # elbow 2 a; shoulder a + 0.5 (default scale 1); wrist 3 a, clipped to +-1
     expected = torch.stack([2 * action[:, 0], action[:, 1] + 0.5, (3 * action[:, 2]).clamp(-1, 1)], dim=1)
     assert torch.allclose(command, expected)
     layout = env.layout.actions[0]
@@ -90,19 +90,19 @@ def test_scale_offset_and_clip_are_given_by_joint(tmp_path):
 
 
 @pytest.mark.parametrize("key", ["scale", "offset", "clip"])
-def test_a_pattern_that_matches_no_driven_joint_is_refused(tmp_path, key):
+def test_pattern_without_driven_joint_is_rejected(tmp_path, key):
     value = {"elbov": [0.0, 1.0] if key == "clip" else 1.0}
     with pytest.raises(ConfigError, match="elbov") as refusal:
         arm(tmp_path, {"func": "joint_effort", "joints": ["elbow"], key: value})
     assert "elbow" in refusal.value.problems[0].hint
 
 
-def test_a_joint_matched_twice_is_refused(tmp_path):
+def test_joint_matched_twice_is_rejected(tmp_path):
     with pytest.raises(ConfigError, match="matched by 'elbow' and by"):
         arm(tmp_path, {"func": "joint_effort", "joints": ["elbow"], "scale": {"elbow": 1.0, "e.*": 2.0}})
 
 
-def test_velocity_targets_reach_velocity_actuators(tmp_path):
+def test_joint_velocity_writes_velocity_actuators(tmp_path):
     env = arm(tmp_path, {"func": "joint_velocity", "joints": ["wrist", "elbow"], "scale": 0.5})
     action = torch.tensor([[2.0, -1.0]] * 3)
     _, command = command_after(env, action)
@@ -114,14 +114,14 @@ def test_velocity_targets_reach_velocity_actuators(tmp_path):
     assert env.entities["robot"].data.joint_vel[0, 3] > 0.4
 
 
-def test_relative_positions_are_added_to_where_joints_are(tmp_path):
+def test_relative_joint_position_adds_to_joint_position(tmp_path):
     env = arm(tmp_path, {"func": "relative_joint_position", "joints": ["elbow", "slide"], "scale": 0.1})
     action = torch.tensor([[1.0, -1.0], [0.5, 0.0], [0.0, 2.0]])
     before, command = command_after(env, action)
     assert torch.allclose(command, before[:, [2, 0]] + 0.1 * action)
 
 
-def test_positions_are_stretched_over_the_soft_limits(tmp_path):
+def test_position_to_limits_stretches_over_soft_limits(tmp_path):
     term = {"func": "joint_position_to_limits", "joints": ["shoulder", "elbow"]}
     env = arm(tmp_path, term, "scene.entities.robot.soft_joint_pos_limit_factor=0.5")
     action = torch.tensor([[-1.0, 1.0], [0.0, 0.5], [3.0, -3.0]])
@@ -130,7 +130,7 @@ def test_positions_are_stretched_over_the_soft_limits(tmp_path):
     assert torch.allclose(command, torch.tensor([[-1.0, 1.25], [0.0, 0.625], [1.0, -1.25]]))
 
 
-def test_a_joint_without_limits_cannot_be_stretched_over_them(tmp_path):
+def test_position_to_limits_rejects_unlimited_joint(tmp_path):
     task = yaml.safe_load(PENDULUM_TASK)
     task["actions"] = {"move": {"func": "joint_position_to_limits"}}
     task["scene"]["entities"]["robot"]["joints"] = {"swing": {"kp": 1.0}}
@@ -138,7 +138,7 @@ def test_a_joint_without_limits_cannot_be_stretched_over_them(tmp_path):
         build(write(tmp_path, dump(task), pendulum_xml=PENDULUM), 2)
 
 
-def test_moving_averages_start_from_where_the_joints_are(tmp_path):
+def test_ema_starts_at_joint_positions(tmp_path):
     env = arm(tmp_path, {"func": "ema_joint_position_to_limits", "joints": ["shoulder"], "alpha": 0.25})
     action = torch.tensor([[1.0], [-1.0], [0.5]])
     before, first = command_after(env, action)
@@ -148,7 +148,7 @@ def test_moving_averages_start_from_where_the_joints_are(tmp_path):
     assert torch.allclose(env.action_manager.terms[0].instance.command, 0.25 * 2.0 * action + 0.75 * expected)
 
 
-def test_a_gripper_opens_and_closes_on_one_column(tmp_path):
+def test_binary_joint_uses_one_column(tmp_path):
     term = {"func": "binary_joint_position", "joints": ["grip", "wrist"], "open_command": {"grip": 0.04, "wrist": 0.1},
             "close_command": {".*": 0.0}}  # fmt: skip
     env = arm(tmp_path, term)
@@ -157,14 +157,14 @@ def test_a_gripper_opens_and_closes_on_one_column(tmp_path):
     assert torch.allclose(command, torch.tensor([[0.04, 0.1], [0.0, 0.0], [0.04, 0.1]]))
 
 
-def test_a_gripper_needs_a_value_for_every_joint(tmp_path):
+def test_binary_joint_requires_value_for_each_joint(tmp_path):
     term = {"func": "binary_joint_position", "joints": ["grip", "wrist"], "open_command": {"grip": 0.04},
             "close_command": {".*": 0.0}}  # fmt: skip
     with pytest.raises(ConfigError, match="open_command has no value for joint 'wrist'"):
         arm(tmp_path, term)
 
 
-def test_the_jacobian_is_mujocos(tmp_path):
+def test_jacobian_matches_mujoco(tmp_path):
     env = arm(tmp_path, {"func": "joint_position"}, num_envs=2)
     env.reset()
     robot = env.entities["robot"]
@@ -180,7 +180,7 @@ def test_the_jacobian_is_mujocos(tmp_path):
 
 
 @pytest.mark.parametrize("engine", ["batch", "warp"])
-def test_inverse_kinematics_reaches_a_position(tmp_path, engine):
+def test_inverse_kinematics_reaches_position(tmp_path, engine):
     term = {"func": "differential_inverse_kinematics", "joints": ["slide", "shoulder", "elbow"], "bodies": ["hand"],
             "mode": "position"}  # fmt: skip
     env = arm(tmp_path, term, f"sim.engine={engine}", episode_length_s=20.0)
@@ -193,7 +193,7 @@ def test_inverse_kinematics_reaches_a_position(tmp_path, engine):
     assert (hand - target).norm(dim=1).max() < 5e-3
 
 
-def test_inverse_kinematics_moves_relative_to_where_the_body_is(tmp_path):
+def test_inverse_kinematics_relative_mode(tmp_path):
     term = {"func": "differential_inverse_kinematics", "joints": ["slide", "shoulder", "elbow", "wrist"],
             "bodies": ["hand"], "mode": "pose", "relative": True, "scale": 0.01, "damping": 1.0e-4}  # fmt: skip
     env = arm(tmp_path, term)
@@ -205,13 +205,13 @@ def test_inverse_kinematics_moves_relative_to_where_the_body_is(tmp_path):
     jacobian = Jacobian(robot, [0, 1, 2, 3], body)(robot.data.body_pos_w[:, body])
     before = robot.data.joint_pos.clone()
     env.step(action)
-    asked = env.action_manager.terms[0].instance.command - before[:, :4]
-    moved = (jacobian @ asked[:, :, None])[:, :, 0]
+    command = env.action_manager.terms[0].instance.command - before[:, :4]
+    moved = (jacobian @ command[:, :, None])[:, :, 0]
     assert torch.allclose(moved[:, [0, 2, 4]], torch.tensor([0.01, 0.005, 0.0]).expand(3, 3), atol=2e-4)
 
 
-def test_inverse_kinematics_brings_spare_joints_home_and_leaves_the_body(tmp_path):
-    """Three joints move the hand in a plane where its position needs two: one is to spare."""
+def test_inverse_kinematics_posture_keeps_body(tmp_path):
+    """Three joints move the hand in a plane, where two are enough: one is redundant."""
     term = {"func": "differential_inverse_kinematics", "joints": ["slide", "shoulder", "elbow"], "bodies": ["hand"],
             "mode": "position", "damping": 1.0e-3}  # fmt: skip
     target = torch.tensor([[0.45, 0.0, 0.25]] * 3)
@@ -229,7 +229,7 @@ def test_inverse_kinematics_brings_spare_joints_home_and_leaves_the_body(tmp_pat
     assert bool((homes[1] < homes[0] - 1e-3).all())
 
 
-def test_inverse_kinematics_needs_one_body(tmp_path):
+def test_inverse_kinematics_requires_one_body(tmp_path):
     term = {"func": "differential_inverse_kinematics", "bodies": ["hand", "lower"]}
     with pytest.raises(ConfigError, match="2 elements"):
         arm(tmp_path, term)
@@ -239,7 +239,7 @@ def test_inverse_kinematics_needs_one_body(tmp_path):
 
 
 def substeps(env, action):
-    """One step, physics step by physics step: (position, velocity, control) before each. (decimation, num_envs, k)"""
+    """Run one step, and return (position, velocity, control) before each physics step. (decimation, num_envs, k)"""
     rows = []
     step = env.engine.step
 
@@ -256,7 +256,7 @@ def substeps(env, action):
 PD = {"joints": ["elbow", "shoulder"], "stiffness": 30.0, "damping": {"elbow": 2.0, "shoulder": 1.0}}
 
 
-def test_a_pd_model_computes_its_effort_before_every_physics_step(tmp_path):
+def test_pd_model_computes_effort_in_each_physics_step(tmp_path):
     env = arm(tmp_path, {"func": "joint_position", "joints": ["elbow", "shoulder"], "use_default_offset": False},
               actuators={"legs": PD})  # fmt: skip
     env.reset()
@@ -270,7 +270,7 @@ def test_a_pd_model_computes_its_effort_before_every_physics_step(tmp_path):
     assert torch.allclose(env.entities["robot"].data.applied_effort[:, [2, 1]], ctrl[-1].float(), atol=1e-4)
 
 
-def test_efforts_and_velocities_may_be_asked_of_a_model_too(tmp_path):
+def test_actuator_model_accepts_efforts_and_velocities(tmp_path):
     effort = arm(tmp_path / "a", {"func": "joint_effort", "joints": ["elbow"]},
                  actuators={"e": {"joints": ["elbow"], "effort_limit": 2.0}})  # fmt: skip
     effort.reset()
@@ -283,18 +283,18 @@ def test_efforts_and_velocities_may_be_asked_of_a_model_too(tmp_path):
     assert torch.allclose(ctrl[:, :, 0], 3.0 * (torch.tensor([1.0, 2.0, 0.0]) - qvel[:, :, 2]), atol=1e-5)
 
 
-def test_a_dc_motor_gives_less_the_faster_it_turns(tmp_path):
+def test_dc_motor_effort_falls_with_speed(tmp_path):
     motor = {"joints": ["elbow"], "kind": "dc_motor", "saturation_effort": 4.0, "velocity_limit": 10.0,
              "effort_limit": 3.0}  # fmt: skip
     env = arm(tmp_path, {"func": "joint_effort", "joints": ["elbow"]}, actuators={"m": motor}, num_envs=6)
     env.reset()
     speeds = torch.tensor([0.0, 5.0, 12.0, -5.0, 30.0, 0.0])
     env.engine.field("qvel")[:, 2] = speeds
-    asked = torch.tensor([[9.0], [9.0], [9.0], [9.0], [9.0], [-9.0]])
-    _, _, ctrl = substeps(env, asked)
+    command = torch.tensor([[9.0], [9.0], [9.0], [9.0], [9.0], [-9.0]])
+    _, _, ctrl = substeps(env, command)
     expected = []
-    for speed, effort in zip(speeds.tolist(), asked[:, 0].tolist(), strict=True):
-        speed = max(-17.5, min(17.5, speed))  # 10 (1 + 3/4): where the line leaves the effort limit
+    for speed, effort in zip(speeds.tolist(), command[:, 0].tolist(), strict=True):
+        speed = max(-17.5, min(17.5, speed))  # 10 (1 + 3/4): speed at which the torque line leaves the effort limit
         low, high = max(-3.0, 4.0 * (-1 - speed / 10)), min(3.0, 4.0 * (1 - speed / 10))
         expected.append(max(low, min(high, effort)))
     # 3 (the limit), 2, -0.8 (it brakes), 3, -3, -3
@@ -302,16 +302,16 @@ def test_a_dc_motor_gives_less_the_faster_it_turns(tmp_path):
     assert ctrl[0, :, 0].tolist() == pytest.approx(expected)
 
 
-def test_commands_of_a_delayed_model_arrive_physics_steps_later(tmp_path):
+def test_delayed_model_applies_commands_later(tmp_path):
     env = arm(tmp_path, {"func": "joint_effort", "joints": ["elbow"]},
               actuators={"e": {"joints": ["elbow"], "delay": [3, 3]}})  # fmt: skip
     env.reset()
     seen = [substeps(env, torch.full((3, 1), value))[2][:, 0, 0].tolist() for value in (1.0, 2.0, 3.0)]
-    # 4 physics steps a step, 3 late; an episode's first command fills the line
+    # 4 physics steps in a step, delay 3; the first command of an episode fills the delay line
     assert seen == [[1.0] * 4, [1.0, 1.0, 1.0, 2.0], [2.0, 2.0, 2.0, 3.0]]
 
 
-def test_delays_are_drawn_an_environment_for_an_episode(tmp_path):
+def test_model_delay_is_drawn_per_env_and_episode(tmp_path):
     env = arm(tmp_path, {"func": "joint_effort", "joints": ["elbow"]}, num_envs=64,
               actuators={"e": {"joints": ["elbow"], "delay": [0, 3]}})  # fmt: skip
     env.reset()
@@ -321,7 +321,7 @@ def test_delays_are_drawn_an_environment_for_an_episode(tmp_path):
     assert set(lags.tolist()) == {0, 1, 2, 3}
 
 
-def test_a_model_replaces_the_mjcfs_actuators(tmp_path):
+def test_actuator_model_replaces_mjcf_actuators(tmp_path):
     model = PENDULUM.replace("</mujoco>", '<actuator><position joint="swing" kp="9"/></actuator></mujoco>')
     task = yaml.safe_load(PENDULUM_TASK)
     task["actions"] = {"a": {"func": "joint_position"}}
@@ -334,7 +334,7 @@ def test_a_model_replaces_the_mjcfs_actuators(tmp_path):
 DELAYED = {"legs": {**PD, "delay": [0, 5]}}
 
 
-def test_a_saved_state_goes_on_with_the_same_bits(tmp_path):
+def test_state_dict_restores_actuator_models_bit_for_bit(tmp_path):
     term = {"func": "ema_joint_position_to_limits", "joints": ["elbow", "shoulder"], "alpha": 0.3}
     env, other = (arm(tmp_path / name, term, actuators=DELAYED, episode_length_s=0.3) for name in "ab")
     env.reset()
@@ -347,7 +347,7 @@ def test_a_saved_state_goes_on_with_the_same_bits(tmp_path):
         assert torch.equal(env.step(action).obs["policy"], other.step(action).obs["policy"])
 
 
-def test_the_number_of_environments_does_not_matter(tmp_path):
+def test_actuator_models_independent_of_num_envs(tmp_path):
     term = {"func": "joint_position", "joints": ["elbow", "shoulder"], "scale": 0.3}
     few, many = (arm(tmp_path / str(n), term, actuators=DELAYED, num_envs=n, episode_length_s=0.3) for n in (3, 11))
     few.reset()
@@ -357,7 +357,7 @@ def test_the_number_of_environments_does_not_matter(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("model", "says"),
+    ("model", "message"),
     [
         ({"joints": ["elbov"]}, "no joint matches 'elbov'"),
         ({"joints": ["elbow"], "kind": "dc_motor"}, "a dc_motor needs saturation_effort and velocity_limit"),
@@ -367,13 +367,13 @@ def test_the_number_of_environments_does_not_matter(tmp_path):
         ({"joints": ["elbow"], "delay": [2, 1]}, "the lower end 2 is above"),
     ],
 )
-def test_a_model_that_does_not_fit_is_refused(tmp_path, model, says):
+def test_invalid_actuator_model_is_rejected(tmp_path, model, message):
     with pytest.raises(ConfigError) as refusal:
         arm(tmp_path, {"func": "joint_effort", "joints": ["elbow"]}, actuators={"m": model})
-    assert says in refusal.value.message
+    assert message in refusal.value.message
 
 
-def test_a_joint_of_two_models_is_refused(tmp_path):
+def test_joint_of_two_models_is_rejected(tmp_path):
     with pytest.raises(ConfigError, match="'elbow' is driven by 'one' already"):
         arm(tmp_path, {"func": "joint_effort", "joints": ["elbow"]},
             actuators={"one": {"joints": ["elbow"]}, "two": {"joints": ["e.*"]}})  # fmt: skip

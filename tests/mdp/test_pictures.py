@@ -1,4 +1,4 @@
-"""The observation term of a camera, on a picture that was made by hand."""
+"""Observation term of a camera, with an image that was made by hand."""
 
 import pytest
 import torch
@@ -48,7 +48,7 @@ def env(tmp_path):
     env.close()
 
 
-def test_colours_become_shares_less_the_mean_of_each(env):
+def test_image_normalizes_colours(env):
     eye = env.sensors["eye"]
     eye.image.copy_(COLOURS)
     seen = image(env, sensor=eye)
@@ -62,7 +62,7 @@ def test_colours_become_shares_less_the_mean_of_each(env):
     torch.testing.assert_close(raw, COLOURS.movedim(3, 1).float(), rtol=0.0, atol=0.0)
 
 
-def test_distances_stay_metres(env):
+def test_image_keeps_distances_in_metres(env):
     depth = env.sensors["depth"]
     depth.image.copy_(torch.arange(12.0).view(2, 2, 3, 1))
     for normalize in (True, False):
@@ -70,7 +70,7 @@ def test_distances_stay_metres(env):
         assert torch.equal(seen, torch.arange(12.0).view(2, 1, 2, 3))
 
 
-def test_the_group_has_pictures_row_by_row_and_the_layout_their_shapes(env):
+def test_image_layout_is_row_major_with_shape(env):
     colours, raw, depth = env.layout.observations["policy"]
     assert [(term.size, term.shape, term.history) for term in (colours, raw, depth)] == [
         (18, (3, 2, 3), 1),
@@ -83,13 +83,13 @@ def test_the_group_has_pictures_row_by_row_and_the_layout_their_shapes(env):
     assert torch.equal(obs[:, 18:36], picture.flatten(1))
 
 
-def test_a_sensor_of_another_kind_is_refused(tmp_path):
+def test_image_rejects_other_kind_of_sensor(tmp_path):
     folder = write(tmp_path / "task", TASK.replace("sensor: eye}", "sensor: rays}"), model_xml=MODEL)
     with pytest.raises(ConfigError, match="of kind rays, the term needs one of kind camera"):
         build(folder, 2)
 
 
-def test_a_term_of_three_dimensions_is_no_picture(tmp_path):
+def test_three_dimensional_term_is_rejected(tmp_path):
     own = "import torch\ndef flat(env):\n    return torch.zeros(env.num_envs, 2, 3)\n"
     task = edited(TASK, observations={"policy": {"flat": {"func": "flat"}}})
     with pytest.raises(ConfigError, match=r"a tensor of shape \(2, 2, 3\)"):

@@ -1,4 +1,4 @@
-"""Every randomisation term: what it writes, in which environment, about which value, and that the physics obeys."""
+"""Every randomisation term: the values that it writes, in which environment, and their effect on physics."""
 
 import math
 
@@ -58,7 +58,7 @@ def machine(tmp_path, num_envs=6, *overrides, engine="batch", seed=42, **events)
 
 
 def models(env):
-    """Each environment's own MjModel, apart from the others."""
+    """Return each environment's own MjModel."""
     made = []
     for i in range(env.num_envs):
         model = env.world(i)[0]
@@ -71,7 +71,7 @@ def value_of(model, name):
 
 
 def row(env, field, name):
-    """The row of a field that belongs to the element `name`, and the field's original value there."""
+    """Return the row of a field that belongs to the element `name`, and its original value."""
     kind = FIELDS[field]
     model = env.engine.model
     lookup = {"Bodies": model.body, "Joints": model.joint, "Geoms": model.geom, "Sites": model.site,
@@ -114,9 +114,7 @@ TABLE = [
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(("term", "params", "element", "field", "axes", "operation"), TABLE)
-def test_each_environment_has_its_own_value_about_the_original(
-    tmp_path, engine, term, params, element, field, axes, operation
-):
+def test_values_differ_between_envs_around_original(tmp_path, engine, term, params, element, field, axes, operation):
     env = machine(tmp_path, engine=engine, it={"func": term, "mode": "startup", "range": U, **params})
     index, original = row(env, field, element)
     original = original.reshape(len(original), -1)
@@ -134,7 +132,7 @@ def test_each_environment_has_its_own_value_about_the_original(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_inertia_and_all_that_derives_from_it_follow_a_mass(tmp_path, engine):
+def test_mass_scales_inertia_and_derived_constants(tmp_path, engine):
     events = {"it": {"func": "randomize_body_mass", "mode": "startup", "bodies": ["hand", "ball"], "range": U}}
     env = machine(tmp_path, engine=engine, **events)
     before = env.engine.model
@@ -148,11 +146,11 @@ def test_inertia_and_all_that_derives_from_it_follow_a_mass(tmp_path, engine):
         fresh.body_mass[:], fresh.body_inertia[:] = model.body_mass, model.body_inertia
         mujoco.mj_setConst(fresh, mujoco.MjData(fresh))
         assert model.dof_invweight0 == pytest.approx(fresh.dof_invweight0, rel=1e-3)
-        chain = slice(1, hand + 1)  # of a body that only slides, MuJoCo Warp weighs the rotation differently
+        chain = slice(1, hand + 1)  # MuJoCo Warp weighs the rotation of a body that only slides differently
         assert model.body_invweight0[chain] == pytest.approx(fresh.body_invweight0[chain], rel=1e-3)
 
 
-def test_the_mass_alone_can_be_changed(tmp_path):
+def test_mass_without_inertia(tmp_path):
     env = machine(tmp_path, it={"func": "randomize_body_mass", "mode": "startup", "range": [2.0, 2.0],
                                 "bodies": "hand", "with_inertia": False})  # fmt: skip
     hand = env.engine.model.body("robot/hand").id
@@ -169,7 +167,7 @@ def test_the_mass_alone_can_be_changed(tmp_path):
         ("randomize_site_quat", "sites", "eye", "site_quat"),
     ],
 )
-def test_orientations_are_turned_about_their_own_axes(tmp_path, engine, term, kind, element, field):
+def test_orientations_turn_about_own_axes(tmp_path, engine, term, kind, element, field):
     env = machine(tmp_path, engine=engine, it={"func": term, "mode": "startup", kind: element, "yaw": [0.2, 0.8]})
     index, original = row(env, field, element)
     turned = []
@@ -184,7 +182,7 @@ def test_orientations_are_turned_about_their_own_axes(tmp_path, engine, term, ki
     assert len(set(turned)) == env.num_envs
 
 
-def test_a_moved_centre_of_mass_of_a_lone_free_body_moves_as_one_compiled_there(tmp_path):
+def test_body_com_of_free_body_matches_compiled_model(tmp_path):
     env = machine(tmp_path, 2, it={"func": "randomize_body_com", "mode": "startup", "bodies": "ball",
                                    "range": [[0.03, 0.03], [0.02, 0.02], [0.0, 0.0]]})  # fmt: skip
     qvel = env.engine.field("qvel")
@@ -205,7 +203,7 @@ def test_a_moved_centre_of_mass_of_a_lone_free_body_moves_as_one_compiled_there(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_actuator_gains_stay_those_of_their_kind(tmp_path, engine):
+def test_actuator_gains_keep_actuator_kind(tmp_path, engine):
     events = {
         "servo": {"func": "randomize_actuator_gains", "mode": "startup", "actuators": "servo", "kp": U, "kv": U},
         "spin": {"func": "randomize_actuator_gains", "mode": "startup", "actuators": "spin", "kv": [2.0, 3.0]},
@@ -227,7 +225,7 @@ def test_actuator_gains_stay_those_of_their_kind(tmp_path, engine):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_actuator_models_have_gains_of_each_environment_that_reach_the_joints(tmp_path, engine):
+def test_pd_gains_differ_between_envs(tmp_path, engine):
     models = "{soft: {joints: [wrist], stiffness: 20.0, damping: 0.0, effort_limit: 100.0}}"
     env = machine(
         tmp_path,
@@ -251,7 +249,7 @@ def test_actuator_models_have_gains_of_each_environment_that_reach_the_joints(tm
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_an_effort_limit_is_that_on_the_joint_whatever_the_gear(tmp_path, engine):
+def test_effort_limit_accounts_for_gear(tmp_path, engine):
     env = machine(
         tmp_path,
         engine=engine,
@@ -275,7 +273,7 @@ def test_an_effort_limit_is_that_on_the_joint_whatever_the_gear(tmp_path, engine
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_joint_limits_are_followed_by_whatever_reads_them(tmp_path, engine):
+def test_joint_range_changes_limits_in_terms(tmp_path, engine):
     env = machine(tmp_path, engine=engine, it={"func": "randomize_joint_range", "mode": "startup", "joints": "shoulder",
                                                "upper": [-0.5, 0.5]},
                   reset={"func": "reset_joints_by_offset", "mode": "reset", "position": [9.0, 9.0]})  # fmt: skip
@@ -286,13 +284,13 @@ def test_joint_limits_are_followed_by_whatever_reads_them(tmp_path, engine):
     _, high = data.joint_limits()
     column = env.entities["robot"].joint_names.index("shoulder")
     assert high[:, column].tolist() == pytest.approx(uppers, rel=1e-6)
-    soft = [0.5 * (u - 1.5) + 0.45 * (u + 1.5) for u in uppers]  # 0.9 of the range from -1.5 to u, about its middle
+    soft = [0.5 * (u - 1.5) + 0.45 * (u + 1.5) for u in uppers]  # 0.9 of the range from -1.5 to u, around its middle
     assert data.joint_limits(soft=True)[1][:, column].tolist() == pytest.approx(soft, rel=1e-5)
     assert data.joint_pos[:, column].tolist() == pytest.approx(soft, rel=1e-5), "the reset stops there"
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_default_pose_moves_resets_and_observations_alike(tmp_path, engine):
+def test_default_joint_pos_changes_resets_and_observations(tmp_path, engine):
     env = machine(
         tmp_path,
         6,
@@ -310,7 +308,7 @@ def test_a_default_pose_moves_resets_and_observations_alike(tmp_path, engine):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_the_observed_direction_of_gravity_follows_it(tmp_path, engine):
+def test_gravity_changes_projected_gravity(tmp_path, engine):
     env = machine(
         tmp_path,
         engine=engine,
@@ -337,20 +335,20 @@ DISTRIBUTIONS = [
 
 
 @pytest.mark.parametrize(("distribution", "range_", "holds"), DISTRIBUTIONS, ids=[d[0] for d in DISTRIBUTIONS])
-def test_a_distribution_has_its_shape(tmp_path, distribution, range_, holds):
+def test_distribution_has_expected_shape(tmp_path, distribution, range_, holds):
     env = machine(tmp_path, 800, it={"func": "randomize_joint_damping", "mode": "startup", "operation": "set",
                                      "joints": "shoulder", "distribution": distribution, "range": range_})  # fmt: skip
     drawn = env.engine.expand("dof_damping")[:, row(env, "dof_damping", "shoulder")[0]].numpy()
     assert all(holds(drawn)), (drawn.mean(), drawn.std())
 
 
-def test_what_cannot_be_negative_is_kept_from_it(tmp_path):
+def test_values_are_clipped_to_lower_bound(tmp_path):
     env = machine(tmp_path, it={"func": "randomize_joint_damping", "mode": "startup", "operation": "add",
                                 "range": [-9.0, -8.0]})  # fmt: skip
     assert set(env.engine.expand("dof_damping")[:, 6:].flatten().tolist()) == {0.0}
 
 
-def test_shared_gives_all_elements_one_draw_and_otherwise_each_its_own(tmp_path):
+def test_shared_gives_all_elements_one_draw(tmp_path):
     both = {"func": "randomize_joint_damping", "mode": "startup", "joints": ["shoulder", "wrist"], "operation": "set"}
     env = machine(tmp_path, shared={**both, "range": U, "shared": True})
     assert torch.equal(*env.engine.expand("dof_damping")[:, 6:8].unbind(1))
@@ -360,7 +358,7 @@ def test_shared_gives_all_elements_one_draw_and_otherwise_each_its_own(tmp_path)
 
 
 @pytest.mark.parametrize("operation", ["add", "scale"])
-def test_drawing_again_is_about_the_original_and_never_adds_up(tmp_path, operation):
+def test_repeated_draws_do_not_accumulate(tmp_path, operation):
     env = machine(tmp_path, it={"func": "randomize_joint_damping", "mode": "reset", "joints": "shoulder",
                                 "operation": operation, "range": [1.5, 2.0]})  # fmt: skip
     damping = env.engine.expand("dof_damping")[:, 6]
@@ -374,7 +372,7 @@ def test_drawing_again_is_about_the_original_and_never_adds_up(tmp_path, operati
     assert len(seen) == 20 * env.num_envs
 
 
-def test_draws_do_not_depend_on_how_many_environments_or_which_other_events_there_are(tmp_path):
+def test_draws_independent_of_num_envs_and_other_events(tmp_path):
     it = {"func": "randomize_body_mass", "mode": "startup", "range": U, "distribution": "loguniform"}
     other = {"func": "randomize_joint_damping", "mode": "startup", "range": U}
     few = machine(tmp_path / "a", 3, it=it).engine.expand("body_mass")
@@ -382,14 +380,14 @@ def test_draws_do_not_depend_on_how_many_environments_or_which_other_events_ther
     assert torch.equal(few, many[:3])
 
 
-def test_both_engines_draw_the_same(tmp_path):
+def test_engines_draw_the_same(tmp_path):
     it = {"func": "randomize_body_mass", "mode": "startup", "range": U, "distribution": "loguniform"}
     host, device = (machine(tmp_path / e, it=it, engine=e).engine.expand("body_mass") for e in ENGINES)
     torch.testing.assert_close(host.float(), device, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_resumed_environment_keeps_what_was_drawn_and_draws_on(tmp_path, engine):
+def test_state_dict_restores_randomized_values(tmp_path, engine):
     events = {
         "mass": {"func": "randomize_body_mass", "mode": "startup", "range": U},
         "pose": {"func": "randomize_default_joint_pos", "mode": "startup", "joints": "wrist", "range": [-0.2, 0.2]},
@@ -425,7 +423,7 @@ def test_a_resumed_environment_keeps_what_was_drawn_and_draws_on(tmp_path, engin
     assert torch.equal(env.entities["robot"].data.default_joint_pos, fresh.entities["robot"].data.default_joint_pos)
 
 
-# --- what physics makes of it, against formulas ---
+# --- effects on physics, compared with formulas ---
 
 FALL = {"decimation": 1, "sim": {"dt": 0.002, "integrator": "implicitfast"}, "episode_length_s": 100.0}
 WORLD = """
@@ -452,7 +450,7 @@ def physical(tmp_path, cone="elliptic", engine="batch", n=5, **events):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_free_fall_is_by_each_environments_gravity(tmp_path, engine):
+def test_free_fall_uses_gravity_of_env(tmp_path, engine):
     env = physical(tmp_path, engine=engine, it={"func": "randomize_gravity", "mode": "startup", "range": [-3.0, 8.0]})
     g = -env.engine.expand("opt.gravity")[:, 2].double()
     assert len(set(g.tolist())) == 5
@@ -461,11 +459,11 @@ def test_free_fall_is_by_each_environments_gravity(tmp_path, engine):
     env.engine.step(steps)
     fallen = 50.0 - env.engine.field("qpos")[:, 2].double()
     t = steps * dt
-    assert fallen.tolist() == pytest.approx((0.5 * g * t * (t + dt)).tolist(), rel=1e-3)  # semi-implicit Euler's sum
+    assert fallen.tolist() == pytest.approx((0.5 * g * t * (t + dt)).tolist(), rel=1e-3)  # semi-implicit Euler
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_force_accelerates_each_environments_mass(tmp_path, engine):
+def test_force_accelerates_mass_of_env(tmp_path, engine):
     env = physical(tmp_path, engine=engine, it={"func": "randomize_body_mass", "mode": "startup", "bodies": "cart",
                                                 "range": [0.5, 4.0]})  # fmt: skip
     mass = env.engine.expand("body_mass")[:, env.engine.model.body("robot/cart").id].double()
@@ -477,7 +475,7 @@ def test_a_force_accelerates_each_environments_mass(tmp_path, engine):
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
-def test_a_sliding_block_stops_where_its_friction_says(tmp_path, cone):
+def test_sliding_distance_matches_friction(tmp_path, cone):
     env = physical(tmp_path, cone, it={"func": "randomize_geom_friction", "mode": "startup", "geoms": "sole",
                                        "range": [0.2, 0.6], "operation": "set"})  # fmt: skip
     mu = env.engine.expand("geom_friction")[:, env.engine.model.geom("robot/sole").id, 0]
@@ -491,7 +489,7 @@ def test_a_sliding_block_stops_where_its_friction_says(tmp_path, cone):
     assert slid.tolist() == pytest.approx((1.0 / (2.0 * mu * 9.81)).tolist(), rel=0.04)
 
 
-def test_a_pendulum_swings_with_the_period_of_its_gravity(tmp_path):
+def test_pendulum_period_matches_gravity(tmp_path):
     env = physical(tmp_path, it={"func": "randomize_gravity", "mode": "startup", "operation": "scale",
                                                 "range": [0.3, 2.0]})  # fmt: skip
     g = -env.engine.expand("opt.gravity")[:, 2].double()
@@ -510,7 +508,7 @@ def test_a_pendulum_swings_with_the_period_of_its_gravity(tmp_path):
         assert 4 * quarter == pytest.approx(2 * math.pi / math.sqrt(float(g[i])), rel=3e-3)
 
 
-# --- what is refused when the environment is built ---
+# --- errors when the environment is built ---
 
 BAD = [
     ({"func": "randomize_model_field", "field": "geom_type", "range": U}, "'geom_type' cannot differ"),
@@ -532,7 +530,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("event", "message"), BAD, ids=[message for _, message in BAD])
-def test_what_cannot_be_randomised_is_refused_with_what_can(tmp_path, event, message):
+def test_invalid_randomization_error_lists_alternatives(tmp_path, event, message):
     with pytest.raises(ConfigError) as error:
         machine(tmp_path, it={"mode": "startup", **event})
     (problem,) = error.value.problems
@@ -543,6 +541,6 @@ def test_what_cannot_be_randomised_is_refused_with_what_can(tmp_path, event, mes
         assert "body_mass" in problem.hint
 
 
-def test_what_an_engine_derives_constants_from_is_known():
+def test_derived_from_covers_mujoco_setconst_inputs():
     inputs = set(mujoco.MjModel._setconst_inputs)
     assert {name for name in FIELDS if name in inputs} <= DERIVED_FROM

@@ -1,4 +1,4 @@
-"""Events on a state whose values are worked out here, and terms that remember."""
+"""Events on hand-made states, and terms with a memory."""
 
 from math import acos, cos, pi, sin, sqrt
 
@@ -16,7 +16,7 @@ LIMIT = pi / 3
 
 @pytest.mark.parametrize("turns", [-3, -1, 0, 1, 2])
 @pytest.mark.parametrize("angle", [0.0, 0.4, -0.4, pi])
-def test_a_wrapped_joint_position_counts_the_same_after_whole_turns(turns, angle):
+def test_joint_pos_target_l2_wraps_whole_turns(turns, angle):
     from rlcli.sim.rotations import wrap_to_pi
 
     wrapped = float(wrap_to_pi(torch.tensor([angle + 2 * pi * turns]))[0])
@@ -24,7 +24,7 @@ def test_a_wrapped_joint_position_counts_the_same_after_whole_turns(turns, angle
     assert -pi - 1e-6 < wrapped <= pi + 1e-6
 
 
-def test_bad_orientation_sees_a_robot_on_its_back(tmp_path):
+def test_bad_orientation_finds_robot_on_its_back(tmp_path):
     env = build(critter(tmp_path), 2)
     env.reset()
     robot = env.entities["robot"]
@@ -34,7 +34,7 @@ def test_bad_orientation_sees_a_robot_on_its_back(tmp_path):
     assert robot.data.projected_gravity_b[1].tolist() == pytest.approx([0, 0, 1])
 
 
-def test_acceleration_and_torque_are_those_of_the_last_substep(tmp_path):
+def test_acceleration_and_torque_are_of_last_substep(tmp_path):
     env = build(critter(tmp_path), 2)
     env.reset()
     action = torch.tensor([[0.1, 0.2, -0.3, 0.4]] * 2)
@@ -52,7 +52,7 @@ def test_acceleration_and_torque_are_those_of_the_last_substep(tmp_path):
     assert float(env.engine.field("qfrc_actuator")[:, 6:].abs().max()) <= 8.0 + 1e-9, "under its limit"
 
 
-def test_progress_is_the_speed_towards_the_target_and_starts_at_each_episodes_start(tmp_path):
+def test_progress_reward_is_speed_to_target(tmp_path):
     start = {
         "func": "reset_root_state_uniform",
         "mode": "reset",
@@ -69,7 +69,7 @@ def test_progress_is_the_speed_towards_the_target_and_starts_at_each_episodes_st
     env = build(critter(tmp_path, task), 3)
     env.reset()
     term = next(t for t in env.reward_manager.terms if t.name == "progress")
-    for step in range(65):  # two time-outs on the way
+    for step in range(65):  # two time-outs within the run
         start = env.engine.field("qpos")[:, 0].clone()
         result = env.step(torch.zeros(3, 4))
         position = env.entities["robot"].data.root_pos_w[:, 0]
@@ -96,7 +96,7 @@ def joints_of(env, names):
     return env.entities["robot"].select("Joints", names)[0]
 
 
-def test_reset_joints_by_offset_adds_to_the_default_and_keeps_to_the_limits(fresh):
+def test_reset_joints_by_offset_clips_to_limits(fresh):
     before = fresh.engine.field("qpos").clone()
     robot, joints = fresh.entities["robot"], joints_of(fresh, ["hip_br", "hip_fl"])
     events.reset_joints_by_offset(
@@ -112,7 +112,7 @@ def test_reset_joints_by_offset_adds_to_the_default_and_keeps_to_the_limits(fres
     assert qpos[1, [7, 10]].tolist() == pytest.approx([LIMIT, LIMIT])
 
 
-def test_reset_joints_by_scale_multiplies_the_default(fresh):
+def test_reset_joints_by_scale_multiplies_default(fresh):
     robot = fresh.entities["robot"]
     events.reset_joints_by_scale(
         fresh, some(fresh, 2), entity=robot, joints=slice(0, 4), position=(2.0, 2.0), velocity=(0.0, 0.0)
@@ -121,7 +121,7 @@ def test_reset_joints_by_scale_multiplies_the_default(fresh):
     assert not fresh.engine.field("qvel")[2, 6:].any()
 
 
-def test_reset_root_state_uniform_sets_pose_and_world_frame_velocity(fresh):
+def test_reset_root_state_sets_pose_and_velocity(fresh):
     zero = (0.0, 0.0)
     events.reset_root_state_uniform(
         fresh, some(fresh, 1), entity=fresh.entities["robot"],
@@ -130,13 +130,13 @@ def test_reset_root_state_uniform_sets_pose_and_world_frame_velocity(fresh):
     )  # fmt: skip
     half = sqrt(0.5)
     assert fresh.engine.field("qpos")[1, :7].tolist() == pytest.approx([1, 2, 0.45, half, 0, 0, half], abs=1e-6)
-    # yawed by 90 degrees the world's x is the body's -y; a free joint's rates are the body's
+    # with a yaw of 90 degrees the world's x is the body's -y; rates of a free joint are in the body frame
     assert fresh.engine.field("qvel")[1, :6].tolist() == pytest.approx([1, 0, 0, 0, -0.5, 0], abs=1e-6)
 
 
 @pytest.mark.parametrize(("axis", "turned"), [("roll", [0, sin(0.4), 0, 0]), ("pitch", [0, 0, sin(0.4), 0]),
                                               ("yaw", [0, 0, 0, sin(0.4)])])  # fmt: skip
-def test_roll_pitch_and_yaw_turn_about_x_y_and_z(fresh, axis, turned):
+def test_reset_root_state_turns_about_roll_pitch_yaw_axes(fresh, axis, turned):
     events.reset_root_state_uniform(fresh, some(fresh, 0), entity=fresh.entities["robot"], **{axis: (0.8, 0.8)})
     expected = [cos(0.4), *turned[1:]]
     assert fresh.engine.field("qpos")[0, 3:7].tolist() == pytest.approx(expected, abs=1e-6)
@@ -153,7 +153,7 @@ def test_uniform_resets_fill_their_ranges(tmp_path):
     assert (qpos[:, 3:7].norm(dim=1) - 1).abs().max() < 1e-6
 
 
-def test_push_adds_to_the_velocity_in_the_world_frame(fresh):
+def test_push_adds_to_world_frame_velocity(fresh):
     robot = fresh.entities["robot"]
     fresh.engine.field("qpos")[0, 3:7] = torch.tensor([sqrt(0.5), 0, 0, sqrt(0.5)], dtype=torch.float64)
     fresh.engine.field("qvel")[0, :6] = torch.tensor([1.0, 0, 0, 0, -0.5, 0], dtype=torch.float64)
@@ -165,7 +165,7 @@ def test_push_adds_to_the_velocity_in_the_world_frame(fresh):
     assert fresh.engine.field("qvel")[0, :6].tolist() == pytest.approx([1.5, 2, 0, 0, -0.75, 0], abs=1e-6)
 
 
-def test_an_external_wrench_acts_on_the_named_bodies_until_reset(fresh):
+def test_external_wrench_lasts_until_reset(fresh):
     robot = fresh.entities["robot"]
     bodies, names = robot.select("Bodies", ["leg_br", "torso"])
     assert names == ["leg_br", "torso"]
@@ -182,7 +182,7 @@ def test_an_external_wrench_acts_on_the_named_bodies_until_reset(fresh):
     assert not wrench.any()
 
 
-def test_reset_scene_to_default_puts_everything_back(fresh):
+def test_reset_scene_to_default_resets_all_entities(fresh):
     for _ in range(5):
         fresh.step(torch.rand(3, 4))
     events.reset_scene_to_default(fresh, some(fresh, 1))
@@ -196,7 +196,7 @@ def test_reset_scene_to_default_puts_everything_back(fresh):
     {"func": "reset_root_state_uniform", "mode": "reset"},
     {"func": "push_by_setting_velocity", "mode": "interval", "interval_range_s": [0.01, 0.01]},
 ])  # fmt: skip
-def test_moving_the_root_of_a_fixed_robot_is_refused_by_name(tmp_path, event):
+def test_root_events_reject_fixed_robot(tmp_path, event):
     from support.worlds import PENDULUM_TASK, pendulum
 
     env = build(pendulum(tmp_path, edited(PENDULUM_TASK, events={"move": event})))
@@ -205,7 +205,7 @@ def test_moving_the_root_of_a_fixed_robot_is_refused_by_name(tmp_path, event):
         env.step(torch.zeros(3, 1))
 
 
-def test_progress_to_a_target_far_away_is_as_exact_as_to_a_near_one(tmp_path):
+def test_progress_reward_is_exact_for_far_target(tmp_path):
     """Two distances of 1000 m in float32 differ by multiples of 0.06 mm."""
     env = build(critter(tmp_path), 3)
     env.reset()
@@ -217,7 +217,7 @@ def test_progress_to_a_target_far_away_is_as_exact_as_to_a_near_one(tmp_path):
     assert not term().any(), "nothing moved since"
 
 
-def test_unlimited_joints_never_violate_their_limits(tmp_path):
+def test_unlimited_joints_have_no_limit_penalty(tmp_path):
     from support.worlds import PENDULUM_TASK, pendulum
 
     terms = {"limits": {"func": "joint_pos_limits", "weight": -1.0},
@@ -232,7 +232,7 @@ def test_unlimited_joints_never_violate_their_limits(tmp_path):
     assert rewards.JointPosLimitsPenaltyRatio(env, entity=robot, joints=slice(0, 1))().tolist() == [0, 0, 0]
 
 
-def test_soft_limits_are_drawn_in_about_the_middle(tmp_path):
+def test_soft_limits_shrink_around_middle(tmp_path):
     robot = {"robot": {"model": "critter.xml", "soft_joint_pos_limit_factor": 0.5,
                        "joints": {".*": {"kp": 20.0}, "hip_fl": {"range": [-0.2, 1.0]}}}}  # fmt: skip
     env = build(critter(tmp_path, edited(CRITTER_TASK, scene={"entities": robot})), 2)

@@ -1,4 +1,4 @@
-"""Every term of the library gives what is worked out by hand, in environments that differ in everything."""
+"""Every term of the library gives the values computed by hand, in environments with different states."""
 
 import ast
 import inspect
@@ -25,8 +25,8 @@ def env(tmp_path_factory):
 
 
 def value_of(env, term, kwargs):
-    given = bound(env, kwargs, sensors())
-    return term(env, **given)() if inspect.isclass(term) else term(env, **given)
+    params = bound(env, kwargs, sensors())
+    return term(env, **params)() if inspect.isclass(term) else term(env, **params)
 
 
 def name_of(row):
@@ -34,7 +34,7 @@ def name_of(row):
 
 
 @pytest.mark.parametrize(("term", "kwargs", "expected"), OBSERVATIONS, ids=map(name_of, OBSERVATIONS))
-def test_an_observation(env, term, kwargs, expected):
+def test_observation_matches_hand_computed_value(env, term, kwargs, expected):
     value = value_of(env, term, kwargs)
     by_hand = np.array([expected(s) for s in states()])
     assert value.dtype == torch.float32
@@ -43,39 +43,39 @@ def test_an_observation(env, term, kwargs, expected):
 
 
 @pytest.mark.parametrize(("term", "kwargs", "expected"), REWARDS, ids=map(name_of, REWARDS))
-def test_a_reward(env, term, kwargs, expected):
+def test_reward_matches_hand_computed_value(env, term, kwargs, expected):
     value = value_of(env, term, kwargs)
     assert value.shape == (3,)
     np.testing.assert_allclose(value.float().numpy(), [expected(s) for s in states()], rtol=2e-5, atol=3e-6)
 
 
-JUDGED = [*TERMINATIONS, *SUCCESS]
+CONDITIONS = [*TERMINATIONS, *SUCCESS]
 
 
-@pytest.mark.parametrize(("term", "kwargs", "expected"), JUDGED, ids=map(name_of, JUDGED))
-def test_a_termination_or_success(env, term, kwargs, expected):
+@pytest.mark.parametrize(("term", "kwargs", "expected"), CONDITIONS, ids=map(name_of, CONDITIONS))
+def test_termination_or_success_matches_hand_computed_value(env, term, kwargs, expected):
     value = value_of(env, term, kwargs)
     assert value.dtype == torch.bool
     assert value.tolist() == [bool(expected(s)) for s in states()]
 
 
 @pytest.mark.parametrize("row", ROWS, ids=map(name_of, ROWS))
-def test_the_numbers_tell_environments_apart(row):
-    """A row whose value is the same everywhere would show little, but for one that is 0 by nature."""
+def test_expected_values_differ_between_envs(row):
+    """A row with the same value everywhere would test little; some terms are 0 by nature."""
     values = np.array([np.broadcast_to(row[2](s), np.shape(row[2](s))) for s in states()], dtype=float)
     same = np.allclose(values, values[0])
     assert not same or name_of(row) in {"ProgressReward", "time_out", "joint_pos_limit_normalized"}
 
 
 FORCES = {"body_lin_acc_l2", "body_incoming_wrench"}
-"""Terms of forces on bodies: worked out on a pendulum, below."""
+"""Terms of body forces: tested with a pendulum below."""
 PICTURES = {"image"}
-"""Terms of cameras: worked out in test_pictures.py."""
+"""Terms of cameras: tested in test_pictures.py."""
 EPISODES = {"velocity_tracked_on_average"}
-"""Terms of a whole episode: worked out in tests/managers/test_commands_and_curriculum.py."""
+"""Terms of whole episodes: tested in tests/managers/test_commands_and_curriculum.py."""
 
 
-def test_every_term_of_the_library_is_worked_out_by_hand():
+def test_all_library_terms_are_in_the_table():
     tabled = {"observations": OBSERVATIONS, "rewards": REWARDS, "terminations": TERMINATIONS, "success": SUCCESS}
     for section, rows in tabled.items():
         named = {name_of(row) for row in rows} | FORCES | PICTURES | EPISODES
@@ -84,7 +84,7 @@ def test_every_term_of_the_library_is_worked_out_by_hand():
         assert terms <= named, terms - named
 
 
-def test_every_docstring_begins_with_what_the_term_is_and_says_its_shape():
+def test_docstrings_of_terms_have_shapes():
     for section in ("observations", "rewards", "terminations", "success"):
         for file in {term.file for term in builtin_terms(section).values()}:
             for node in ast.parse(file.read_text()).body:
@@ -93,7 +93,7 @@ def test_every_docstring_begins_with_what_the_term_is_and_says_its_shape():
                     assert "(num_envs," in text, node.name
 
 
-def test_terms_do_not_write_to_what_they_read(env):
+def test_terms_do_not_modify_state(env):
     read = ("qpos", "qvel", "qacc", "qfrc_actuator", "sensordata", "xpos", "xquat", "cvel", "site_xpos", "ctrl")
     watched = {name: env.engine.field(name).clone() for name in read}
     made = sensors()
@@ -101,8 +101,8 @@ def test_terms_do_not_write_to_what_they_read(env):
     data = env.entities["robot"].data
     cached = [data.body_lin_vel_w.clone(), data.site_lin_vel_w.clone(), data.projected_gravity_b.clone()]
     for term, kwargs, _ in ROWS:
-        given = bound(env, kwargs, made)
-        _ = term(env, **given)() if inspect.isclass(term) else term(env, **given)
+        params = bound(env, kwargs, made)
+        _ = term(env, **params)() if inspect.isclass(term) else term(env, **params)
     assert all(torch.equal(values, env.engine.field(name)) for name, values in watched.items())
     for part, was in zip(made.values(), before, strict=True):
         assert all(torch.equal(getattr(part, key), value) for key, value in was.items())
@@ -127,7 +127,7 @@ SWING = {
 
 
 @pytest.mark.parametrize("engine", ["batch", "warp"])
-def test_the_wrench_at_a_joint_and_accelerations_are_newtons(tmp_path, engine):
+def test_joint_wrench_and_acceleration_follow_newton(tmp_path, engine):
     """A pendulum of 2 kg, 0.5 m from its joint; the angle is below the horizontal."""
     env = build(write(tmp_path / "swing", edited("{}", **SWING), arm_xml=PENDULUM), 3, f"sim.engine={engine}")
     env.reset()
@@ -139,7 +139,7 @@ def test_the_wrench_at_a_joint_and_accelerations_are_newtons(tmp_path, engine):
     along, across = np.stack([np.cos(angle), -np.sin(angle)]), np.stack([-np.sin(angle), -np.cos(angle)])  # x, z
     centre = length * (turning * across - rate**2 * along)
     force = m * (centre + np.array([[0.0], [g]]))
-    # in the arm's frame x lies along it, and z points up, against `across`
+    # the arm's frame: x along the arm, z up, against `across`
     np.testing.assert_allclose(wrench[:, 0], (force * along).sum(axis=0), rtol=2e-4, atol=5e-3)
     np.testing.assert_allclose(wrench[:, 2], -(force * across).sum(axis=0), rtol=2e-4, atol=5e-3)
     np.testing.assert_allclose(wrench[:, [1, 3, 4, 5]], 0.0, atol=2e-2)  # a free hinge holds no torque about y
@@ -152,7 +152,7 @@ FALLING = '<mujoco><worldbody><body name="b"><freejoint/><geom size="0.1" mass="
 
 
 @pytest.mark.parametrize("engine", ["batch", "warp"])
-def test_a_falling_and_spinning_body_accelerates_by_gravity_and_its_edge_inwards_too(tmp_path, engine):
+def test_spinning_body_acceleration_is_gravity_plus_centripetal(tmp_path, engine):
     task = {**SWING, "observations": {"policy": {"z": {"func": "base_pos_z"}}},
             "rewards": {"acc": {"func": "body_lin_acc_l2", "weight": 1.0, "bodies": "b"}}}  # fmt: skip
     env = build(write(tmp_path / "fall", edited("{}", **task), arm_xml=FALLING), 3, f"sim.engine={engine}")
@@ -160,7 +160,7 @@ def test_a_falling_and_spinning_body_accelerates_by_gravity_and_its_edge_inwards
     env.engine.field("qvel")[:, 5] = torch.tensor([0.0, 2.0, -4.0]).to(env.engine.field("qvel").dtype)
     result = env.step(torch.zeros(3, 1))
     acceleration = env.entities["robot"].data.body_lin_acc_w.numpy()
-    out = 0.3 * 1.0 / 1.001  # from the common centre of mass
+    out = 0.3 * 1.0 / 1.001  # relative to the common centre of mass
     np.testing.assert_allclose(acceleration[:, 0, 2], -9.81, rtol=1e-4)
     inward = np.array([0.0, 4.0, 16.0])
     np.testing.assert_allclose(acceleration[:, 1, 0], -out * inward, atol=2e-3)
@@ -168,7 +168,7 @@ def test_a_falling_and_spinning_body_accelerates_by_gravity_and_its_edge_inwards
     np.testing.assert_allclose(result.reward.numpy(), expected * env.step_dt, rtol=1e-3)
 
 
-def test_forces_of_bodies_without_a_sensor_for_them_are_refused_with_what_to_do(tmp_path):
+def test_body_forces_without_sensor_error_has_hint(tmp_path):
     code = "def mine(env, *, entity: Entity = 'robot'):\n    return entity.data.body_lin_acc_w[:, 0, 0]\n"
     task = {**SWING, "observations": {"policy": {"pos": {"func": "joint_pos"}}},
             "rewards": {"x": {"func": "mine", "weight": 1.0}}}  # fmt: skip
@@ -184,7 +184,7 @@ def len_like(env):
     return env
 
 
-def test_action_acceleration_is_the_second_difference_and_starts_anew_with_an_episode(env):
+def test_action_acc_l2_is_second_difference_within_episode(env):
     put(env)
     term = rewards.ActionAccL2(env)
     manager = env.action_manager
@@ -196,9 +196,9 @@ def test_action_acceleration_is_the_second_difference_and_starts_anew_with_an_ep
         expected = 4 * (step**2 - 2 * float(history[-1][0, 0]) + float(history[-2][0, 0])) ** 2
         assert term().tolist() == [expected] * 3
         history.append(action)
-    everyone = env._select_all()
+    all_envs = env._select_all()
     state = term.state_dict()
-    term.reset(everyone)
+    term.reset(all_envs)
     manager.prev_action.zero_()
     manager.action.fill_(1.0)
     assert term().tolist() == [4.0] * 3
@@ -207,7 +207,7 @@ def test_action_acceleration_is_the_second_difference_and_starts_anew_with_an_ep
     put(env)
 
 
-def test_a_swing_is_judged_by_its_highest_point_when_the_foot_comes_down(env):
+def test_feet_swing_height_uses_peak_at_touchdown(env):
     put(env)
     made = sensors()
     term = rewards.FeetSwingHeight(env, **bound(env, {
@@ -216,7 +216,7 @@ def test_a_swing_is_judged_by_its_highest_point_when_the_foot_comes_down(env):
     feet = made["feet"]
     feet.first_contact[:], feet.found[:] = False, False
     qpos, high = env.engine.field("qpos"), {}
-    for lift in (0.0, 0.7, 0.1):  # up and down again
+    for lift in (0.0, 0.7, 0.1):  # lift and touch down
         qpos[1, 2] = states()[1].pos[2] + lift
         env.engine.forward(env._select_all())
         env.sim.refresh()
@@ -226,11 +226,11 @@ def test_a_swing_is_judged_by_its_highest_point_when_the_foot_comes_down(env):
     peaks = [max(0.0, *(float(values[i]) for values in high.values())) for i in range(4)]
     assert float(term()[1]) == pytest.approx(sum((peak / 0.5 - 1) ** 2 for peak in peaks), rel=1e-5)
     feet.first_contact[1], feet.found[1] = False, False
-    assert float(term()[1]) == 0.0, "begun anew"
+    assert float(term()[1]) == 0.0, "reset"
     put(env)
 
 
-def test_terms_say_what_does_not_fit_together(env):
+def test_mismatched_parameters_raise_value_error(env):
     made = sensors()
     with pytest.raises(ValueError, match="3 elements, the sensor has 4"):
         rewards.feet_slide(env, **bound(env, {"entity": "robot", "bodies": "leg_[fb]l|torso", "sensor": "feet"}, made))
@@ -249,8 +249,8 @@ def test_terms_say_what_does_not_fit_together(env):
         rewards.Posture(env, entity=env.entities["robot"], joints=slice(0, 4), std=[1.0, 2.0, 3.0])
 
 
-def test_what_an_actuator_model_withholds_is_its_own_limits(tmp_path):
-    """A PD controller of 30 N m/rad with a limit of 4 N m, 0.3 rad from its target: 9 N m asked, 5 withheld."""
+def test_withheld_effort_uses_limits_of_actuator_model(tmp_path):
+    """A PD controller of 30 N m/rad with a limit of 4 N m, 0.3 rad from its target: 9 N m wanted, 5 withheld."""
     robot = {"model": "arm.xml", "actuators": {"pd": {"kind": "pd", "joints": "swing", "stiffness": 30.0,
                                                       "damping": 0.0, "effort_limit": 4.0}}}  # fmt: skip
     rewards_of = {"limits": {"func": "applied_torque_limits", "weight": 1.0}}

@@ -1,4 +1,4 @@
-"""Every term runs recorded on a GPU: it reads nothing back, makes no tensor of Python's numbers, and agrees."""
+"""Every term can be captured on a GPU: no host reads, no new tensors of Python numbers, and the same values."""
 
 import contextlib
 import copy
@@ -24,14 +24,14 @@ def both(tmp_path_factory):
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0].__name__)
-def test_a_term_can_be_recorded_and_gives_the_cpu_engines_value(both, row):
+def test_captured_term_matches_cpu_engine(both, row):
     term, kwargs, _ = row
     values = []
     for env in both:
-        given = bound(env, kwargs, sensors())
-        call = term(env, **given) if inspect.isclass(term) else lambda env=env, given=given: term(env, **given)
+        params = bound(env, kwargs, sensors())
+        call = term(env, **params) if inspect.isclass(term) else lambda env=env, params=params: term(env, **params)
         first = call().clone()
-        env.sim.stamp += 1  # nothing is remembered from the first call
+        env.sim.stamp += 1  # without a memory of the first call
         with HostSyncGuard() if env.engine.asynchronous else contextlib.nullcontext():
             again = call()
         assert torch.equal(first, again) or term is rewards.ActionAccL2
@@ -40,22 +40,22 @@ def test_a_term_can_be_recorded_and_gives_the_cpu_engines_value(both, row):
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0].__name__)
-def test_a_term_gives_an_environment_the_same_bits_whatever_their_number(both, row):
+def test_term_is_bit_identical_for_any_num_envs(both, row):
     term, kwargs, _ = row
     env = both[0]
-    given = bound(env, kwargs, sensors())
-    value = (term(env, **given)() if inspect.isclass(term) else term(env, **given)).clone()
+    params = bound(env, kwargs, sensors())
+    value = (term(env, **params)() if inspect.isclass(term) else term(env, **params)).clone()
     again = []
-    for count in (1, 2, 37):  # the same arithmetic on rows that are repeated
+    for count in (1, 2, 37):  # the same arithmetic on repeated rows
         repeated = _Repeated(env, count)
-        given = bound(repeated, kwargs, {name: repeated.of(part) for name, part in sensors().items()})
-        again.append((term(repeated, **given)() if inspect.isclass(term) else term(repeated, **given)).clone())
+        params = bound(repeated, kwargs, {name: repeated.of(part) for name, part in sensors().items()})
+        again.append((term(repeated, **params)() if inspect.isclass(term) else term(repeated, **params)).clone())
         assert len(again[-1]) == 3 * count
         assert (again[-1].view(count, *value.shape) == value).all()
 
 
 class _Repeated:
-    """The environment with all rows of its state repeated."""
+    """Environment whose rows are those of another environment, repeated."""
 
     def __init__(self, env, count):
         self.count, self.num_envs = count, env.num_envs * count
@@ -92,7 +92,7 @@ class _Repeated:
         return new
 
 
-def test_the_detector_sees_what_a_graph_cannot_record():
+def test_detector_finds_uncapturable_operations():
     values = torch.arange(4.0)
     readings = [
         lambda: values[values > 1],
@@ -120,7 +120,7 @@ BOX = """<mujoco><worldbody><body name="b" pos="0 0 0.1"><freejoint/><geom size=
 </mujoco>"""
 
 
-def test_steps_with_terms_of_forces_on_bodies_are_recorded(tmp_path):
+def test_steps_with_body_force_terms_are_captured(tmp_path):
     env = build(write(tmp_path / "box", edited(FORCES), box_xml=BOX))
     env.reset()
     action = torch.ones(3, 1)
@@ -132,7 +132,7 @@ def test_steps_with_terms_of_forces_on_bodies_are_recorded(tmp_path):
     assert observations.body_incoming_wrench.reads_body_forces
 
 
-def test_a_task_with_every_term_and_real_sensors_and_commands_is_recorded(tmp_path):
+def test_task_with_every_term_is_captured(tmp_path):
     rows = {"observations": OBSERVATIONS, "rewards": REWARDS, "terminations": TERMINATIONS}
     folder = write(tmp_path / "all", whole_task(rows, engine="warp"), **FILES)
     env = build(folder, 3, "episode_length_s=0.1")
@@ -146,7 +146,7 @@ def test_a_task_with_every_term_and_real_sensors_and_commands_is_recorded(tmp_pa
     assert all(r.reward.isfinite().all() and r.obs["policy"].isfinite().all() for r in results)
 
 
-def test_a_task_with_every_term_lives_the_same_life_whatever_the_number_of_environments(tmp_path):
+def test_task_with_every_term_is_independent_of_num_envs(tmp_path):
     rows = {"observations": OBSERVATIONS, "rewards": REWARDS, "terminations": []}
     folder = write(tmp_path / "all", whole_task(rows), **FILES)
     few, many = build(folder, 2, "episode_length_s=0.1"), build(folder, 19, "episode_length_s=0.1")

@@ -1,6 +1,6 @@
-"""A state of three environments, in plain numbers, and what follows from it by hand: rotations, positions, velocities.
+"""States of three environments in plain numbers, and values that follow from them: rotations, positions, velocities.
 
-Nothing of rlcli is used here: what terms give is compared with this.
+This module does not use rlcli: tests compare terms with it.
 """
 
 from dataclasses import dataclass, field
@@ -12,17 +12,17 @@ import numpy as np
 HIPS = ["hip_fl", "hip_fr", "hip_bl", "hip_br"]
 FEET = ["leg_fl", "leg_fr", "leg_bl", "leg_br"]
 AT = np.array([[0.18, 0.14, 0.0], [0.18, -0.14, 0.0], [-0.18, 0.14, 0.0], [-0.18, -0.14, 0.0]])
-"""Where the hips are on the torso."""
+"""Positions of the hips on the torso [m]."""
 TIP = np.array([0.02, 0.0, -0.25])
-"""Where a foot's site is on its leg."""
+"""Position of a foot's site on its leg [m]."""
 LIMIT = pi / 3
 DEFAULT = np.array([0.1, -0.1, 0.1, -0.1])
 GRAVITY = np.array([[0.0, 0.0, -9.81], [3.0, 0.0, -4.0], [0.0, 0.0, -1.6]])
-"""Each environment has its own."""
+"""Gravity of each environment [m/s^2]."""
 
 
 def turn(axis, angle):
-    """A rotation matrix about x, y or z."""
+    """Return the rotation matrix about x, y or z."""
     c, s = np.cos(angle), np.sin(angle)
     if axis == "x":
         return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
@@ -32,13 +32,13 @@ def turn(axis, angle):
 
 
 def product(a, b):
-    """Of two quaternions."""
+    """Return the product of two quaternions."""
     w, v, x, u = a[0], np.asarray(a[1:]), b[0], np.asarray(b[1:])
     return np.array([w * x - v @ u, *(w * u + x * v + np.cross(v, u))])
 
 
 def quaternion(rpy):
-    """First about x, then y, then z."""
+    """Return the quaternion of a turn about x, then y, then z."""
     parts = [np.array([np.cos(a / 2), *(np.sin(a / 2) * np.eye(3)[i])]) for i, a in enumerate(rpy)]
     return product(parts[2], product(parts[1], parts[0]))
 
@@ -65,7 +65,7 @@ def wrapped(angle):
 
 @dataclass
 class State:
-    """One environment."""
+    """State of one environment."""
 
     index: int
     origin: np.ndarray
@@ -132,7 +132,7 @@ class State:
 
 
 def states():
-    """Three environments that differ in everything."""
+    """Return the states of three environments that differ in everything."""
     a = np.array
     rng = np.random.default_rng(7)
 

@@ -1,4 +1,4 @@
-"""Every term of the library, its parameters, and its value worked out by hand in each of three environments."""
+"""Every term of the library with its parameters, and its value in each of three environments, computed by hand."""
 
 from math import cos, pi
 

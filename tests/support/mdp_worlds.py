@@ -1,4 +1,4 @@
-"""A world of a walker, an arm, a thing and a cabinet, and how it is put into a state given in numbers."""
+"""A scene of a walker, an arm, an object and a cabinet, and functions that set its state."""
 
 from types import SimpleNamespace
 
@@ -78,7 +78,7 @@ FILES = {"walker_xml": WALKER, "arm_xml": ARM, "thing_xml": THING, "cabinet_xml"
 
 
 def hand_made(folder, *overrides, num_envs=3):
-    """Environments in the three states of `mdp_numbers`, in turn."""
+    """Build environments in the three states of `mdp_numbers`, in turn."""
     env = build(write(folder / "hand", TASK, **FILES), num_envs, *overrides)
     env.reset()
     put(env)
@@ -86,7 +86,7 @@ def hand_made(folder, *overrides, num_envs=3):
 
 
 def put(env):
-    """Write the numbers into the engine and the managers."""
+    """Write the state into the engine and the managers."""
     three, field = states(), env.engine.field
     some = [three[i % 3] for i in range(env.num_envs)]
     model = env.engine.model
@@ -139,7 +139,7 @@ def stacked(values):
 
 
 def sensors(num_envs=3):
-    """What contact and ray sensors, and commands, would hold, as the tensors that terms read."""
+    """Return the values of contact and ray sensors, and commands, as the tensors that terms read."""
     three = states()
     some = [three[i % 3] for i in range(num_envs)]
     feet = {name: stacked([getattr(s.feet, name) for s in some]) for name in vars(some[0].feet)}
@@ -156,22 +156,22 @@ def sensors(num_envs=3):
 
 
 def bound(env, kwargs, made):
-    """Parameters as the YAML has them -> what the term is given."""
-    given = dict(kwargs)
+    """Resolve parameters of the YAML to those that the term gets."""
+    params = dict(kwargs)
     for name in ("entity", "object", "cabinet", "goal"):
-        if name in given:
-            given[name] = env.entities[given[name]]
+        if name in params:
+            params[name] = env.entities[params[name]]
     for name in ("joints", "bodies", "sites", "sensors"):
-        if name in given:
-            given[name] = given["entity"].select(name.capitalize(), given[name])[0]
+        if name in params:
+            params[name] = params["entity"].select(name.capitalize(), params[name])[0]
     for name in ("command", "sensor"):
-        if name in given:
-            given[name] = made[given[name]]
-    return given
+        if name in params:
+            params[name] = made[params[name]]
+    return params
 
 
 def whole_task(rows, **sim):
-    """A task that uses rows of the table by their names and parameters, with real commands and sensors."""
+    """Return a task that uses rows of the table by name, with real commands and sensors."""
     task = yaml.safe_load(TASK)
     task["sim"] |= sim
     task["scene"]["ground"] = {"size": 50.0}

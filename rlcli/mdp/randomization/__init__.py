@@ -1,10 +1,10 @@
-"""Randomisation of the model: every environment gets masses, friction, gains, ... of its own.
+"""Event terms that randomise the model: masses, friction, gains, ... differ between environments.
 
-Every term draws anew from the value that the compiled model has, so that what was drawn before never adds up:
-`operation: add` is original + draw, `scale` original x draw, `set` the draw itself. `range` is `[low, high]` of the
-distributions uniform and loguniform, and `[mean, std]` of gaussian; a list of pairs gives one to each axis, and a
-curriculum may move them. Axes are drawn each for itself, and so are the elements, unless `shared` gives all of
-them one draw. What cannot be negative is kept from it.
+Each draw is relative to the value in the compiled model, so repeated draws do not add up. `operation: add` gives
+original + draw, `scale` gives original x draw, `set` gives the draw itself. `range` is `[low, high]` for the
+distributions `uniform` and `loguniform`, and `[mean, std]` for `gaussian`. A list of pairs has one pair for each axis.
+A curriculum may change ranges. Axes and elements are drawn independently; with `shared` all elements get the same draw.
+Values that cannot be negative are clipped.
 """
 
 from rlcli.mdp.randomization.actuators import *

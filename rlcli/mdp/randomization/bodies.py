@@ -25,7 +25,7 @@ from rlcli.sim.selection import Selection
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeBodyMass(Randomization, BodyTerm):
-    """Masses of bodies [kg]; their inertias are scaled alike, unless `with_inertia` is false."""
+    """Random masses of bodies [kg]. The inertias are scaled by the same factor, unless `with_inertia` is false."""
 
     model_field = "body_mass"
     lowest = SMALLEST
@@ -34,15 +34,15 @@ class RandomizeBodyMass(Randomization, BodyTerm):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        massless = (self.target.original[:, 0] == 0).tolist()
-        if self.with_inertia and any(massless):
+        is_massless = (self.target.original[:, 0] == 0).tolist()
+        if self.with_inertia and any(is_massless):
             bodies = element_names(self.entity, "Bodies", self.bodies)
-            names = [name for name, none in zip(bodies, massless, strict=True) if none]
+            names = [name for name, massless in zip(bodies, is_massless, strict=True) if massless]
             raise NameProblem(f"no mass to change on {listing(names)}", "choose other bodies, or with_inertia: false")
         self._inertia = ModelField(self.entity, "body_inertia", self.bodies) if self.with_inertia else None
 
     def __call__(self, selection: Selection) -> None:
-        """Draw anew for the selected environments."""
+        """Draw new masses for the selected environments."""
         mass = self.draw(selection, self.target.original)
         self.target.write(selection, mass)
         if self._inertia is not None:
@@ -51,20 +51,20 @@ class RandomizeBodyMass(Randomization, BodyTerm):
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeBodyCom(AxisRandomization, BodyTerm):
-    """Centres of mass of bodies, in the body's frame [m]."""
+    """Random centres of mass of bodies, in the body's frame [m]."""
 
     model_field = "body_ipos"
 
     @staticmethod
     def prepare(spec: mujoco.MjSpec, params: dict[str, Any]) -> None:
-        """Have MuJoCo compile the bodies as ones whose mass may lie anywhere."""
+        """Clear the bodies' `simple` flag, with which MuJoCo assumes the centre of mass at the frame's origin."""
         for body in matching_elements(spec.bodies, params, "bodies", "body"):
             body.simple = 0
 
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeBodyInertia(FieldRandomization, BodyTerm):
-    """Principal moments of inertia of bodies [kg m^2], the three of a body by one factor."""
+    """Random factors of the principal moments of inertia of bodies [kg m^2], one factor for each body."""
 
     model_field = "body_inertia"
     lowest = SMALLEST
@@ -77,21 +77,24 @@ class RandomizeBodyInertia(FieldRandomization, BodyTerm):
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeBodyPos(AxisRandomization, BodyTerm):
-    """Positions of bodies, in the frame of their parent [m]; a floating root's is its reset's."""
+    """Random positions of bodies, in the frame of their parent [m].
+
+    A floating root is placed by its reset event, not by this term.
+    """
 
     model_field = "body_pos"
 
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeBodyQuat(OrientationRandomization, BodyTerm):
-    """Orientations of bodies, turned about their own axes by roll, pitch and yaw [rad]."""
+    """Random turns of bodies about their own axes: roll, pitch and yaw [rad]."""
 
     model_field = "body_quat"
 
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeGravity(FieldRandomization):
-    """Gravity, world frame [m/s^2]; the direction that observations see follows."""
+    """Random gravity, world frame [m/s^2]. Observations of the direction of gravity follow it."""
 
     model_field = "opt.gravity"
 

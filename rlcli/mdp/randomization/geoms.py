@@ -13,7 +13,7 @@ from rlcli.mdp.randomization_base import (
     AxisRandomization,
     OrientationRandomization,
     matching_elements,
-    require_able,
+    require_supported,
 )
 from rlcli.mdp.term import GeomTerm, PairTerm, SiteTerm
 from rlcli.sim.selection import Columns
@@ -21,11 +21,11 @@ from rlcli.sim.selection import Columns
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeGeomFriction(AxisRandomization, GeomTerm):
-    """Friction of geoms: axis 0 slides, 1 spins [m], 2 rolls [m]; it prevails over that of what they touch.
+    """Random friction of geoms: axis 0 is sliding, axis 1 torsional [m], axis 2 rolling [m].
 
-    MuJoCo takes the larger friction of two geoms of equal priority, so that a lower one would change nothing: the
-    chosen geoms get a higher priority than all others, unless `prevail` is false. With it their `condim`, `solref` and
-    `solimp` hold, too.
+    In a contact of two geoms with equal priority MuJoCo uses the larger friction, so a lower one would have no effect.
+    With `prevail` the chosen geoms therefore get a higher priority than all others. In their contacts their `condim`,
+    `solref` and `solimp` then hold, too.
     """
 
     model_field = "geom_friction"
@@ -37,7 +37,7 @@ class RandomizeGeomFriction(AxisRandomization, GeomTerm):
 
     @staticmethod
     def prepare(spec: mujoco.MjSpec, params: dict[str, Any]) -> None:
-        """Raise the priority of the chosen geoms."""
+        """Raise the priority of the chosen geoms above that of all others."""
         if params["prevail"]:
             chosen = matching_elements(spec.geoms, params, "geoms", "geom")
             names = {geom.name for geom in chosen}
@@ -48,7 +48,10 @@ class RandomizeGeomFriction(AxisRandomization, GeomTerm):
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeGeomSize(AxisRandomization, GeomTerm):
-    """Sizes of geoms [m], the values of a geom by one draw; meshes, height fields and planes have none."""
+    """Random sizes of geoms [m], one draw for all numbers of a geom.
+
+    Meshes, height fields and planes have no size to change.
+    """
 
     model_field = "geom_size"
     lowest = SMALLEST
@@ -63,35 +66,38 @@ class RandomizeGeomSize(AxisRandomization, GeomTerm):
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeGeomPos(AxisRandomization, GeomTerm):
-    """Positions of geoms, in the frame of the body they belong to [m]."""
+    """Random positions of geoms, in the frame of their body [m]."""
 
     model_field = "geom_pos"
 
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeGeomQuat(OrientationRandomization, GeomTerm):
-    """Orientations of geoms, turned about their own axes by roll, pitch and yaw [rad]."""
+    """Random turns of geoms about their own axes: roll, pitch and yaw [rad]."""
 
     model_field = "geom_quat"
 
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeSitePos(AxisRandomization, SiteTerm):
-    """Positions of sites, in the frame of the body they belong to [m]."""
+    """Random positions of sites, in the frame of their body [m]."""
 
     model_field = "site_pos"
 
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeSiteQuat(OrientationRandomization, SiteTerm):
-    """Orientations of sites, turned about their own axes by roll, pitch and yaw [rad]."""
+    """Random turns of sites about their own axes: roll, pitch and yaw [rad]."""
 
     model_field = "site_quat"
 
 
 @dataclass(kw_only=True, eq=False)
 class RandomizePairFriction(AxisRandomization, PairTerm):
-    """Friction of contact pairs that the MJCF names: axes 0 and 1 slide, 2 spins [m], 3 and 4 roll [m]."""
+    """Random friction of the contact pairs in the MJCF.
+
+    Axes 0 and 1 are sliding, axis 2 is torsional [m], axes 3 and 4 are rolling [m].
+    """
 
     model_field = "pair_friction"
     lowest = 0.0
@@ -103,5 +109,6 @@ class RandomizePairFriction(AxisRandomization, PairTerm):
 def _require_sized(entity: Entity, geoms: Columns) -> None:
     shapeless = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_MESH)
     types = entity.engine.model.geom_type[entity.geom_ids]
-    good = [int(kind) not in map(int, shapeless) for kind in types]
-    require_able(entity, "Geoms", geoms, good, "cannot change its size", "boxes, spheres, capsules, ... can")
+    sized = [int(kind) not in map(int, shapeless) for kind in types]
+    hint = "choose boxes, spheres, capsules, ellipsoids or cylinders"
+    require_supported(entity, "Geoms", geoms, sized, "cannot change its size", hint)

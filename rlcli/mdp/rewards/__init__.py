@@ -1,4 +1,4 @@
-"""Reward terms, unsigned and unweighted: the YAML's `weight` gives sign and size. (num_envs,) each."""
+"""Reward terms, without sign and weight: `weight` in the YAML gives both. (num_envs,) each."""
 
 from rlcli.mdp.rewards.base import *
 from rlcli.mdp.rewards.feet import *

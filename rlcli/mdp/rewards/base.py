@@ -2,115 +2,123 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from rlcli.mdp.parameters import Command, Entity, RaySensor
-from rlcli.mdp.term_helpers import asked_speed, vector
+from rlcli.mdp.parameters import Command, Entity, ManagedEnv, RaySensor
+from rlcli.mdp.term import EntityTerm, Term
+from rlcli.mdp.term_helpers import commanded_speed, constant
 from rlcli.sim.rotations import length, roll_pitch_yaw
-from rlcli.sim.selection import Columns, Selection
+from rlcli.sim.selection import Selection
 from rlcli.sim.tensor_state import TensorState
 from rlcli.task import Bodies, Sensors, reads_body_forces
 
-if TYPE_CHECKING:
-    from rlcli.envs.managed import ManagedEnv
-
 
 def is_alive(env: ManagedEnv) -> Tensor:
-    """1 unless the episode was terminated in this step; 1 on a time-out. (num_envs,)"""
+    """1 unless the episode was terminated in this step. A time-out counts as alive. (num_envs,)"""
     return ~env.termination_manager.terminated
 
 
 def is_terminated(env: ManagedEnv) -> Tensor:
-    """1 where the episode was terminated in this step; 0 on a time-out. (num_envs,)"""
+    """1 where the episode was terminated in this step. A time-out does not count. (num_envs,)"""
     return env.termination_manager.terminated
 
 
 def lin_vel_z_l2(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
-    """Squared vertical velocity of the root, in its own frame [m^2/s^2]. (num_envs,)"""
+    """Square of the vertical velocity of the root, in its own frame [m^2/s^2]. (num_envs,)"""
     return entity.data.root_lin_vel_b[:, 2].square()
 
 
 def ang_vel_xy_l2(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
-    """Squared roll and pitch rates of the root, in its own frame [rad^2/s^2]. (num_envs,)"""
+    """Sum of the squared roll and pitch rates of the root, in its own frame [rad^2/s^2]. (num_envs,)"""
     return entity.data.root_ang_vel_b[:, :2].square().sum(dim=1)
 
 
 def flat_orientation_l2(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
-    """Squared horizontal part of gravity's direction in the root's frame: 0 upright, 1 on its side. (num_envs,)"""
+    """g_x^2 + g_y^2 of gravity's direction g in the root's frame: 0 upright, 1 lying on its side. (num_envs,)"""
     return entity.data.projected_gravity_b[:, :2].square().sum(dim=1)
 
 
 def upright_posture_bonus(env: ManagedEnv, *, entity: Entity = "robot", threshold: float) -> Tensor:
-    """1 where the root's up axis is within acos(threshold) of the world's. (num_envs,)"""
+    """1 where the cosine between the root's up axis and the world's is above `threshold`. (num_envs,)"""
     return -entity.data.projected_gravity_b[:, 2] > threshold
 
 
 def move_to_target_bonus(
     env: ManagedEnv, *, entity: Entity = "robot", threshold: float, target: tuple[float, float, float]
 ) -> Tensor:
-    """1 where the root heads for `target` to within acos(threshold), else a share of it. (num_envs,)"""
-    to_target = vector(target, env.device)[:2] + env.origins[:, :2] - entity.data.root_pos_w[:, :2]
+    """1 where the cosine between the root's heading and the way to `target` is above `threshold`. (num_envs,)
+
+    Elsewhere cosine / threshold. target: a point from the environment's origin [m].
+    """
+    to_target = constant(target, env.device)[:2] + env.origins[:, :2] - entity.data.root_pos_w[:, :2]
     forward = entity.data.forward_w
     heading = (forward[:, 0] * to_target[:, 0] + forward[:, 1] * to_target[:, 1]) / _norm_xy(to_target).clamp_(min=1e-9)
     return torch.where(heading > threshold, 1.0, heading / threshold)
 
 
-class ProgressReward(TensorState):
-    """Speed at which the root comes nearer to `target`, horizontally [m/s]. (num_envs,)
+@dataclass(kw_only=True, eq=False)
+class ProgressReward(EntityTerm, TensorState):
+    """Speed at which the horizontal distance from the root to `target` decreases [m/s]. (num_envs,)
 
-    Of the way since the last step, not of two distances: those to a target 1 km away are known to 0.06 mm only, which
-    is 4 mm/s at 60 Hz.
+    target: a point from the environment's origin [m]. The speed is computed from the way since the last step. The
+    difference of two distances would be inexact: 32-bit floats resolve a distance of 1 km to 0.06 mm, which is 4 mm/s
+    at 60 Hz.
     """
 
-    def __init__(self, env: ManagedEnv, *, entity: Entity = "robot", target: tuple[float, float, float]) -> None:
-        self._entity, self._dt = entity, env.step_dt
-        self._origins, self._target = env.origins, vector(target, env.device)[:2]
-        self._position = entity.data.root_pos_w[:, :2].clone()
+    target: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        self._target_xy = constant(self.target, self.env.device)[:2]
+        self._position = self.entity.data.root_pos_w[:, :2].clone()
 
     def __call__(self) -> Tensor:
-        """(num_envs,)"""
-        now = self._entity.data.root_pos_w[:, :2]
-        ahead, ahead_before = self._target_from(now), self._target_from(self._position)
-        # |a| - |b| = (a - b) (a + b) / (|a| + |b|)
-        gained = _dot_xy(now - self._position, ahead + ahead_before)
-        progress = gained / ((_norm_xy(ahead) + _norm_xy(ahead_before)).clamp_(min=1e-9) * self._dt)
-        self._position.copy_(now)
+        """Return the speed. (num_envs,)"""
+        position = self.entity.data.root_pos_w[:, :2]
+        ahead, ahead_before = self._target_from(position), self._target_from(self._position)
+        # |b| - |a| = (b - a) (b + a) / (|b| + |a|), with b - a computed from the short way of one step
+        gained = _dot_xy(position - self._position, ahead + ahead_before)
+        progress = gained / ((_norm_xy(ahead) + _norm_xy(ahead_before)).clamp_(min=1e-9) * self.env.step_dt)
+        self._position.copy_(position)
         return progress
 
     def reset(self, selection: Selection) -> None:
-        """The first step of an episode compares with its start state, which is set by now."""
-        position = selection.read(self._entity.engine.field("qpos"), _xy(self._entity)).float()
+        """Start new episodes at their start positions, which are written already."""
+        # from qpos: the derived positions are computed after all terms are reset
+        first, _ = self.entity.floating()
+        position = selection.read(self.entity.engine.field("qpos"), slice(first, first + 2)).float()
         selection.write(self._position, position)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return where the root was in the last step."""
+        """Return the position of the root in the last step."""
         return {"position": self._position}
 
     def _target_from(self, position: Tensor) -> Tensor:
-        return self._target + self._origins[:, :2] - position
+        return self._target_xy + self.env.origins[:, :2] - position
 
 
 # --- episodes and actions ---
 
 
-class IsTerminatedTerm:
-    """How many of the terminations `terms` ended the episode in this step; 0 on a time-out. (num_envs,)"""
+@dataclass(kw_only=True, eq=False)
+class IsTerminatedTerm(Term):
+    """Number of the terminations `terms` that ended the episode in this step; 0 on a time-out. (num_envs,)"""
 
-    def __init__(self, env: ManagedEnv, *, terms: list[str]) -> None:
-        known = [name for name, config in env.config.terminations.items() if config is not None]
-        for name in terms:
+    terms: list[str]
+
+    def __post_init__(self) -> None:
+        known = [name for name, config in self.env.config.terminations.items() if config is not None]
+        for name in self.terms:
             if name not in known:
                 raise ValueError(f"no termination '{name}'; terminations: {', '.join(known) or 'none'}")
-        self._env, self._terms = env, terms
 
     def __call__(self) -> Tensor:
-        """(num_envs,)"""
-        manager = self._env.termination_manager
+        """Return the number. (num_envs,)"""
+        manager = self.env.termination_manager
         fired = torch.zeros_like(manager.terminated, dtype=torch.float32)
-        for name in self._terms:
+        for name in self.terms:
             fired = fired + manager.fired[name]
         return fired * ~manager.time_outs
 
@@ -121,9 +129,10 @@ class IsTerminatedTerm:
 def base_height_l2(
     env: ManagedEnv, *, entity: Entity = "robot", target_height: float, sensor: RaySensor | None = None
 ) -> Tensor:
-    """Squared deviation of the root's height from `target_height` [m^2]. (num_envs,)
+    """Square of the difference between the root's height and `target_height` [m^2]. (num_envs,)
 
-    target_height: above the environment's origin [m]; with a sensor, above the mean height of what its rays hit.
+    target_height: above the environment's origin [m]; with a sensor, above the mean height of the points that its rays
+    hit.
     """
     ground = env.origins[:, 2] if sensor is None else sensor.hits[:, :, 2].mean(dim=1)
     return (entity.data.root_pos_w[:, 2] - ground - target_height).square_()
@@ -135,23 +144,23 @@ def upright(env: ManagedEnv, *, entity: Entity = "robot", std: float) -> Tensor:
 
 
 def base_motion_penalty(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
-    """0.8 v_z^2 + 0.2 (|w_x| + |w_y|) of the root, in its own frame. (num_envs,)"""
+    """0.8 v_z^2 + 0.2 (|w_x| + |w_y|) of the root, in its own frame [m/s, rad/s]. (num_envs,)"""
     data = entity.data
     return 0.8 * data.root_lin_vel_b[:, 2].square() + 0.2 * data.root_ang_vel_b[:, :2].abs().sum(dim=1)
 
 
 def base_orientation_penalty(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
-    """Size of the horizontal part of gravity's direction in the root's frame: 0 upright, 1 on its side. (num_envs,)"""
+    """sqrt(g_x^2 + g_y^2) of gravity's direction g in the root's frame: 0 upright, 1 on its side. (num_envs,)"""
     return length(entity.data.projected_gravity_b[:, :2])
 
 
 def lin_vel_xyz_exp(env: ManagedEnv, *, entity: Entity = "robot", std: float) -> Tensor:
-    """exp(-|v|^2 / std^2) of the root's velocity; std [m/s]. (num_envs,)"""
+    """exp(-|v|^2 / std^2) of the root's linear velocity v; std [m/s]. (num_envs,)"""
     return _bell(entity.data.root_lin_vel_w.square().sum(dim=1), std)
 
 
 def ang_vel_xyz_exp(env: ManagedEnv, *, entity: Entity = "robot", std: float) -> Tensor:
-    """exp(-|w|^2 / std^2) of the root's angular velocity; std [rad/s]. (num_envs,)"""
+    """exp(-|w|^2 / std^2) of the root's angular velocity w; std [rad/s]. (num_envs,)"""
     return _bell(entity.data.root_ang_vel_b.square().sum(dim=1), std)
 
 
@@ -165,12 +174,12 @@ def yaw_aligned(env: ManagedEnv, *, entity: Entity = "robot", std: float = 0.5) 
 
 @reads_body_forces
 def body_lin_acc_l2(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
-    """Sum of squared accelerations of the bodies' origins over the last substep [m^2/s^4]. (num_envs,)"""
+    """Sum of the squared accelerations of the bodies' origins in the last substep [m^2/s^4]. (num_envs,)"""
     return entity.data.body_lin_acc_w[:, bodies].square().sum(dim=-1).sum(dim=1)
 
 
 def body_angular_velocity_penalty(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies) -> Tensor:
-    """Sum of squared roll and pitch rates of bodies, each in its own frame [rad^2/s^2]. (num_envs,)
+    """Sum of the squared roll and pitch rates of bodies, each in its own frame [rad^2/s^2]. (num_envs,)
 
     mjlab: `body_angular_velocity_penalty`.
     """
@@ -178,7 +187,7 @@ def body_angular_velocity_penalty(env: ManagedEnv, *, entity: Entity = "robot", 
 
 
 def angular_momentum_penalty(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
-    """Sum of squared readings of `subtreeangmom` sensors of the MJCF [kg^2 m^4/s^2]. (num_envs,)
+    """Sum of the squared readings of `subtreeangmom` sensors in the MJCF [kg^2 m^4/s^2]. (num_envs,)
 
     mjlab: `angular_momentum_penalty`.
     """
@@ -189,19 +198,25 @@ def angular_momentum_penalty(env: ManagedEnv, *, entity: Entity = "robot", senso
 
 
 def track_lin_vel_xy_exp(env: ManagedEnv, *, entity: Entity = "robot", command: Command, std: float) -> Tensor:
-    """exp(-|c - v|^2 / std^2) of the plane velocity asked for and the root's, in its frame; std [m/s]. (num_envs,)"""
+    """exp(-|c - v|^2 / std^2) of the commanded and the actual horizontal velocity; std [m/s]. (num_envs,)
+
+    Both are in the root's frame.
+    """
     return _bell((command.command[:, :2] - entity.data.root_lin_vel_b[:, :2]).square_().sum(dim=1), std)
 
 
 def track_ang_vel_z_exp(env: ManagedEnv, *, entity: Entity = "robot", command: Command, std: float) -> Tensor:
-    """exp(-(c_z - w_z)^2 / std^2) of the turn rate asked for and the root's, in its frame; std [rad/s]. (num_envs,)"""
+    """exp(-(c_z - w_z)^2 / std^2) of the commanded and the actual yaw rate; std [rad/s]. (num_envs,)
+
+    Both are in the root's frame.
+    """
     return _bell((command.command[:, 2] - entity.data.root_ang_vel_b[:, 2]).square_(), std)
 
 
 def track_lin_vel_xy_yaw_frame_exp(
     env: ManagedEnv, *, entity: Entity = "robot", command: Command, std: float
 ) -> Tensor:
-    """`track_lin_vel_xy_exp` in the root's heading frame: upright, turned about the vertical only. (num_envs,)"""
+    """`track_lin_vel_xy_exp` in the root's yaw frame: the world frame turned by the root's heading. (num_envs,)"""
     ahead = entity.data.forward_w[:, :2]
     ahead = ahead / length(ahead).clamp_(min=1e-9)[:, None]
     v = entity.data.root_lin_vel_w
@@ -211,7 +226,7 @@ def track_lin_vel_xy_yaw_frame_exp(
 
 
 def track_ang_vel_z_world_exp(env: ManagedEnv, *, entity: Entity = "robot", command: Command, std: float) -> Tensor:
-    """`track_ang_vel_z_exp` with the turn rate about the world's vertical. (num_envs,)"""
+    """`track_ang_vel_z_exp` with the rate about the world's vertical axis. (num_envs,)"""
     return _bell((command.command[:, 2] - entity.data.root_ang_vel_w[:, 2]).square_(), std)
 
 
@@ -237,29 +252,32 @@ def base_linear_velocity_reward(
     ramp_at_vel: float = 1.0,
     ramp_rate: float = 0.5,
 ) -> Tensor:
-    """exp(-|c - v| / std) x max(1, 1 + ramp_rate (|c| - ramp_at_vel)), c and v in the plane; std [m/s]. (num_envs,)"""
+    """exp(-|c - v| / std) max(1, 1 + ramp_rate (|c| - ramp_at_vel)) of horizontal velocities. (num_envs,)
+
+    c: the command, v: the root's velocity in its own frame. std, ramp_at_vel [m/s], ramp_rate [s/m].
+    """
     error = length(command.command[:, :2] - entity.data.root_lin_vel_b[:, :2])
-    factor = (1.0 + ramp_rate * (asked_speed(command) - ramp_at_vel)).clamp_(min=1.0)
+    factor = (1.0 + ramp_rate * (commanded_speed(command) - ramp_at_vel)).clamp_(min=1.0)
     return torch.exp(-error / std) * factor
 
 
 def base_angular_velocity_reward(env: ManagedEnv, *, entity: Entity = "robot", command: Command, std: float) -> Tensor:
-    """exp(-|c_z - w_z| / std) of the turn rate asked for and the root's; std [rad/s]. (num_envs,)"""
+    """exp(-|c_z - w_z| / std) of the commanded and the actual yaw rate; std [rad/s]. (num_envs,)"""
     return torch.exp(-(command.command[:, 2] - entity.data.root_ang_vel_b[:, 2]).abs() / std)
 
 
 def heading_command_error_abs(env: ManagedEnv, *, command: Command) -> Tensor:
-    """Absolute value of the fourth column of a command (x, y, z, heading), the turn still to make [rad]. (num_envs,)"""
+    """Absolute angle to the commanded heading: the fourth column of a command (x, y, z, angle) [rad]. (num_envs,)"""
     return command.command[:, 3].abs()
 
 
 def distance_to_goal_exp(env: ManagedEnv, *, entity: Entity = "robot", command: Command, std: float) -> Tensor:
     """exp(-distance^2 / std^2) from the root to a position command; std [m]. (num_envs,)
 
-    The command is in the environment's frame.
+    The command is a position from the environment's origin [m].
     """
-    way = command.command[:, :3] + env.origins - entity.data.root_pos_w
-    return _bell(way.square_().sum(dim=1), std)
+    offset = command.command[:, :3] + env.origins - entity.data.root_pos_w
+    return _bell(offset.square_().sum(dim=1), std)
 
 
 def _bell(squared: Tensor, std: float) -> Tensor:
@@ -272,8 +290,3 @@ def _dot_xy(left: Tensor, right: Tensor) -> Tensor:
 
 def _norm_xy(vector: Tensor) -> Tensor:
     return (vector[:, 0].square() + vector[:, 1].square()).sqrt_()
-
-
-def _xy(entity: Entity) -> Columns:
-    first, _ = entity.floating()
-    return slice(first, first + 2)

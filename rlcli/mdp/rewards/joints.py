@@ -3,51 +3,47 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from rlcli.mdp.parameters import Command, Entity
+from rlcli.mdp.parameters import Command, Entity, ManagedEnv
 from rlcli.mdp.term import JointTerm
-from rlcli.mdp.term_helpers import asked_speed, is_moving, total
+from rlcli.mdp.term_helpers import commanded_speed, is_moving, sum_columns
 from rlcli.sim.rotations import length
 from rlcli.sim.selection import Selection
 from rlcli.task import Joints
 
-if TYPE_CHECKING:
-    from rlcli.envs.managed import ManagedEnv
-
 
 def joint_pos_target_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", target: float) -> Tensor:
-    """Squared joint deviation from `target` [rad^2], positions wrapped to [-pi, pi]. (num_envs,)"""
+    """Sum of the squared deviations of joints from `target` [rad^2], positions wrapped to [-pi, pi]. (num_envs,)"""
     angle = entity.data.joint_angle_of(joints)
     deviation = angle - target if isinstance(target, Tensor) or target else angle
-    return total(deviation.square())
+    return sum_columns(deviation.square())
 
 
 def joint_vel_l1(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Sum of absolute joint velocities [rad/s]. (num_envs,)"""
-    return total(entity.data.joint_vel_of(joints).abs())
+    """Sum of the absolute joint velocities [rad/s]. (num_envs,)"""
+    return sum_columns(entity.data.joint_vel_of(joints).abs())
 
 
 def joint_vel_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Sum of squared joint velocities [rad^2/s^2]. (num_envs,)"""
-    return total(entity.data.joint_vel_of(joints).square())
+    """Sum of the squared joint velocities [rad^2/s^2]. (num_envs,)"""
+    return sum_columns(entity.data.joint_vel_of(joints).square())
 
 
 def joint_acc_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Sum of squared joint accelerations over the last substep [rad^2/s^4]. (num_envs,)"""
-    return total(entity.data.joint_acc[:, joints].square())
+    """Sum of the squared joint accelerations in the last substep [rad^2/s^4]. (num_envs,)"""
+    return sum_columns(entity.data.joint_acc[:, joints].square())
 
 
 def joint_torques_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Sum of squared actuator efforts on the joints, after their limits [N^2 m^2]. (num_envs,)"""
-    return total(entity.data.applied_effort[:, joints].square())
+    """Sum of the squared actuator efforts on the joints, after their limits [N^2 m^2]. (num_envs,)"""
+    return sum_columns(entity.data.applied_effort[:, joints].square())
 
 
 def joint_pos_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """How far joints are outside their soft limits, summed [rad]. (num_envs,)"""
+    """Sum of the distances of joints beyond their soft limits [rad]. (num_envs,)"""
     position = entity.data.joint_pos_of(joints)
     low, high = entity.data.joint_limits_of(joints, soft=True)
     return ((low - position).clamp_(min=0.0) + (position - high).clamp_(min=0.0)).sum(dim=1)
@@ -55,19 +51,20 @@ def joint_pos_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joint
 
 @dataclass(kw_only=True, eq=False)
 class JointPosLimitsPenaltyRatio(JointTerm):
-    """How far beyond `threshold` of their range joints are, as a share of what is left of it, summed. (num_envs,)
+    """Sum of (|x| - threshold) / (1 - threshold) x gear_ratio over joints with |x| > threshold. (num_envs,)
 
-    gear_ratio: what each joint counts, one for all or one each, in the order of `joints`.
+    x: joint position, scaled to -1 at the lower and 1 at the upper limit; joints without limits do not count.
+    gear_ratio: one for all joints, or one for each in the order of `joints`.
     """
 
     threshold: float = 0.98
     gear_ratio: float | list[float] = 1.0
 
     def __post_init__(self) -> None:
-        self._ratio = _spread(self.gear_ratio, self.entity, self.joints, self.env.device, "gear_ratio")
+        self._ratio = _per_joint(self, self.gear_ratio, "gear_ratio")
 
     def __call__(self) -> Tensor:
-        """(num_envs,)"""
+        """Return the sum. (num_envs,)"""
         low, high = (limit[:, self.joints] for limit in self.entity.data.joint_limits())
         scaled = ((2.0 * self.entity.data.joint_pos_of(self.joints) - low - high) / (high - low)).abs()
         violation = (scaled - self.threshold) / (1.0 - self.threshold)
@@ -78,9 +75,9 @@ class JointPosLimitsPenaltyRatio(JointTerm):
 def joints_at_limit(
     env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", threshold: float = 0.99
 ) -> Tensor:
-    """How many joints are beyond `threshold` of their range, -1 and 1 at the soft limits. (num_envs,)
+    """Count of the joints with |x| > threshold. (num_envs,)
 
-    A joint without limits never is.
+    x: joint position, scaled to -1 at the lower and 1 at the upper soft limit; joints without limits do not count.
     """
     low, high = entity.data.joint_limits_of(joints, soft=True)
     scaled = (2.0 * entity.data.joint_pos_of(joints) - low - high) / (high - low)
@@ -89,18 +86,18 @@ def joints_at_limit(
 
 @dataclass(kw_only=True, eq=False)
 class PowerConsumption(JointTerm):
-    """Sum of |raw action x joint velocity x gear ratio|; `joints` are the driven ones, in the action's order [rad/s].
+    """Sum of |raw action x joint velocity x gear ratio| over joints [rad/s]. (num_envs,)
 
-    gear_ratio: one for all or one each, in the order of `joints`. (num_envs,)
+    joints: the driven ones, in the order of the action. gear_ratio: one for all joints, or one for each.
     """
 
     gear_ratio: float | list[float] = 1.0
 
     def __post_init__(self) -> None:
-        self._ratio = _spread(self.gear_ratio, self.entity, self.joints, self.env.device, "gear_ratio")
+        self._ratio = _per_joint(self, self.gear_ratio, "gear_ratio")
 
     def __call__(self) -> Tensor:
-        """(num_envs,)"""
+        """Return the sum. (num_envs,)"""
         action, velocity = self.env.action_manager.action, self.entity.data.joint_vel_of(self.joints)
         if action.shape != velocity.shape:
             raise ValueError(f"selects {velocity.shape[1]} joints, the action has {action.shape[1]} columns")
@@ -109,24 +106,27 @@ class PowerConsumption(JointTerm):
 
 
 def action_rate_l2(env: ManagedEnv) -> Tensor:
-    """Sum of squared changes of the policy's action. (num_envs,)"""
+    """Sum of the squared changes of the policy's action since the last step. (num_envs,)"""
     return (env.action_manager.action - env.action_manager.prev_action).square_().sum(dim=1)
 
 
 def action_l2(env: ManagedEnv) -> Tensor:
-    """Sum of squares of the policy's action. (num_envs,)"""
+    """Sum of the squares of the policy's action. (num_envs,)"""
     return env.action_manager.action.square().sum(dim=1)
 
 
 class ActionAccL2:
-    """Sum of squared second differences of the policy's action, a - 2 a' + a''. (num_envs,)  mjlab: `action_acc_l2`."""
+    """Sum of the squared second differences a - 2 a' + a'' of the policy's action. (num_envs,)
+
+    mjlab: `action_acc_l2`.
+    """
 
     def __init__(self, env: ManagedEnv) -> None:
         self._env = env
         self._before: Tensor | None = None
 
     def __call__(self) -> Tensor:
-        """(num_envs,)"""
+        """Return the sum. (num_envs,)"""
         action, previous = self._env.action_manager.action, self._env.action_manager.prev_action
         if self._before is None:
             self._before = torch.zeros_like(action)
@@ -135,27 +135,27 @@ class ActionAccL2:
         return change.square_().sum(dim=1)
 
     def reset(self, selection: Selection) -> None:
-        """New episodes begin without past actions."""
+        """Clear the past actions of new episodes."""
         if self._before is not None:
             selection.write(self._before, 0.0)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The action before the previous one."""
+        """Return the action before the previous one."""
         return {"before": self._before.clone()} if self._before is not None else {}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Take back what `state_dict` gave."""
+        """Restore the state returned by `state_dict()`."""
         self._before = state["before"].clone()
 
 
 def action_smoothness_penalty(env: ManagedEnv) -> Tensor:
-    """Size of the change of the policy's action. (num_envs,)"""
+    """Norm of the change of the policy's action since the last step. (num_envs,)"""
     return length(env.action_manager.action - env.action_manager.prev_action)
 
 
 def joint_deviation_l1(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Sum of absolute deviations of joints from their defaults [rad]. (num_envs,)"""
-    return _off_default(entity, joints).abs().sum(dim=1)
+    """Sum of the absolute deviations of joints from their default positions [rad]. (num_envs,)"""
+    return _deviation(entity, joints).abs().sum(dim=1)
 
 
 def stand_still_joint_deviation_l1(
@@ -166,17 +166,14 @@ def stand_still_joint_deviation_l1(
     command: Command,
     command_threshold: float = 0.06,
 ) -> Tensor:
-    """`joint_deviation_l1` [rad] where a velocity command asks for less than `command_threshold` [m/s]. (num_envs,)"""
-    return _off_default(entity, joints).abs().sum(dim=1) * (asked_speed(command) < command_threshold)
+    """`joint_deviation_l1` [rad] where the commanded speed is below `command_threshold` [m/s]. (num_envs,)"""
+    return _deviation(entity, joints).abs().sum(dim=1) * (commanded_speed(command) < command_threshold)
 
 
 def joint_vel_limits(
     env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", soft_ratio: float = 1.0
 ) -> Tensor:
-    """How much faster joints are than `soft_ratio` x their `velocity_limit`, each at most 1, summed. (num_envs,)
-
-    [m/s or rad/s]
-    """
+    """Sum of the joint speeds above `soft_ratio` x `velocity_limit`, each at most 1 [m/s or rad/s]. (num_envs,)"""
     excess = entity.data.joint_vel_of(joints).abs() - entity.data.joint_vel_limits[joints] * soft_ratio
     return excess.clamp_(0.0, 1.0).sum(dim=1)
 
@@ -184,23 +181,24 @@ def joint_vel_limits(
 def joint_velocity_hinge_penalty(
     env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", max_velocity: float
 ) -> Tensor:
-    """Sum of squares of how much faster joints are than `max_velocity` [rad^2/s^2]. (num_envs,)
+    """Sum of the squares of the joint speeds above `max_velocity` [rad^2/s^2]. (num_envs,)
 
-    mjlab: `joint_velocity_hinge_penalty`.
+    max_velocity [rad/s]. mjlab: `joint_velocity_hinge_penalty`.
     """
     return (entity.data.joint_vel_of(joints).abs() - max_velocity).clamp_(min=0.0).square_().sum(dim=1)
 
 
 def applied_torque_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """How much of what actuators were to give their limits withhold, summed [N or N m]. (num_envs,)
+    """Sum of the efforts that actuators withhold because of their limits [N or N m]. (num_envs,)
 
-    MuJoCo's own actuators by the present state and controls. Isaac Lab: explicit actuators only, of the last substep.
+    MuJoCo's own actuators: from the present state and controls. Isaac Lab: explicit actuators only, of the last
+    substep.
     """
     return entity.data.withheld_effort[:, joints].sum(dim=1)
 
 
 def electrical_power_cost(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Mechanical power that actuators put into joints, without what they take out, summed [W]. (num_envs,)
+    """Sum of the positive mechanical power of actuators; braking power does not count [W]. (num_envs,)
 
     mjlab: `electrical_power_cost`.
     """
@@ -209,17 +207,17 @@ def electrical_power_cost(env: ManagedEnv, *, entity: Entity = "robot", joints: 
 
 
 def joint_acceleration_penalty(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Size of the joints' accelerations over the last substep [rad/s^2]. (num_envs,)"""
+    """Norm of the joint accelerations in the last substep [rad/s^2]. (num_envs,)"""
     return length(entity.data.joint_acc[:, joints])
 
 
 def joint_torques_penalty(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Size of the actuators' efforts on the joints, after their limits [N m]. (num_envs,)"""
+    """Norm of the actuator efforts on the joints, after their limits [N m]. (num_envs,)"""
     return length(entity.data.applied_effort[:, joints])
 
 
 def joint_velocity_penalty(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Size of the joints' velocities [rad/s]. (num_envs,)"""
+    """Norm of the joint velocities [rad/s]. (num_envs,)"""
     return length(entity.data.joint_vel_of(joints))
 
 
@@ -232,11 +230,11 @@ def joint_position_penalty(
     stand_still_scale: float,
     velocity_threshold: float,
 ) -> Tensor:
-    """Size of the joints' deviation from their defaults, times `stand_still_scale` at a stand [rad]. (num_envs,)
+    """Norm of the deviations of joints from their defaults, times `stand_still_scale` while standing [rad]. (num_envs,)
 
-    At a stand: nothing is asked, and the root is slower than `velocity_threshold` [m/s].
+    Standing: the command is zero, and the root is slower than `velocity_threshold` [m/s].
     """
-    deviation = length(_off_default(entity, joints))
+    deviation = length(_deviation(entity, joints))
     return torch.where(is_moving(entity, command, velocity_threshold), deviation, stand_still_scale * deviation)
 
 
@@ -244,25 +242,25 @@ def joint_position_penalty(
 class Posture(JointTerm):
     """exp(-mean of (deviation from default / std)^2) over the joints. (num_envs,)  mjlab: `posture`.
 
-    std: how far joints may be off [rad], one for all or one each, in the order of `joints`.
+    std: tolerated deviation [rad], one for all joints or one for each in the order of `joints`.
     """
 
     std: float | list[float]
 
     def __post_init__(self) -> None:
-        self._std = _spread(self.std, self.entity, self.joints, self.env.device)
+        self._std = _per_joint(self, self.std)
 
     def __call__(self) -> Tensor:
-        """(num_envs,)"""
-        return (_off_default(self.entity, self.joints) / self._std).square_().mean(dim=1).neg_().exp_()
+        """Return the exponential. (num_envs,)"""
+        return (_deviation(self.entity, self.joints) / self._std).square_().mean(dim=1).neg_().exp_()
 
 
 @dataclass(kw_only=True, eq=False)
 class VariablePosture(JointTerm):
-    """`posture` with another `std` at a stand, at a walk and at a run. (num_envs,)  mjlab: `variable_posture`.
+    """`posture` with different `std` for standing, walking and running. (num_envs,)  mjlab: `variable_posture`.
 
-    By the speed that a velocity command asks for, in the plane [m/s] and about the vertical [rad/s] added up: below
-    `walking_threshold` at a stand, from `running_threshold` on at a run.
+    The commanded speed decides: the horizontal speed [m/s] plus the yaw rate [rad/s] of a velocity command. Below
+    `walking_threshold` the robot stands, from `running_threshold` on it runs. std: as of `posture` [rad].
     """
 
     command: Command
@@ -274,28 +272,24 @@ class VariablePosture(JointTerm):
 
     def __post_init__(self) -> None:
         stds = (self.std_standing, self.std_walking, self.std_running)
-        self._standing, self._walking, self._running = (
-            _spread(std, self.entity, self.joints, self.env.device) for std in stds
-        )
+        self._standing, self._walking, self._running = (_per_joint(self, std) for std in stds)
 
     def __call__(self) -> Tensor:
-        """(num_envs,)"""
-        speed = (asked_speed(self.command) + self.command.command[:, 2].abs())[:, None]
+        """Return the exponential. (num_envs,)"""
+        speed = (commanded_speed(self.command) + self.command.command[:, 2].abs())[:, None]
         std = torch.where(speed < self.walking_threshold, self._standing, self._walking)
         std = torch.where(speed < self.running_threshold, std, self._running)
-        return (_off_default(self.entity, self.joints) / std).square_().mean(dim=1).neg_().exp_()
+        return (_deviation(self.entity, self.joints) / std).square_().mean(dim=1).neg_().exp_()
 
 
-def _off_default(entity: Entity, joints: Joints) -> Tensor:
+def _deviation(entity: Entity, joints: Joints) -> Tensor:
     return entity.data.joint_pos_of(joints) - entity.data.default_joint_pos_of(joints)
 
 
-def _spread(
-    given: float | list[float] | Tensor, entity: Entity, joints: Joints, device: torch.device, what: str = "std"
-) -> Tensor:
-    """One value a joint. (k,) or (1,)"""
-    count = len(entity.data.joint_vel_limits[joints])
-    values = given if isinstance(given, Tensor) else torch.tensor(given, dtype=torch.float32, device=device)
+def _per_joint(term: JointTerm, value: float | list[float] | Tensor, key: str = "std") -> Tensor:
+    """Return one value for all joints, or one for each. (1,) or (k,)"""
+    count = len(term.entity.data.joint_vel_limits[term.joints])
+    values = value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float32, device=term.env.device)
     if values.dim() and len(values) != count:
-        raise ValueError(f"has {len(values)} values of {what} for {count} joints")
+        raise ValueError(f"has {len(values)} values of {key} for {count} joints")
     return values.view(-1)
