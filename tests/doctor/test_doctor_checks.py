@@ -6,7 +6,7 @@ import os
 import pytest
 
 from rlcli.doctor import isolated_checks
-from rlcli.doctor.installation import installation_checks, unmet
+from rlcli.doctor.installation import installation_checks, violates_bounds
 from rlcli.doctor.isolated_checks import compute_checks, gpu_checks, graphics_check, run_isolated, shared_memory_check
 from rlcli.doctor.machine import machine_checks, memory_check
 from rlcli.doctor.settings import harmful_variables, settings_checks
@@ -50,7 +50,7 @@ def test_a_mujoco_core_of_another_version_is_named_with_both_versions_and_the_me
     check = named(installation_checks())["mujoco packages"]
     assert check.state == "broken"
     assert f"mujoco {mine} needs mujoco-core {mine}, but mujoco-core 3.13.0 is installed" in check.found
-    assert "mujoco-core is there 2 times" in check.found
+    assert "mujoco-core is installed 2 times" in check.found
     assert check.hint == f'pip uninstall -y mujoco mujoco-core mujoco-studio && pip install "mujoco=={mine}"'
 
 
@@ -58,7 +58,7 @@ def test_a_mujoco_from_before_it_was_split_is_found_beside_the_new_one(package):
     package("mujoco", "3.3.0", "numpy")
     check = named(installation_checks())["mujoco packages"]
     assert check.state == "broken"
-    assert "mujoco is there 2 times: 3.3.0 in" in check.found
+    assert "mujoco is installed 2 times: 3.3.0 in" in check.found
     assert "mujoco 3.3.0 does not fit" in named(installation_checks())["packages"].found
 
 
@@ -101,7 +101,7 @@ def test_an_extra_is_there_absent_or_half_installed(package):
     ],
 )
 def test_bounds_of_versions(wanted, found, bad):
-    assert unmet(wanted, found) == bad
+    assert violates_bounds(wanted, found) == bad
 
 
 def test_a_library_of_another_version_than_its_package_is_told():
@@ -188,19 +188,19 @@ WARP = {"version": "1.19.0", "devices": ["H200"], "error": ""}
         (
             {"torch_cuda": "13.0"},
             "warning",
-            "torch is built for CUDA 13.0, the driver offers CUDA 12.9",
+            "torch is built for CUDA 13.0, the driver supports CUDA 12.9",
             "update the driver",
         ),
-        ({"devices": []}, "warning", "torch sees no device", "nvidia-smi"),
+        ({"devices": []}, "warning", "torch finds no device", "nvidia-smi"),
         (
             {"torch_error": ": no kernel image"},
             "warning",
-            "cannot compute there: no kernel image",
+            "cannot compute on it: no kernel image",
             "built for this GPU",
         ),
-        ({"warp": None}, "warning", "without", 'pip install "rlcli[gpu]"'),
-        ({"warp": {**WARP, "devices": []}}, "warning", "Warp 1.19.0 sees no GPU", "warp-lang"),
-        ({"warp": {**WARP, "error": "E: x"}}, "warning", "sees no GPU: E: x", "warp-lang"),
+        ({"warp": None}, "warning", "warp-lang is not installed", 'pip install "rlcli[gpu]"'),
+        ({"warp": {**WARP, "devices": []}}, "warning", "Warp 1.19.0 finds no GPU", "warp-lang"),
+        ({"warp": {**WARP, "error": "E: x"}}, "warning", "finds no GPU: E: x", "warp-lang"),
     ],
 )
 def test_driver_torch_and_warp_are_compared(monkeypatch, change, state, said, hint):

@@ -139,7 +139,7 @@ def test_a_hidden_plugin_is_said_to_be_hidden(broken_plugins, cli):
     broken_plugins()
     done = cli("show", "good-task", RLCLI_PLUGINS="none")
     assert done.returncode == 4
-    assert "RLCLI_PLUGINS=none leaves its plugin out" in done.stderr
+    assert "RLCLI_PLUGINS=none excludes its plugin" in done.stderr
     assert cli("show", "good-task", RLCLI_PLUGINS="GOOD").returncode == 0
     assert "RLCLI_PLUGINS names 'nmae'" in cli("list-tasks", RLCLI_PLUGINS="good,nmae").stderr
 
@@ -149,7 +149,7 @@ def test_a_plugin_that_wants_a_newer_rlcli_is_told_which(plugins, cli):
     plugins("early", "from rlcli.task import Wings\n", metadata=metadata)
     done = cli("show", "early-task")
     assert done.returncode == 4
-    assert "it asks for rlcli 99.1, this is" in done.stderr
+    assert "it needs rlcli 99.1, this is" in done.stderr
 
 
 @pytest.mark.parametrize("command", ["doctor", "list-tasks"])

@@ -408,7 +408,7 @@ def test_a_model_that_the_user_has_not_got_is_no_error_of_the_task(tmp_path, mon
     assert "RLCLI_MODELS is not set; no Python package 'no_such_package_here' is installed" in missing.value.message
     assert missing.value.hint == (
         "set RLCLI_MODELS to a folder that holds arm/arm.xml,"
-        " or install the package no_such_package_here, which carries it"
+        " or install the package no_such_package_here, which contains it"
     )
 
 
