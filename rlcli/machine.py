@@ -23,13 +23,14 @@ _NO_LIMIT = 1 << 60
 
 
 def available_cores(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> int:
-    """Return the number of cores that this process may use: its CPU affinity, limited by the quota of its control group.
+    """Return the number of cores that this process may use.
 
-    The quota is rounded down. If a launcher such as torchrun started several processes, they share the cores equally.
+    These are the cores of its CPU affinity, limited by the quota of its control group (rounded down). If a launcher
+    such as torchrun started several processes, they share the cores equally.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quota = core_quota(groups, own)
-    if quota is not None:  # one thread too many is paused for the rest of each period, and the other threads wait for it
+    if quota is not None:  # a thread above the quota is paused for the rest of each period, and the others wait for it
         cores = min(cores, int(quota))
     return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 

@@ -156,7 +156,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Step all environments. actions (num_envs, a)
 
         Returns:
-            Observations (num_envs, d) float32, rewards (num_envs,) float64, terminated and truncated (num_envs,), infos.
+            Observations (num_envs, d) float32, rewards (num_envs,) float64, terminated and truncated (num_envs,) bool,
+            infos.
 
         Raises:
             RuntimeError: in mode DISABLED, if an episode has ended and no new one was started.

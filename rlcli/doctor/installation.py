@@ -98,8 +98,10 @@ def _packages() -> Check:
             bad.append(f"{name} is missing")
         elif found is not None and violates_bounds(wanted, found):
             bad.append(f"{name} {found} does not fit, {wanted} is needed")
-    hint = "pip install --upgrade rlcli" if bad else None
-    return Check("packages", "broken" if bad else "ok", "; ".join(bad) or _listed(versions), hint, {"versions": versions})
+    details = {"versions": versions}
+    if bad:
+        return Check("packages", "broken", "; ".join(bad), "pip install --upgrade rlcli", details)
+    return Check("packages", "ok", _listed(versions), details=details)
 
 
 def _mujoco_packages() -> Check:

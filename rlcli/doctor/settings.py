@@ -66,5 +66,5 @@ def harmful_variables(variables: dict[str, str], cores: int) -> dict[str, str]:
         if variables.get(name, "").strip().lower() == spinning:
             found[name] = "waiting OpenMP threads spin and occupy cores that the engine needs"
     if variables.get("LOCAL_WORLD_SIZE", "1") not in ("", "1"):
-        found["LOCAL_WORLD_SIZE"] = "this process uses only its share of the cores, as if a launcher had started several"
+        found["LOCAL_WORLD_SIZE"] = "the cores are divided by this number, as a launcher of several processes needs it"
     return found

@@ -66,9 +66,10 @@ def python_config(root: Path) -> TaskSource | None:
 
 
 def python_task(reference: str, name: str | None = None) -> TaskSource:
-    """Return a task whose configuration is a Python object: `file.py:attribute`, or a package's `folder` or `folder:ID`.
+    """Return a task whose configuration is a Python object.
 
-    The configuration of a package is `TASK` in its `task.py`, or what it registers with Gymnasium under `ID`.
+    `reference` is `file.py:attribute`, or the folder of a package: `folder` or `folder:ID`. The configuration of a
+    package is `TASK` in its `task.py`, or what it registers with Gymnasium under `ID`.
 
     Raises:
         TaskError: if there is no such file.

@@ -253,7 +253,8 @@ class Checkpoint:
 
     def _shard(self, name: str, shard: Shard) -> dict[str, Tensor]:
         file = self.folder.parent / LOG_FOLDER / name / shard.file
-        columns = _tensors(_verified(file, shard.size, shard.sha256, min(_MOST_OF_A_SHARD, available_memory() // 3)), file)
+        most = min(_MOST_OF_A_SHARD, available_memory() // 3)
+        columns = _tensors(_verified(file, shard.size, shard.sha256, most), file)
         for column, values in columns.items():
             if values.shape[:1] != (shard.stop - shard.start,):
                 raise CheckpointError(f"{file} is corrupt: '{column}' has not the rows of its name")

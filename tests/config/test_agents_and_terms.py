@@ -263,9 +263,9 @@ def test_a_direct_tasks_parameters_are_checked_against_its_class(task, problems_
 def test_a_direct_task_has_no_terms_and_only_declared_parameters(task, problems_of):
     assert resolve(task(DIRECT, task=PLAIN)).task.params == {}
     (message,) = problems_of(f"{DIRECT}params: {{x: 1}}\n", files={"task": PLAIN})
-    assert "params: this task's class declares no Params" in message
+    assert "params: the class of this task has no Params" in message
     (message,) = problems_of(f"{DIRECT}rewards: {{a: {{func: is_alive, weight: 1}}}}\n", files={"task": PLAIN})
-    assert "rewards: a direct task has no rewards terms; its class does this" in message
+    assert "rewards: a direct task has no rewards terms; its class implements them" in message
 
 
 def test_checking_all_tries_every_agent_and_play(task):
@@ -303,13 +303,9 @@ def test_a_known_trainer_that_is_there_but_cannot_be_found_is_not_called_missing
 def test_a_trainer_of_a_newer_api_is_refused(task, monkeypatch):
     from dataclasses import replace
 
-    from rlcli.config import validation
+    from rlcli.registry import imports
 
-    real = validation.load_entry
-    monkeypatch.setattr(
-        validation, "load_entry", lambda entry, kind: replace(real(entry, kind), api=validation.API_VERSION + 1)
-    )
-    with pytest.raises(
-        TaskError, match=rf"needs plugin API {validation.API_VERSION + 1}; this rlcli has {validation.API_VERSION}"
-    ):
+    real, newer = imports.load_entry, imports.API_VERSION + 1
+    monkeypatch.setattr(imports, "load_entry", lambda entry, kind: replace(real(entry, kind), api=newer))
+    with pytest.raises(TaskError, match=rf"needs plugin API {newer}; this rlcli has {imports.API_VERSION}"):
         resolve(task())

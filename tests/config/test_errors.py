@@ -18,7 +18,7 @@ TYPOS = [
     ("sim.dt=nan", "sim.dt: expected a number, found 'nan'", None),
     ("sim.dt=.nan", "sim.dt: .nan is not allowed", None),
     ("sim.dt=1/0", "sim.dt: expected a number, found '1/0'", None),
-    ('sim.dt="0.01"', "sim.dt: expected a number, found '0.01'", "drop the quotes"),
+    ('sim.dt="0.01"', "sim.dt: expected a number, found '0.01'", "remove the quotes"),
     ("sim.dt=true", "sim.dt: expected a number, found true", None),
     (
         "sim.integrator=rk5",
@@ -126,7 +126,7 @@ def test_all_problems_are_reported_at_once_each_at_its_place(problems_of, tmp_pa
 
 def test_a_relation_between_keys_is_said_of_their_owner(problems_of):
     (message,) = problems_of(TASK, "agent.max_iterations=null")
-    assert "task.yaml:22:3: agents.one: one of max_iterations and max_steps is needed" in message
+    assert "task.yaml:22:3: agents.one: set max_iterations or max_steps" in message
 
 
 def test_an_unknown_agent_does_not_hide_other_mistakes(problems_of):

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from rlcli.config.layers import Layers, Origin, marked, parse_address, parse_override, read
+from rlcli.config.layers import Layers, Origin, document_origins, parse_address, parse_override, read
 from rlcli.config.strict_yaml import Document, load
 from rlcli.errors import ConfigError
 
@@ -142,14 +142,17 @@ def test_a_place_is_that_of_the_nearest_thing_around():
 
 def test_a_part_of_a_document_knows_its_lines():
     document = load("a: 1\nagent:\n  lr: 2\n  net: {h: [3]}\n")
-    whole, part = marked(document, "f.yaml", "config"), marked(document, "f.yaml", "config", ("agent",))
+    whole, part = (
+        document_origins(document, "f.yaml", "config"),
+        document_origins(document, "f.yaml", "config", ("agent",)),
+    )
     assert whole(("a",)) == Origin("config", "f.yaml:1:1")
     assert part(("lr",)) == Origin("config", "f.yaml:3:3")
     assert part(("net", "h", 0)) == Origin("config", "f.yaml:4:13")
     assert part(("net", "none")) == part(("net",)) == Origin("config", "f.yaml:4:3")
     assert part(("other",)) == part(()) == Origin("config", "f.yaml:2:1")
     assert whole(("other",)) == Origin("config", "f.yaml:1:1")
-    assert marked(Document({"a": 1}), "task.py", "task")(("a",)) == Origin("task", "task.py")
+    assert document_origins(Document({"a": 1}), "task.py", "task")(("a",)) == Origin("task", "task.py")
 
 
 def test_a_file_that_cannot_be_read_or_parsed_is_a_problem_at_its_place(tmp_path):

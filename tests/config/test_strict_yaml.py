@@ -72,7 +72,7 @@ def test_scalars_are_read_as_yaml_1_2_reads_them(text, value):
         ("a: &x 1\nb: 2\n", 1, 4, "anchors and aliases"),
         ("a: 1\nb: *x\n", 2, 4, "anchors and aliases"),
         ("a: 1\nb:\n  <<: {c: 1}\n", 3, 3, "merge keys"),
-        ("a: 010\n", 1, 4, "drop the leading 0 or quote it"),
+        ("a: 010\n", 1, 4, "remove the leading 0 or quote it"),
         ("a: [on]\n", 1, 5, "true or false, or quote it"),
         ("a: No\n", 1, 4, "true or false, or quote it"),
         ("a: .nan\n", 1, 4, "null for none"),

@@ -85,7 +85,7 @@ def test_selectors_are_names_or_lists_of_names(model, alias):
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
-        ("x: dict", "annotation 'dict' is not one that YAML can express; use float"),
+        ("x: dict", "YAML cannot express the annotation 'dict'; use float"),
         ("x: Tensor", "annotation 'Tensor'"),
         ("x: list", "annotation 'list'"),
         ("x: list[dict]", "annotation 'dict'"),
@@ -95,7 +95,7 @@ def test_selectors_are_names_or_lists_of_names(model, alias):
         ("x: 'float['", "annotation 'float[' is not valid Python"),
         ("x: float = math.pi", "'math.pi' is not a literal"),
         ("x: Joints", "the term also needs 'entity: Entity'"),
-        ("weight: float", "every term of rewards has a key of this name already"),
+        ("weight: float", "every term of rewards already has a key of this name"),
         ("_x: float", "underscore"),
     ],
 )
@@ -289,7 +289,7 @@ def test_files_whose_classes_inherit_in_a_circle_are_read_to_an_end(tmp_path):
         (CLASS.replace("count: int", "count: dict"), "line 8: 'count': annotation 'dict'"),
         (CLASS.replace("count: int", "count: int = COUNT"), "line 8: 'count': 'COUNT' is not a literal"),
         (CLASS + "   )", "not valid Python"),
-        ("class Task: ...", "declares no Params"),
+        ("class Task: ...", "has no Params"),
     ],
 )
 def test_params_that_cannot_be_read_are_a_problem_of_the_source(problems_of, source, said):
@@ -300,7 +300,7 @@ def test_params_that_cannot_be_read_are_a_problem_of_the_source(problems_of, sou
 def test_a_direct_task_has_no_manager_terms(problems_of):
     text = DIRECT.replace("{gain: 2.0}", "{count: 1}") + "rewards: {alive: {func: is_alive, weight: 1.0}}\n"
     (message,) = problems_of(text, files={"task": CLASS})
-    assert "rewards: a direct task has no rewards terms; its class does this" in message
+    assert "rewards: a direct task has no rewards terms; its class implements them" in message
 
 
 def test_an_unknown_success_condition_is_called_by_its_section(tmp_path):

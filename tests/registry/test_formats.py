@@ -122,10 +122,10 @@ HANDS = 2
 def read(document, source):
     if "seconds" not in document.data:
         return None
-    from rlcli.config.layers import marked
+    from rlcli.config.layers import document_origins
     data = {{"episode_length_s": document.data["seconds"], "elsewhere": {{"hands": HANDS}}}}
     data |= {{key: value for key, value in document.data.items() if key != "seconds"}}
-    return Translation(data, marked(document, source.label, "task"), [Note("", "seconds", "mapped")])
+    return Translation(data, document_origins(document, source.label, "task"), [Note("", "seconds", "mapped")])
 
 
 def check(block):
