@@ -40,9 +40,9 @@ class FormatSpec:
         environment: the `VecEnv` class that runs a task whose file has content at `key`.
         importer: the function of the command `rlcli import NAME`, which returns an `Imported`. Its parameters have
             Typer's annotations.
-        hint: `(error: BaseException) -> str | None`. Return what to do about an error of a task's code. agents_beside:
-        `(folder: Path) -> Iterable[Path]`. Yield Python files that may hold the agents of a configuration. aliases:
-        module name -> module. While a task's files are imported, the first name (and names below it) resolves
+        hint: `(error: BaseException) -> str | None`. Return what to do about an error of a task's code.
+        agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration.
+        aliases: module name -> module. While a task's files are imported, the first name (and names below it) resolves
             to the second.
         api: the `API_VERSION` that the format was written for.
     """

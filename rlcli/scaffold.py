@@ -26,20 +26,6 @@ MAX_LENGTH = 64
 _TEMPLATES = Path(__file__).parent / "templates"
 _DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))}
 """File names that Windows reserves for devices."""
-_FLAVOUR_TEXTS = {
-    "yaml": {
-        "code": "terms",
-        "yaml_is": "the task: scene, actions, observations, rewards, terminations, success, agents",
-        "code_is": "terms of your own; terms of rlcli need only their name in the YAML",
-        "schema_changes": "the parameters in `terms.py`",
-    },
-    "direct": {
-        "code": "task",
-        "yaml_is": "scene, parameters, success, agents",
-        "code_is": "the task: one class, whose hooks write observations, rewards and terminations",
-        "schema_changes": "`Params` in `task.py`",
-    },
-}
 
 
 def create(name: str, flavour: str, folder: Path | None = None) -> tuple[Path, list[str]]:
@@ -103,7 +89,7 @@ def render(name: str, flavour: str) -> dict[str, str]:
 
     package = name.replace("-", "_")
     version = ".".join(__version__.split(".")[:2])
-    values = {"name": name, "package": package, "version": version, **_FLAVOUR_TEXTS[flavour]}
+    values = {"name": name, "package": package, "version": version, "flavour": flavour}
     # No escaping: the texts are Python, TOML, XML and Markdown, and `check_name` has checked the values.
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
     names = {"package": package, "suite": "tests", "gitignore": ".gitignore"}

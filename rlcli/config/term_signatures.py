@@ -74,9 +74,7 @@ class SignatureError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A keyword-only parameter: its name, its YAML type, its default, and the alias of `rlcli.task` in its
-    annotation.
-    """
+    """A keyword-only parameter of a term. `alias` is the alias of `rlcli.task` in its annotation."""
 
     name: str
     type: Any
