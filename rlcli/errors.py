@@ -20,7 +20,7 @@ class RlcliError(Exception):
 
 
 class UsageError(RlcliError):
-    """The command line is invalid."""
+    """Invalid command line."""
 
     exit_code = 2
     kind = "usage"
@@ -56,64 +56,64 @@ class ConfigError(RlcliError):
 
 
 class ShapeError(ConfigError):
-    """A term returned a value whose shape or type its manager does not accept."""
+    """Value of a term with a shape or type that its manager does not accept."""
 
 
 class TaskError(RlcliError):
-    """A task or plugin is missing or broken."""
+    """Missing or broken task or plugin."""
 
     exit_code = 4
     kind = "task"
 
 
 class MissingModelError(TaskError):
-    """A robot model that the user must provide is not on this machine."""
+    """Missing robot model that the user must provide."""
 
 
 class CheckpointError(RlcliError):
-    """A checkpoint or run is missing, corrupt or does not fit the task."""
+    """Checkpoint or run that is missing, corrupt or does not fit the task."""
 
     exit_code = 5
     kind = "checkpoint"
 
 
 class DivergedError(RlcliError):
-    """The simulation or the learner produced NaN or infinite values."""
+    """NaN or infinite values of the simulation or the learner."""
 
     exit_code = 6
     kind = "diverged"
 
 
 class DependencyError(RlcliError):
-    """An optional dependency is missing; the hint is the pip command that installs it."""
+    """Missing optional dependency; the hint is the pip command that installs it."""
 
     exit_code = 7
     kind = "dependency"
 
 
 class DeviceError(RlcliError):
-    """The requested device is not available."""
+    """Requested device that is not available."""
 
     exit_code = 8
     kind = "device"
 
 
 class VerdictError(RlcliError):
-    """The command ran to its end, and its result is negative (a check failed, a limit was not reached)."""
+    """Negative result of a command that ran to its end: a check failed, or a limit was not reached."""
 
     exit_code = 9
     kind = "verdict"
 
 
 class MachineError(RlcliError):
-    """The machine refused an operation: disk, port, OpenGL, storage."""
+    """Operation that the machine refused: disk, port, OpenGL, storage."""
 
     exit_code = 10
     kind = "machine"
 
 
 class Stopped(RlcliError):
-    """A run was stopped on request (Ctrl-C, a signal, a time limit); it can be resumed."""
+    """Stop of a run on request (Ctrl-C, a signal, a time limit); the run can be resumed."""
 
     kind = "stopped"
 

@@ -36,7 +36,7 @@ _CONSTANTS = {
 
 
 class YamlError(ValueError):
-    """The text is not strict YAML. `line` and `column` count from 1; both are 0 if the file as a whole is refused."""
+    """Text that is not strict YAML. `line` and `column` count from 1; both are 0 if the file as a whole is refused."""
 
     def __init__(self, message: str, mark: Any = None, *, place: Mark = (0, 0)) -> None:
         super().__init__(message)

@@ -69,7 +69,7 @@ _MDP = Path(__file__).resolve().parent.parent / "mdp"
 
 
 class SignatureError(ValueError):
-    """The signature of a term uses something that YAML cannot express."""
+    """Signature of a term that YAML cannot express."""
 
 
 @dataclass(frozen=True, slots=True)

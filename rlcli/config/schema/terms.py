@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from rlcli.config.schema.base import (
     Columns,
     Count,
     NotNegative,
     Number,
+    PositiveRange,
     Range,
     Share,
     StepRange,
@@ -57,7 +58,7 @@ class EventConfig(TermConfig):
 
     mode: Literal["startup", "reset", "interval"]
     """startup: once at the start; reset: when an episode starts; interval: repeatedly."""
-    interval_range_s: Range | None = None
+    interval_range_s: PositiveRange | None = None
     """[low, high] time between two events [s], drawn for each environment; required by mode interval."""
     global_time: bool = False
     """Mode interval: true: one timer for all environments, which resets do not restart."""
@@ -69,8 +70,7 @@ class EventConfig(TermConfig):
     def _interval(self) -> EventConfig:
         if (self.mode == "interval") != (self.interval_range_s is not None):
             raise ValueError("interval_range_s belongs to mode interval, and mode interval needs it")
-        if self.interval_range_s is not None and self.interval_range_s[0] <= 0:
-            raise ValueError("interval_range_s must be above 0")
+
         if self.global_time and self.mode != "interval":
             raise ValueError("global_time belongs to mode interval")
         if self.min_steps_between and self.mode != "reset":
@@ -217,16 +217,9 @@ class ActionConfig(TermConfig):
 class CommandConfig(TermConfig):
     """A command for the policy, for example a target velocity, which is sampled again from time to time."""
 
-    resampling_time_s: Range
+    resampling_time_s: PositiveRange
     """[low, high] time until the next sample [s], drawn for each environment. Each episode starts with a new
     command."""
-
-    @field_validator("resampling_time_s")
-    @classmethod
-    def _check_time(cls, value: tuple[float, float]) -> tuple[float, float]:
-        if value[0] <= 0:
-            raise ValueError("resampling_time_s must be above 0")
-        return value
 
 
 class CurriculumConfig(TermConfig):
