@@ -130,8 +130,8 @@ def _write(folder: Path, files: dict[str, str], package: str) -> None:
                 moved.append(folder / part.name)
                 os.replace(part, moved[-1])
         except BaseException:
-            for path in moved:
-                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+            for part in moved:
+                shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
             raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

@@ -204,12 +204,12 @@ def _settings_called(option: str) -> list[str]:
     name = option.replace("-", "_")
     if "." in name.strip("."):
         return [name]
-    from rlcli.config.messages import homes
+    from rlcli.config.messages import key_locations
     from rlcli.config.schema import TaskConfig
 
     key = _SHORT_FOR.get(name, name)
     models: list[dict[str, Any]] = [{"": TaskConfig}, *({"agent": model} for model in _agent_models())]
-    places = list(dict.fromkeys(place for model in models for place in homes(model).get(key, [])))
+    places = list(dict.fromkeys(place for model in models for place in key_locations(model).get(key, [])))
     return places if len(places) <= 3 and name != "task" else []  # the task is an argument
 
 

@@ -245,8 +245,8 @@ class TaskCheck:
         except TaskError as error:
             if name in known_trainers() and name not in {entry.name for entry in catalog(TRAINERS)[0]}:
                 where = f"{self.layers.place((*at, 'trainer'))}: {messages.dotted((*at, 'trainer'))}"
-                hint = f"pip install {known_trainers()[name]}"
-                self.missing = DependencyError(f"{where}: trainer '{name}' is not installed", hint=hint)
+                install = f"pip install {known_trainers()[name]}"
+                self.missing = DependencyError(f"{where}: trainer '{name}' is not installed", hint=install)
             else:
                 self.problem((*at, "trainer"), error.message, error.hint)
             return None, _AnyAgent

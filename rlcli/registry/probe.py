@@ -7,7 +7,6 @@ other tasks are in the user's cache folder, keyed by distribution, version and t
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import os
 import signal
@@ -18,16 +17,13 @@ import threading
 import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rlcli.machine import available_cores
 from rlcli.registry import OWN, TASKS, Entry, package_folder
-
-if TYPE_CHECKING:
-    from pydantic import TypeAdapter
 
 TIMEOUT_S = 30.0
 _BUILDER = "rlcli.envs.task_index"
@@ -62,6 +58,15 @@ class Details:
     def record(self) -> dict[str, Any]:
         """Return the details as JSON data."""
         return asdict(self)
+
+
+_TYPES: dict[str, Any] = {
+    **dict.fromkeys(("observation_size", "action_size", "num_envs"), int | None),
+    **dict.fromkeys(("workflow", "agent", "broken"), str | None),
+    "summary": str,
+    "policy": bool,
+}
+"""Types of the fields of `Details`. Pydantic would check them too, but `list-tasks` does not import it, to start fast."""
 
 
 def cached_details(entries: Iterable[Entry]) -> dict[str, Details]:
@@ -261,16 +266,8 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 def _parse_details(row: object) -> Details | None:
     """Return the details in JSON data of an untrusted file; None if a value has the wrong type."""
-    from pydantic import ValidationError
-
-    try:
-        return _details_adapter().validate_json(json.dumps(row), strict=True)
-    except ValidationError:
+    if not isinstance(row, dict):
         return None
-
-
-@functools.cache
-def _details_adapter() -> TypeAdapter[Details]:
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(Details)
+    known = {f.name: row[f.name] for f in fields(Details) if f.name in row}
+    valid = all(isinstance(value, _TYPES[name]) for name, value in known.items())
+    return Details(**known) if valid else None

@@ -286,7 +286,7 @@ def test_circular_inheritance_across_files_terminates(tmp_path):
 @pytest.mark.parametrize(
     ("source", "said"),
     [
-        (CLASS.replace("count: int", "count: dict"), "line 8: 'count': annotation 'dict'"),
+        (CLASS.replace("count: int", "count: dict"), "line 8: 'count': YAML cannot express the annotation 'dict'"),
         (CLASS.replace("count: int", "count: int = COUNT"), "line 8: 'count': 'COUNT' is not a literal"),
         (CLASS + "   )", "not valid Python"),
         ("class Task: ...", "has no Params"),
