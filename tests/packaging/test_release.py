@@ -40,7 +40,7 @@ def licence_of(distribution):
 def test_public_words_are_up_to_date():
     reference = script("reference")
     known, now = set(reference.WORDS.read_text().splitlines()), set(reference.public_words())
-    assert not known - now, "somebody's files may say it: note it in the changelog, then `python docs/reference.py`"
+    assert not known - now, "user files may contain it: note it in the changelog, then `python docs/reference.py`"
     assert not now - known, "`python docs/reference.py` notes what is new"
 
 
@@ -73,7 +73,7 @@ def test_licences_match_package_metadata():
         try:
             said = licence_of(name)
         except importlib.metadata.PackageNotFoundError:
-            continue  # the trackers, which nobody installs all of
+            continue  # not all trackers are installed
         family = re.match(r"MIT|BSD|Apache|PSF|MPL|LGPL", licence)[0]
         family = {"PSF": "PSF|Python Software", "MPL": "MPL|Mozilla"}.get(family, family)
         assert re.search(family, said), f"{name}: {said}"

@@ -152,10 +152,10 @@ def test_status_shows_state_and_policy(plugins, spec, cli):
     done = cli("list-tasks")
     head, *lines = done.stdout.splitlines()
     assert head.split()[2:8] == ["WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "STATUS"]
-    told = {line.split()[0]: line for line in lines}
-    assert "  ok, policy  " in told["good-task"]
-    assert "  ok, policy  " in told["cartpole"]
-    assert "  ?  " in told["plain-task"]
+    shown = {line.split()[0]: line for line in lines}
+    assert "  ok, policy  " in shown["good-task"]
+    assert "  ok, policy  " in shown["cartpole"]
+    assert "  ?  " in shown["plain-task"]
     found = rows(cli("list-tasks", "--json"))
     assert [found[name]["status"] for name in ("good-task", "cartpole", "plain-task")] == ["ok, policy"] * 2 + ["?"]
     assert (found["cartpole"]["policy"], found["ant-direct"]["policy"]) == (True, found["ant-direct"]["status"] != "ok")
