@@ -48,7 +48,7 @@ def source_of(value: object, root: FilePath | None = None, name: str = "task") -
         name: the name of the task.
     """
     root = (root or FilePath.cwd()).resolve()
-    return TaskSource(name, root, root / "task.py", None, None, (), (), None, None, value=value)
+    return TaskSource(name, root, root / "task.py", value=value)
 
 
 def load(source: TaskSource) -> PythonTask:

@@ -44,8 +44,6 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
         name=root.name,
         root=root,
         config=config,
-        distribution=None,
-        version=None,
         term_files=(terms,) if terms.is_file() else (),
         term_modules=(str(terms),) if terms.is_file() else (),
         task=f"{task}:Task" if task.is_file() else None,
@@ -87,12 +85,6 @@ def python_task(reference: str, name: str | None = None) -> TaskSource:
         name=name or re.sub(r"[^A-Za-z0-9_.-]", "-", label),
         root=file.parent,
         config=file,
-        distribution=None,
-        version=None,
-        term_files=(),
-        term_modules=(),
-        task=None,
-        task_file=None,
         python=f"{path}:{attribute}" if attribute else str(path),
     )
 

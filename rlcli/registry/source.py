@@ -14,12 +14,12 @@ class TaskSource:
     name: str
     root: Path
     config: Path
-    distribution: str | None
-    version: str | None
-    term_files: tuple[Path, ...]
-    term_modules: tuple[str, ...]
-    task: str | None
-    task_file: Path | None
+    distribution: str | None = None
+    version: str | None = None
+    term_files: tuple[Path, ...] = ()
+    term_modules: tuple[str, ...] = ()
+    task: str | None = None
+    task_file: Path | None = None
     python: str | None = None
     """A configuration in Python: `module:attribute`, `file.py:attribute` or the folder of a package; None: in YAML."""
     agents: tuple[tuple[str, str], ...] = ()
