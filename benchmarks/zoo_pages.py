@@ -208,7 +208,7 @@ def _outcome(rows: list[dict[str, Any]], entry: Any) -> str:
 
 
 def _index_json() -> dict[str, Any]:
-    from rlcli.registry.probe import cached
+    from rlcli.registry.probe import cached_details
 
     own = [entry for entry in catalog()[0] if entry.distribution == OWN]
-    return {name.partition(":")[2]: row.record() for name, row in cached(own).items()}
+    return {name.partition(":")[2]: row.record() for name, row in cached_details(own).items()}

@@ -1,4 +1,8 @@
-"""`python -m rlcli`: the same as the `rlcli` command, which does not import from the current folder either."""
+"""Entry point of `python -m rlcli`, which is the same as the command `rlcli`.
+
+Python puts the current folder first on `sys.path`. It is removed here, because the command `rlcli` does not import from
+the current folder either.
+"""
 
 import os
 import sys

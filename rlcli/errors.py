@@ -1,4 +1,4 @@
-"""The errors that are the user's to mend, each with its exit code. Everything else is a bug and keeps its traceback."""
+"""Errors that the user can fix, each with its exit code. Any other exception is a bug and keeps its traceback."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 
 class RlcliError(Exception):
-    """Something a user can mend: `message` says where and what, `hint` what to do."""
+    """An error that the user can fix. `message` says what is wrong and where; `hint` says what to do."""
 
     exit_code = 1
     kind = "error"
@@ -20,7 +20,7 @@ class RlcliError(Exception):
 
 
 class UsageError(RlcliError):
-    """The command line does not make sense."""
+    """Invalid command line."""
 
     exit_code = 2
     kind = "usage"
@@ -30,7 +30,7 @@ class UsageError(RlcliError):
 class Problem:
     """One mistake in a configuration.
 
-    `where` is `file:line:column` or the text of an override; `path` is the dotted key.
+    `where` is `file:line:column` or the text of an override; `path` is the dotted key of the value.
     """
 
     where: str
@@ -39,81 +39,81 @@ class Problem:
     hint: str | None = None
 
     def __str__(self) -> str:
-        """One line: where, key, what is wrong, what to do."""
+        """Return one line: where, key, what is wrong, what to do."""
         text = f"{self.where}: {self.path}: {self.message}" if self.path else f"{self.where}: {self.message}"
         return f"{text}; {self.hint}" if self.hint else text
 
 
 class ConfigError(RlcliError):
-    """Invalid configuration; carries every problem of its phase."""
+    """Invalid configuration. `problems` lists every mistake that was found, not only the first."""
 
     exit_code = 3
     kind = "config"
 
     def __init__(self, problems: Iterable[Problem]) -> None:
-        self.problems = sorted(dict.fromkeys(problems), key=_by_place)
+        self.problems = sorted(dict.fromkeys(problems), key=_position)
         super().__init__("\n".join(str(problem) for problem in self.problems))
 
 
 class ShapeError(ConfigError):
-    """What a term gives is nothing that its manager can take."""
+    """Value of a term with a shape or type that its manager does not accept."""
 
 
 class TaskError(RlcliError):
-    """A task or plugin is not found or broken."""
+    """Missing or broken task or plugin."""
 
     exit_code = 4
     kind = "task"
 
 
 class MissingModelError(TaskError):
-    """A model that the user is to have is not there."""
+    """Missing robot model that the user must provide."""
 
 
 class CheckpointError(RlcliError):
-    """A checkpoint or run is missing, corrupt or does not fit."""
+    """Checkpoint or run that is missing, corrupt or does not fit the task."""
 
     exit_code = 5
     kind = "checkpoint"
 
 
 class DivergedError(RlcliError):
-    """The simulation or the learner produced values that are not finite."""
+    """NaN or infinite values of the simulation or the learner."""
 
     exit_code = 6
     kind = "diverged"
 
 
 class DependencyError(RlcliError):
-    """An optional dependency is missing; the hint holds the pip line."""
+    """Missing optional dependency; the hint is the pip command that installs it."""
 
     exit_code = 7
     kind = "dependency"
 
 
 class DeviceError(RlcliError):
-    """The requested device is not available."""
+    """Requested device that is not available."""
 
     exit_code = 8
     kind = "device"
 
 
 class VerdictError(RlcliError):
-    """The command ran and its verdict is negative."""
+    """Negative result of a command that ran to its end: a check failed, or a limit was not reached."""
 
     exit_code = 9
     kind = "verdict"
 
 
 class MachineError(RlcliError):
-    """The machine said no: disk, port, GL, storage."""
+    """Operation that the machine refused: disk, port, OpenGL, storage."""
 
     exit_code = 10
     kind = "machine"
 
 
 class Stopped(RlcliError):
-    """A run stopped because it was asked to; it can be resumed."""
+    """Stop of a run on request (Ctrl-C, a signal, a time limit); the run can be resumed."""
 
     kind = "stopped"
 
@@ -123,40 +123,41 @@ class Stopped(RlcliError):
 
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str | None:
-    """`did you mean 'x'?` for the nearest of `candidates`, or None."""
+    """Return `did you mean 'x'?` for the most similar candidates (at most three), or None if none is similar."""
     close = difflib.get_close_matches(name, dict.fromkeys(candidates), n=3, cutoff=0.6)
     return f"did you mean {' or '.join(repr(match) for match in close)}?" if close else None
 
 
 def one_line(error: BaseException, limit: int | None = None) -> str:
-    """Return the message of an error on one line, cut to a length; its class if it has no message."""
+    """Return the message of an error on one line, cut to `limit` characters; its class name if it has no message."""
     return " ".join(str(error).split())[:limit] or type(error).__name__
 
 
 def require_known(name: str, names: Sequence[str], what: str, plural: str) -> None:
-    """Check that a name on the command line is one of a few.
+    """Check that a name on the command line is valid.
 
     Args:
-        name: the name that was given.
+        name: the name that the user typed.
         names: the valid names.
         what: the kind of name, as in `no {what} '{name}'`.
-        plural: several of that kind, for the hint.
+        plural: the plural of `what`, for the hint.
 
     Raises:
-        UsageError: with the nearest name, or else all of them.
+        UsageError: with the most similar valid name, or with all valid names if none is similar.
     """
     if name not in names:
         raise UsageError(f"no {what} '{name}'", hint=did_you_mean(name, names) or f"{plural}: {', '.join(names)}")
 
 
 def listing(names: Iterable[str], limit: int = 20) -> str:
-    """Comma-separated names for a message, cut after `limit`."""
+    """Return the names for a message, separated by commas and cut after `limit` names."""
     names = list(names)
     shown = ", ".join(names[:limit])
     return f"{shown}, ... ({len(names)} in all)" if len(names) > limit else shown or "(none)"
 
 
-def _by_place(problem: Problem) -> tuple[str, tuple[int, ...], str]:
+def _position(problem: Problem) -> tuple[str, tuple[int, ...], str]:
+    """Return the sort key of a problem: file, line and column as numbers, dotted key."""
     file, *numbers = problem.where.rsplit(":", 2)
     place = tuple(int(number) for number in numbers if number.isdecimal() and len(number) < 10)
     return (file if len(place) == 2 else problem.where, place, problem.path)

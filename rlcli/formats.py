@@ -1,4 +1,4 @@
-"""What a plugin exports that reads the task files of another framework, and what such a reader reports."""
+"""Interface of plugins that read the task files of other frameworks: their specification and their results."""
 
 from __future__ import annotations
 
@@ -16,33 +16,35 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 Status = Literal["mapped", "approximated", "ignored", "task", "default", "to do"]
-"""task: read by the task's own class; default: as it always is; to do: left to the user."""
+"""mapped, approximated, ignored: translated exactly, translated with a difference, not translated; task: read by the
+task's own class; default: the key has its default value; to do: the user must translate it."""
 
 
 @dataclass(frozen=True, slots=True)
 class FormatSpec:
-    """What an entry point of the group `rlcli.formats` resolves to. Importing its module must be cheap.
+    """A format of task files. An entry point of the group `rlcli.formats` names an object of this class.
 
-    The format's name is the entry point's name. Every reference is `module:name` and is imported when it is used; an
-    empty one means that the format has no such part.
+    The module that defines the object must be cheap to import. The format's name is the name of the entry point. Each
+    reference below has the form `module:name` and is imported when it is used first; an empty string means that the
+    format does not have this part.
 
     Attributes:
-        summary: what the format is of, for messages, as in `tasks of LIBRARY`.
-        find: `(path: Path) -> TaskSource | None`, the task of a folder or file in this format. No code of the task is
-            imported.
-        read: `(document: Document, source: TaskSource) -> Translation | None`, a YAML document of this format as the
-            data of a task; None for a document of another format.
-        key: the top-level key of a task file that holds what only the format's environment reads.
-        check: `(block: Mapping) -> Iterable[(path, message, hint)]`, mistakes in what stands at `key`.
-        open_scene: the format's environment adds entities to the scene, so a task file need not name any.
-        environment: the `VecEnv` class that runs a task with something at `key`.
-        importer: the function of the command `rlcli import NAME`, which returns an `Imported`. Its parameters are
-            annotated as Typer's are.
-        hint: `(error: BaseException) -> str | None`, what to do about an error of a task's code.
-        agents_beside: `(folder: Path) -> Iterable[Path]`, Python files that may hold the agents of a configuration.
+        summary: the tasks that the format describes, for messages, for example `tasks of LIBRARY`.
+        find: `(path: Path) -> TaskSource | None`. Return the task of a folder or file in this format, without importing
+            code of the task.
+        read: `(document: Document, source: TaskSource) -> Translation | None`. Translate a YAML document of this format
+            into the data of a task; None for a document of another format.
+        key: the top-level key of a task file whose content only the format's environment reads.
+        check: `(block: Mapping) -> Iterable[(path, message, hint)]`. Yield the mistakes in the content of `key`.
+        open_scene: the format's environment adds entities to the scene, so a task file may have no entities.
+        environment: the `VecEnv` class that runs a task whose file has content at `key`.
+        importer: the function of the command `rlcli import NAME`, which returns an `Imported`. Its parameters have
+            Typer's annotations.
+        hint: `(error: BaseException) -> str | None`. Return what to do about an error of a task's code.
+        agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration.
         aliases: module name -> module. While a task's files are imported, the first name (and names below it) resolves
             to the second.
-        api: the `API_VERSION` the format was written for.
+        api: the `API_VERSION` that the format was written for.
     """
 
     summary: str
@@ -61,34 +63,34 @@ class FormatSpec:
 
 @dataclass(slots=True)
 class Translation:
-    """A task of another format as the data of a task."""
+    """A task of another format, translated into the data of a task."""
 
     data: dict[str, Any]
     origin: Callable[[tuple[str | int, ...]], Origin]
-    """Path in `data` -> where it was written."""
+    """Path in `data` -> origin of that value in the source."""
     notes: list[Note]
     agents: dict[str, Any] = field(default_factory=dict)
-    """Agents from a file of their own."""
+    """Agents that were read from a separate file."""
     agents_origin: Callable[[tuple[str | int, ...]], Origin] | None = None
 
 
 @dataclass(slots=True)
 class Imported:
-    """The result of an importer: the files that it wrote, and what became of each key of the source."""
+    """Result of an importer: the files that it wrote, and one note for each key of the source."""
 
     folder: Path
     files: list[Path]
     notes: list[Note]
     messages: list[str] = field(default_factory=list)
-    """What is left to do."""
+    """What the user still has to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """What became of a key."""
+    """How one key of the source was translated."""
 
     where: str
-    """File and line, as far as they are known."""
+    """File and line of the key; empty if unknown."""
     key: str
     status: Status
     text: str = ""
@@ -96,12 +98,13 @@ class Note:
     def __str__(self) -> str:
         """Return the note on one line."""
         status = "read by the task's class" if self.status == "task" else self.status
-        place = f"{self.where}: " if self.where else ""
-        return f"{place}{self.key}: {status}{f': {self.text}' if self.text else ''}"
+        where = f"{self.where}: " if self.where else ""
+        text = f": {self.text}" if self.text else ""
+        return f"{where}{self.key}: {status}{text}"
 
 
 def summary(notes: Iterable[Note]) -> list[str]:
-    """Return the notes in a few lines, one for each status."""
+    """Return one line for each of the statuses mapped, approximated and ignored, with the keys that have it."""
     lines, notes = [], list(notes)
     for status in ("mapped", "approximated", "ignored"):
         parents: dict[str, list[str]] = {}
@@ -117,7 +120,10 @@ def summary(notes: Iterable[Note]) -> list[str]:
 
 
 def log_notes(notes: Iterable[Note]) -> None:
-    """Log what became of the keys of a configuration in another format: a summary, and each note at debug level."""
+    """Log how the keys of a configuration in another format were translated.
+
+    The summary is logged at info level, each note at debug level.
+    """
     notes = list(notes)
     for line in summary(notes):
         _log.info(line)

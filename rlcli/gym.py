@@ -1,7 +1,8 @@
-"""Importing this registers every installed task with Gymnasium, as `rlcli/NAME`.
+"""Registration of every installed task with Gymnasium as `rlcli/NAME`, done when this module is imported.
 
-`gym.make_vec("rlcli.gym:rlcli/cartpole", num_envs=8)` imports it by itself. No task is imported before it is made.
-A name that two plugins share becomes `rlcli/DISTRIBUTION.NAME`; `rlcli/task` takes the folder of a task as `task`.
+`gym.make_vec("rlcli.gym:rlcli/cartpole", num_envs=8)` imports this module by itself. The code of a task is imported
+when its environment is made. If two plugins offer the same name, the ids are `rlcli/DISTRIBUTION.NAME`. The id
+`rlcli/task` takes the folder of a task as its argument `task`.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ _ADAPTER = "rlcli.adapters.gymnasium"
 
 
 def register_all() -> list[str]:
-    """Register what is installed; returns the ids."""
+    """Register all installed tasks with Gymnasium and return their ids."""
     entries, _ = catalog()
     shared = Counter(entry.name for entry in entries)
     tasks: dict[str, dict[str, str]] = {"task": {}}

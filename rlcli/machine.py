@@ -1,4 +1,4 @@
-"""What the machine offers this process."""
+"""Resources of the machine that this process may use: cores, memory, devices."""
 
 from __future__ import annotations
 
@@ -19,59 +19,60 @@ from rlcli.errors import DependencyError, DeviceError, UsageError
 
 _GROUPS, _OWN_GROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _NO_LIMIT = 1 << 60
-"""Version 1 says with a number like this that there is none."""
+"""Memory limits [bytes] from this number on mean "no limit": version 1 of control groups writes about 2**63."""
 
 
 def available_cores(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> int:
-    """Cores this process may use: its affinity, and no more than its control group grants it whole.
+    """Return the number of cores that this process may use.
 
-    Processes that a launcher started together share them.
+    These are the cores of its CPU affinity, limited by the quota of its control group (rounded down). If a launcher
+    such as torchrun started several processes, they share the cores equally.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quota = core_quota(groups, own)
-    if quota is not None:  # a thread more is stopped for the rest of every period, and the others wait for it
+    if quota is not None:  # a thread above the quota is paused for the rest of each period, and the others wait for it
         cores = min(cores, int(quota))
     return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 def core_quota(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> float | None:
-    """Cores' worth of time that a container's control group grants this process; None where there is no limit."""
+    """Return the CPU quota of this process's control group in cores, for example 1.5; None if there is no limit."""
     quotas = [_quota(folder) for folder in _control_groups("cpu", groups, own)]
     return min((quota for quota in quotas if quota is not None), default=None)
 
 
 def memory_limit(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> int | None:
-    """Bytes that a container's control group grants; None where there is no limit."""
+    """Return the memory limit of this process's control group [bytes]; None if there is no limit."""
     limits = []
     for folder in _control_groups("memory", groups, own):
         for name in ("memory.max", "memory.limit_in_bytes"):
             try:
                 limits.append(int((folder / name).read_text(encoding="utf-8")))
-            except (OSError, ValueError):  # not there, or `max`
+            except (OSError, ValueError):  # the file is missing, or holds the word `max`
                 continue
     return min((limit for limit in limits if limit < _NO_LIMIT), default=None)
 
 
 def _control_groups(controller: str, groups: Path, own: Path) -> Iterator[Path]:
-    """The folders of this process's control groups, from its own up."""
+    """Yield the folders of this process's control groups, from its own group up to the root group."""
     try:
-        places = [line.split(":", 2) for line in own.read_text(encoding="utf-8").splitlines()]
+        lines = [line.split(":", 2) for line in own.read_text(encoding="utf-8").splitlines()]
     except (OSError, ValueError):
         return
-    for _, controllers, place in (parts for parts in places if len(parts) == 3):
+    for _, controllers, path in (parts for parts in lines if len(parts) == 3):
         if controllers and controller not in controllers.split(","):
             continue
-        # version 1 has a folder a controller, which may be mounted under either name; version 2 has none
+        # version 1 has one folder for each controller, mounted under either name; version 2 has one tree for all
         for root in (groups / controllers, groups / controller) if controllers else (groups,):
-            folder = root / place.strip("/")
+            folder = root / path.strip("/")
             yield from (each for each in (folder, *folder.parents) if each.is_relative_to(root))
 
 
 def read_plain(file: Path, most: int) -> bytes:
-    """What a plain file holds; a pipe or a device in its place is not waited for.
+    """Return the content of a regular file. A pipe or a device at this path is refused without blocking.
 
     Raises:
-        OSError: if it is missing, is not a plain file, or is larger than `most` bytes.
+        OSError: if the file is missing, is not a regular file, or is larger than `most` bytes.
     """
     descriptor = os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with open(descriptor, "rb") as opened:
@@ -83,8 +84,11 @@ def read_plain(file: Path, most: int) -> bytes:
     return data
 
 
-def memory(report: Path = Path("/proc/meminfo")) -> int:
-    """Bytes of memory that this process may still ask for, as far as the system says; else half of what there is."""
+def available_memory(report: Path = Path("/proc/meminfo")) -> int:
+    """Return the memory that this process may still allocate [bytes].
+
+    The value is `MemAvailable` of the system; else half of the machine's memory; else 8 GiB.
+    """
     try:
         lines = report.read_text(encoding="utf-8").splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
@@ -96,47 +100,48 @@ def memory(report: Path = Path("/proc/meminfo")) -> int:
         return 8 * 2**30
 
 
-def resident(report: Path = Path("/proc/self/statm")) -> int | None:
-    """Bytes of memory that this process holds now; None where the system does not say."""
+def resident_memory(report: Path = Path("/proc/self/statm")) -> int | None:
+    """Return the memory that this process occupies now [bytes]; None if the system does not report it."""
     try:
         return int(report.read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError, AttributeError):
         return None
 
 
-def wait_calmly() -> None:
-    """Threads of OpenMP spin briefly while they wait, unless somebody said how long; before torch is imported.
+def limit_openmp_spinning() -> None:
+    """Let OpenMP threads spin only briefly while they wait, unless the user set GOMP_SPINCOUNT.
 
-    On a busy machine libgomp's long spinning makes an update ten times slower.
+    Call it before torch is imported. On a busy machine libgomp's long spinning makes an update ten times slower.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 
 _SELDOM = (100_000, 10, 10)
-_usual: list[tuple[int, int, int]] = []
+_saved_thresholds: list[tuple[int, int, int]] = []
 
 
-def collect_seldom() -> None:
-    """Let Python look for cycles of garbage seldom, until `collect_as_usual`: for a process of our own that starts.
+def delay_garbage_collection() -> None:
+    """Make Python's cyclic garbage collection rare until `restore_garbage_collection` is called.
 
-    Imports make hundreds of thousands of objects that stay; to look through them again and again takes a fifth of the
-    time that torch takes to import.
+    The command line calls it at its start. Imports create hundreds of thousands of objects that stay in memory;
+    scanning them again and again takes a fifth of the time of importing torch.
     """
-    _usual.append(gc.get_threshold())
+    _saved_thresholds.append(gc.get_threshold())
     gc.set_threshold(*_SELDOM)
 
 
-def collect_as_usual() -> None:
-    """End what `collect_seldom` began, if it did, once what is large has been imported.
+def restore_garbage_collection() -> None:
+    """Undo `delay_garbage_collection`, if it was called. Call it when the large libraries have been imported.
 
-    What there is by then stays to the end, and is not looked through again: neither now nor when the process ends.
+    The objects that exist now are excluded from all later collections, also from the one at the end of the process.
     """
-    if _usual:
+    if _saved_thresholds:
         gc.freeze()
-        gc.set_threshold(*_usual.pop())
+        gc.set_threshold(*_saved_thresholds.pop())
 
 
 def _quota(group: Path) -> float | None:
+    """Return the CPU quota that one control group sets, in cores; None if it sets none."""
     try:
         if (group / "cpu.max").is_file():
             limit, period = (group / "cpu.max").read_text(encoding="utf-8").split()
@@ -148,10 +153,10 @@ def _quota(group: Path) -> float | None:
 
 
 def require_device(device: str) -> None:
-    """Refuse a device that torch cannot use here.
+    """Check that torch can use a device on this machine.
 
     Raises:
-        DeviceError: for anything but cpu and a CUDA device that is there.
+        DeviceError: for any device except cpu and an existing CUDA device.
     """
     kind, _, index = device.partition(":")
     if kind == "cpu":
@@ -168,14 +173,14 @@ def require_device(device: str) -> None:
 
 
 def choose_device(wanted: str) -> str:
-    """Return the torch device for auto, cpu, cuda or cuda:N; auto is the GPU if it can be used.
+    """Return the torch device for auto, cpu, cuda or cuda:N. auto means the GPU if torch and MuJoCo Warp can use it.
 
     Raises:
-        UsageError: for something else.
-        DeviceError: for a device that is not there.
-        DependencyError: for a GPU without rlcli[gpu].
+        UsageError: for any other name.
+        DeviceError: if the device does not exist.
+        DependencyError: for a GPU if rlcli[gpu] is not installed.
     """
-    if wanted == "cpu" or (wanted == "auto" and not _may_have_gpu()):
+    if wanted == "cpu" or (wanted == "auto" and not has_gpu_driver()):  # without a driver torch is not imported
         return "cpu"
     if wanted == "auto":
         import torch
@@ -189,23 +194,23 @@ def choose_device(wanted: str) -> str:
     return wanted
 
 
-def _may_have_gpu() -> bool:
-    """Whether a driver is installed; torch is not imported for that."""
-    return (
-        Path("/dev/nvidiactl").exists()
-        or Path("/proc/driver/nvidia").exists()
-        or shutil.which("nvidia-smi") is not None
-    )
+def has_gpu_driver() -> bool:
+    """Return whether an NVIDIA driver is installed (/dev/dxg is the one of WSL), without importing torch."""
+    files = ("/proc/driver/nvidia", "/dev/nvidiactl", "/dev/dxg")
+    return shutil.which("nvidia-smi") is not None or any(Path(file).exists() for file in files)
 
 
 def processor(info: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
-    """The processor's model and the hash of what it can do: libraries choose their kernels by both."""
+    """Return the processor's model, its vector instruction sets and a hash of all its flags.
+
+    Math libraries choose their kernels by these, so results may differ in the last bits between two processors.
+    """
     entries: dict[str, str] = {}
     with contextlib.suppress(OSError), info.open(encoding="utf-8", errors="replace") as lines:
         for line in lines:
             key, colon, value = line.partition(":")
             if not colon:
-                break  # the first core's block is over
+                break  # an empty line: the block of the first core ends here
             entries[key.strip()] = value.strip()
     model = entries.get("model name") or platform.processor() or platform.machine()
     flags = sorted((entries.get("flags") or entries.get("Features") or "").split())

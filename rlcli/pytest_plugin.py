@@ -1,4 +1,4 @@
-"""For task authors: the pytest fixture `rlcli_check`. It comes with rlcli and costs nothing where it is not used.
+"""Pytest fixture `rlcli_check` for authors of tasks. It comes with rlcli and is imported only when a test uses it.
 
 ```python
 def test_the_contract(rlcli_check):
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def rlcli_check() -> Callable[..., list[Finding]]:
-    """A function that fails the test with everything a task does not keep, and returns the warnings.
+    """Return a function that runs `rlcli check` on a task: it fails the test with all errors and returns the warnings.
 
-    Its arguments are those of `rlcli.testing.check_task`: a task's name or folder, `agent`, `overrides`, `only`.
+    Its arguments are those of `rlcli.testing.check_task`: the name or folder of a task, `agent`, `overrides`, `only`.
     """
 
     def check(

@@ -1,7 +1,8 @@
 """Counter-based random numbers: a draw depends on (seed, stream, environment, counter, index) and nothing else.
 
-So environment 7 lives the same life whatever the number of environments or threads, and whoever else resets or
-draws. The mixing function is the finaliser of SplitMix64 (Steele, Lea and Flood 2014).
+Environment 7 therefore draws the same numbers for any number of environments and threads, and for any order in which
+other environments reset or draw. The mixing function is the finaliser of SplitMix64 (Steele, Lea and Flood 2014,
+https://doi.org/10.1145/2660193.2660195).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 Keys = NDArray[np.uint64]
 
-# arrays without axes: numpy makes one of every scalar that it meets, which takes as long as the operation
+# 0-d arrays instead of scalars: numpy converts each scalar operand to an array, which takes as long as the operation
 _GOLDEN = np.array(0x9E3779B97F4A7C15, np.uint64)
 _MIX1 = np.array(0xBF58476D1CE4E5B9, np.uint64)
 _MIX2 = np.array(0x94D049BB133111EB, np.uint64)
@@ -24,12 +25,15 @@ _TO_UNIT = np.array(2.0**-24, np.float32)
 
 @functools.lru_cache(maxsize=4096)
 def stream(name: str) -> np.uint64:
-    """The stream of a term, from its name."""
+    """Return the stream of a term: the first 64 bits of the BLAKE2b hash of its name."""
     return np.uint64(int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little"))
 
 
 def mix(x: Keys) -> Keys:
-    """SplitMix64's finaliser, in place: a bijection whose output bits all depend on all input bits."""
+    """Apply SplitMix64's finaliser in place: a bijection in which every output bit depends on every input bit.
+
+    Overflow of the products is intended: the arithmetic is modulo 2**64.
+    """
     x ^= x >> _S30
     x *= _MIX1
     x ^= x >> _S27
@@ -39,47 +43,48 @@ def mix(x: Keys) -> Keys:
 
 
 def row_keys(seed: int, env_ids: NDArray[np.int64], counters: NDArray[np.int64]) -> Keys:
-    """One key a row, from the seed, the environment and a counter (its episode, or its step). (n,)"""
+    """Return one key for each row, from the seed, the environment and a counter (episode or step number). (n,)"""
     keys = mix(env_ids.astype(np.uint64) * _GOLDEN + start(seed))
     keys += counters.astype(np.uint64) * _GOLDEN
     return mix(keys)
 
 
 def bits(keys: Keys, stream: np.uint64, index: int, count: int) -> Keys:
-    """`count` words a row, those of index `index`, `index + 1`, ... of a stream. (n, count)"""
+    """Return `count` 64-bit words for each row: those with index `index`, `index + 1`, ... of a stream. (n, count)"""
     return mix(keys[:, None] + _offsets(int(stream), index, count))
 
 
 def uniform(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
-    """Uniform in [0, 1), multiples of 2**-24. (n, count)"""
+    """Return uniform numbers in [0, 1), multiples of 2**-24. (n, count)"""
     words = bits(keys, stream, index, count)
-    words >>= _S40
+    words >>= _S40  # 24 bits remain, as many as the significand of a float32 holds exactly
     unit = words.astype(np.float32)
     unit *= _TO_UNIT
     return unit
 
 
 def normal(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
-    """Standard normal, by Box and Muller's transform of two uniforms each. (n, count)"""
+    """Return standard normal numbers, each from two uniform numbers by the Box-Muller transform. (n, count)"""
     u = uniform(keys, stream, index, 2 * count)
+    # log1p(-u) with u in [0, 1) is finite; log(u) would be -inf at u = 0
     radius = np.sqrt(-2.0 * np.log1p(-u[:, :count].astype(np.float64)))
     values: NDArray[np.float32] = (radius * np.cos(2.0 * np.pi * u[:, count:])).astype(np.float32)
     return values
 
 
 def integers(keys: Keys, stream: np.uint64, index: int, count: int, high: int) -> NDArray[np.int64]:
-    """Whole numbers in [0, high). (n, count)"""
+    """Return whole numbers in [0, high). (n, count)"""
     return (uniform(keys, stream, index, count).astype(np.float64) * high).astype(np.int64)
 
 
 def derive(seed: int, name: str) -> int:
-    """A 31-bit seed for a library that wants its own, independent for each name."""
+    """Return a 31-bit seed for another library; seeds of different names are independent."""
     return int(mix(_word(seed) ^ stream(name))[0] >> np.uint64(33))
 
 
 @functools.lru_cache
 def start(seed: int) -> Keys:
-    """The word that every key of a seed begins from. (1,)"""
+    """Return the word from which every key of a seed is computed. (1,)"""
     return mix(_word(seed) + _GOLDEN)
 
 

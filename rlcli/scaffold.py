@@ -1,7 +1,7 @@
-"""A new task as a package of its own: the files that `rlcli new` writes.
+"""Generator of the files that `rlcli new` writes: a Python package with a new task.
 
-They are templates in `rlcli/templates`: `common`, and a folder for each flavour. In their paths `package` stands for
-the name of the Python package and `suite` for `tests`, a name that builders of wheels may leave out.
+The templates are in `rlcli/templates`: the folder `common`, and one folder for each flavour. In their paths `package`
+stands for the name of the Python package, and `suite` for `tests` (some wheel builders exclude folders named `tests`).
 """
 
 from __future__ import annotations
@@ -25,32 +25,18 @@ FLAVOURS = ("yaml", "direct")
 MAX_LENGTH = 64
 _TEMPLATES = Path(__file__).parent / "templates"
 _DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))}
-"""What Windows does not let a file be called."""
-_FLAVOUR_TEXTS = {
-    "yaml": {
-        "code": "terms",
-        "yaml_is": "the task: scene, actions, observations, rewards, ends, success, agents",
-        "code_is": "terms of its own; those that rlcli has are named in the YAML alone",
-        "schema_changes": "the parameters in `terms.py`",
-    },
-    "direct": {
-        "code": "task",
-        "yaml_is": "scene, parameters, success, agents",
-        "code_is": "the task: one class, whose hooks fill its observations, rewards and ends",
-        "schema_changes": "`Params` in `task.py`",
-    },
-}
+"""File names that Windows reserves for devices."""
 
 
 def create(name: str, flavour: str, folder: Path | None = None) -> tuple[Path, list[str]]:
-    """Write the package of a new task, whole or not at all.
+    """Write the package of a new task, completely or not at all.
 
     Returns:
-        Its folder, and its files relative to that.
+        The folder of the package, and its files relative to that folder.
 
     Raises:
-        UsageError: if the name cannot be a task's, a distribution's and a package's, or the folder holds something.
-        MachineError: if the disk refuses.
+        UsageError: if the name is not valid for a task, a distribution and a package, or if the folder is not empty.
+        MachineError: if the files cannot be written.
     """
     require_known(flavour, FLAVOURS, "flavour", "flavours")
     check_name(name)
@@ -65,45 +51,46 @@ def create(name: str, flavour: str, folder: Path | None = None) -> tuple[Path, l
 
 
 def check_name(name: str) -> None:
-    """Whether a task, a distribution and a Python package can have this name.
+    """Check that a task, a distribution and a Python package can have this name.
 
     Raises:
-        UsageError: if one of them cannot.
+        UsageError: if the name is not valid or already in use.
     """
     if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name):
-        said = "small letters a-z, digits and single hyphens, and begins with a letter"
-        raise UsageError(f"'{name}' is not a name for a task: that has {said}", hint=_instead(name))
+        rule = "a task name has only letters a-z, digits and single hyphens, and starts with a letter"
+        raise UsageError(f"'{name}' is not a valid task name: {rule}", hint=_suggest_name(name))
     if len(name) > MAX_LENGTH:
-        raise UsageError(f"'{name}' has {len(name)} characters; a name has at most {MAX_LENGTH}")
+        raise UsageError(f"'{name}' has {len(name)} characters; a task name has at most {MAX_LENGTH}")
     package = name.replace("-", "_")
-    for word, what in (
-        (keyword.iskeyword(package), "a word of Python's own"),
+    for reserved, reason in (
+        (keyword.iskeyword(package), "a keyword of Python"),
         (package in sys.stdlib_module_names, "a module of Python's standard library"),
-        (package in ("test", "tests", "site", "conftest"), "what folders of tests and modules are called"),
-        (name in _DEVICES, "what Windows calls a device"),
+        (package in ("test", "tests", "site", "conftest"), "a usual name of test folders and modules"),
+        (name in _DEVICES, "the name of a device on Windows"),
     ):
-        if word:
-            raise UsageError(f"'{name}' cannot be a package: it is {what}", hint=f"{name}-task, for example")
-    for entry in catalog(TASKS, hidden=True)[0]:
-        if entry.name == name:
-            owner = f"{entry.distribution} {entry.version}"
-            raise UsageError(f"'{name}' is a task of {owner} already", hint=f"{name}-2, for example")
-    installed = _installed(name)
-    if installed is not None:
-        raise UsageError(f"a package {installed} is installed already", hint=f"{name}-2, for example")
-    place = _module_place(package)
-    if place is not None:
-        raise UsageError(f"there is a Python module '{package}' already: {place}", hint=f"{name}-2, for example")
+        if reserved:
+            raise UsageError(f"'{name}' cannot be a package: it is {reason}", hint=f"{name}-task, for example")
+    owners = [f"{entry.distribution} {entry.version}" for entry in catalog(TASKS, hidden=True)[0] if entry.name == name]
+    distribution, module = _installed(name), _module_file(package)
+    if owners:
+        message = f"{owners[0]} already has a task '{name}'"
+    elif distribution is not None:
+        message = f"a package {distribution} is already installed"
+    elif module is not None:
+        message = f"a Python module '{package}' already exists: {module}"
+    else:
+        return
+    raise UsageError(message, hint=f"{name}-2, for example")
 
 
 def render(name: str, flavour: str) -> dict[str, str]:
-    """The files of a new task: path within its folder -> text."""
+    """Return the files of a new task: path within its folder -> text."""
     import jinja2
 
     package = name.replace("-", "_")
     version = ".".join(__version__.split(".")[:2])
-    values = {"name": name, "package": package, "version": version, **_FLAVOUR_TEXTS[flavour]}
-    # The texts are Python, TOML, XML and Markdown, and the values have been checked: nothing is to be escaped.
+    values = {"name": name, "package": package, "version": version, "flavour": flavour}
+    # No escaping: the texts are Python, TOML, XML and Markdown, and `check_name` has checked the values.
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
     names = {"package": package, "suite": "tests", "gitignore": ".gitignore"}
     files = {}
@@ -119,32 +106,32 @@ _SCHEMA = "task.schema.json"
 
 
 def _write(folder: Path, files: dict[str, str], package: str) -> None:
-    """Write all beside the folder, and move it into its place when it is complete."""
+    """Write all files to a temporary folder beside the target folder, then move them when they are complete."""
     from rlcli.config.dump import json_schema
     from rlcli.config.load import extensions
 
     folder.absolute().parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.absolute().parent))
     try:
-        made = temporary / "made"  # a folder that mkdtemp makes is its owner's alone
+        made = temporary / "made"  # a subfolder, because the folder of mkdtemp has mode 0700
         for path, text in files.items():
             (made / path).parent.mkdir(parents=True, exist_ok=True)
             (made / path).write_text(text, encoding="utf-8", newline="\n")
         schema = json_schema(*extensions(folder_task(made / package)))
         (made / _SCHEMA).write_text(json.dumps(schema), encoding="utf-8")
-        for left in made.rglob("__pycache__"):
-            shutil.rmtree(left)
+        for cache in made.rglob("__pycache__"):
+            shutil.rmtree(cache)
         if not folder.is_dir():
             os.replace(made, folder)
             return
-        there = []
+        moved = []
         try:
             for part in made.iterdir():
-                there.append(folder / part.name)
-                os.replace(part, there[-1])
+                moved.append(folder / part.name)
+                os.replace(part, moved[-1])
         except BaseException:
-            for moved in there:
-                shutil.rmtree(moved) if moved.is_dir() else moved.unlink(missing_ok=True)
+            for part in moved:
+                shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
             raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -155,18 +142,18 @@ def _check_folder(folder: Path) -> None:
         raise UsageError(f"'{folder}' exists and is not a folder", hint="--output FOLDER")
     if folder.is_dir() and any(folder.iterdir()):
         inside = listing(sorted(path.name for path in folder.iterdir()), 5)
-        raise UsageError(f"the folder '{folder}' holds files already ({inside})", hint="--output FOLDER")
+        raise UsageError(f"the folder '{folder}' is not empty ({inside})", hint="--output FOLDER")
 
 
-def _instead(name: str) -> str | None:
-    """The nearest name that can be one."""
+def _suggest_name(name: str) -> str | None:
+    """Return a hint with a valid name that is similar to an invalid one."""
     words = re.sub(r"([a-z0-9])([A-Z])", r"\1-\2", name)
     near = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-").lstrip("0123456789-")
     return f"did you mean '{near}'?" if near and near != name and name.isascii() else "my-arm, for example"
 
 
 def _installed(name: str) -> str | None:
-    """The distribution of this name, with its version."""
+    """Return the installed distribution of this name with its version; None if there is none."""
     try:
         return f"{name} {metadata.version(name)}"
     except metadata.PackageNotFoundError:
@@ -175,7 +162,8 @@ def _installed(name: str) -> str | None:
         return name
 
 
-def _module_place(package: str) -> str | None:
+def _module_file(package: str) -> str | None:
+    """Return the file of an installed module; None if there is none."""
     try:
         found = importlib.util.find_spec(package)
     except (ImportError, ValueError):

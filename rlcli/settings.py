@@ -1,8 +1,7 @@
-"""The user's preferences of the command line, for every folder and task; never a part of a task.
+"""The user's settings of the command line. They hold for all folders and tasks and are never a part of a task.
 
-They stand in `settings.yaml` in the platform's folder for configurations; `rlcli.config.settings_file` reads that file.
-A flag comes before an environment variable, that before this file, and the file before the default. Programs that use
-the library are not affected by it.
+The file `settings.yaml` is in the platform's folder for user configuration; `rlcli.config.settings_file` reads it.
+Precedence: flag, environment variable, settings file, default. Programs that import the library ignore the file.
 """
 
 from __future__ import annotations
@@ -14,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 NO_FILE = "none"
-"""What RLCLI_SETTINGS says to leave every settings file alone."""
+"""Value of RLCLI_SETTINGS that means: read no settings file."""
 
 
 def settings_file() -> Path | None:
-    """The file that would be read, whether it is there or not; None where RLCLI_SETTINGS is `none`."""
+    """Return the path of the settings file, whether it exists or not; None if RLCLI_SETTINGS is `none`."""
     named = os.environ.get("RLCLI_SETTINGS", "").strip()
     if named:
         return None if named == NO_FILE else Path(named).expanduser()
@@ -27,20 +26,20 @@ def settings_file() -> Path | None:
     return Path(platformdirs.user_config_dir("rlcli", appauthor=False, roaming=True)) / "settings.yaml"
 
 
-_applied: Mapping[str, Any] = {}
+_current: Mapping[str, Any] = {}
 
 
 @contextmanager
-def applied(settings: Mapping[str, Any]) -> Iterator[None]:
-    """Let `setting` answer from these."""
-    global _applied
-    before, _applied = _applied, settings
+def use_settings(settings: Mapping[str, Any]) -> Iterator[None]:
+    """Make `setting` read from these settings inside the `with` block."""
+    global _current
+    before, _current = _current, settings
     try:
         yield
     finally:
-        _applied = before
+        _current = before
 
 
 def setting(key: str) -> Any:
-    """What the user prefers; None where nothing is said, and outside of the command line."""
-    return _applied.get(key)
+    """Return a setting of the user; None if the file does not set it, and outside of the command line."""
+    return _current.get(key)

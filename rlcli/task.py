@@ -1,4 +1,4 @@
-"""What a task plugin exports, and the light type aliases that its terms are written with."""
+"""Interface of task plugins: `TaskSpec`, and the type aliases for the parameters of terms."""
 
 from __future__ import annotations
 
@@ -7,25 +7,26 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 API_VERSION = 1
-"""Version of the plugin interface. A task built for a newer one is refused with both numbers."""
+"""Version of the plugin interface. A plugin that needs a newer version is refused, with both numbers."""
 
 
 @dataclass(frozen=True, slots=True)
 class TaskSpec:
-    """What an entry point of the group `rlcli.tasks` resolves to. Importing its module must be cheap.
+    """A task of a plugin. An entry point of the group `rlcli.tasks` names an object of this class.
 
-    The task's name is the entry point's name and its owner the distribution: neither is repeated here.
+    The module that defines the object must be cheap to import. The name of the task is the name of the entry point, and
+    its owner is the distribution; neither is repeated here.
 
     Attributes:
-        package: the package that the YAML and the models lie in, usually `__name__`.
+        package: the package that holds the YAML and the models, usually `__name__`.
         summary: one line for `list-tasks`.
         config: the YAML file, relative to the package; or `module:attribute`, a `TaskConfig` built in Python.
         task: the direct task class as `module:Class`; None for a manager-based task.
-        terms: modules whose functions the YAML may name, searched before `rlcli.mdp`.
+        terms: modules whose functions the YAML may name. They are searched before `rlcli.mdp`.
         agents: further agents of a configuration in Python: name -> `module:attribute`.
-        policies: a folder, relative to the package. `NAME` in it is the policy shipped with the task of that name, as
-            `rlcli export --format bundle` writes it; a task need not ship one.
-        api: the `API_VERSION` the task was written for.
+        policies: a folder, relative to the package. Its subfolder `NAME` is the trained policy of the task `NAME`, as
+            `rlcli export --format bundle` writes it. Trained policies are optional.
+        api: the `API_VERSION` that the task was written for.
     """
 
     package: str
@@ -47,13 +48,13 @@ class TaskSpec:
                 raise TypeError(f"{name} is a string, not {getattr(self, name)!r}")
 
 
-# In a YAML file these are names or regular expressions; a term receives what they resolve to in the compiled
-# model. They are Any to a type checker because the default in a signature is the name ("robot") while the
-# function body uses the object.
+# Aliases for the parameters of terms. A YAML file gives a name or regular expressions; the term receives the object or
+# index that they resolve to in the compiled model. A type checker sees Any, because the default in the signature is the
+# name ("robot"), while the body of the function uses the object.
 Entity: TypeAlias = Any
 """An entity of the scene. YAML: its name. At run time: `rlcli.scene.entity.Entity`."""
 Joints: TypeAlias = Any
-"""Hinge and slide joints of `entity`, in the order written. At run time: an index into joint columns."""
+"""Hinge and slide joints of `entity`, in the order of the YAML. At run time: an index into joint columns."""
 Bodies: TypeAlias = Any
 """Bodies of `entity`. At run time: an index into body columns."""
 Sites: TypeAlias = Any
@@ -77,8 +78,9 @@ CameraSensor: TypeAlias = Any
 Command: TypeAlias = Any
 """A term of `commands:`. YAML: its name. At run time: the term, whose `.command` is (num_envs, k)."""
 Address: TypeAlias = Any
-"""A number, or a list of numbers, of this configuration that may change while training goes on. YAML: its dotted key.
-At run time: a tensor on the environment's device; whoever reads the number reads what is written there."""
+"""A number or a list of numbers of this configuration that may change during training. YAML: its dotted key.
+At run time: a tensor on the environment's device. A value that is written into this tensor takes effect wherever the
+number is used."""
 Range: TypeAlias = tuple[float, float]
 """`[low, high]` with low <= high."""
 
@@ -86,8 +88,8 @@ Range: TypeAlias = tuple[float, float]
 def reads_body_forces(term: Any) -> Any:
     """Mark a term that reads `body_lin_acc_w`, `body_ang_acc_w` or `body_incoming_wrench_b` of an entity.
 
-    MuJoCo computes accelerations and forces of bodies only for models with a sensor that needs them; a task that uses
-    a term so marked gets one.
+    MuJoCo computes accelerations and forces of bodies only if a sensor of the model needs them. If a task uses a marked
+    term, rlcli adds such a sensor to the model.
     """
     term.reads_body_forces = True
     return term

@@ -1,4 +1,4 @@
-"""What a trainer plugin exports."""
+"""Interface of trainer plugins: `TrainerSpec`."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from rlcli.task import API_VERSION
 
 @dataclass(frozen=True, slots=True)
 class TrainerSpec:
-    """What an entry point of the group `rlcli.trainers` resolves to. Importing its module must be cheap.
+    """A trainer of a plugin. An entry point of the group `rlcli.trainers` names an object of this class.
+
+    The module that defines the object must be cheap to import.
 
     Attributes:
-        summary: one line.
-        algorithms: algorithm name -> `module:Model`, the pydantic model of its settings (an `AgentConfig`). An agent
-            whose `algorithm` is a mapping names it by `class_name`, or means the first.
+        summary: one line that describes the trainer.
+        algorithms: algorithm name -> `module:Model`, the pydantic model of its settings (an `AgentConfig`). If the
+            `algorithm` of an agent is a mapping, its key `class_name` names the algorithm; without that key it is the
+            first one.
         trainer: `module:Class` of a `Trainer`, called as `Class(env, config, seed=, device=, torch_threads=)`.
-        refused: algorithms that the library has and this trainer cannot run -> why.
+        refused: algorithms that the library has and this trainer cannot run -> the reason.
         parallel: whether several processes can train one policy (`rlcli.rl.distributed`).
-        gpu: whether it trains with everything on a GPU.
-        api: the plugin interface that it was written for.
+        gpu: whether the trainer keeps all tensors on a GPU.
+        api: the `API_VERSION` that the trainer was written for.
     """
 
     summary: str

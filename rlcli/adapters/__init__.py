@@ -1,1 +1,1 @@
-"""Views of a `VecEnv` for other libraries."""
+"""Adapters of a `VecEnv` to the interfaces of other libraries."""

@@ -1,4 +1,4 @@
-"""A task as Gymnasium wants it: a `VectorEnv` of many environments, and an `Env` of one.
+"""Gymnasium environments of a task: a `VectorEnv` of many environments, and an `Env` of one environment.
 
 `rlcli.gym` registers them: `gym.make_vec("rlcli.gym:rlcli/cartpole", num_envs=8)`.
 """
@@ -34,15 +34,15 @@ Changes = Mapping[str, Any] | Iterable[str] | TaskConfig | Resolved | None
 def open_task(
     task: str, num_envs: int, cfg: Changes = None, *, agent: str | None = None, seed: int = 42, device: str = "cpu"
 ) -> VecEnv:
-    """The environment of a task.
+    """Return the environment of a task.
 
     Args:
-        task: its name, or its folder.
-        num_envs: environments.
-        cfg: what to change: a mapping, `{"episode_length_s": 3.0}`, with dotted keys or nested; or a list of overrides,
-            `["episode_length_s=3.0"]`; or a whole configuration in the task's place.
-        agent: the agent whose patch of the task is applied; None: the default one.
-        seed: of every random draw, until `reset` is given another.
+        task: name or folder of the task.
+        num_envs: number of environments.
+        cfg: changes of the configuration: a mapping with dotted or nested keys, `{"episode_length_s": 3.0}`; or a list
+            of overrides, `["episode_length_s=3.0"]`; or a whole configuration that replaces the task's own.
+        agent: the agent whose patch of the task is applied; None: the default agent.
+        seed: seed of all random draws, until `reset` gets another one.
         device: cpu, cuda or cuda:N.
     """
     if isinstance(cfg, Resolved):
@@ -52,7 +52,7 @@ def open_task(
         source = find_task(task)
         return make_env(cfg.model_copy(update={"scene": scene}), seed=seed, device=device, root=source.root)
     if isinstance(cfg, str):
-        raise TypeError(f"cfg is a mapping or a list of overrides: [{cfg!r}]")
+        raise TypeError(f"cfg must be a mapping or a list of overrides: [{cfg!r}]")
     changes = dict(_flat(cfg)) if isinstance(cfg, Mapping) else {}
     overrides = () if cfg is None or isinstance(cfg, Mapping) else tuple(cfg)
     flags = {**changes, "scene.num_envs": num_envs}
@@ -70,7 +70,7 @@ def make_vector(
     render_mode: str | None = None,
     **settings: Any,
 ) -> GymnasiumVectorEnv:
-    """What `gym.make_vec` calls; see `open_task` and `GymnasiumVectorEnv` for the arguments."""
+    """Return a vector environment; `gym.make_vec` calls it. Arguments: see `open_task` and `GymnasiumVectorEnv`."""
     env = open_task(task, num_envs, cfg, **settings)
     return GymnasiumVectorEnv(env, autoreset_mode, action_bound=action_bound, render_mode=render_mode)
 
@@ -83,23 +83,26 @@ def make_single(
     render_mode: str | None = None,
     **settings: Any,
 ) -> GymnasiumEnv:
-    """What `gym.make` calls; see `open_task` and `GymnasiumEnv` for the arguments."""
+    """Return a single environment; `gym.make` calls it. Arguments: see `open_task` and `GymnasiumEnv`."""
     return GymnasiumEnv(open_task(task, 1, cfg, **settings), action_bound=action_bound, render_mode=render_mode)
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
-    """The policy group of a `VecEnv`, as float32 arrays of their own in every step.
+    """Gymnasium vector environment of the observation group `policy`. Each step returns new float32 arrays.
 
-    In each mode an environment lives through the same episodes, since what starts one depends on its number alone:
-    - SAME_STEP: the observation of an ended episode is the next one's first; its last is in `info["final_obs"]`;
-    - NEXT_STEP: it is its last; the step after ignores the action, has reward 0 and gives the next one's first;
-    - DISABLED: it is its last; `reset(options={"reset_mask": mask})` begins the next one where the mask holds.
+    The autoreset mode decides what `step` returns when an episode ends. The episodes are the same in each mode, because
+    the start state of an episode depends only on the environment and the number of the episode:
+    - SAME_STEP: `step` returns the first observation of the next episode; the last one is in `info["final_obs"]`;
+    - NEXT_STEP: `step` returns the last observation; the next step ignores the action, has reward 0 and returns the
+      first observation of the next episode;
+    - DISABLED: `step` returns the last observation; `reset(options={"reset_mask": mask})` starts the next episode in
+      the environments where the mask is true.
 
     Args:
         env: the environment.
-        autoreset_mode: which of them, or its value: "SameStep", "NextStep", "Disabled".
-        action_bound: limits of the action space where the task has none; None for unbounded.
-        render_mode: rgb_array, pictures of the first environment; None.
+        autoreset_mode: the mode, or its value: "SameStep", "NextStep", "Disabled".
+        action_bound: limit of the action space (+-) if the task has none; None: unbounded.
+        render_mode: "rgb_array" for images of the first environment; None for no images.
     """
 
     metadata: dict[str, Any]
@@ -116,41 +119,48 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.num_envs = env.num_envs
         self.mode = AutoresetMode(autoreset_mode)
         self.metadata = {**_metadata(env), "autoreset_mode": self.mode}
-        self.render_mode = _known_mode(render_mode)
+        self.render_mode = _check_mode(render_mode)
         self.single_observation_space = observation_space(env)
         self.single_action_space = action_space(env, action_bound)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._ended = np.zeros(self.num_envs, dtype=bool)
-        self._first: Floats | None = None  # of the episodes that have begun where the last ones ended
-        self._seen: Floats | None = None
+        # The `VecEnv` resets an ended environment within the step. The first observation of the new episode is kept
+        # here until Gymnasium's mode allows it to be returned.
+        self._first: Floats | None = None
+        self._last_obs: Floats | None = None
         self._camera = _Camera(env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        """Begin new episodes: everywhere, or where `options["reset_mask"]` holds. (num_envs, d)
+        """Start new episodes in all environments, or in those where `options["reset_mask"]` is true. (num_envs, d)
 
-        A seed seeds every environment, each with its own stream.
+        One seed is enough: each environment has its own random stream.
 
         Raises:
-            ValueError: for a mask that holds where no episode has ended.
+            ValueError: if the mask is true for an environment whose episode has not ended.
         """
         if seed is not None and not isinstance(seed, int | np.integer):
-            raise TypeError(f"seed is one number for all environments, which have a stream each; found {seed!r}")
+            raise TypeError(f"seed must be one number; each environment has its own stream of it; found {seed!r}")
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
+        # a mask of all environments is a full reset, unless all have ended and wait for their next episode
         if mask is not None and not (np.all(mask) and (seed is not None or not self._ended.all())):
-            return self._begin(np.asarray(mask, dtype=bool)), {}
+            return self._start_episodes(np.asarray(mask, dtype=bool)), {}
         self._ended[:] = False
-        self._seen = _floats(self.env.reset(seed=seed))
-        return self._seen.copy(), {}
+        self._last_obs = _policy_obs(self.env.reset(seed=seed))
+        return self._last_obs.copy(), {}
 
     def step(
         self, actions: Floats
     ) -> tuple[Floats, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Step all environments. actions (num_envs, a)
 
+        Returns:
+            Observations (num_envs, d) float32, rewards (num_envs,) float64, terminated and truncated (num_envs,) bool,
+            infos.
+
         Raises:
-            RuntimeError: in mode DISABLED, if an episode has ended and no new one has begun.
+            RuntimeError: in mode DISABLED, if an episode has ended and no new one was started.
         """
         action = torch.as_tensor(np.asarray(actions, dtype=np.float32), device=self.env.device)
         waiting = self._ended.copy()
@@ -158,10 +168,11 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             result = self.env.step(action)
         elif self.mode is AutoresetMode.DISABLED:
             ids = np.flatnonzero(waiting).tolist()
-            raise RuntimeError(f"environments {ids} have ended: reset(options={{'reset_mask': mask}}) begins anew")
+            message = f"the episodes of environments {ids} have ended; call reset(options={{'reset_mask': mask}})"
+            raise RuntimeError(message)
         else:
             result = self.env.step(action, torch.from_numpy(waiting).to(self.env.device))
-        obs = _floats(result.obs)
+        obs = _policy_obs(result.obs)
         terminated, truncated = (flags.cpu().numpy().copy() for flags in (result.terminated, result.truncated))
         infos = self._infos(result)
         if self.mode is AutoresetMode.SAME_STEP:
@@ -171,32 +182,34 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             if self._ended.any():
                 assert result.final_obs is not None
                 self._first = obs
-                obs = np.where(self._ended[:, None], _floats(result.final_obs), obs)
-        self._seen = obs
+                obs = np.where(self._ended[:, None], _policy_obs(result.final_obs), obs)
+        self._last_obs = obs
         return obs.copy(), result.reward.cpu().numpy().astype(np.float64), terminated, truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """A picture of the first environment; None without a `render_mode`. (height, width, 3)"""
-        return None if self.render_mode is None else (self._camera.picture(),)
+        """Return an image of the first environment, uint8 (height, width, 3); None without a `render_mode`."""
+        return None if self.render_mode is None else (self._camera.image(),)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the environment."""
         self._camera.close()
         self.env.close()
 
-    def _begin(self, mask: NDArray[np.bool_]) -> Floats:
+    def _start_episodes(self, mask: NDArray[np.bool_]) -> Floats:
+        """Start the next episode in the environments of a mask."""
         if mask.shape != (self.num_envs,):
             raise ValueError(f"reset_mask has shape {mask.shape}, expected {(self.num_envs,)}")
         running = np.flatnonzero(mask & ~self._ended).tolist()
-        if running or self._seen is None:
-            raise ValueError(f"reset_mask holds in environments {running}, whose episodes have not ended")
+        if running or self._last_obs is None:
+            raise ValueError(f"reset_mask is true for environments {running}, whose episodes have not ended")
         if mask.any():
             assert self._first is not None
-            self._seen = np.where(mask[:, None], self._first, self._seen)
+            self._last_obs = np.where(mask[:, None], self._first, self._last_obs)
             self._ended &= ~mask
-        return self._seen.copy()
+        return self._last_obs.copy()
 
     def _infos(self, result: StepResult) -> dict[str, Any]:
+        """Return the success of ended episodes; `_success` marks the environments for which it is valid."""
         if result.episodes is None or result.episodes.success is None:
             return {}
         ended = result.episodes.ended()
@@ -207,68 +220,69 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return {"success": success, "_success": known} if known.any() else {}
 
     def _final_infos(self, result: StepResult, infos: dict[str, Any]) -> dict[str, Any]:
+        """Return `final_obs` and `final_info` of the ended episodes in Gymnasium's form for SAME_STEP."""
         if result.episodes is None or result.final_obs is None:
             return {}
-        final = _floats(result.final_obs)
+        final = _policy_obs(result.final_obs)
         found: dict[str, Any] = {}
-        for world in result.episodes.ended().ids.tolist():
-            own = {"success": bool(infos["success"][world])} if "success" in infos else {}
-            found = self._add_info(found, {"final_obs": final[world].copy(), "final_info": own}, world)
+        for env_id in result.episodes.ended().ids.tolist():
+            info = {"success": bool(infos["success"][env_id])} if "success" in infos else {}
+            found = self._add_info(found, {"final_obs": final[env_id].copy(), "final_info": info}, env_id)
         return found
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """The policy group of a `VecEnv` of one environment.
+    """Gymnasium environment of the observation group `policy`.
 
     Args:
-        env: the environment.
-        action_bound: limits of the action space where the task has none; None for unbounded.
-        render_mode: rgb_array, or None.
+        env: a `VecEnv` with one environment.
+        action_bound: limit of the action space (+-) if the task has none; None: unbounded.
+        render_mode: "rgb_array" or None.
     """
 
     metadata: dict[str, Any]
 
     def __init__(self, env: VecEnv, *, action_bound: float | None = 1.0, render_mode: str | None = None) -> None:
         if env.num_envs != 1:
-            raise ValueError(f"the environment has {env.num_envs} worlds; GymnasiumVectorEnv takes more than one")
+            raise ValueError(f"GymnasiumEnv takes 1 environment, found {env.num_envs}; use GymnasiumVectorEnv")
         self.env = env
         self.metadata = _metadata(env)
-        self.render_mode = _known_mode(render_mode)
+        self.render_mode = _check_mode(render_mode)
         self.observation_space = observation_space(env)
         self.action_space = action_space(env, action_bound)
-        self._first: Floats | None = None  # of the episode that has begun where the last one ended
+        self._first: Floats | None = None  # first observation of the next episode, kept until `reset`
         self._camera = _Camera(env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        """Begin a new episode. (d,)"""
+        """Start a new episode and return its first observation. (d,)"""
         super().reset(seed=seed)
         first, self._first = self._first, None
         if first is None or seed is not None:
-            first = _floats(self.env.reset(seed=seed))[0]
+            first = _policy_obs(self.env.reset(seed=seed))[0]
         return first.copy(), {}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Step. action (a,)
+        """Step the environment. action (a,)
 
         Raises:
-            RuntimeError: if the episode has ended and no new one has begun.
+            RuntimeError: if the episode has ended and `reset` was not called.
         """
         if self._first is not None:
-            raise RuntimeError("the episode has ended: reset() begins a new one")
+            raise RuntimeError("the episode has ended; call reset()")
         actions = torch.as_tensor(np.asarray(action, dtype=np.float32), device=self.env.device)
         result = self.env.step(actions[None])
-        obs, info = _floats(result.obs)[0], {}
+        obs, info = _policy_obs(result.obs)[0], {}
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         if terminated or truncated:
             assert result.final_obs is not None
-            self._first, obs = obs, _floats(result.final_obs)[0]
+            self._first, obs = obs, _policy_obs(result.final_obs)[0]
             if result.episodes is not None and result.episodes.success is not None:
                 info["success"] = bool(result.episodes.success[0])
         return obs.copy(), float(result.reward[0]), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A picture; None without a `render_mode`. (height, width, 3)"""
-        return None if self.render_mode is None else self._camera.picture()
+        """Return an image, uint8 (height, width, 3); None without a `render_mode`."""
+        return None if self.render_mode is None else self._camera.image()
 
     def close(self) -> None:
         """Close the environment."""
@@ -277,12 +291,12 @@ class GymnasiumEnv(gymnasium.Env):
 
 
 def observation_space(env: VecEnv) -> spaces.Box:
-    """Of the policy group of one environment."""
+    """Return the unbounded observation space of one environment: the group `policy`, float32 (d,)."""
     return spaces.Box(-np.inf, np.inf, (env.layout.size("policy"),), np.float32)
 
 
 def action_space(env: VecEnv, action_bound: float | None = 1.0) -> spaces.Box:
-    """Of one environment: the direct task's `action_limits`, else +-action_bound."""
+    """Return the action space of one environment: the direct task's `action_limits`, else +-`action_bound`. (a,)"""
     limits = getattr(getattr(env, "task", None), "action_limits", ())
     size = env.layout.action_size
     if len(limits) == size:
@@ -293,14 +307,14 @@ def action_space(env: VecEnv, action_bound: float | None = 1.0) -> spaces.Box:
 
 
 class _Camera:
-    """Pictures of the first environment; what draws is opened with the first one."""
+    """Renderer of the first environment, opened with the first image."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
         self._renderer: Renderer | None = None
 
-    def picture(self) -> NDArray[np.uint8]:
-        """As the environment is now. (height, width, 3)"""
+    def image(self) -> NDArray[np.uint8]:
+        """Render the current state. (height, width, 3)"""
         if self._renderer is None:
             from rlcli.viewer.offscreen import Renderer
 
@@ -317,18 +331,19 @@ def _metadata(env: VecEnv) -> dict[str, Any]:
     return {"render_modes": ["rgb_array"], "render_fps": max(1, round(1.0 / env.step_dt))}
 
 
-def _known_mode(render_mode: str | None) -> str | None:
+def _check_mode(render_mode: str | None) -> str | None:
     if render_mode not in (None, "rgb_array"):
-        raise ValueError(f"render_mode is 'rgb_array' or None, found {render_mode!r}; `rlcli play` has viewers")
+        raise ValueError(f"render_mode must be 'rgb_array' or None, found {render_mode!r}; `rlcli play` has viewers")
     return render_mode
 
 
-def _floats(groups: Mapping[str, Tensor]) -> Floats:
-    """The policy group, a copy."""
+def _policy_obs(groups: Mapping[str, Tensor]) -> Floats:
+    """Return a copy of the observation group `policy`. (num_envs, d)"""
     return np.array(groups["policy"].cpu().numpy())
 
 
 def _flat(changes: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    """Yield the values of a nested mapping with their dotted keys."""
     for key, value in changes.items():
         if isinstance(value, Mapping) and value:
             yield from _flat(value, f"{prefix}{key}.")

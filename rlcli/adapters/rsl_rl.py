@@ -1,4 +1,4 @@
-"""A `VecEnv` with the interface of RSL-RL, for its own runners."""
+"""Adapter of a `VecEnv` to RSL-RL's interface, for the runners of RSL-RL."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from rlcli.rl.statistics import EpisodeStatistics
 
 
 class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types
-    """All observation groups of a `VecEnv`. The first call of `get_observations` starts the first episodes.
+    """RSL-RL environment with all observation groups of a `VecEnv`.
 
-    `extras["time_outs"]` marks episodes that were truncated and not terminated; RSL-RL then bootstraps from the
-    observation before the step. The last observations of episodes are in `extras["final_obs"]`, which RSL-RL does not
-    read.
+    The first call of `get_observations` starts the first episodes. `extras["time_outs"]` marks episodes that were
+    truncated and not terminated; RSL-RL then bootstraps from the observation before the step. The last observations of
+    episodes are in `extras["final_obs"]`, which RSL-RL does not read.
 
     Args:
         env: the environment.
-        clip_actions: actions are clipped to +-this; None: they are not.
+        clip_actions: actions are clipped to +-`clip_actions`; None: no clipping.
     """
 
     def __init__(self, env: VecEnv, clip_actions: float | None = None) -> None:
@@ -38,7 +38,7 @@ class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types
 
     @property
     def episode_length_buf(self) -> Tensor:
-        """Steps of each episode so far. (num_envs,) int64"""
+        """Number of steps of the current episodes. (num_envs,) int64"""
         return self.unwrapped.episode_length_buf
 
     @episode_length_buf.setter
@@ -57,7 +57,11 @@ class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types
         return self._obs
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
-        """Step; see RSL-RL's `VecEnv.step`."""
+        """Step all environments. actions (num_envs, a)
+
+        Returns:
+            Observations, rewards (num_envs,), dones (num_envs,) int64, and extras, as RSL-RL's `VecEnv.step` does.
+        """
         if self._obs is None:
             self.get_observations()
         bound = self.clip_actions
@@ -72,11 +76,11 @@ class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types
         return self._obs, result.reward, (result.terminated | result.truncated).long(), extras
 
     def observations(self, groups: dict[str, Tensor]) -> TensorDict:
-        """Return observation groups in RSL-RL's form."""
+        """Return observation groups as the `TensorDict` that RSL-RL uses."""
         return TensorDict(dict(groups), batch_size=[self.num_envs], device=self.device)
 
     def zero_observations(self) -> TensorDict:
-        """Return observations of zeros, for their shapes."""
+        """Return observations that are all zero, for code that needs their shapes."""
         layout = self.unwrapped.layout
         return self.observations(
             {group: torch.zeros(self.num_envs, layout.size(group), device=self.device) for group in layout.observations}

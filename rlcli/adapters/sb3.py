@@ -1,4 +1,4 @@
-"""Environments of a task for Stable-Baselines3's own scripts."""
+"""Environments of a task for scripts that use Stable-Baselines3 directly."""
 
 from __future__ import annotations
 
@@ -13,5 +13,5 @@ __all__ = ["Sb3VecEnv", "make_sb3"]
 def make_sb3(
     task: str, num_envs: int = 1, cfg: Changes = None, *, action_bound: float | None = 1.0, **settings: Any
 ) -> Sb3VecEnv:
-    """Return the environments of a task; see `rlcli.adapters.gymnasium.open_task` for the arguments."""
+    """Return the environments of a task as an SB3 `VecEnv`. Arguments: see `rlcli.adapters.gymnasium.open_task`."""
     return Sb3VecEnv(open_task(task, num_envs, cfg, **settings), action_bound)

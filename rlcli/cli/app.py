@@ -17,9 +17,9 @@ from rlcli.cli.ui.console import console, discard, print_log_records
 from rlcli.cli.ui.options import CHOOSE, with_common_options
 from rlcli.config.settings_file import read_settings
 from rlcli.errors import ConfigError, RlcliError
-from rlcli.machine import collect_seldom
+from rlcli.machine import delay_garbage_collection
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
-from rlcli.settings import applied, settings_file
+from rlcli.settings import settings_file, use_settings
 from rlcli.trainers import TrainerSpec
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def main(arguments: list[str] | None = None) -> int:
     print_log_records()
     console.owns_process = arguments is None
     if console.owns_process:
-        collect_seldom()
+        delay_garbage_collection()
     arguments = sys.argv[1:] if arguments is None else arguments
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
     console.has_document = False  # an earlier command of this process may have printed one
@@ -115,7 +115,7 @@ def _command_name(arguments: list[str]) -> str | None:
 
 def _run(arguments: list[str]) -> int:
     try:
-        with applied(_preferences(arguments)):
+        with use_settings(_preferences(arguments)):
             result = build(_command_name(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
         if result == _INTERRUPTED:  # how typer hands on Ctrl-C
             raise KeyboardInterrupt
@@ -204,12 +204,12 @@ def _settings_called(option: str) -> list[str]:
     name = option.replace("-", "_")
     if "." in name.strip("."):
         return [name]
-    from rlcli.config.messages import homes
+    from rlcli.config.messages import key_locations
     from rlcli.config.schema import TaskConfig
 
     key = _SHORT_FOR.get(name, name)
     models: list[dict[str, Any]] = [{"": TaskConfig}, *({"agent": model} for model in _agent_models())]
-    places = list(dict.fromkeys(place for model in models for place in homes(model).get(key, [])))
+    places = list(dict.fromkeys(place for model in models for place in key_locations(model).get(key, [])))
     return places if len(places) <= 3 and name != "task" else []  # the task is an argument
 
 

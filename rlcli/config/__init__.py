@@ -1,1 +1,1 @@
-"""Configuration: strict YAML, the schema of a task, and the layers that make up a resolved one."""
+"""Configuration: the strict YAML reader, the schema of a task, and the layers of a resolved configuration."""

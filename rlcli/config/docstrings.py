@@ -1,4 +1,4 @@
-"""What stands below the settings in a model's source, as descriptions in its JSON Schema."""
+"""Reader of the docstrings below the fields of a model, which become descriptions in its JSON Schema."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic import BaseModel
 
 
 def describe(schema: dict[str, Any], model: type[BaseModel]) -> None:
-    """Put the docstrings of a model's fields into its schema, where they have no description of their own."""
+    """Add the docstrings of a model's fields to its schema. Existing descriptions are kept."""
     properties = schema.get("properties", {})
     for each in model.__mro__:
         module = each.__dict__.get("_defined_in")
@@ -27,10 +27,13 @@ def describe(schema: dict[str, Any], model: type[BaseModel]) -> None:
 
 @functools.cache
 def _class_docstrings(module: ModuleType) -> dict[str, dict[str, str]]:
-    """Class, by its qualified name -> field -> the string that follows it. Two classes of one name say nothing."""
+    """Return the docstrings of a module: qualified class name -> field -> the string below the field.
+
+    If two classes have the same qualified name, both have no docstrings, because the right one is unknown.
+    """
     try:
         tree = ast.parse(inspect.getsource(module))
-    except (OSError, TypeError, SyntaxError, ValueError):  # built in, or typed into a prompt
+    except (OSError, TypeError, SyntaxError, ValueError):  # no source: a built-in module, or an interactive session
         return {}
     found: dict[str, dict[str, str]] = {}
     for name, body in _classes(tree, ""):
@@ -38,19 +41,21 @@ def _class_docstrings(module: ModuleType) -> dict[str, dict[str, str]]:
     return found
 
 
-def _classes(node: ast.AST, outside: str) -> Iterator[tuple[str, list[ast.stmt]]]:
+def _classes(node: ast.AST, prefix: str) -> Iterator[tuple[str, list[ast.stmt]]]:
+    """Yield qualified name and body of every class in a syntax tree."""
     for inner in ast.iter_child_nodes(node):
         if isinstance(inner, ast.ClassDef):
-            yield outside + inner.name, inner.body
-            yield from _classes(inner, f"{outside}{inner.name}.")
+            yield prefix + inner.name, inner.body
+            yield from _classes(inner, f"{prefix}{inner.name}.")
         elif isinstance(inner, ast.FunctionDef | ast.AsyncFunctionDef):
-            yield from _classes(inner, f"{outside}{inner.name}.<locals>.")
-        elif not isinstance(inner, ast.expr):  # an `if`, a `try` and what belongs to it
-            yield from _classes(inner, outside)
+            yield from _classes(inner, f"{prefix}{inner.name}.<locals>.")
+        elif not isinstance(inner, ast.expr):  # statements with a body, such as `if` and `try`
+            yield from _classes(inner, prefix)
 
 
 def _field_docstrings(body: list[ast.stmt]) -> Iterator[tuple[str, str]]:
-    for field, text in itertools.pairwise(body):
-        match field, text:
-            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(said))):
-                yield name, inspect.cleandoc(said)
+    """Yield name and docstring of every annotated field that a string follows."""
+    for field, below in itertools.pairwise(body):
+        match field, below:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                yield name, inspect.cleandoc(text)

@@ -1,4 +1,4 @@
-"""A resolved configuration as YAML that reads back as the same configuration."""
+"""Output of a resolved configuration: YAML that reads back as the same configuration, origins, JSON Schema."""
 
 from __future__ import annotations
 
@@ -19,10 +19,13 @@ _TAGS = {type(None): "null", bool: "bool", int: "int", float: "float", str: "str
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
     def resolve(self, kind: type[yaml.Node], value: Any, implicit: tuple[bool, bool]) -> str:
-        """The tag that the strict reader gives a plain scalar, so that whatever it reads otherwise is quoted."""
+        """Return the tag that the strict reader gives to a plain scalar.
+
+        PyYAML quotes a string whose tag is not that of a string, so that the strict reader reads it back as a string.
+        """
         if kind is not yaml.ScalarNode or not implicit[0]:
             return str(super().resolve(kind, value, implicit))
-        if value == "<<":  # a merge, as a key
+        if value == "<<":  # as a plain key it would be a merge key
             return "not a plain scalar"
         try:
             return f"tag:yaml.org,2002:{_TAGS[type(strict_yaml.load_value(value))]}"
@@ -31,13 +34,13 @@ class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
 
 
 def _text(dumper: _Dumper, value: str) -> yaml.Node:
-    style = '"' if len(value.splitlines()) > 1 or value[-1:].isspace() else None  # on one line, with escapes
+    style = '"' if len(value.splitlines()) > 1 or value[-1:].isspace() else None  # double quotes keep it on one line
     return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
 
 
 def _number(dumper: _Dumper, value: float) -> yaml.Node:
     text = repr(value)
-    if "." not in text and "e" in text:  # YAML 1.1 takes 1e-05 for a string
+    if "." not in text and "e" in text:  # YAML 1.1 reads 1e-05 as a string
         text = text.replace("e", ".0e")
     return dumper.represent_scalar("tag:yaml.org,2002:float", text)
 
@@ -53,7 +56,7 @@ _Dumper.add_representer(list, _sequence)
 
 
 def to_data(resolved: Resolved) -> dict[str, Any]:
-    """The whole configuration as plain data: patches applied, defaults filled in, one agent."""
+    """Return the whole configuration as plain data: with patches, with defaults, with one agent."""
     data = resolved.task.model_dump(mode="json", exclude={"agents"})
     data |= data.pop("foreign")
     data["play"] = resolved.layers.data.get("play", {})
@@ -66,35 +69,41 @@ def to_data(resolved: Resolved) -> dict[str, Any]:
 
 
 def to_yaml(data: dict[str, Any]) -> str:
-    """Plain data as YAML that `strict_yaml` reads back unchanged."""
+    """Return plain data as YAML that `strict_yaml` reads back unchanged."""
     return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=110, allow_unicode=True))
 
 
 def to_yaml_with_origins(resolved: Resolved) -> str:
-    """The configuration as YAML, every value followed by where it comes from."""
+    """Return the configuration as YAML with the origin of every value as a comment."""
     lines: list[str] = []
     _annotate(to_data(resolved), (), resolved, lines)
     return "\n".join(lines) + "\n"
 
 
 def origins(resolved: Resolved) -> dict[str, str]:
-    """Dotted key of every value -> where it comes from."""
+    """Return the origin of every value, by dotted key."""
     return {messages.dotted(path): _origin(resolved, path) for path, _ in leaves(to_data(resolved))}
 
 
-def given(resolved: Resolved) -> dict[str, str]:
-    """Dotted key of every value that stands on the command line or in a `--config` file -> where."""
-    written = resolved.layers.origins.items()
+def explicit_values(resolved: Resolved) -> dict[str, str]:
+    """Return the origin of every value set on the command line or in a `--config` file, by dotted key."""
+    found = resolved.layers.origins.items()
     layers = ("config", "override", "flag")
-    return {messages.dotted(path): _place(origin) for path, origin in written if path and origin.layer in layers}
+    return {messages.dotted(path): _location(origin) for path, origin in found if path and origin.layer in layers}
 
 
 def json_schema(vocabulary: Vocabulary, params: type[BaseModel] | None = None) -> dict[str, Any]:
-    """JSON Schema of a task file, for editors: the parameters of its terms and of a direct task included."""
+    """Return the JSON Schema of a task file, for editors.
+
+    Args:
+        vocabulary: the terms that the file may name; their parameters are part of the schema.
+        params: the model of a direct task's parameters; None: they are not described.
+    """
     schema = TaskConfig.model_json_schema()
     definitions = schema.setdefault("$defs", {})
 
-    def standing_alone(model: type[BaseModel]) -> dict[str, Any]:
+    def model_schema(model: type[BaseModel]) -> dict[str, Any]:
+        """Return the schema of a model and move its definitions to those of the whole schema."""
         part = model.model_json_schema()
         definitions.update(part.pop("$defs", {}))
         return part
@@ -105,25 +114,26 @@ def json_schema(vocabulary: Vocabulary, params: type[BaseModel] | None = None) -
             signature = vocabulary.find(section, name)
             assert signature is not None
             try:
-                entry = standing_alone(params_model(signature, section))
+                entry = model_schema(params_model(signature, section))
             except SignatureError:
-                continue  # it cannot be used in this section
+                continue  # the term cannot be used in this section
             entry["properties"]["func"] = {"const": name, "description": signature.summary}
             choices.append(entry)
         term: dict[str, Any] = {"anyOf": [*choices, {"type": "null"}]}
         if section == "observations":
-            settings = standing_alone(ObservationGroupConfig)["properties"]
+            settings = model_schema(ObservationGroupConfig)["properties"]
             term = {"type": "object", "properties": settings, "additionalProperties": term}
         if section != "success":
             term = {"type": "object", "additionalProperties": term}
         schema["properties"][section] = {**term, "description": schema["properties"][section]["description"]}
     if params is not None:
-        schema["properties"]["params"] = standing_alone(params)
+        schema["properties"]["params"] = model_schema(params)
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     return schema
 
 
 def _annotate(value: Any, path: Path, resolved: Resolved, lines: list[str]) -> None:
+    """Append the YAML lines of a mapping, each value with its origin."""
     indent = "  " * len(path)
     for key, item in value.items():
         below = (*path, key)
@@ -136,20 +146,20 @@ def _annotate(value: Any, path: Path, resolved: Resolved, lines: list[str]) -> N
 
 
 def _inline(value: object) -> str:
-    """A value on one line, to stand anywhere in YAML."""
+    """Return a value as YAML on one line."""
     text: str = yaml.dump((value,), Dumper=_Dumper, default_flow_style=True, width=10**6, allow_unicode=True)
     return text.strip()[1:-1]
 
 
 def _origin(resolved: Resolved, path: Path) -> str:
-    """Where a value was written; of a list, also the overrides of its items."""
+    """Return the origin of a value as text; for a list also the origins of overridden items."""
     known = resolved.layers.origins
     if path not in known:
         return "default"
     items = (o for p, o in known.items() if len(p) > len(path) and p[: len(path)] == path and o.layer == "override")
-    return ", ".join(dict.fromkeys(_place(origin) for origin in (known[path], *items)))
+    return ", ".join(dict.fromkeys(_location(origin) for origin in (known[path], *items)))
 
 
-def _place(origin: Origin) -> str:
+def _location(origin: Origin) -> str:
     where = " ".join(origin.where.split())
     return where if origin.layer in ("task", "override", "flag") else f"{origin.layer}: {where}"

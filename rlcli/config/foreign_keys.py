@@ -1,4 +1,4 @@
-"""Keys of a task file that belong to another framework's format."""
+"""Top-level keys of a task file that belong to another framework's format."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from rlcli.config.schema import TaskConfig
 from rlcli.registry.formats import format_keys
 
 
-def with_foreign(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a task file's content with the keys of other frameworks' formats moved into `foreign`."""
+def move_foreign_keys(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a task file with the keys of other frameworks' formats moved into `foreign`."""
     unknown = data.keys() - TaskConfig.model_fields.keys()
     keys = format_keys() & unknown if unknown else set()
     if not keys:

@@ -1,4 +1,4 @@
-"""Layers of raw configuration, merged in order, each value keeping the place it was written."""
+"""Layers of raw configuration, merged in order. Every value keeps its origin: the file and line it was written in."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _OVERRIDE = re.compile(rf"\s*((?:{_KEY.pattern})(?:\.(?:{_KEY.pattern}))*)\s*=(.
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where a value was written: `layer` is task, agent, play, config, override or flag."""
+    """Origin of a value. `layer` is task, agent, play, config, override or flag; `where` is `file:line:column`."""
 
     layer: str
     where: str
@@ -27,13 +27,16 @@ class Origin:
 
 @dataclass(slots=True)
 class Layers:
-    """Merged data and, for every path in it, the origin of its value."""
+    """Merged data, and the origin of the value at every path."""
 
     data: dict[str, Any] = field(default_factory=dict)
     origins: dict[Path, Origin] = field(default_factory=dict)
 
     def merge(self, patch: Mapping[str, Any], origin: Callable[[Path], Origin], at: Path = ()) -> None:
-        """Merge a patch: mappings key by key, everything else replaced. `origin` is asked with paths in the patch."""
+        """Merge a patch into the data at path `at`: mappings key by key, all other values are replaced.
+
+        `origin` returns the origin of the value at a path of the patch.
+        """
         self.origins.setdefault((), origin(()))
         self._merge(patch, origin, at, ())
 
@@ -51,15 +54,15 @@ class Layers:
                 self.origins[path + below] = origin(source + below)
 
     def set(self, path: Path, value: object, origin: Origin) -> None:
-        """Set one value, as an override does; missing mappings on the way are made.
+        """Set one value, as an override does. Missing mappings on the path are created.
 
         Raises:
-            LookupError: if the path leads into something that has no such member.
+            LookupError: if the path leads into a value that is no mapping, or to a list item that does not exist.
         """
         target: Any = self.data
         taken: Path = ()
         for step in path[:-1]:
-            target, taken = self._step(target, step, taken, origin)
+            target, taken = self._descend(target, step, taken, origin)
         last: str | int = path[-1]
         if isinstance(target, list):
             last = _index(target, last, taken)
@@ -72,7 +75,7 @@ class Layers:
             self.origins[taken + below] = origin
 
     def get(self, path: Path, default: object = None) -> Any:
-        """The value at a path."""
+        """Return the value at a path, or `default` if there is none."""
         value: Any = self.data
         for step in path:
             if not isinstance(value, dict) or step not in value:
@@ -81,18 +84,19 @@ class Layers:
         return value
 
     def origin(self, path: Path) -> Origin | None:
-        """The origin of the value at a path, or of the nearest thing around it."""
+        """Return the origin of the value at a path, or of the nearest value that contains it; None if there is none."""
         for length in range(len(path), -1, -1):
             if path[:length] in self.origins:
                 return self.origins[path[:length]]
         return None
 
     def place(self, path: Path) -> str:
-        """Where a path was written, for a message."""
+        """Return the location of the value at a path, for a message."""
         origin = self.origin(path)
         return origin.where if origin else "configuration"
 
-    def _step(self, target: object, step: str | int, taken: Path, origin: Origin) -> tuple[Any, Path]:
+    def _descend(self, target: object, step: str | int, taken: Path, origin: Origin) -> tuple[Any, Path]:
+        """Return the member `step` of a value and its path; create a mapping if there is no member."""
         if isinstance(target, list):
             index = _index(target, step, taken)
             return target[index], (*taken, index)
@@ -106,6 +110,7 @@ class Layers:
         return target[str(step)], path
 
     def _mapping(self, path: Path, origin: Origin) -> dict[str, Any]:
+        """Return the mapping at a path; create it, and replace values on the path that are no mappings."""
         target = self.data
         for depth, step in enumerate(path):
             if not isinstance(target.get(str(step)), dict):
@@ -124,11 +129,11 @@ def read(file: FilePath, name: str | None = None, *, pipe: bool = False) -> Docu
 
     Args:
         file: the file.
-        name: how messages call it.
-        pipe: whether it may be a pipe, as a shell makes one for `--config <(...)`.
+        name: name of the file in messages; None: its path.
+        pipe: whether the file may be a pipe, as a shell creates it for `--config <(...)`.
 
     Raises:
-        ConfigError: if it cannot be read or parsed, with the position.
+        ConfigError: if the file cannot be read or parsed, with the position of the mistake.
     """
     name = name or str(file)
     try:
@@ -140,14 +145,14 @@ def read(file: FilePath, name: str | None = None, *, pipe: bool = False) -> Docu
         raise ConfigError([Problem(place, "", error.message)]) from None
 
 
-def marked(document: Document, name: str, layer: str, at: Path = ()) -> Callable[[Path], Origin]:
-    """The origin function of a document's part below `at`."""
+def document_origins(document: Document, name: str, layer: str, at: Path = ()) -> Callable[[Path], Origin]:
+    """Return a function that maps a path below `at` in a document to its origin."""
 
     def origin(path: Path) -> Origin:
         full = at + path
         while full not in document.marks and full:
             full = full[:-1]
-        if not document.marks:  # built in Python
+        if not document.marks:  # a configuration in Python has no lines
             return Origin(layer, name)
         line, column = document.marks[full]
         return Origin(layer, f"{name}:{line}:{column}")
@@ -156,12 +161,12 @@ def marked(document: Document, name: str, layer: str, at: Path = ()) -> Callable
 
 
 def flags(**values: Any) -> dict[str, Any]:
-    """Return the values of flags by dotted key (`scene__num_envs` is `scene.num_envs`), without those that are None."""
+    """Return the flags that are not None, by dotted key (the argument `scene__num_envs` is `scene.num_envs`)."""
     return {key.replace("__", "."): value for key, value in values.items() if value is not None}
 
 
 def leaves(value: object, path: Path = ()) -> Iterator[tuple[Path, Any]]:
-    """Yield every value in nested mappings with its path; an empty mapping is a value."""
+    """Yield every value in nested mappings with its path. An empty mapping counts as a value."""
     if isinstance(value, dict) and value:
         for key, item in value.items():
             yield from leaves(item, (*path, key))
@@ -170,10 +175,12 @@ def leaves(value: object, path: Path = ()) -> Iterator[tuple[Path, Any]]:
 
 
 def parse_override(text: str) -> tuple[Path, Any]:
-    """`rewards.alive.weight=2` -> (path, value); a key that holds a dot is quoted: joints.".*".damping=1.
+    """Return path and value of an override such as `rewards.alive.weight=2`.
+
+    A key that contains a dot is written in quotes: `joints.".*".damping=1`.
 
     Raises:
-        ConfigError: if it is not of that form.
+        ConfigError: if the text is not of the form key.path=value, or the value is not YAML.
     """
     where = f"override '{text}'"
     match = _OVERRIDE.fullmatch(text)
@@ -187,7 +194,7 @@ def parse_override(text: str) -> tuple[Path, Any]:
 
 
 def parse_address(text: str) -> tuple[str, ...]:
-    """`rewards.alive.weight` -> its keys; a key that holds a dot is quoted."""
+    """Return the keys of a dotted key such as `rewards.alive.weight`. A key that contains a dot is in quotes."""
     return tuple(quoted or plain for quoted, plain in _KEY.findall(text))
 
 
@@ -198,6 +205,7 @@ def _index(target: list[Any], step: str | int, taken: Path) -> int:
 
 
 def _paths(value: object) -> list[Path]:
+    """Return the paths of a value and of everything inside it, lists included."""
     if isinstance(value, dict):
         return [(), *((key, *below) for key, item in value.items() for below in _paths(item))]
     if isinstance(value, list):

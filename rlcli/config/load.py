@@ -1,7 +1,8 @@
-"""From a task's files and the command line to a validated configuration: phase 1, before any heavy import.
+"""Loading of a configuration: read the task's files and the command line, merge them, validate the result.
 
-Precedence: schema default < task < the agent's `task:` patch < the task's `play:` patch (play and eval only) <
-`--config` < overrides. All errors of the phase are reported at once, each at the place it was written.
+This is phase 1 of a command: it runs before any heavy import. Precedence: schema default < task < the agent's `task:`
+patch < the task's `play:` patch (play and eval only) < `--config` < overrides. All mistakes are reported at once, each
+with its file and line.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from rlcli.config import messages
-from rlcli.config.layers import Layers, marked, read
+from rlcli.config.layers import Layers, document_origins, read
 from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.term_signatures import Vocabulary
@@ -30,7 +31,7 @@ __all__ = ["Resolved", "agent_names", "check_all", "extensions", "resolve", "ter
 
 @dataclass(frozen=True, slots=True)
 class Resolved:
-    """A validated configuration and where each of its values comes from."""
+    """A validated configuration with the origin of each value."""
 
     source: TaskSource
     task: TaskConfig
@@ -40,23 +41,23 @@ class Resolved:
     layers: Layers
     vocabulary: Vocabulary
     notes: tuple[Note, ...] = ()
-    """What became of each key of a configuration in another tool's form; empty for one in rlcli's own."""
+    """How each key was translated, if the task is in another framework's format; else empty."""
     format: Format | None = None
-    """The format of another framework that the task is written in."""
+    """The other framework's format in which the task is written; None: rlcli's own."""
 
     def place(self, path: Path) -> str:
-        """Where a path was written, for a message."""
+        """Return the location of the value at a path, for a message."""
         return self.layers.place(path)
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> Problem:
-        """A problem at a path of this configuration."""
+        """Return a problem at a path of this configuration."""
         return Problem(self.place(path), messages.dotted(path), message, hint)
 
     def require_agent(self) -> None:
-        """Training needs an agent.
+        """Check that the configuration has an agent, which training needs.
 
         Raises:
-            ConfigError: if the task has none, or several and no default.
+            ConfigError: if the task has no agent, or several agents and no default.
         """
         if self.agent is None:
             names = agent_names(self.layers)
@@ -77,40 +78,41 @@ def resolve(
     overrides: Sequence[str] = (),
     flags: Mapping[str, Any] | None = None,
 ) -> Resolved:
-    """Read, merge and validate.
+    """Read, merge and validate the configuration of a task.
 
     Args:
         source: the task.
-        agent: which of its agents; None takes `agents.default`. A task without agents resolves to none.
-        device: cpu or cuda, for a default that differs by device.
-        play: apply the task's `play:` patch.
-        config_file: a YAML file merged over the task; `agent:` in it addresses the chosen agent.
-        overrides: `key.path=value`; `agent.x=...` addresses the chosen agent.
+        agent: name of the agent; None: `agents.default`. For a task without agents the result has no agent.
+        device: cpu or cuda, for a default agent that differs by device.
+        play: whether to apply the task's `play:` patch.
+        config_file: a YAML file that is merged over the task; its key `agent:` changes the chosen agent.
+        overrides: `key.path=value`; `agent.x=...` changes the chosen agent.
         flags: values of command-line flags by dotted key, applied like overrides.
 
     Raises:
-        ConfigError: with every problem found.
-        DependencyError: if that is all, but the agent's trainer is not installed.
+        ConfigError: with every problem that was found.
+        DependencyError: if there is no other problem, but the agent's trainer is not installed.
     """
     check = TaskCheck(source)
     document = check.document()
     extra = read(config_file, pipe=True) if config_file else Document({})
-    origin = marked(extra, str(config_file), "config")
+    origin = document_origins(extra, str(config_file), "config")
     changes = check.changes(overrides, flags or {})
 
     check.read_task(document)
     check.layers.merge({key: extra.data[key] for key in PATCHES if key in extra.data}, origin)
     name = check.choose_agent(agent, device, changes)
     if "agent" in extra.data:
-        check.merge_agent(extra.data["agent"], marked(extra, str(config_file), "config", ("agent",)), name)
-    apart = [change for change in changes if change[0][0] in (*PATCHES, "agent")]
-    check.apply(apart, name)
+        check.merge_agent(extra.data["agent"], document_origins(extra, str(config_file), "config", ("agent",)), name)
+    # overrides of agents and patches are applied before the patches are merged, all others after them
+    early = [change for change in changes if change[0][0] in (*PATCHES, "agent")]
+    check.apply(early, name)
     if name is not None:
         check.patch("agent", ("agents", name, "task"))
     if play:
         check.patch("play", ("play",))
     check.layers.merge({k: v for k, v in extra.data.items() if k not in (*PATCHES, "agent")}, origin)
-    check.apply([change for change in changes if change not in apart], name)
+    check.apply([change for change in changes if change not in early], name)
 
     trainer, agent_config = check.agent(name) if name is not None else (None, None)
     task = check.task()
@@ -124,13 +126,13 @@ def resolve(
 
 
 def check_all(source: TaskSource, *, config_file: FilePath | None = None, overrides: Sequence[str] = ()) -> list[str]:
-    """Every mistake in a task's files, whichever agent and command would meet it.
+    """Check the configuration of a task with every agent, for training and for play.
 
     Returns:
         The agents that could not be checked because their trainer is not installed.
 
     Raises:
-        ConfigError: with the problems of all agents, in training and in play.
+        ConfigError: with the problems of all agents.
     """
     check = TaskCheck(source)
     check.read_task(check.document())
@@ -152,10 +154,10 @@ def check_all(source: TaskSource, *, config_file: FilePath | None = None, overri
 
 
 def extensions(source: TaskSource) -> tuple[Vocabulary, type[BaseModel] | None]:
-    """What a task's source adds to the schema: its terms, and the parameters of a direct task.
+    """Return what a task adds to the schema: its own terms, and the model of a direct task's parameters (or None).
 
     Raises:
-        ConfigError: if that source cannot be read.
+        ConfigError: if the source code of the task cannot be read.
     """
     check = TaskCheck(source)
     check.document()

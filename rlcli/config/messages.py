@@ -1,8 +1,10 @@
-"""Validation errors of pydantic, said as a user reads them: the key, what was found, what is allowed, the near key."""
+"""Messages for the validation errors of pydantic: the key, the value found, what is allowed, the most similar key."""
 
 from __future__ import annotations
 
+import functools
 import json
+import operator
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Union, get_args, get_origin
@@ -12,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 from rlcli.config import strict_yaml
 from rlcli.config.strict_yaml import Path
 from rlcli.errors import Problem, did_you_mean, listing
+from rlcli.safe_text import shorten
 
 _EXPECTED = {
     "float": "a number",
@@ -34,8 +37,8 @@ _BOUNDS = {
     "less_than_equal": ("<=", "le"),
 }
 
-Homes = Mapping[str, list[str]]
-"""Key -> the dotted places in the whole schema where it belongs."""
+KeyLocations = Mapping[str, list[str]]
+"""Key -> its dotted paths in the whole schema."""
 
 
 def problems(
@@ -44,106 +47,114 @@ def problems(
     data: object,
     place: Callable[[Path], str],
     prefix: Path = (),
-    homes: Homes | None = None,
+    locations: KeyLocations | None = None,
 ) -> list[Problem]:
-    """Every error as a Problem; `data` is what was validated, `place` tells where a path was written."""
+    """Return the errors of a validation as problems.
+
+    Args:
+        error: the error that pydantic raised.
+        model: the model that validated the data.
+        data: the data that was validated.
+        place: returns the location in which a path was written.
+        prefix: path of the data in the whole configuration.
+        locations: where each key belongs in the whole schema, for hints about misplaced keys.
+    """
     grouped: dict[Path, list[Any]] = {}
     for item in error.errors(include_url=False):
         path = _data_path(item, data)
         if item["type"] == "missing" and isinstance(path[-1], int):
-            path = path[:-1]  # a list that is too short
+            path = path[:-1]  # a tuple that is too short: report the list, not the missing item
         grouped.setdefault(path, []).append(item)
     found = []
     for path, items in grouped.items():
         if any(len(other) > len(path) and other[: len(path)] == path for other in grouped):
-            continue  # an arm of a union that did not fit; another one got further
-        message, hint, at = _message(path, items, model, data, homes or {})
+            continue  # one alternative of a union; the error of another alternative is more precise
+        message, hint, at = _message(path, items, model, data, locations or {})
         found.append(Problem(place(prefix + at), dotted(prefix + at), message, hint))
     return found
 
 
 def dotted(path: Path) -> str:
-    """`('rewards', 'alive', 0)` -> `rewards.alive.0`; a key with a dot is quoted."""
+    """Return the dotted key of a path: `('rewards', 'alive', 0)` -> `rewards.alive.0`. A key with a dot is quoted."""
     return ".".join(f'"{part}"' if isinstance(part, str) and "." in part else str(part) for part in path)
 
 
-def shown(value: object) -> str:
-    """A value as it would be written in YAML, cut short."""
+def format_value(value: object) -> str:
+    """Return a value as it would be written in YAML, cut to 60 characters."""
     if isinstance(value, dict):
         return "a mapping"
-    text = repr(value) if isinstance(value, str) else json.dumps(value, default=repr)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return shorten(repr(value) if isinstance(value, str) else json.dumps(value, default=repr), 60)
 
 
-def homes(models: Mapping[str, type[BaseModel]]) -> dict[str, list[str]]:
-    """Where each key belongs, in models that stand at dotted prefixes (the whole task stands at '')."""
+def key_locations(models: Mapping[str, type[BaseModel]]) -> dict[str, list[str]]:
+    """Return the dotted paths of every key of some models. `models` maps a dotted prefix to a model ('': the task)."""
     found: dict[str, list[str]] = {}
     for prefix, model in models.items():
-        for key, place in _keys(model, prefix):
-            found.setdefault(key, []).append(place)
+        for key, location in _keys(model, prefix):
+            found.setdefault(key, []).append(location)
     return found
 
 
 def _message(
-    path: Path, items: list[Any], model: type[BaseModel], data: object, homes: Homes
+    path: Path, items: list[Any], model: type[BaseModel], data: object, locations: KeyLocations
 ) -> tuple[str, str | None, Path]:
-    """What to say, what to do, and at which path."""
+    """Return the message, the hint and the path for pydantic's errors at one path."""
     kind, found = items[0]["type"], items[0]["input"]
     if kind == "extra_forbidden":
-        return f"unknown key '{path[-1]}'", _right_key(str(path[-1]), _fields(model, path[:-1]), homes), path
+        return f"unknown key '{path[-1]}'", _suggest_key(str(path[-1]), _fields(model, path[:-1]), locations), path
     if kind == "union_tag_not_found":
         return "missing key 'kind'", f"one of {listing(_tags(model, path))}", path
     if kind == "union_tag_invalid":
-        tag = items[0]["ctx"]["tag"]
-        near = did_you_mean(tag, _tags(model, path))
-        return (
-            f"expected {items[0]['ctx']['expected_tags'].replace(', ', ' or ')}, found {shown(tag)}",
-            near,
-            (*path, "kind"),
-        )
+        tag, expected = items[0]["ctx"]["tag"], items[0]["ctx"]["expected_tags"].replace(", ", " or ")
+        similar = did_you_mean(tag, _tags(model, path))
+        return f"expected {expected}, found {format_value(tag)}", similar, (*path, "kind")
     if kind == "value_error":
         return str(items[0]["ctx"]["error"]), None, path
     if kind == "missing" and isinstance(items[0]["loc"][-1], str):
         return f"missing key '{path[-1]}'", None, path[:-1]
     length = _length(model, path)
     if length is not None and kind in ("missing", "too_short", "too_long"):
-        return f"expected a list of {length}, found {shown(_value_at(data, path))}", None, path
+        value: Any = functools.reduce(operator.getitem, path, data)  # type: ignore[arg-type]
+        return f"expected a list of {length}, found {format_value(value)}", None, path
     hint = None
     if isinstance(found, str):
         choices = [word.strip("'") for item in items for word in _choices(item)]
         hint = did_you_mean(found, choices) or _unquoted(found, items)
     elif isinstance(found, dict) and found and all(key.isdecimal() for key in found):
+        # an override of one item, such as `size.0=1`, created a mapping
         hint = "its default has no items to change; give the whole list"
-    return f"expected {' or '.join(dict.fromkeys(map(_expected, items)))}, found {shown(found)}", hint, path
+    return f"expected {' or '.join(dict.fromkeys(map(_expected, items)))}, found {format_value(found)}", hint, path
 
 
 _OTHER_PLACES = {
-    "env": ("scene", "leave 'env.' out: the task's settings stand at the top, as scene.num_envs"),
-    "params": ("func", "the parameters of a term stand beside its 'func'"),
-    "device": ("dt", "it is an option: --device cpu"),
+    "env": ("scene", "remove 'env.': the keys of a task are at the top level, for example scene.num_envs"),
+    "params": ("func", "write the parameters of a term beside its 'func'"),
+    "device": ("dt", "the device is an option: --device cpu"),
 }
-"""Key -> a key that stands where it is looked for, and what to write instead."""
+"""Key that users of other frameworks write -> (a key that the mapping has in this case, what to write instead)."""
 
 
-def _right_key(key: str, fields: Iterable[str], homes: Homes) -> str:
+def _suggest_key(key: str, fields: Iterable[str], locations: KeyLocations) -> str:
+    """Return the hint for an unknown key in a mapping with these fields."""
     fields = list(fields)
     beside, instead = _OTHER_PLACES.get(key, ("", ""))
     if beside in fields:
         return instead
-    near = did_you_mean(key, fields)
-    places = homes.get(key, [])
-    home = f"it belongs {' or '.join(map(_inside, places))}" if 0 < len(places) <= 3 else None
-    if near or home:
-        return "; ".join(filter(None, (near, home)))
+    similar = did_you_mean(key, fields)
+    elsewhere = locations.get(key, [])
+    belongs = f"it belongs {' or '.join(map(_inside, elsewhere))}" if 0 < len(elsewhere) <= 3 else None
+    if similar or belongs:
+        return "; ".join(filter(None, (similar, belongs)))
     return f"allowed: {listing(sorted(fields), 40)}"
 
 
-def _inside(place: str) -> str:
-    parent = place.rpartition(".")[0]
-    return f"in {parent} ({place})" if parent else "at the top level"
+def _inside(location: str) -> str:
+    parent = location.rpartition(".")[0]
+    return f"in {parent} ({location})" if parent else "at the top level"
 
 
 def _expected(item: Any) -> str:
+    """Return what pydantic expected, in words."""
     kind, context = item["type"], item.get("ctx", {})
     if kind in _BOUNDS:
         sign, key = _BOUNDS[kind]
@@ -152,14 +163,14 @@ def _expected(item: Any) -> str:
         return f"a {whole}number {sign} {bound if isinstance(bound, int) else f'{bound:g}'}"
     if kind == "literal_error":
         return str(context["expected"])
-    if kind in ("too_short", "too_long"):
-        bound = context.get("min_length", context.get("max_length"))
-        return f"{'at least' if kind == 'too_short' else 'at most'} {bound} item{'s' if bound != 1 else ''}"
     if kind == "string_pattern_mismatch":
         return f"text like {context['pattern']}"
-    if kind in ("string_too_short", "string_too_long"):
-        bound = f"{'at least' if kind == 'string_too_short' else 'at most'}"
-        return f"text of {bound} {context.get('min_length', context.get('max_length'))} characters"
+    if kind.endswith(("too_short", "too_long")):
+        bound = "at least" if kind.endswith("short") else "at most"
+        length = context.get("min_length", context.get("max_length"))
+        if kind.startswith("string"):
+            return f"text of {bound} {length} characters"
+        return f"{bound} {length} item{'s' if length != 1 else ''}"
     stem = kind.removesuffix("_type").removesuffix("_parsing").removesuffix("_required")
     return _EXPECTED.get(stem) or str(item["msg"])
 
@@ -169,7 +180,7 @@ def _choices(item: Any) -> list[str]:
 
 
 def _unquoted(text: str, items: Iterable[Any]) -> str | None:
-    """Quotes around a number or a truth value are a common slip."""
+    """Return the hint for a number or truth value that was written in quotes by mistake."""
     try:
         value = strict_yaml.load_value(text)
     except strict_yaml.YamlError:
@@ -177,12 +188,12 @@ def _unquoted(text: str, items: Iterable[Any]) -> str | None:
     wanted = {_expected(item) for item in items}
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if (number and wanted & {"a number", "a whole number"}) or (isinstance(value, bool) and "true or false" in wanted):
-        return "drop the quotes"
+        return "remove the quotes"
     return None
 
 
 def _data_path(item: Any, data: Any) -> Path:
-    """The error's location with pydantic's union tags dropped: only steps that the data can take are kept."""
+    """Return the path of an error in the data. Pydantic's location also has the tags of unions, which are removed."""
     path: list[str | int] = []
     location = item["loc"]
     for position, step in enumerate(location):
@@ -196,25 +207,19 @@ def _data_path(item: Any, data: Any) -> Path:
     return tuple(path)
 
 
-def _value_at(data: Any, path: Path) -> Any:
-    for step in path:
-        data = data[step]
-    return data
-
-
 def _fields(model: type[BaseModel], path: Path) -> set[str]:
-    """Keys that the mapping at `path` may have, following the model's annotations."""
+    """Return the keys that the mapping at a path of a model may have."""
     return {name for arm in _arms_at(model, path) if _is_model(arm) for name in arm.model_fields}
 
 
 def _tags(model: type[BaseModel], path: Path) -> list[str]:
-    """Values of `kind` that tell the mappings apart which may stand at `path`."""
+    """Return the possible values of `kind` of the mapping at a path of a model."""
     kinds = [arm.model_fields["kind"].annotation for arm in _arms_at(model, path) if _is_model(arm)]
     return [tag for kind in kinds for tag in get_args(kind)]
 
 
 def _length(model: type[BaseModel], path: Path) -> int | None:
-    """Items of the list at `path`, where the model says how many."""
+    """Return the length of the list at a path of a model; None if it is not fixed."""
     for arm in _arms_at(model, path):
         if get_origin(arm) is tuple and get_args(arm)[-1] is not ...:
             return len(get_args(arm))
@@ -222,6 +227,7 @@ def _length(model: type[BaseModel], path: Path) -> int | None:
 
 
 def _arms_at(model: type[BaseModel], path: Path) -> list[Any]:
+    """Return the types that the value at a path of a model may have."""
     arms: list[Any] = [model]
     for step in path:
         arms = [below for arm in arms for child in _children(arm, step) for below in _arms(child)]
@@ -239,6 +245,7 @@ def _children(arm: Any, step: str | int) -> Iterator[Any]:
 
 
 def _arms(annotation: object) -> Iterator[Any]:
+    """Yield the alternatives of an annotation, without `Annotated` and unions."""
     if get_origin(annotation) in (Union, types.UnionType):
         for arm in get_args(annotation):
             yield from _arms(arm)
@@ -249,11 +256,12 @@ def _arms(annotation: object) -> Iterator[Any]:
 
 
 def _keys(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, str]]:
+    """Yield every key of a model and its dotted path, nested models included."""
     for name, field in model.model_fields.items():
-        place = f"{prefix}.{name}".lstrip(".")
-        yield name, place
+        location = f"{prefix}.{name}".lstrip(".")
+        yield name, location
         for arm in _arms(field.annotation):
-            inner, below = arm, place
+            inner, below = arm, location
             while get_origin(inner) is dict:
                 inner, below = next(_arms(get_args(inner)[1])), f"{below}.NAME"
             if _is_model(inner):

@@ -1,8 +1,8 @@
-"""A configuration that is built in Python, as the same plain data that a YAML file holds.
+"""Conversion of a configuration in Python to the plain data that a YAML file would contain.
 
-The object is a `TaskConfig` (or the mapping that one is made of), something that makes one, or a configuration of
-another framework that knows how it is written as one: it has a method `__rlcli_task__(root) -> PythonTask`. Terms are
-names or functions; a function that is no term of `rlcli.mdp` joins the task's own terms under its name.
+The configuration is a `TaskConfig`, a mapping with its keys, or a function that returns one. Or it is a configuration
+of another framework with a method `__rlcli_task__(root) -> PythonTask`. Terms are names or functions. A function that
+is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
 """
 
 from __future__ import annotations
@@ -30,26 +30,32 @@ _AGENTS = "agents/*.py"
 
 @dataclass(slots=True)
 class PythonTask:
-    """A task as plain data, the functions that its terms name, and what there is to say about how it came to be."""
+    """A task as plain data, with the functions that its terms name and the notes of the translation."""
 
     data: dict[str, Any]
     terms: dict[str, Signature] = field(default_factory=dict)
     notes: list[Note] = field(default_factory=list)
     format: Format | None = None
-    """The format whose class the configuration is an object of."""
+    """The other framework's format to whose classes the configuration belongs; None: rlcli's own."""
 
 
 def source_of(value: object, root: FilePath | None = None, name: str = "task") -> TaskSource:
-    """A task that exists in memory only. `root` is the folder its models lie in, by default the current one."""
+    """Return the source of a task that exists in memory only.
+
+    Args:
+        value: the configuration.
+        root: the folder of its models; None: the current folder.
+        name: the name of the task.
+    """
     root = (root or FilePath.cwd()).resolve()
-    return TaskSource(name, root, root / "task.py", None, None, (), (), None, None, value=value)
+    return TaskSource(name, root, root / "task.py", value=value)
 
 
 def load(source: TaskSource) -> PythonTask:
-    """The configuration of a task in Python.
+    """Return the configuration of a task in Python.
 
     Raises:
-        TaskError: if its code does not run, or there is no such object.
+        TaskError: if the code of the task raises an error, or the object does not exist.
         ConfigError: if the object is not a configuration.
     """
     if source.value is not None:
@@ -61,25 +67,27 @@ def load(source: TaskSource) -> PythonTask:
         for name, agent in agents.items():
             _add_agent(task, name, agent)
     except ValidationError as error:
-        raise ConfigError(_problems(error, source.label)) from None
+        items = error.errors(include_url=False)
+        problems = [Problem(source.label, ".".join(map(str, item["loc"])), item["msg"]) for item in items]
+        raise ConfigError(problems) from None
     except ConfigError as error:
-        raise ConfigError(
-            [replace(p, where=source.label) if p.where == "configuration" else p for p in error.problems]
-        ) from None
+        label = source.label
+        problems = [replace(p, where=label) if p.where == "configuration" else p for p in error.problems]
+        raise ConfigError(problems) from None
     except RlcliError:
         raise
     except Exception as error:
         require_module(error)
-        said = f"{source.python}: {type(error).__name__}: {error}{_place(error)}"
-        raise TaskError(said, hint=_hint(error)) from error
+        message = f"{source.python}: {type(error).__name__}: {error}{_location(error)}"
+        raise TaskError(message, hint=_hint(error)) from error
     return task
 
 
 def to_task(value: Any, label: str, root: FilePath) -> PythonTask:
-    """A configuration object as plain data.
+    """Return a configuration object as plain data.
 
     Raises:
-        ConfigError: if it is not a configuration.
+        ConfigError: if the object is not a configuration.
     """
     if hasattr(value, "__rlcli_task__"):
         value = value() if isinstance(value, type) else value
@@ -98,7 +106,10 @@ def to_task(value: Any, label: str, root: FilePath) -> PythonTask:
 
 
 def agent_data(value: object, notes: list[Note]) -> dict[str, Any]:
-    """An agent's settings as plain data: a mapping, a trainer's model, or an object with `__rlcli_agent__(notes)`."""
+    """Return an agent's settings as plain data.
+
+    `value` is a mapping, the model of a trainer's settings, or an object with `__rlcli_agent__(notes)`.
+    """
     value = value() if isinstance(value, type) else value
     if hasattr(value, "__rlcli_agent__"):
         value = value.__rlcli_agent__(notes)
@@ -109,7 +120,7 @@ def agent_data(value: object, notes: list[Note]) -> dict[str, Any]:
 
 
 class _PlainData:
-    """Walks a configuration; only what was set is written down, so that defaults stay defaults."""
+    """Converter of a configuration to plain data. Only values that were set are written; defaults are left out."""
 
     def __init__(self, terms: dict[str, Signature], label: str) -> None:
         self.terms = terms
@@ -124,10 +135,10 @@ class _PlainData:
 
     def plain(self, value: object, path: tuple[str | int, ...]) -> Any:
         if isinstance(value, BaseModel):
-            given = {name: getattr(value, name) for name in type(value).model_fields if name in value.model_fields_set}
+            data = {name: getattr(value, name) for name in type(value).model_fields if name in value.model_fields_set}
             if isinstance(value, AgentConfig):
-                given["algorithm"] = value.algorithm  # which model the settings are read with
-            return self.plain({**given, **(value.model_extra or {})}, path)
+                data["algorithm"] = value.algorithm  # needed even if it is the default: it selects the agent's model
+            return self.plain({**data, **(value.model_extra or {})}, path)
         if isinstance(value, Mapping):
             return {str(key): self.plain(item, (*path, str(key))) for key, item in value.items()}
         if path and path[-1] == "func" and callable(value):
@@ -144,14 +155,15 @@ class _PlainData:
         return None
 
     def _term(self, term: object, path: tuple[str | int, ...]) -> str:
-        """The name under which the task knows a function."""
+        """Return the name of a function in the task's vocabulary; add the function if it is new."""
         section = str(path[0])
         wanted = getattr(term, "__name__", type(term).__name__)
         wanted = snake_case(wanted) if isinstance(term, type) else wanted
-        if getattr(term, "__module__", "").startswith(_OWN) and wanted in _builtin(section):
+        is_builtin = getattr(term, "__module__", "").startswith(_OWN) and section in SECTIONS
+        if is_builtin and wanted in builtin_terms(section):
             return wanted
         name, number = wanted, 1
-        while name in self.terms and self.terms[name].target is not _target(term):
+        while name in self.terms and self.terms[name].target is not _target(term):  # two functions of the same name
             number += 1
             name = f"{wanted}_{number}"
         if name not in self.terms:
@@ -170,29 +182,25 @@ def _target(term: Any) -> Any:
     return term.target if hasattr(term, "__rlcli_term__") else term
 
 
-def _builtin(section: str) -> Mapping[str, Signature]:
-    return builtin_terms(section) if section in SECTIONS else {}
-
-
 def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
-    """The configuration that a source names, and its further agents."""
+    """Import the configuration of a source, and its further agents."""
     assert source.python is not None
     agents = {name: load_object(reference) for name, reference in source.agents}
     if source.distribution is not None:
         return load_object(source.python), agents
-    place, _, attribute = source.python.rpartition(":")
-    if not place.endswith(".py"):
+    file, _, attribute = source.python.rpartition(":")
+    if not file.endswith(".py"):
         return _registered(source)
-    module = import_file(FilePath(place))
+    module = import_file(FilePath(file))
     value: Any = module
     for part in attribute.split("."):
         if not hasattr(value, part):
             names = [n for n in vars(value) if not n.startswith("_")]
-            raise TaskError(f"{place} has no '{part}'", hint=f"it has {listing(names)}")
+            raise TaskError(f"{file} has no '{part}'", hint=f"it has {listing(names)}")
         value = getattr(value, part)
     if agents or not hasattr(value, "__rlcli_task__"):
         return value, agents
-    folder, form = FilePath(place).parent, format_of_module(value.__rlcli_task__.__module__)
+    folder, form = FilePath(file).parent, format_of_module(value.__rlcli_task__.__module__)
     files = sorted(folder.glob(_AGENTS))
     if form is not None and form.spec.agents_beside:
         files += form.load(form.spec.agents_beside)(folder)
@@ -200,7 +208,7 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
 
 
 def _agents_in_modules(modules: Iterable[Any]) -> dict[str, Any]:
-    """The agents that stand beside a configuration: in its module, in the `agents` folder, or in a file next to it."""
+    """Return the agents that are defined in some modules, by name; a single agent has the name of its library."""
     found = {
         name: item
         for module in modules
@@ -214,7 +222,10 @@ def _agents_in_modules(modules: Iterable[Any]) -> dict[str, Any]:
 
 
 def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
-    """What a package has registered with gymnasium: kwargs with `env_cfg_entry_point` and the agents beside it."""
+    """Return the configuration and the agents that a package registers with Gymnasium.
+
+    They are the arguments `env_cfg_entry_point` and `AGENT_cfg_entry_point` of the registration.
+    """
     module = import_file(source.root / "__init__.py")
     gymnasium = sys.modules.get("gymnasium")
     registry = gymnasium.envs.registry if gymnasium is not None else {}
@@ -244,6 +255,7 @@ def _module_of(entry: object) -> str:
 
 
 def _object(entry: object) -> Any:
+    """Import the object of a reference; return other objects, and names of YAML files, unchanged."""
     if not isinstance(entry, str):
         return entry
     return entry if entry.endswith((".yaml", ".yml")) else load_object(entry)
@@ -252,19 +264,15 @@ def _object(entry: object) -> Any:
 def _add_agent(task: PythonTask, name: str, agent: object) -> None:
     if isinstance(agent, str) or not (isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__")):
         what = agent if isinstance(agent, str) else type(agent).__name__
-        task.notes.append(Note("", f"agents.{name}", "ignored", f"{what} is no agent that this reads"))
+        task.notes.append(Note("", f"agents.{name}", "ignored", f"{what} is not an agent in a form that rlcli reads"))
         return
     agents = task.data.setdefault("agents", {})
     agents.setdefault("default", name)
     agents[name] = agent_data(agent, task.notes)
 
 
-def _problems(error: ValidationError, label: str) -> list[Problem]:
-    return [Problem(label, ".".join(map(str, item["loc"])), item["msg"]) for item in error.errors(include_url=False)]
-
-
-def _place(error: BaseException) -> str:
-    """Return the line that the error came from: of the task's own files, if it went through one."""
+def _location(error: BaseException) -> str:
+    """Return ` (file:line)` of the code that raised an error, if possible of the task's own code."""
     frames = [
         (frame.f_code.co_filename, line, is_framework(str(frame.f_globals.get("__name__", ""))))
         for frame, line in traceback.walk_tb(error.__traceback__)
@@ -275,7 +283,7 @@ def _place(error: BaseException) -> str:
 
 
 def _hint(error: BaseException) -> str | None:
-    """Return what an installed format says about an error of a task's code."""
+    """Return the hint of an installed format about an error of a task's code; None if no format has one."""
     for form in installed_formats():
         hint: str | None = form.load(form.spec.hint)(error) if form.spec.hint else None
         if hint is not None:

@@ -10,10 +10,10 @@ from rlcli.settings import settings_file
 
 
 def read_settings() -> dict[str, Any]:
-    """What the file sets, by key; nothing if there is no file.
+    """Return the user's settings by key; an empty mapping if there is no settings file.
 
     Raises:
-        ConfigError: with every mistake, at its line and column; also if RLCLI_SETTINGS names a file that is not there.
+        ConfigError: with every mistake, its line and column; also if the file that RLCLI_SETTINGS names does not exist.
     """
     file = settings_file()
     if file is None or (not os.path.lexists(file) and not os.environ.get("RLCLI_SETTINGS")):
@@ -21,15 +21,15 @@ def read_settings() -> dict[str, Any]:
     from pydantic import ValidationError
 
     from rlcli.config import messages
-    from rlcli.config.layers import marked, read
+    from rlcli.config.layers import document_origins, read
     from rlcli.config.settings_schema import UserSettings
 
-    hint = "mend it, or RLCLI_SETTINGS=none leaves it out"
+    hint = "correct the file, or set RLCLI_SETTINGS=none to ignore it"
     try:
         document = read(file)
     except ConfigError as error:
         raise ConfigError(Problem(p.where, p.path, p.message, hint) for p in error.problems) from None
-    origin = marked(document, str(file), "settings")
+    origin = document_origins(document, str(file), "settings")
     try:
         return UserSettings.model_validate(document.data).model_dump(exclude_unset=True)
     except ValidationError as error:

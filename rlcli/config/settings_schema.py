@@ -1,4 +1,4 @@
-"""The keys of the user's settings file."""
+"""Schema of the user's settings file."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ Loggers = Annotated[list[Literal["tensorboard", "wandb", "mlflow", "trackio", "n
 
 
 class UserSettings(StrictModel):
-    """Preferences of the command line; every key may be left out."""
+    """Settings of the command line. Every key is optional."""
 
     runs_dir: Text | None = None
-    """The runs folder, as RLCLI_RUNS_DIR and `--runs-dir` name it; `~` is your home. Default: runs, in the current
-    folder."""
+    """The folder for runs, as with RLCLI_RUNS_DIR and `--runs-dir`; `~` is your home folder. Default: the folder `runs`
+    in the current folder."""
     loggers: Loggers | None = None
-    """What new trainings log to, as `--logger` does. Default: TensorBoard, where it is installed."""
+    """Loggers of new trainings, as with `--logger`. Default: TensorBoard, if it is installed."""
     viewer: Literal["auto", "native", "web", "none"] = "auto"
-    """What `play` opens where it may choose: `--viewer` comes first, and nothing is opened for `--json` or a file."""
+    """Viewer that `play` opens without `--viewer`. With `--json` or a video file, `play` opens no viewer."""
     verbosity: Literal["quiet", "normal", "verbose"] = "normal"
-    """quiet and verbose are `--quiet` and `-v` of every command."""
+    """quiet and verbose have the effect of `--quiet` and `-v` for every command."""
     color: Literal["auto", "always", "never"] = "auto"
-    """never and always are what NO_COLOR and FORCE_COLOR say; auto: colours on a terminal."""
+    """auto: colours on a terminal; always: as with FORCE_COLOR; never: as with NO_COLOR."""
     plugins: list[Text] | None = None
-    """Distributions whose tasks and trainers are there, as RLCLI_PLUGINS names them; an empty list leaves the built-in
-    ones. Default: every one that is installed."""
+    """Distributions whose tasks and trainers are used, as with RLCLI_PLUGINS; an empty list: only the built-in tasks
+    and trainers. Default: all installed distributions."""

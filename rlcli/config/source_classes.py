@@ -1,4 +1,4 @@
-"""Classes in their source text, and the bases that can be found beside them or in `rlcli.mdp`: nothing is imported."""
+"""Classes in source files, and their base classes in the same package or in `rlcli.mdp`, without importing anything."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from pathlib import Path
 
 _RLCLI = Path(__file__).resolve().parents[1]
 MOST = 64
-"""How many classes one search looks at: a stranger's files may name each other in a circle."""
+"""Largest number of classes in one search. The files may be untrusted, and may inherit from each other in a circle."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceClass:
-    """A class as a file writes it."""
+    """A class in a source file: its file and its syntax tree."""
 
     file: Path
     node: ast.ClassDef
 
     def nested(self, name: str) -> SourceClass | None:
-        """The class of this name in its body."""
+        """Return the class of this name in the body of the class; None if there is none."""
         node = next((n for n in self.node.body if isinstance(n, ast.ClassDef) and n.name == name), None)
         return None if node is None else SourceClass(self.file, node)
 
 
 def parse(file: Path) -> ast.Module:
-    """The syntax tree of a file.
+    """Return the syntax tree of a file.
 
     Raises:
         SyntaxError: if the file is not Python.
@@ -37,16 +37,16 @@ def parse(file: Path) -> ast.Module:
             warnings.simplefilter("ignore")
             return ast.parse(file.read_bytes(), filename=str(file))
     except SyntaxError as error:
-        error.filename = str(file)  # absent where there is a null byte
+        error.filename = str(file)  # Python leaves it out for a file with a null byte
         raise
     except (ValueError, RecursionError, MemoryError) as error:
         raise SyntaxError(str(error) or "nested too deeply", (str(file), 1, 1, None)) from None
 
 
 def constructor(source: SourceClass, trees: dict[Path, ast.Module]) -> ast.FunctionDef | None:
-    """Return the `__init__` of a class: its own, the one that `@dataclass` writes, or that of a base; None without one.
+    """Return the `__init__` of a class: its own, the one that `@dataclass` generates, or that of a base; else None.
 
-    `trees` holds the syntax trees of the files read so far, and is added to.
+    `trees` is a cache of the syntax trees of files; new files are added to it.
 
     Raises:
         SyntaxError: if the file of a base is not Python.
@@ -55,9 +55,9 @@ def constructor(source: SourceClass, trees: dict[Path, ast.Module]) -> ast.Funct
 
 
 def lineage(file: Path, name: str) -> list[SourceClass]:
-    """A class and those that it inherits from, depth first, each once; empty if the file has no such class.
+    """Return a class and its base classes, depth first, each once; an empty list if the file has no such class.
 
-    Bases are followed where their source is at hand: in the same file, or in another one of the same package.
+    Base classes are found in the same file, in other files of the same package, and in `rlcli.mdp`.
 
     Raises:
         SyntaxError: if one of the files is not Python.
@@ -66,7 +66,7 @@ def lineage(file: Path, name: str) -> list[SourceClass]:
 
 
 def nested_lineage(file: Path, name: str, nested: str) -> list[SourceClass]:
-    """The same of a class that is written in the body of another, or of one that the other inherits from.
+    """Return a class in the body of another class (or of its bases), and the base classes of the inner class.
 
     Raises:
         SyntaxError: if one of the files is not Python.
@@ -77,6 +77,8 @@ def nested_lineage(file: Path, name: str, nested: str) -> list[SourceClass]:
 
 
 class _Search:
+    """Search for classes in source files. It stops after `MOST` classes."""
+
     def __init__(self, trees: dict[Path, ast.Module] | None = None) -> None:
         self._trees = {} if trees is None else trees
         self._left = MOST
@@ -86,10 +88,12 @@ class _Search:
         return [] if first is None else list(self.walk(first))
 
     def nested(self, file: Path, outer: str, name: str) -> SourceClass | None:
+        """Return the class `name` in the body of the class `outer` or of one of its bases."""
         found = (owner.nested(name) for owner in self.lineage(file, outer))
         return next((inner for inner in found if inner is not None), None)
 
     def walk(self, first: SourceClass, seen: set[ast.ClassDef] | None = None) -> Iterator[SourceClass]:
+        """Yield a class and its base classes, depth first, each once."""
         seen = set() if seen is None else seen
         if first.node in seen or not self._left:
             return
@@ -102,7 +106,7 @@ class _Search:
                 yield from self.walk(base, seen)
 
     def bases(self, source: SourceClass) -> list[SourceClass]:
-        """Return the classes that a class names as its bases, or none once the search has looked at `MOST` classes."""
+        """Return the direct base classes of a class; none after `MOST` classes."""
         if not self._left:
             return []
         self._left -= 1
@@ -110,6 +114,7 @@ class _Search:
         return [base for base in found if base is not None]
 
     def _base(self, file: Path, expression: ast.expr) -> SourceClass | None:
+        """Return the class of an expression `Name` or `Outer.Name`; None if it is not found."""
         if isinstance(expression, ast.Name):
             return self._find(file, expression.id)
         if isinstance(expression, ast.Attribute) and isinstance(expression.value, ast.Name):
@@ -117,10 +122,7 @@ class _Search:
         return None
 
     def _find(self, file: Path, name: str) -> SourceClass | None:
-        """The class that a file defines or imports by this name; None for what is not found.
-
-        Of rlcli's own classes only terms are found.
-        """
+        """Return the class that a file defines or imports under a name; None if it is not found."""
         for node in self._tree(file).body:
             if isinstance(node, ast.ClassDef) and node.name == name:
                 return SourceClass(file, node)
@@ -145,10 +147,11 @@ class _Search:
 
 
 def _module_files(file: Path, node: ast.ImportFrom) -> Iterator[Path]:
-    """Where the module that a file imports from may lie."""
+    """Yield the possible files of the module that a file imports from."""
     parts = (node.module or "").split(".")
+    # an absolute import may start at any folder above the file, because the root of the package is unknown
     roots: Sequence[Path] = file.parents[node.level - 1 : node.level] if node.level else file.parents
-    if parts[0] == "rlcli" and not node.level:
+    if parts[0] == "rlcli" and not node.level:  # of rlcli itself only `rlcli.mdp` is searched
         roots = (_RLCLI.parent,) if parts[1:2] == ["mdp"] else ()
     for root in roots:
         yield root.joinpath(*parts).with_suffix(".py")
@@ -157,7 +160,7 @@ def _module_files(file: Path, node: ast.ImportFrom) -> Iterator[Path]:
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """A field of a dataclass, as a parameter of its `__init__`."""
+    """A field of a dataclass, which is a parameter of its `__init__`."""
 
     argument: ast.arg
     default: ast.expr | None
@@ -176,6 +179,7 @@ def _constructor(source: SourceClass, search: _Search) -> ast.FunctionDef | None
 
 
 def _dataclass_init(node: ast.ClassDef, fields: list[_Field]) -> ast.FunctionDef:
+    """Return the syntax tree of the `__init__` that `@dataclass` generates."""
     keywords = [field for field in fields if field.keyword_only]
     arguments = ast.arguments(
         posonlyargs=[],
@@ -188,14 +192,14 @@ def _dataclass_init(node: ast.ClassDef, fields: list[_Field]) -> ast.FunctionDef
 
 
 def _fields(source: SourceClass, search: _Search) -> dict[str, _Field]:
-    """The fields of a dataclass, in the order of its `__init__`: those of its last base first."""
+    """Return the fields of a dataclass in the order of its `__init__`: the fields of its last base class first."""
     fields: dict[str, _Field] = {}
     for base in reversed(search.bases(source)):
         fields.update(_fields(base, search))
     decorator = _dataclass_decorator(source.node)
-    if decorator is None:  # the annotations of a plain class are no fields
+    if decorator is None:  # annotations of a class without @dataclass are not fields
         return fields
-    keyword_only = _is_true(_keywords(decorator).get("kw_only"))
+    keyword_only = _is_constant(_keywords(decorator).get("kw_only"), True)
     for node in source.node.body:
         if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
             continue
@@ -203,7 +207,7 @@ def _fields(source: SourceClass, search: _Search) -> dict[str, _Field]:
         name = node.target.id
         if kind == "KW_ONLY":
             keyword_only = True
-        elif kind == "ClassVar" or _is_false(_options(node.value).get("init")):
+        elif kind == "ClassVar" or _is_constant(_options(node.value).get("init"), False):
             fields.pop(name, None)
         else:
             fields[name] = _Field(ast.arg(name, node.annotation), _default(node.value), keyword_only)
@@ -211,12 +215,15 @@ def _fields(source: SourceClass, search: _Search) -> dict[str, _Field]:
 
 
 def _dataclass_decorator(node: ast.ClassDef) -> ast.expr | None:
-    called = ((d, d.func if isinstance(d, ast.Call) else d) for d in node.decorator_list)
-    return next((decorator for decorator, function in called if last_name(function) == "dataclass"), None)
+    """Return the decorator `@dataclass` or `@dataclass(...)` of a class; None without one."""
+    for decorator in node.decorator_list:
+        if last_name(decorator.func if isinstance(decorator, ast.Call) else decorator) == "dataclass":
+            return decorator
+    return None
 
 
 def _default(value: ast.expr | None) -> ast.expr | None:
-    """The default of a dataclass's field, also one written as `field(default_factory=lambda: ...)`."""
+    """Return the default of a dataclass field, also of `field(default_factory=lambda: ...)`; None without one."""
     options = _options(value)
     factory = options.get("default_factory")
     if factory is not None:
@@ -225,7 +232,7 @@ def _default(value: ast.expr | None) -> ast.expr | None:
 
 
 def _options(value: ast.expr | None) -> dict[str, ast.expr]:
-    """The keywords of `field(...)`."""
+    """Return the keyword arguments of `field(...)`; an empty mapping for any other expression."""
     return _keywords(value) if isinstance(value, ast.Call) and last_name(value.func) == "field" else {}
 
 
@@ -233,16 +240,12 @@ def _keywords(call: ast.expr | None) -> dict[str, ast.expr]:
     return {k.arg: k.value for k in call.keywords if k.arg} if isinstance(call, ast.Call) else {}
 
 
-def _is_true(node: ast.expr | None) -> bool:
-    return isinstance(node, ast.Constant) and node.value is True
-
-
-def _is_false(node: ast.expr | None) -> bool:
-    return isinstance(node, ast.Constant) and node.value is False
+def _is_constant(node: ast.expr | None, value: bool) -> bool:
+    return isinstance(node, ast.Constant) and node.value is value
 
 
 def last_name(node: ast.expr) -> str | None:
-    """Return the name that an expression ends with: `b` of `b` and of `a.b`."""
+    """Return the last name of an expression: `b` for `b` and for `a.b`; None for other expressions."""
     if isinstance(node, ast.Name):
         return node.id
     return node.attr if isinstance(node, ast.Attribute) else None

@@ -1,7 +1,8 @@
-"""Strict YAML: the YAML 1.2 scalars people expect, positions for every value, and nothing that can run or explode.
+"""Reader of strict YAML: scalars of YAML 1.2, the position of every value, and limits that make untrusted files safe.
 
-Built on the event stream of PyYAML's pure-Python parser (the C parser crashes on deep nesting). Refused, each with
-its position: duplicate keys, anchors, tags, merge keys, a second document, ambiguous scalars (`on`, `010`, `.nan`).
+The reader uses the event stream of PyYAML's pure-Python parser (the C parser crashes on deep nesting). It refuses, each
+with its position: duplicate keys, anchors, tags, merge keys, a second document, ambiguous scalars (`on`, `010`,
+`.nan`).
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _CONSTANTS = {
 
 
 class YamlError(ValueError):
-    """A file that is not strict YAML; `line` and `column` count from 1 (0 when the file as a whole is meant)."""
+    """Text that is not strict YAML. `line` and `column` count from 1; both are 0 if the file as a whole is refused."""
 
     def __init__(self, message: str, mark: Any = None, *, place: Mark = (0, 0)) -> None:
         super().__init__(message)
@@ -47,7 +48,7 @@ class YamlError(ValueError):
 
 @dataclass(slots=True)
 class Document:
-    """A parsed mapping and the position (line, column) of every key and item, by path."""
+    """A parsed mapping, and the position (line, column) of every key and list item by path."""
 
     data: dict[str, Any]
     marks: dict[Path, Mark] = field(default_factory=dict)
@@ -55,6 +56,8 @@ class Document:
 
 @dataclass(slots=True)
 class _Frame:
+    """A mapping or list that is being read. `key` is the key whose value comes next."""
+
     container: dict[str, Any] | list[Any]
     path: Path
     key: str | None = None
@@ -64,7 +67,7 @@ def load(text: str | bytes) -> Document:
     """Parse one document whose top level is a mapping.
 
     Raises:
-        YamlError: with the position of the first thing that is not allowed.
+        YamlError: with the position of the first mistake.
     """
     value, marks = _parse(_decode(text))
     if value is None:
@@ -75,7 +78,7 @@ def load(text: str | bytes) -> Document:
 
 
 def load_value(text: str) -> Any:
-    """Parse one value as it would be read after a key: `1e-3`, `[1, 2]`, `{a: 1}`, `text`."""
+    """Parse one value, such as `1e-3`, `[1, 2]`, `{a: 1}` or `text`, as it would be read after a key."""
     return _parse(_decode(text))[0]
 
 
@@ -88,11 +91,11 @@ def _decode(text: str | bytes) -> str:
         except UnicodeDecodeError as error:
             before = error.object[: error.start].decode("utf-8")
             raise YamlError(f"not UTF-8: {error.reason}", place=_after(before)) from None
-    return text.removeprefix("\ufeff")
+    return text.removeprefix("\ufeff")  # the byte order mark
 
 
 def _after(before: str) -> Mark:
-    """The position of what follows this text."""
+    """Return the position (line, column) after a text."""
     return before.count("\n") + 1, len(before) - before.rfind("\n")
 
 
@@ -109,6 +112,8 @@ def _parse(text: str) -> tuple[Any, dict[Path, Mark]]:
 
 
 class _Reader:
+    """Builder of data and positions from PyYAML's events."""
+
     def __init__(self) -> None:
         self.marks: dict[Path, Mark] = {}
         self.stack: list[_Frame] = []
@@ -135,6 +140,7 @@ class _Reader:
         return self.root, self.marks
 
     def _awaits_key(self) -> bool:
+        """Return whether the next event is the key of a mapping."""
         return bool(self.stack) and isinstance(self.stack[-1].container, dict) and self.stack[-1].key is None
 
     def _refuse(self, event: events.Event) -> None:
@@ -152,10 +158,11 @@ class _Reader:
         self.stack.append(_Frame(container, self._put(container, mark)))
 
     def _put(self, value: Any, mark: Any) -> Path:
-        place = (mark.line + 1, mark.column + 1)
+        """Add a value to the innermost container (or use it as a key) and return its path."""
+        position = (mark.line + 1, mark.column + 1)
         if not self.stack:
             self.root = value
-            self.marks[()] = place
+            self.marks[()] = position
             return ()
         frame = self.stack[-1]
         if isinstance(frame.container, list):
@@ -167,7 +174,7 @@ class _Reader:
             path = (*frame.path, frame.key)
             frame.container[frame.key] = value
             frame.key = None
-        self.marks.setdefault(path, place)
+        self.marks.setdefault(path, position)  # for a mapping this is the position of the key, set by `_key`
         return path
 
     def _key(self, frame: _Frame, key: Any, mark: Any) -> Path:
@@ -182,6 +189,7 @@ class _Reader:
 
 
 def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
+    """Return the value of a scalar by the rules of YAML 1.2; refuse scalars that other parsers read differently."""
     text = event.value
     if len(text) > MAX_SCALAR:
         raise YamlError(f"a value longer than {MAX_SCALAR} characters", event.start_mark)
@@ -192,7 +200,7 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
     if text in _CONSTANTS:
         return _CONSTANTS[text]
     if _OCTAL.match(text):
-        raise YamlError(f"{text} is ambiguous (octal in YAML 1.1); drop the leading 0 or quote it", event.start_mark)
+        raise YamlError(f"{text} is ambiguous (octal in YAML 1.1); remove the leading 0 or quote it", event.start_mark)
     if _INT.match(text):
         return int(text)
     if _FLOAT.match(text):
@@ -202,6 +210,6 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
         return number
     if _NOT_FINITE.match(text):
         raise YamlError(f"{text} is not allowed; write a number, or null for none", event.start_mark)
-    if text.lower() in _WORDS:  # not y and n: x, y and z are names of parameters
+    if text.lower() in _WORDS:  # y and n are allowed, because x, y and z are names of parameters
         raise YamlError(f"{text} is ambiguous; write true or false, or quote it", event.start_mark)
     return text

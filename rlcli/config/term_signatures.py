@@ -1,8 +1,9 @@
-"""Term signatures, read from source text with `ast`: files are checked without importing a stranger's code.
+"""Signatures of terms, read from source text with `ast`, so that files are checked without importing untrusted code.
 
-A term is a public function whose first parameter is `env`, or a class whose `__init__` takes `(self, env, *, ...)`
-(named in YAML by its class name in snake_case). Its keyword-only parameters are its YAML keys. A class may inherit its
-`__init__` from a base in the same file, in another file of the task or in `rlcli.mdp`, or have it from `@dataclass`.
+A term is a public function whose first parameter is `env`, or a class whose `__init__` takes `(self, env, *, ...)`. The
+YAML name of a class is its name in snake_case. The keyword-only parameters are the YAML keys of the term. A class may
+inherit its `__init__` from a base in the same file, in another file of the task or in `rlcli.mdp`, or get it from
+`@dataclass`.
 """
 
 from __future__ import annotations
@@ -46,13 +47,13 @@ SECTIONS: dict[str, type[TermConfig]] = {
     "curriculum": CurriculumConfig,
     "success": SuccessConfig,
 }
-"""Section of the YAML -> what its terms have in common."""
+"""Section of the YAML -> model of the keys that all its terms share."""
 
 SELECTORS = ("Joints", "Bodies", "Sites", "Sensors", "Actuators", "Geoms", "Tendons", "Pairs")
-"""Aliases of `rlcli.task` that pick elements of the term's `entity`."""
+"""Aliases of `rlcli.task` that select elements of the term's `entity`."""
 
 NAMED = ("Entity", "Command", "Address", "ContactSensor", "RaySensor", "CameraSensor")
-"""Aliases of `rlcli.task` that name one thing."""
+"""Aliases of `rlcli.task` that name one object."""
 
 _TYPES: dict[str, Any] = {
     "float": Number,
@@ -68,12 +69,12 @@ _MDP = Path(__file__).resolve().parent.parent / "mdp"
 
 
 class SignatureError(ValueError):
-    """A term's signature uses something that YAML cannot express."""
+    """Signature of a term that YAML cannot express."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One keyword-only parameter: its YAML type, its default, and the selector alias it was written with."""
+    """A keyword-only parameter of a term. `alias` is the alias of `rlcli.task` in its annotation."""
 
     name: str
     type: Any
@@ -84,7 +85,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """A term as its source declares it."""
+    """Signature of a term in its source file."""
 
     name: str
     attribute: str
@@ -95,53 +96,53 @@ class Signature:
     parameters: tuple[Parameter, ...]
     error: str | None = None
     target: Any = None
-    """What to call, where a configuration in Python holds it; None: `attribute` of the file."""
+    """The function or class itself, if it comes from a configuration in Python; None: `attribute` of the file."""
     description: str = ""
-    """The first paragraph of its docstring, on one line."""
+    """The first paragraph of the docstring, on one line."""
 
     @property
     def module(self) -> str:
-        """The module of a built-in term."""
+        """The module name of a built-in term."""
         return ".".join(("rlcli", "mdp", *self.file.relative_to(_MDP).with_suffix("").parts))
 
 
 @dataclass(slots=True)
 class Vocabulary:
-    """The terms that a task's YAML may name: its own first, then those of `rlcli.mdp` for the section."""
+    """The terms that the YAML of a task may name: its own terms first, then those of `rlcli.mdp` for the section."""
 
     own: dict[str, Signature] = field(default_factory=dict)
 
     @classmethod
     def of(cls, files: tuple[Path, ...]) -> Vocabulary:
-        """Read the task's own term files; a later file wins."""
+        """Read the task's own term files. If two files define a term, the later file wins."""
         own: dict[str, Signature] = {}
         for file in files:
             own.update(read_terms(file))
         return cls(own)
 
     def find(self, section: str, name: str) -> Signature | None:
-        """The term `name` of a section, or None."""
+        """Return the term `name` of a section, or None."""
         return self.own.get(name) or builtin_terms(section).get(name)
 
     def names(self, section: str) -> list[str]:
-        """Every name that may stand in `func` in a section."""
+        """Return every name that `func` may have in a section."""
         return sorted({*self.own, *builtin_terms(section)})
 
     def other_section(self, section: str, name: str) -> str | None:
-        """Another section that has a built-in term of this name."""
+        """Return another section that has a built-in term of this name, or None."""
         return next((other for other in SECTIONS if other != section and name in builtin_terms(other)), None)
 
 
 @functools.cache
 def builtin_terms(section: str) -> dict[str, Signature]:
-    """The terms of `rlcli.mdp` for a section of the YAML."""
+    """Return the terms of `rlcli.mdp` for a section of the YAML, by name."""
     modules = ("randomization", "events") if section == "events" else (section,)
     files = [file for module in modules for file in (_MDP / f"{module}.py", *sorted((_MDP / module).glob("*.py")))]
     return {name: term for file in files if file.exists() for name, term in read_terms(file).items()}
 
 
 def read_terms(file: Path) -> dict[str, Signature]:
-    """The terms that a Python file defines, by YAML name.
+    """Return the terms that a Python file defines, by YAML name.
 
     Raises:
         SyntaxError: if the file is not Python.
@@ -161,10 +162,10 @@ def read_terms(file: Path) -> dict[str, Signature]:
 
 
 def signature_of(term: Any, name: str) -> Signature:
-    """The signature of a term given as an object: a function or class in `rlcli.mdp`'s form.
+    """Return the signature of a term that is a function or class in memory.
 
     Raises:
-        SignatureError: if it is not in that form, or its source cannot be read.
+        SignatureError: if the object does not have the form of a term, or its source cannot be read.
     """
     try:
         file, source = inspect.getsourcefile(term), inspect.getsource(term)
@@ -182,17 +183,17 @@ def signature_of(term: Any, name: str) -> Signature:
 
 
 def read_params(file: Path, class_name: str) -> type[StrictModel] | None:
-    """The `Params` model of a direct task's class, its own or inherited, rebuilt from its source; None without one.
+    """Return the `Params` model of a direct task's class (own or inherited), rebuilt from its source; None without one.
 
     Raises:
         SyntaxError: if a file is not Python.
-        SignatureError: if a field is not one that YAML can express.
+        SignatureError: if YAML cannot express the type of a field.
     """
     params = nested_lineage(file, class_name, "Params")
     if not params:
         return None
     fields: dict[str, Any] = {}
-    for source in reversed(params):  # its own come last and win
+    for source in reversed(params):  # the own fields come last and override those of the bases
         for node in source.node.body:
             if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
                 try:
@@ -203,29 +204,31 @@ def read_params(file: Path, class_name: str) -> type[StrictModel] | None:
 
 
 def params_model(signature: Signature, section: str) -> type[TermConfig]:
-    """The model of a term's YAML entry: the section's own keys and the function's parameters, nothing else.
+    """Return the model of a term's YAML entry. Its keys are the keys of the section and the function's parameters.
 
     Raises:
         SignatureError: if the function cannot be a term of this section.
     """
     if signature.error:
         raise SignatureError(signature.error)
-    if taken := [p.name for p in signature.parameters if p.name in (*SECTIONS[section].model_fields, "params")]:
-        raise SignatureError(f"parameter '{taken[0]}': every term of {section} has a key of this name already")
+    reserved = (*SECTIONS[section].model_fields, "params")
+    if taken := [p.name for p in signature.parameters if p.name in reserved]:
+        raise SignatureError(f"parameter '{taken[0]}': every term of {section} already has a key of this name")
     fields: dict[str, Any] = {p.name: (p.type, ... if p.required else p.default) for p in signature.parameters}
     return _model(signature.name, _closed(section), fields)
 
 
 def snake_case(name: str) -> str:
-    """`JointEffort` -> `joint_effort`."""
+    """Convert a class name to snake case: `JointEffort` -> `joint_effort`."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
 
 
 def annotation_type(node: ast.expr) -> Any:
-    """The YAML type of an annotation.
+    """Return the YAML type of an annotation.
 
     Raises:
-        SignatureError: for anything but float, int, bool, str, Literal, tuple, list, dict, `X | None` and the aliases.
+        SignatureError: for types other than float, int, bool, str, Literal, tuple, list, dict, `X | None` and the
+            aliases of `rlcli.task`.
     """
     if isinstance(node, ast.Constant) and node.value is None:
         return None
@@ -250,7 +253,7 @@ def annotation_type(node: ast.expr) -> Any:
                 return tuple[annotation_type(items[0]), ...]  # type: ignore[misc]
             return tuple[tuple(annotation_type(item) for item in items)]  # type: ignore[misc]
     raise SignatureError(
-        f"annotation '{ast.unparse(node)}' is not one that YAML can express; use float, int, bool, str, Literal, tuple,"
+        f"YAML cannot express the annotation '{ast.unparse(node)}'; use float, int, bool, str, Literal, tuple,"
         f" list, dict[str, X], X | None, Range, {', '.join(NAMED)} or {' / '.join(SELECTORS)}"
     )
 
@@ -263,15 +266,14 @@ def _model(name: str, base: type[StrictModel], fields: dict[str, Any]) -> type[A
 
 @functools.cache
 def _closed(section: str) -> type[TermConfig]:
+    """Return the model of a section's terms that refuses unknown keys."""
     base = SECTIONS[section]
-    return type(
-        base.__name__,
-        (base,),
-        {"model_config": ConfigDict(extra="forbid", protected_namespaces=()), "__module__": __name__},
-    )
+    config = ConfigDict(extra="forbid", protected_namespaces=())  # a parameter may start with `model_`
+    return type(base.__name__, (base,), {"model_config": config, "__module__": __name__})
 
 
 def _signature(node: ast.FunctionDef | ast.ClassDef, call: ast.FunctionDef, name: str, file: Path) -> Signature:
+    """Return the signature of a term. `node` is the function or class; `call` is the function or its `__init__`."""
     parameters: list[Parameter] = []
     error = _positional_error(call, isinstance(node, ast.ClassDef))
     for argument, default in zip(call.args.kwonlyargs, call.args.kw_defaults, strict=True):
@@ -296,7 +298,7 @@ def _signature(node: ast.FunctionDef | ast.ClassDef, call: ast.FunctionDef, name
 
 
 def first_paragraph(docstring: str) -> str:
-    """What a docstring begins with, on one line."""
+    """Return the first paragraph of a docstring on one line."""
     return " ".join(re.split(r"\n\s*\n", docstring.strip())[0].split())
 
 
@@ -316,7 +318,7 @@ def _parameter(argument: ast.arg, default: ast.expr | None) -> Parameter:
     if argument.annotation is None:
         raise SignatureError("has no annotation")
     if argument.arg.startswith("_"):
-        raise SignatureError("starts with an underscore, which no key of a YAML does")
+        raise SignatureError("starts with an underscore, which is not allowed for a key of a YAML file")
     return Parameter(
         argument.arg,
         annotation_type(argument.annotation),
@@ -327,7 +329,7 @@ def _parameter(argument: ast.arg, default: ast.expr | None) -> Parameter:
 
 
 def _alias(node: ast.expr) -> str | None:
-    """The alias that an annotation is written with, also as `Joints | None` or in quotes."""
+    """Return the alias of `rlcli.task` in an annotation, also in `Joints | None` or in quotes; None if it has none."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return _alias(_quoted(node.value))
     if isinstance(node, ast.BinOp):
@@ -337,6 +339,7 @@ def _alias(node: ast.expr) -> str | None:
 
 
 def _quoted(text: str) -> ast.expr:
+    """Parse an annotation that is written in quotes."""
     try:
         return ast.parse(text, mode="eval").body
     except (SyntaxError, ValueError):
@@ -344,15 +347,16 @@ def _quoted(text: str) -> ast.expr:
 
 
 def _literal(node: ast.expr) -> Any:
+    """Return the value of a literal in source text."""
     try:
         return ast.literal_eval(node)
     except (ValueError, TypeError):
-        raise SignatureError(
-            f"'{ast.unparse(node)}' is not a literal, and files are checked without running them"
-        ) from None
+        message = f"'{ast.unparse(node)}' is not a literal, and files are checked without running them"
+        raise SignatureError(message) from None
 
 
 def _field_default(node: ast.expr | None) -> Any:
+    """Return the default of a `Params` field in the form that `create_model` takes."""
     if node is None:
         return ...
     if isinstance(node, ast.Call) and last_name(node.func) == "Field":

@@ -1,4 +1,4 @@
-"""Checks of a configuration against the schema, the terms and the trainers."""
+"""Validation of a configuration against the schema, the signatures of its terms and the settings of its trainer."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rlcli.config import messages, python_task
-from rlcli.config.foreign_keys import with_foreign
-from rlcli.config.layers import Layers, Origin, marked, parse_override, read
+from rlcli.config.foreign_keys import move_foreign_keys
+from rlcli.config.layers import Layers, Origin, document_origins, parse_override, read
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, Vocabulary, params_model, read_params
@@ -26,21 +26,21 @@ from rlcli.registry.formats import (
     missing_formats,
     require_format,
 )
-from rlcli.task import API_VERSION
+from rlcli.registry.imports import load_spec
 from rlcli.trainers import TrainerSpec
 
 PATCHES = ("agents", "play")
-"""Keys of a task file that are not the task itself: they hold patches of it, and are merged before those apply."""
+"""Keys of a task file that contain patches of the task. They are merged before the patches are applied."""
 _DEVICES = ("cpu", "cuda")
 
 
 def agent_names(layers: Layers) -> list[str]:
-    """The agents that a configuration describes."""
+    """Return the names of the agents in a configuration."""
     return [name for name in _mapping(layers.get(("agents",))) if name != "default"]
 
 
 class _AnyAgent(AgentConfig):
-    """An agent of a trainer that is not known: what all agents have in common is still checked."""
+    """An agent whose trainer is unknown or not installed: only the keys that all agents share are checked."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -48,52 +48,59 @@ class _AnyAgent(AgentConfig):
 
     @model_validator(mode="after")
     def _budget(self) -> _AnyAgent:
-        return self  # a trainer may have its budget elsewhere
+        return self  # the trainer may have other keys for its budget
 
 
 Change = tuple[Path, Any, Origin]
+"""Path, new value and origin of a change from the command line."""
 
 
 @dataclass(slots=True)
 class TaskCheck:
-    """One pass of phase 1: the layers so far, and every problem found on the way."""
+    """One check of a configuration: the layers that are merged so far, and every problem that was found."""
 
     source: TaskSource
     layers: Layers = field(default_factory=Layers)
     vocabulary: Vocabulary = field(default_factory=Vocabulary)
     problems: list[Problem] = field(default_factory=list)
     missing: DependencyError | None = None
-    homes: messages.Homes = field(default_factory=dict)
+    locations: messages.KeyLocations = field(default_factory=dict)
     functions: dict[str, Signature] = field(default_factory=dict)
     notes: list[Note] = field(default_factory=list)
     format: Format | None = None
 
     def document(self) -> Document:
-        """What the task's file holds; a configuration in Python also brings its functions."""
+        """Return the content of the task's file. For a configuration in Python, also store its functions and notes."""
         if self.source.python is None and self.source.value is None:
             return read(self.source.config, self.source.label)
         task = python_task.load(self.source)
         self.functions, self.notes, self.format = task.terms, task.notes, task.format
         if self.source.config.suffix == ".py":
             return Document(task.data)
-        return read(self.source.config, self.source.label)  # a run's record of it
+        return read(self.source.config, self.source.label)  # the record of a run, which is YAML
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> None:
-        """Note a problem at a path."""
+        """Add a problem at a path."""
         self.problems.append(Problem(self.layers.place(path), messages.dotted(path), message, hint))
+
+    def _is_mapping(self, value: object, path: Path) -> bool:
+        """Return whether the value at a path is a mapping; add a problem if it is not."""
+        if not isinstance(value, dict):
+            self.problem(path, f"expected a mapping, found {messages.format_value(value)}")
+        return isinstance(value, dict)
 
     # --- layers ---
 
     def read_task(self, document: Document) -> None:
-        """Merge the task's file, in whichever form it is."""
+        """Merge the content of the task's file, which may be in another framework's format."""
         if not self._read_other_format(document):
-            self.layers.merge(document.data, marked(document, self.source.label, "task"))
+            self.layers.merge(document.data, document_origins(document, self.source.label, "task"))
 
     def _read_other_format(self, document: Document) -> bool:
-        """Merge the data of a document that has another format; False for one in rlcli's own.
+        """Merge a document in another framework's format. Return False for a document in rlcli's own format.
 
         Raises:
-            DependencyError: if its format is known and the plugin is not installed.
+            DependencyError: if the format is known and its plugin is not installed.
         """
         unknown = {key: value for key, value in document.data.items() if key not in TaskConfig.model_fields}
         if not unknown:
@@ -114,7 +121,7 @@ class TaskCheck:
         return False
 
     def changes(self, overrides: Iterable[str], flags: Mapping[str, Any]) -> list[Change]:
-        """What the command line changes, overrides before flags."""
+        """Return the changes from the command line, overrides before flags."""
         found: list[Change] = []
         for text in overrides:
             try:
@@ -127,17 +134,25 @@ class TaskCheck:
         return found
 
     def choose_agent(self, wanted: str | None, device: str, changes: Iterable[Change]) -> str | None:
-        """The agent's name; None if the task has none, or several and no default."""
+        """Return the name of the agent; None if the task has no agent, or several agents and no default.
+
+        Args:
+            wanted: the name that the user chose; None: the default agent.
+            device: cpu or cuda, for a default that differs by device.
+            changes: changes from the command line, which may change the default.
+        """
         agents = self.layers.get(("agents",), {})
-        if not isinstance(agents, dict):
-            self.problem(("agents",), f"expected a mapping, found {messages.shown(agents)}")
+        if not self._is_mapping(agents, ("agents",)):
             return None
         names = [name for name in agents if name != "default"]
+
+        def hint(name: str) -> str:
+            return did_you_mean(name, names) or f"agents of this task: {listing(names)}"
+
         if wanted is not None:
             if wanted in names:
                 return wanted
-            near = did_you_mean(wanted, names) or f"agents of this task: {listing(names)}"
-            self.problems.append(Problem("--agent", "", f"no agent '{wanted}'", near))
+            self.problems.append(Problem("--agent", "", f"no agent '{wanted}'", hint(wanted)))
             return None
         self.apply([change for change in changes if change[0][:2] == ("agents", "default")], None)
         at: Path = ("agents", "default")
@@ -152,36 +167,33 @@ class TaskCheck:
         if default is None:
             return names[0] if len(names) == 1 else None
         if default not in names:
-            near = did_you_mean(str(default), names) or f"agents of this task: {listing(names)}"
-            self.problem(at, f"no agent {messages.shown(default)}", near)
+            self.problem(at, f"no agent {messages.format_value(default)}", hint(str(default)))
             return None
         return str(default)
 
     def merge_agent(self, patch: object, origin: Callable[[Path], Origin], name: str | None) -> None:
-        """Merge the `agent:` part of a --config file into the chosen agent."""
+        """Merge the key `agent:` of a --config file into the chosen agent."""
         if name is None:
             self._no_agent(origin(()).where)
         elif not isinstance(patch, dict):
             where = origin(()).where
-            self.problems.append(Problem(where, "agent", f"expected a mapping, found {messages.shown(patch)}"))
+            self.problems.append(Problem(where, "agent", f"expected a mapping, found {messages.format_value(patch)}"))
         else:
             self.layers.merge(patch, origin, ("agents", name))
 
     def _no_agent(self, where: str) -> None:
+        """Add the problem that a change of `agent` has no agent to apply to."""
         names = agent_names(self.layers)
         if not names:
             self.problems.append(Problem(where, "agent", "this task has no agents"))
-        elif not self.problems:  # otherwise the choice itself was wrong, and that has been said
+        elif not self.problems:  # otherwise the choice of the agent was wrong and is reported already
             hint = f"name one: --agent {' or '.join(names)}"
             self.problems.append(Problem(where, "agent", "the task has several agents and no default", hint))
 
     def patch(self, layer: str, at: Path) -> None:
-        """Merge what stands at `at` over the task."""
+        """Merge the patch at path `at` over the task."""
         patch = self.layers.get(at)
-        if patch is None:
-            return
-        if not isinstance(patch, dict):
-            self.problem(at, f"expected a mapping, found {messages.shown(patch)}")
+        if patch is None or not self._is_mapping(patch, at):
             return
         for key in PATCHES:
             if key in patch:
@@ -190,7 +202,7 @@ class TaskCheck:
         self.layers.merge(task, lambda path: Origin(layer, self.layers.place(at + path)))
 
     def apply(self, changes: Iterable[Change], name: str | None) -> None:
-        """Set what the command line changes."""
+        """Apply changes from the command line. `agent.x` changes the agent `name`."""
         for path, value, origin in changes:
             if path[0] == "agent":
                 if name is None:
@@ -198,11 +210,11 @@ class TaskCheck:
                     continue
                 path = ("agents", name, *path[1:])
             if value is None and path[0] in SECTIONS and not isinstance(self.layers.get(path), dict):
-                near = did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))
-                if near:
-                    self.problems.append(
-                        Problem(origin.where, messages.dotted(path), "there is nothing to remove", near)
-                    )
+                # null removes a term; for a term that does not exist, suggest one with a similar name
+                similar = did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))
+                if similar:
+                    key = messages.dotted(path)
+                    self.problems.append(Problem(origin.where, key, "there is nothing to remove", similar))
                     continue
             try:
                 self.layers.set(path, value, origin)
@@ -212,20 +224,19 @@ class TaskCheck:
     # --- validation ---
 
     def agent(self, name: str) -> tuple[TrainerSpec | None, AgentConfig | None]:
-        """The agent's trainer and validated settings."""
+        """Return the agent's trainer and its validated settings; None for what is not valid."""
         at: Path = ("agents", name)
         for path in (("agents",), at):
             data = self.layers.get(path)
-            if not isinstance(data, dict):
-                self.problem(path, f"expected a mapping, found {messages.shown(data)}")
+            if not self._is_mapping(data, path):
                 return None, None
         spec, model = self._trainer(at, data)
-        self.homes = messages.homes({"": TaskConfig, "agent": model})
+        self.locations = messages.key_locations({"": TaskConfig, "agent": model})
         config = self._validate(model, data, at)
         return spec, config if isinstance(config, AgentConfig) else None
 
     def _trainer(self, at: Path, data: Mapping[str, Any]) -> tuple[TrainerSpec | None, type[AgentConfig]]:
-        """The record of the agent's trainer, and the model of its settings (a common one if that is not known)."""
+        """Return the agent's trainer and the model of its settings; `_AnyAgent` if trainer or algorithm is unknown."""
         name, algorithm = data.get("trainer"), data.get("algorithm")
         if not isinstance(name, str):
             return None, _AnyAgent
@@ -234,29 +245,21 @@ class TaskCheck:
         except TaskError as error:
             if name in known_trainers() and name not in {entry.name for entry in catalog(TRAINERS)[0]}:
                 where = f"{self.layers.place((*at, 'trainer'))}: {messages.dotted((*at, 'trainer'))}"
-                hint = f"pip install {known_trainers()[name]}"
-                self.missing = DependencyError(f"{where}: trainer '{name}' is not installed", hint=hint)
+                install = f"pip install {known_trainers()[name]}"
+                self.missing = DependencyError(f"{where}: trainer '{name}' is not installed", hint=install)
             else:
                 self.problem((*at, "trainer"), error.message, error.hint)
             return None, _AnyAgent
-        spec = load_entry(entry, TrainerSpec)
-        if spec.api > API_VERSION:
-            raise TaskError(
-                f"trainer '{entry.qualified}' ({entry.version}) needs plugin API {spec.api};"
-                f" this rlcli has {API_VERSION}",
-                hint="pip install --upgrade rlcli",
-            )
-        if isinstance(algorithm, dict):  # a library's own form
+        spec = load_spec(entry, TrainerSpec, "trainer")
+        if isinstance(algorithm, dict):  # the form of another library, such as RSL-RL
             algorithm = str(algorithm.get("class_name", next(iter(spec.algorithms)))).lower()
         if not isinstance(algorithm, str):
             return spec, _AnyAgent
         if algorithm not in spec.algorithms:
+            message, hint = f"trainer '{name}' has no algorithm '{algorithm}'", did_you_mean(algorithm, spec.algorithms)
             if algorithm in spec.refused:
-                reason = f"trainer '{name}' cannot run '{algorithm}': {spec.refused[algorithm]}"
-                self.problem((*at, "algorithm"), reason, f"algorithms: {listing(spec.algorithms)}")
-                return spec, _AnyAgent
-            near = did_you_mean(algorithm, spec.algorithms) or f"algorithms: {listing(spec.algorithms)}"
-            self.problem((*at, "algorithm"), f"trainer '{name}' has no algorithm '{algorithm}'", near)
+                message, hint = f"trainer '{name}' cannot run '{algorithm}': {spec.refused[algorithm]}", None
+            self.problem((*at, "algorithm"), message, hint or f"algorithms: {listing(spec.algorithms)}")
             return spec, _AnyAgent
         model = load_entry(replace(entry, value=spec.algorithms[algorithm]), type)
         if not issubclass(model, AgentConfig):
@@ -264,13 +267,14 @@ class TaskCheck:
         return spec, model
 
     def task(self) -> TaskConfig | None:
-        """The validated task; None if there are problems."""
-        self.homes = self.homes or messages.homes({"": TaskConfig, "agents.NAME": AgentConfig})
+        """Return the validated task; None if there are problems."""
+        self.locations = self.locations or messages.key_locations({"": TaskConfig, "agents.NAME": AgentConfig})
         self.read_terms()
         data = {key: value for key, value in self.layers.data.items() if key not in PATCHES}
         unknown = {key: value for key, value in data.items() if key not in TaskConfig.model_fields}
         self.format = format_of_key(unknown) or self.format
         entries = term_entries(data)
+        # each term is validated with the model of its own function, then removed from the data for `TaskConfig`
         terms = {path: self._term(section, path, entry) for section, path, entry in entries}
         task = self._validate(TaskConfig, _without(data, terms), ())
         params = self._params(data)
@@ -283,12 +287,13 @@ class TaskCheck:
         return _filled(task, terms, params)
 
     def _validate(self, model: type[BaseModel], data: Any, at: Path) -> BaseModel | None:
+        """Validate the data at a path with a model; add the problems and return None if it is not valid."""
         try:
             context = {"open_scene": self.format is not None and self.format.spec.open_scene}
-            content = with_foreign(data) if model is TaskConfig else data
+            content = move_foreign_keys(data) if model is TaskConfig else data
             return model.model_validate_json(json.dumps(content), context=context)
         except ValidationError as error:
-            self.problems += messages.problems(error, model, data, self.layers.place, at, self.homes)
+            self.problems += messages.problems(error, model, data, self.layers.place, at, self.locations)
             return None
 
     def read_terms(self) -> None:
@@ -300,12 +305,12 @@ class TaskCheck:
             self.problems.append(_not_python(error))
 
     def _term(self, section: str, path: Path, entry: dict[str, Any]) -> TermConfig | None:
-        """A term with its parameters, all of it checked against the signature of the function that it names."""
+        """Return a term with its parameters, checked against the signature of its function; None if it is not valid."""
         base = SECTIONS[section]
         model = base
         name = entry.get("func")
-        if "func" not in entry and (near := did_you_mean(str(path[-1]), self._siblings(path))):
-            self.problem(path, f"no term '{path[-1]}'", near)  # a slip in an override
+        if "func" not in entry and (similar := did_you_mean(str(path[-1]), self._siblings(path))):
+            self.problem(path, f"no term '{path[-1]}'", similar)  # a misspelt term in an override
             return None
         if isinstance(name, str):
             signature = self.vocabulary.find(section, name)
@@ -320,6 +325,7 @@ class TaskCheck:
         return base.model_construct(**dict(checked)) if checked is not None else None
 
     def _siblings(self, path: Path) -> list[str]:
+        """Return the names of the terms beside the one at a path."""
         terms = _mapping(self.layers.get(path[:-1]))
         return [name for name, term in terms.items() if isinstance(term, dict) and "func" in term]
 
@@ -331,21 +337,21 @@ class TaskCheck:
         self.problem(path, f"no {what} term '{name}'", hint or f"terms: {listing(known, 60)}")
 
     def _params(self, data: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The parameters of a direct task, checked against the Params in its source."""
-        given, count = data.get("params", {}), len(self.problems)
+        """Return the parameters of a direct task, checked against `Params` in its source; None if not valid."""
+        values, count = data.get("params", {}), len(self.problems)
         model = self.params_model()
-        if len(self.problems) > count or not isinstance(given, dict):
-            return None  # that has been said
+        if len(self.problems) > count or not isinstance(values, dict):
+            return None  # the problem is reported already
         if model is None:
-            if given:
-                direct = "this task's class declares no Params" if self.source.task else "only direct tasks have params"
-                self.problem(("params",), direct)
+            if values:
+                reason = "the class of this task has no Params" if self.source.task else "only direct tasks have params"
+                self.problem(("params",), reason)
             return {}
-        checked = self._validate(model, given, ("params",))
+        checked = self._validate(model, values, ("params",))
         return checked.model_dump() if checked is not None else None
 
     def params_model(self) -> type[BaseModel] | None:
-        """The model of a direct task's parameters; None if it has none."""
+        """Return the model of a direct task's parameters; None if it has none."""
         if self.source.task is None or self.source.task_file is None:
             return None
         try:
@@ -357,6 +363,7 @@ class TaskCheck:
         return None
 
     def _require_managed(self, data: Mapping[str, Any]) -> None:
+        """Check that a manager-based task has actions, rewards and observations of the policy."""
         for section in ("actions", "rewards"):
             if isinstance(data.get(section, {}), dict) and not any(_mapping(data.get(section)).values()):
                 self.problem((section,), "a manager-based task needs at least one term here")
@@ -366,17 +373,18 @@ class TaskCheck:
             self.problem(("observations",), "needs a group 'policy' with at least one term")
 
     def _require_direct(self, data: Mapping[str, Any]) -> None:
+        """Check the block of another framework's format, and that a direct task has no terms."""
         if self.format is not None and self.format.spec.check:
             key, check = self.format.spec.key, self.format.load(self.format.spec.check)
             for path, message, hint in check(data.get(key, {})):
                 self.problem((key, *path), message, hint)
         for section in SECTIONS:
             if section != "success" and data.get(section):
-                self.problem((section,), f"a direct task has no {section} terms; its class does this")
+                self.problem((section,), f"a direct task has no {section} terms; its class implements them")
 
 
 def term_entries(data: Mapping[str, Any]) -> list[tuple[str, Path, dict[str, Any]]]:
-    """Every term of a raw configuration: (section, path, entry)."""
+    """Return every term of a raw configuration as (section, path, entry)."""
     found: list[tuple[str, Path, dict[str, Any]]] = []
     for section in SECTIONS:
         content = data.get(section)
@@ -393,7 +401,7 @@ def term_entries(data: Mapping[str, Any]) -> list[tuple[str, Path, dict[str, Any
 
 
 def _without(data: Any, paths: Iterable[Path]) -> Any:
-    """A copy in which null stands at these paths; nothing below them is looked at twice."""
+    """Return a copy of the data with null at these paths, for values that are validated separately."""
     inner: dict[Any, list[Path]] = {}
     for path in paths:
         if path == ():
@@ -403,22 +411,22 @@ def _without(data: Any, paths: Iterable[Path]) -> Any:
 
 
 def _filled(task: TaskConfig, terms: Mapping[Path, TermConfig | None], params: dict[str, Any] | None) -> TaskConfig:
-    """The task with its validated terms in their places; a term that is null in the data is a removed one."""
+    """Return the task with its validated terms and parameters. Terms that are null in the data are removed."""
     update: dict[str, Any] = {} if params is None else {"params": params}
     for section in SECTIONS:
         if section == "success":
             update[section] = terms.get((section,))
         elif section == "observations":
             update[section] = {
-                name: group.model_copy(update=_kept(terms, (section, name), group.terms), deep=False)
+                name: group.model_copy(update=_kept_terms(terms, (section, name), group.terms), deep=False)
                 for name, group in task.observations.items()
             }
         else:
-            update[section] = _kept(terms, (section,), getattr(task, section))
+            update[section] = _kept_terms(terms, (section,), getattr(task, section))
     return task.model_copy(update=update)
 
 
-def _kept(terms: Mapping[Path, TermConfig | None], at: Path, names: Iterable[str]) -> dict[str, TermConfig]:
+def _kept_terms(terms: Mapping[Path, TermConfig | None], at: Path, names: Iterable[str]) -> dict[str, TermConfig]:
     found = {name: terms.get((*at, name)) for name in names}
     return {name: term for name, term in found.items() if term is not None}
 

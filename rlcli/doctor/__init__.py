@@ -1,4 +1,4 @@
-"""What `rlcli doctor` finds out: whether this machine, this installation and every plugin in it can work."""
+"""Checks of `rlcli doctor`: whether this machine, this installation and every installed plugin work."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ __all__ = ["Check", "run_checks"]
 
 
 def run_checks(runs_dir: Path, timeout_s: float = TIMEOUT_S) -> list[Check]:
-    """Look at everything.
+    """Run all checks.
 
-    Whatever may hang or crash (drivers, graphics, plugins) is asked in processes of its own, several at a time.
+    Checks that may hang or crash (drivers, graphics, plugins) run in separate processes, several at a time.
 
     Args:
         runs_dir: the folder that runs would be written to.
-        timeout_s: how long each task, trainer and driver is given.
+        timeout_s: time limit for each task, trainer and driver [s].
     """
     stop = threading.Event()
     with ThreadPoolExecutor(2) as pool:

@@ -1,4 +1,4 @@
-"""`python -m rlcli.doctor QUESTION`: a process that answers with a line of JSON, and may crash of it."""
+"""`python -m rlcli.doctor CHECK`: run one check that may crash the process, and print its result as a line of JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import threading
 from typing import Any
 
 from rlcli.doctor.installation import version
-from rlcli.errors import MachineError, RlcliError
+from rlcli.errors import MachineError, RlcliError, one_line
 from rlcli.registry import malformed_metadata_ignored
 from rlcli.sim.gl import has_display, open_context
 
@@ -25,6 +25,7 @@ _PIXELS = 64
 
 
 def _compute() -> dict[str, Any]:
+    """Import torch and MuJoCo, compute with both, and return their versions."""
     before = _cores()
     import mujoco
     import torch
@@ -32,7 +33,7 @@ def _compute() -> dict[str, Any]:
     model = mujoco.MjModel.from_xml_string(_WORLD)
     mujoco.mj_step(model, mujoco.MjData(model))
     torch.randn(512, 512) @ torch.randn(512, 512)
-    torch.randn(1 << 16).sort()  # OpenMP begins, and with it what it does to the cores of the process
+    torch.randn(1 << 16).sort()  # starts OpenMP, which may pin the process to fewer cores
     return {
         "torch": torch.__version__,
         "cuda": torch.version.cuda,
@@ -44,7 +45,7 @@ def _compute() -> dict[str, Any]:
 
 
 def _cores() -> int:
-    """Cores that a thread started now may use."""
+    """Return the number of cores that a thread started now may use."""
     found: list[int] = []
     if not hasattr(os, "sched_getaffinity"):
         return os.cpu_count() or 1
@@ -55,18 +56,19 @@ def _cores() -> int:
 
 
 def _gpu() -> dict[str, Any]:
+    """Return what driver, torch and Warp report about the GPUs."""
     import torch
 
-    devices, failed = [], ""
+    devices, failure = [], ""
     try:
         devices = [torch.cuda.get_device_name(n) for n in range(torch.cuda.device_count())]
         if devices:
             float((torch.ones(8, device="cuda") * 2.0).sum())
-    except Exception as error:  # as many as there are ways not to fit
-        failed = f": {' '.join(str(error).split())[:200]}"
+    except Exception as error:  # the class depends on what does not fit: driver, build, device
+        failure = f": {one_line(error, 200)}"
     return {
         "torch_cuda": torch.version.cuda,
-        "torch_error": failed,
+        "torch_error": failure,
         "devices": devices,
         "driver_cuda": _driver(),
         "warp": _warp(),
@@ -74,8 +76,8 @@ def _gpu() -> dict[str, Any]:
 
 
 def _driver() -> str | None:
-    """The newest CUDA that the driver offers, as the driver's library says."""
-    number = ctypes.c_int()
+    """Return the newest CUDA version that the driver supports; None if there is no driver library."""
+    number = ctypes.c_int()  # 1000 * major + 10 * minor
     for name in ("libcuda.so.1", "nvcuda.dll"):
         with contextlib.suppress(OSError, AttributeError):
             if ctypes.CDLL(name).cuDriverGetVersion(ctypes.byref(number)) == 0:
@@ -84,6 +86,7 @@ def _driver() -> str | None:
 
 
 def _warp() -> dict[str, Any] | None:
+    """Return version, devices and error of Warp; None if it is not installed."""
     if version("warp-lang") is None:
         return None
     found: dict[str, Any] = {"version": version("warp-lang"), "devices": [], "error": ""}
@@ -94,12 +97,12 @@ def _warp() -> dict[str, Any] | None:
         warp.init()
         found["devices"] = [str(device.name) for device in warp.get_cuda_devices()]
     except Exception as error:
-        found["error"] = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        found["error"] = f"{type(error).__name__}: {one_line(error, 200)}"
     return found
 
 
-def _render_picture(backend: str) -> dict[str, Any]:
-    """Draw a picture offscreen, as videos are drawn; without what is not drawing, which takes seconds to import."""
+def _render_image(backend: str) -> dict[str, Any]:
+    """Render an image offscreen with plain MuJoCo, as videos do; rlcli's renderer would take seconds to import."""
     if backend == "glfw" and not has_display():
         raise MachineError("there is no display")
     os.environ["MUJOCO_GL"] = backend
@@ -116,28 +119,28 @@ def _render_picture(backend: str) -> dict[str, Any]:
     mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, everything, scene)
     canvas = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, canvas)
-    place = mujoco.MjrRect(0, 0, _PIXELS, _PIXELS)
-    mujoco.mjr_render(place, scene, canvas)
-    picture = np.zeros((_PIXELS, _PIXELS, 3), np.uint8)
-    mujoco.mjr_readPixels(picture, None, place, canvas)
+    viewport = mujoco.MjrRect(0, 0, _PIXELS, _PIXELS)
+    mujoco.mjr_render(viewport, scene, canvas)
+    image = np.zeros((_PIXELS, _PIXELS, 3), np.uint8)
+    mujoco.mjr_readPixels(image, None, viewport, canvas)
     canvas.free()
     context.free()
-    if int(picture.max()) - int(picture.min()) < 16:
-        raise MachineError("it draws, but the picture is empty")
-    return {"backend": backend, "brightest": int(picture.max())}
+    if int(image.max()) - int(image.min()) < 16:
+        raise MachineError("rendering works, but the image is empty")
+    return {"backend": backend, "brightest": int(image.max())}
 
 
 def _main(check_name: str) -> None:
     try:
         with malformed_metadata_ignored():
-            others = {"compute": _compute, "gpu": _gpu}
-            answer = others[check_name]() if check_name in others else _render_picture(check_name)
+            checks = {"compute": _compute, "gpu": _gpu}
+            answer = checks[check_name]() if check_name in checks else _render_image(check_name)
     except Exception as error:
-        said = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"
-        answer = {"failed": " ".join(said.split())[:300]}
+        reason = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"
+        answer = {"failed": " ".join(reason.split())[:300]}
     sys.stdout.write("\n" + json.dumps(answer) + "\n")
     sys.stdout.flush()
-    os._exit(0)  # some graphics drivers crash when they are unloaded
+    os._exit(0)  # without unloading libraries: some graphics drivers crash then
 
 
 if __name__ == "__main__":

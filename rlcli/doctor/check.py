@@ -1,4 +1,4 @@
-"""The form of a finding."""
+"""Result of one check of `rlcli doctor`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 STATES = ("ok", "absent", "warning", "broken")
-"""absent: an extra that is not installed, which is nothing wrong; warning: something will not work, or not
-well; broken: what was installed or asked for does not work."""
+"""ok: works; absent: an optional extra is not installed, which is no fault; warning: something will not work, or will
+work badly; broken: something that is installed or configured does not work."""
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing that was looked at; `hint` is what mends it."""
+    """Result of one check: its name, its state, what was found, and the hint that repairs it."""
 
     name: str
     state: str

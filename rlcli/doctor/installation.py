@@ -1,4 +1,4 @@
-"""What is installed, and whether it fits together."""
+"""Checks of the installed packages: whether they are present, load, and fit together."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ from pathlib import Path
 import rlcli
 from rlcli.doctor.check import Check
 from rlcli.registry import Entry, catalog, unreadable_distributions
+from rlcli.registry.imports import release_numbers
 from rlcli.registry.probe import probe
 
 TRIPLE = ("mujoco", "mujoco-core", "mujoco-studio")
-"""Packages that MuJoCo comes as, of one version: the library, and what is around it."""
+"""The three packages of MuJoCo, which must have the same version."""
 _NO_EXTRAS = ("all", "dev", "docs")
-"""Extras that are lists of others, or of what builds rlcli."""
+"""Extras that are not checked: lists of other extras, and the tools that develop rlcli."""
 _REQUIREMENT = re.compile(r"\s*([\w.-]+)(?:\[[^]]*\])?\s*([^;]*)(?:;(.*))?")
 _BOUND = re.compile(r"\s*(==|>=|<=|!=|<|>)\s*([\d.]+)(\.\*)?\s*")
 
 
 def installation_checks() -> list[Check]:
-    """Python, rlcli, what it requires, MuJoCo's packages, and the extras."""
-    place = f"{platform.python_implementation()} {platform.python_version()} at {sys.executable}"
+    """Return the checks of Python, rlcli, its dependencies, MuJoCo's packages and the extras."""
+    python = f"{platform.python_implementation()} {platform.python_version()} at {sys.executable}"
     return [
-        Check("python", "ok", place, details={"platform": platform.platform(), "prefix": sys.prefix}),
+        Check("python", "ok", python, details={"platform": platform.platform(), "prefix": sys.prefix}),
         Check("rlcli", "ok", f"{rlcli.__version__} at {Path(rlcli.__file__).parent}"),
         _packages(),
         _mujoco_packages(),
@@ -35,47 +36,49 @@ def installation_checks() -> list[Check]:
 
 
 def metadata_checks() -> list[Check]:
-    """Distributions whose metadata nobody can read."""
+    """Return one broken check for each distribution whose metadata cannot be read."""
     bad = unreadable_distributions()
-    hint = "install that package again, or remove the folder; it stops others than rlcli too"
+    hint = "install that package again, or remove the folder; it breaks other programs than rlcli too"
     return [Check(f"metadata of {each.distribution}", "broken", each.reason, hint) for each in bad]
 
 
 def entry_checks(group: str, timeout_s: float, stop: threading.Event) -> list[Check]:
-    """Load every task, trainer or format in another process."""
+    """Load every task, trainer or format in another process and return one check for each."""
     kind = group.rpartition(".")[2].removesuffix("s")
-    found, _ = catalog(group)
-    without = {"MUJOCO_GL"}  # one that is wrong stops MuJoCo from starting: a finding of its own, not of every task
-    rows = probe(found, timeout_s, group, stop, without)
+    entries, _ = catalog(group)
+    without = {"MUJOCO_GL"}  # a wrong value stops MuJoCo from starting; `graphics_check` reports it once
+    rows = probe(entries, timeout_s, group, stop, without)
     checks = []
-    for entry in found:
+    for entry in entries:
         row = rows[entry.qualified]
-        said = f"{entry.distribution} {entry.version}: {row.broken or row.summary or 'loads'}"
-        hint = _remedy(entry, row.broken) if row.broken else None
-        shared = kind == "task" and _shared(entry, found)
-        state = "broken" if row.broken else "warning" if shared else "ok"
-        if shared and not row.broken:
-            hint = f"{shared} offers one of that name; write {entry.qualified}"
-        checks.append(Check(f"{kind} {entry.name}", state, said, hint, {"distribution": entry.distribution}))
+        owners = _other_owners(entry, entries) if kind == "task" else ""
+        state, hint = "ok", None
+        if row.broken:
+            state, hint = "broken", _remedy(entry, row.broken)
+        elif owners:
+            state, hint = "warning", f"{owners} offers a task of the same name; write {entry.qualified}"
+        text = f"{entry.distribution} {entry.version}: {row.broken or row.summary or 'loads'}"
+        checks.append(Check(f"{kind} {entry.name}", state, text, hint, {"distribution": entry.distribution}))
     return checks
 
 
 def version(name: str) -> str | None:
-    """Of an installed distribution; None if there is none, or its metadata is malformed."""
+    """Return the version of an installed distribution; None if it is missing or its metadata is malformed."""
     try:
         return metadata.version(name)
     except Exception:
         return None
 
 
-def unmet(wanted: str, found: str) -> bool:
-    """Whether a version is outside of bounds like `>=4.0,<5`; what is not understood is taken as met."""
-    have = _numbers(found)
+def violates_bounds(wanted: str, found: str) -> bool:
+    """Return whether a version is outside of bounds such as `>=4.0,<5`. Bounds of an unknown form are ignored."""
+    have = release_numbers(found)
     for part in wanted.split(","):
         match = _BOUND.fullmatch(part)
         if match is None:
             continue
-        sign, bound, prefix = match[1], _numbers(match[2]), match[3] is not None
+        sign, bound, prefix = match[1], release_numbers(match[2]), match[3] is not None
+        # compare lists of equal length: 4.0 equals 4.0.0, and `==4.0.*` compares only the first two numbers
         mine = have[: len(bound)] if prefix else have + [0] * (len(bound) - len(have))
         bound = bound + [0] * (len(mine) - len(bound))
         met = {"==": mine == bound, "!=": mine != bound, ">=": mine >= bound, "<=": mine <= bound}
@@ -85,6 +88,7 @@ def unmet(wanted: str, found: str) -> bool:
 
 
 def _packages() -> Check:
+    """Check that the dependencies of rlcli are installed in versions that fit."""
     bad, versions = [], {}
     for name, wanted, extra in _requirements("rlcli"):
         if extra in _NO_EXTRAS:
@@ -92,15 +96,16 @@ def _packages() -> Check:
         versions[name] = found = version(name)
         if found is None and extra is None:
             bad.append(f"{name} is missing")
-        elif found is not None and unmet(wanted, found):
+        elif found is not None and violates_bounds(wanted, found):
             bad.append(f"{name} {found} does not fit, {wanted} is needed")
-    there = ", ".join(f"{name} {found}" for name, found in versions.items() if found)
-    mend = "pip install --upgrade rlcli" if bad else None
-    return Check("packages", "broken" if bad else "ok", "; ".join(bad) or there, mend, {"versions": versions})
+    details = {"versions": versions}
+    if bad:
+        return Check("packages", "broken", "; ".join(bad), "pip install --upgrade rlcli", details)
+    return Check("packages", "ok", _listed(versions), details=details)
 
 
 def _mujoco_packages() -> Check:
-    """Whether the packages of MuJoCo are of one version, and each there once."""
+    """Check that the packages of MuJoCo have the same version and that each is installed once."""
     copies = {name: _copies(name) for name in TRIPLE}
     first = {name: next(iter(found.values()), None) for name, found in copies.items()}
     bad = [f"{name} is missing" for name in TRIPLE if first[name] is None]
@@ -108,53 +113,63 @@ def _mujoco_packages() -> Check:
         own = first[name]
         for other, wanted, extra in _requirements(name):
             have = first.get(other)
-            if own is not None and have is not None and extra is None and unmet(wanted, have):
+            if own is not None and have is not None and extra is None and violates_bounds(wanted, have):
                 bad.append(f"{name} {own} needs {other} {wanted.lstrip('=')}, but {other} {have} is installed")
         if len(copies[name]) > 1:
             places = ", ".join(f"{found} in {place}" for place, found in copies[name].items())
-            bad.append(f"{name} is there {len(copies[name])} times: {places}")
-    said = ", ".join(f"{name} {found}" for name, found in first.items() if found)
+            bad.append(f"{name} is installed {len(copies[name])} times: {places}")
     if not bad:
-        return Check("mujoco packages", "ok", said, details=first)
-    newest = max((found for found in first.values() if found), key=_numbers, default=None)
+        return Check("mujoco packages", "ok", _listed(first), details=first)
+    newest = max((found for found in first.values() if found), key=release_numbers, default=None)
     wanted = f"mujoco=={first['mujoco'] or newest}" if newest else "mujoco"
-    mend = f'pip uninstall -y {" ".join(TRIPLE)} && pip install "{wanted}"'  # why both: isolated_checks.REINSTALL
-    return Check("mujoco packages", "broken", "; ".join(dict.fromkeys(bad)), mend, first)
+    # uninstall first: see isolated_checks.REINSTALL
+    hint = f'pip uninstall -y {" ".join(TRIPLE)} && pip install "{wanted}"'
+    return Check("mujoco packages", "broken", "; ".join(dict.fromkeys(bad)), hint, first)
 
 
 def _copies(name: str) -> dict[str, str]:
-    """Folder -> version of every installation of a distribution, the one that Python imports first."""
+    """Return every installation of a distribution (folder -> version); the first is the one that Python imports."""
     found: dict[str, str] = {}
     for distribution in metadata.distributions(name=name):
-        place = Path(str(getattr(distribution, "_path", "?"))).parent
+        folder = Path(str(getattr(distribution, "_path", "?"))).parent
         try:
-            found.setdefault(str(place.resolve()), str(distribution.version))
-        except Exception:  # malformed: `metadata_checks` says it
+            found.setdefault(str(folder.resolve()), str(distribution.version))
+        except Exception:  # malformed metadata: `metadata_checks` reports it
             continue
     return found
 
 
 def _extras() -> list[Check]:
-    """What each extra brings, whether it is installed, and how to install it."""
+    """Return one check for each extra: its packages, whether they are installed, and how to install them."""
     wanted: dict[str, list[tuple[str, str]]] = {}
     for name, bounds, extra in _requirements("rlcli"):
         if extra is not None and extra not in _NO_EXTRAS and name != "rlcli":
             wanted.setdefault(extra, []).append((name, bounds))
     checks = []
     for extra, packages in sorted(wanted.items()):
-        line = f'pip install "rlcli[{extra}]"'
+        hint = f'pip install "rlcli[{extra}]"'
         versions = {name: version(name) for name, _ in packages}
-        there = ", ".join(f"{name} {found}" for name, found in versions.items() if found)
         missing = [name for name, found in versions.items() if found is None]
-        state, said = ("warning", f"{there}; missing: {', '.join(missing)}") if missing else ("ok", there)
-        if len(missing) == len(packages):
-            state, said = "absent", "not installed"
-        checks.append(Check(f"extra {extra}", state, said, line if missing else None, versions))
+        if not missing:
+            state, text = "ok", _listed(versions)
+        elif len(missing) < len(packages):
+            state, text = "warning", f"{_listed(versions)}; missing: {', '.join(missing)}"
+        else:
+            state, text = "absent", "not installed"
+        checks.append(Check(f"extra {extra}", state, text, hint if missing else None, versions))
     return checks
 
 
+def _listed(versions: dict[str, str | None]) -> str:
+    """Return the installed packages with their versions, as text."""
+    return ", ".join(f"{name} {found}" for name, found in versions.items() if found)
+
+
 def _requirements(distribution: str) -> list[tuple[str, str, str | None]]:
-    """Name, bounds and extra of all that a distribution requires; those of another platform are left out."""
+    """Return name, bounds and extra of every requirement of a distribution.
+
+    Requirements with a condition other than an extra (platform, Python version) are left out.
+    """
     try:
         lines = metadata.requires(distribution) or []
     except Exception:
@@ -173,18 +188,14 @@ def _requirements(distribution: str) -> list[tuple[str, str, str | None]]:
 
 
 def _remedy(entry: Entry, reason: str) -> str:
+    """Return the hint for a broken plugin."""
     if entry.distribution == "rlcli":
         return "pip install --upgrade --force-reinstall rlcli"
     late = "; if the machine is busy: rlcli doctor --probe-timeout 120" if " within " in reason else ""
-    return f"pip uninstall {entry.distribution}, or leave it out with RLCLI_PLUGINS; tell its authors{late}"
+    return f"pip uninstall {entry.distribution}, or exclude it with RLCLI_PLUGINS; report it to its authors{late}"
 
 
-def _shared(entry: Entry, others: list[Entry]) -> str | None:
-    """The other distributions that have a task of this name."""
-    owners = [e.distribution for e in others if e.name == entry.name and e.distribution != entry.distribution]
-    return " and ".join(owners) if owners and entry.distribution != "rlcli" else None
-
-
-def _numbers(text: str) -> list[int]:
-    """The numbers of a release: `2.13.0+cpu` -> [2, 13, 0]."""
-    return [int(number) for number in re.findall(r"\d+", text.partition("+")[0])]
+def _other_owners(entry: Entry, entries: list[Entry]) -> str:
+    """Return the other distributions that have a task of this name; empty for a task of rlcli, which wins."""
+    owners = [e.distribution for e in entries if e.name == entry.name and e.distribution != entry.distribution]
+    return " and ".join(owners) if entry.distribution != "rlcli" else ""

@@ -1,4 +1,4 @@
-"""What the user has set: the settings file, and environment variables."""
+"""Checks of the user's settings file and of environment variables."""
 
 from __future__ import annotations
 
@@ -16,53 +16,55 @@ VARIABLES = (
     *("MUJOCO_GL", "DISPLAY", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OMP_THREAD_LIMIT"),
     *("OMP_WAIT_POLICY", "KMP_BLOCKTIME", "LOCAL_WORLD_SIZE", "PYTHONPATH", "NO_COLOR", "FORCE_COLOR"),
 )
-"""Environment variables that are shown."""
+"""Environment variables that the check lists."""
 
 
 def settings_checks() -> list[Check]:
-    """The user's settings file and the variables of the environment."""
+    """Return the checks of the settings file and of the environment variables."""
     return [_file(), _variables()]
 
 
 def _file() -> Check:
+    """Check that the settings file is valid."""
     file = settings_file()
     if file is None:
-        return Check("settings", "ok", "left out by RLCLI_SETTINGS=none", details={"file": None})
+        return Check("settings", "ok", "not read, because of RLCLI_SETTINGS=none", details={"file": None})
     try:
         found = read_settings()
     except ConfigError as error:
-        mend = f"edit {file}; until then RLCLI_SETTINGS=none leaves it out"
-        return Check("settings", "broken", "; ".join(map(str, error.problems)), mend, {"file": str(file)})
-    said = ", ".join(f"{key}: {value}" for key, value in found.items()) or "sets nothing"
-    said = f"{file}: {said}" if file.exists() else f"none; they would be read from {file}"
-    return Check("settings", "ok", said, details={"file": str(file), "settings": found})
+        hint = f"edit {file}; to ignore the file until then, set RLCLI_SETTINGS=none"
+        return Check("settings", "broken", "; ".join(map(str, error.problems)), hint, {"file": str(file)})
+    text = ", ".join(f"{key}: {value}" for key, value in found.items()) or "sets nothing"
+    text = f"{file}: {text}" if file.exists() else f"none; the file would be {file}"
+    return Check("settings", "ok", text, details={"file": str(file), "settings": found})
 
 
 def _variables() -> Check:
-    given = {name: os.environ[name] for name in VARIABLES if name in os.environ}
-    said = [", ".join(f"{name}={value}" for name, value in given.items()) or "none"]
+    """Check that no environment variable names a missing plugin or slows training down."""
+    variables = {name: os.environ[name] for name in VARIABLES if name in os.environ}
+    texts = [", ".join(f"{name}={value}" for name, value in variables.items()) or "none"]
     hints = []
     if unknown := unknown_wanted():
-        said.append(f"{plugins_chosen_by()} names what is not installed: {', '.join(unknown)}")
-        hints.append("name distributions, as list-tasks does")
-    for name, why in harmful_variables(given, available_cores()).items():
-        said.append(f"{name}: {why}")
+        texts.append(f"{plugins_chosen_by()} names distributions that are not installed: {', '.join(unknown)}")
+        hints.append("write the names of distributions, as list-tasks prints them")
+    for name, reason in harmful_variables(variables, available_cores()).items():
+        texts.append(f"{name}: {reason}")
         hints.append(f"unset {name}")
-    return Check("variables", "warning" if hints else "ok", "; ".join(said), "; ".join(hints) or None, given)
+    return Check("variables", "warning" if hints else "ok", "; ".join(texts), "; ".join(hints) or None, variables)
 
 
-def harmful_variables(given: dict[str, str], cores: int) -> dict[str, str]:
-    """Variables that make training slower -> how."""
+def harmful_variables(variables: dict[str, str], cores: int) -> dict[str, str]:
+    """Return the environment variables that make training slower, each with the reason."""
     found = {}
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        if given.get(name, "").isdecimal() and int(given[name]) > cores:
+        if variables.get(name, "").isdecimal() and int(variables[name]) > cores:
             found[name] = f"more threads than the {cores} cores of this process"
-    limit = given.get("OMP_THREAD_LIMIT", "")
+    limit = variables.get("OMP_THREAD_LIMIT", "")
     if limit.isdecimal() and int(limit) < min(4, cores):
-        found["OMP_THREAD_LIMIT"] = "fewer threads than agent.torch_threads asks for"
+        found["OMP_THREAD_LIMIT"] = "fewer threads than the default of agent.torch_threads"
     for name, spinning in (("OMP_WAIT_POLICY", "active"), ("KMP_BLOCKTIME", "infinite")):
-        if given.get(name, "").strip().lower() == spinning:
-            found[name] = "threads that wait keep the engine's from their cores"
-    if given.get("LOCAL_WORLD_SIZE", "1") not in ("", "1"):
-        found["LOCAL_WORLD_SIZE"] = "the cores are divided by it, as a launcher of several processes asks for"
+        if variables.get(name, "").strip().lower() == spinning:
+            found[name] = "waiting OpenMP threads spin and occupy cores that the engine needs"
+    if variables.get("LOCAL_WORLD_SIZE", "1") not in ("", "1"):
+        found["LOCAL_WORLD_SIZE"] = "the cores are divided by this number, as a launcher of several processes needs it"
     return found

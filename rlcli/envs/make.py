@@ -8,7 +8,7 @@ from rlcli.config.load import Resolved, resolve
 from rlcli.config.python_task import source_of
 from rlcli.config.schema import TaskConfig
 from rlcli.envs.vec_env import VecEnv
-from rlcli.machine import collect_as_usual
+from rlcli.machine import restore_garbage_collection
 from rlcli.registry import load_object
 
 _MANAGED, _DIRECT = "rlcli.envs.managed:ManagedEnv", "rlcli.envs.direct:DirectEnv"
@@ -32,7 +32,7 @@ def make_env(
         root: folder of the models of a `TaskConfig`; by default the working directory.
         shared_streams: see `VecEnv`.
     """
-    collect_as_usual()  # garbage collection was delayed while large libraries were imported
+    restore_garbage_collection()  # garbage collection was delayed while large libraries were imported
     resolved = task if isinstance(task, Resolved) else resolve(source_of(task, root))
     if resolved.source.task is not None and resolved.format is not None and resolved.format.spec.environment:
         env_class = resolved.format.load(resolved.format.spec.environment)

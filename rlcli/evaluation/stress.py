@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from rlcli.config.dump import given
+from rlcli.config.dump import explicit_values
 from rlcli.config.load import Resolved
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
@@ -202,7 +202,7 @@ def score(summary: Summary) -> tuple[float, float]:
 
 def one_each(resolved: Resolved, episodes: int) -> Resolved:
     """Return the task with one environment for each episode, unless the user has set the number."""
-    return resolved if "scene.num_envs" in given(resolved) else with_envs(resolved, min(episodes, MOST_ENVS))
+    return resolved if "scene.num_envs" in explicit_values(resolved) else with_envs(resolved, min(episodes, MOST_ENVS))
 
 
 def with_envs(resolved: Resolved, count: int) -> Resolved:

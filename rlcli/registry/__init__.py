@@ -1,4 +1,4 @@
-"""Tasks, trainers and formats by name, from the metadata of installed distributions; plugins are imported when used."""
+"""Registry of tasks, trainers and formats by name. Names come from package metadata; plugins are imported when used."""
 
 from __future__ import annotations
 

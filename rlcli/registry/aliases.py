@@ -1,4 +1,4 @@
-"""Import hooks that are active while a task's files are imported: module names that installed formats stand in for."""
+"""Import hooks for the module aliases of installed formats, active while the files of a task are imported."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from rlcli.registry.formats import format_aliases, is_framework
 
 @contextlib.contextmanager
 def aliases_resolved() -> Iterator[None]:
-    """Let the aliases of installed formats resolve as module names.
+    """Make the aliases of installed formats importable inside the `with` block.
 
-    A module that was imported by its alias stays known under it, so that an import in a function of the task, which
-    runs later, finds it.
+    A module that was imported by its alias stays in `sys.modules` under the alias, so that an import inside a function
+    of the task, which runs later, finds the module.
     """
     if _SUBMODULES in sys.meta_path:
         yield
@@ -34,38 +34,41 @@ def aliases_resolved() -> Iterator[None]:
 
 
 class _AliasFinder(MetaPathFinder):
-    """Finder of a module by its alias, asked last: for a name that nothing else has, the formats are looked up."""
+    """Import finder for aliases. It is the last finder, so it is used only for names that no installed module has."""
 
     def find_spec(self, name: str, path: object = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Return the spec of an alias; None for any other name."""
+        """Return the module spec of an alias; None for any other name."""
         module = format_aliases().get(name)
         return None if module is None else _spec(name, module)
 
 
 class _SubmoduleFinder(MetaPathFinder):
-    """Finder of the modules below an alias, asked first: the path of the package has them too, as second copies."""
+    """Import finder for the modules below an alias.
+
+    It is the first finder: the usual one would also find these modules through `__path__` and import second copies.
+    """
 
     def find_spec(self, name: str, path: object = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Return the spec of a module below an alias; None for any other name."""
+        """Return the module spec of a module below an alias; None for any other name."""
         package, _, last = name.rpartition(".")
         real = str(getattr(sys.modules.get(package), "__name__", package))
         return _spec(name, f"{real}.{last}") if real != package and is_framework(real) else None
 
 
 class _AliasLoader(Loader):
-    """Loader that returns a module which has another name."""
+    """Loader that returns an existing module which has another name."""
 
     def __init__(self, real: str) -> None:
         self.real = real
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """Import the module under its own name."""
+        """Import the module under its real name and return it."""
         module = importlib.import_module(self.real)
         self.spec = module.__spec__
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """Give the module its own spec back, which the import system has replaced."""
+        """Restore the module's own spec, which the import system has replaced by the one of the alias."""
         module.__spec__ = self.spec
 
 

@@ -1,6 +1,6 @@
 """Entry points of installed distributions, read without importing any of them.
 
-Distributions are read one by one, so that a broken one costs its own row and nothing else.
+Distributions are read one by one, so that a broken one does not hide the others.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ FORMATS = "rlcli.formats"
 GROUPS = (TASKS, TRAINERS, FORMATS)
 """The groups of entry points that plugins offer."""
 OWN = "rlcli"
-"""The distribution of the built-in tasks and trainers; a plugin cannot take their names."""
+"""The distribution of the built-in tasks and trainers. Its entries win over entries of plugins with the same name."""
 
 _entry_points: Any = vars(metadata.Distribution)["entry_points"].fget
-"""As the standard library reads them, malformed or not, inside `malformed_metadata_ignored` too."""
+"""The original getter of the standard library. It raises for malformed metadata, also inside of
+`malformed_metadata_ignored`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One entry point: what can be known of it without importing anything."""
+    """An entry point: the facts that are available without importing anything."""
 
     name: str
     value: str
@@ -40,8 +41,13 @@ class Entry:
 
     @property
     def qualified(self) -> str:
-        """`distribution:name`, unique even where two distributions share a name."""
+        """`distribution:name`, which is unique even if two distributions offer the same name."""
         return f"{self.distribution}:{self.name}"
+
+    @property
+    def package(self) -> str:
+        """The top-level package of the object that the entry point names."""
+        return self.value.partition(":")[0].partition(".")[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +59,9 @@ class Broken:
 
 
 def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], list[Broken]]:
-    """Every entry of a group, sorted by name then distribution, and the distributions that could not be read.
+    """Return every entry of a group, sorted by name and distribution, and the distributions that could not be read.
 
-    Those that RLCLI_PLUGINS or the user's settings leave out are only there if `hidden`.
+    Entries that RLCLI_PLUGINS or the user's settings exclude are returned only if `hidden` is true.
     """
     entries: dict[tuple[str, str], Entry] = {}
     broken: dict[str, Broken] = {}
@@ -65,10 +71,8 @@ def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], l
         try:
             text = distribution.read_text("entry_points.txt") or ""
             if group not in text:
-                continue  # most distributions; their metadata is not read
-            name, version = distribution.metadata["Name"], distribution.version
-            if not name or not version:
-                raise ValueError("no Name and Version in its METADATA")
+                continue  # true for most distributions: reading their metadata would be slow
+            name, version = _name_and_version(distribution)
             if wanted is not None and _normalized(name) not in wanted:
                 continue
             for point in _entry_points(distribution):
@@ -79,8 +83,24 @@ def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], l
     return sorted(entries.values(), key=lambda e: (e.name, e.distribution)), list(broken.values())
 
 
+def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
+    name, version = distribution.metadata["Name"], distribution.version
+    if not name or not version:
+        raise ValueError("no Name and Version in its METADATA")
+    return name, version
+
+
 def find_entry(group: str, name: str, *, what: str) -> Entry:
-    """One entry of a group by its name or `distribution:name`."""
+    """Return the entry of a group with this name or `distribution:name`.
+
+    Args:
+        group: the entry-point group.
+        name: the name to look up.
+        what: the kind of entry for messages: task, trainer or format.
+
+    Raises:
+        TaskError: if no entry or several entries have the name, or if its plugin is excluded.
+    """
     entries, _ = catalog(group)
     matches = [e for e in entries if name in (e.name, e.qualified)]
     own = [e for e in matches if e.distribution == OWN]
@@ -92,25 +112,24 @@ def find_entry(group: str, name: str, *, what: str) -> Entry:
         raise TaskError(f"{what} '{name}' is offered by {owners}", hint=f"name one: {choices}")
     if any(name in (e.name, e.qualified) for e in catalog(group, hidden=True)[0]):
         value = os.environ.get("RLCLI_PLUGINS", "").strip()
-        said = f"RLCLI_PLUGINS={value}" if value else plugins_chosen_by()
-        remedy = "unset RLCLI_PLUGINS" if value else "name its distribution there, or remove that key"
-        raise TaskError(f"{what} '{name}' is installed, but {said} leaves its plugin out", hint=remedy)
+        excluded_by = f"RLCLI_PLUGINS={value}" if value else plugins_chosen_by()
+        remedy = "unset RLCLI_PLUGINS" if value else "add its distribution to that key, or remove the key"
+        raise TaskError(f"{what} '{name}' is installed, but {excluded_by} excludes its plugin", hint=remedy)
     names = list(dict.fromkeys(e.name for e in entries))
-    installed = listing(sorted({f"{e.distribution} {e.version}" for e in entries}))
-    near = did_you_mean(name, [*names, *(e.qualified for e in entries)] if ":" in name else names)
-    where = f"installed: {listing(names)} (from {installed})"
-    raise TaskError(f"no {what} '{name}'", hint=f"{near} {where}" if near else where)
+    distributions = listing(sorted({f"{e.distribution} {e.version}" for e in entries}))
+    similar = did_you_mean(name, [*names, *(e.qualified for e in entries)] if ":" in name else names)
+    installed = f"installed: {listing(names)} (from {distributions})"
+    raise TaskError(f"no {what} '{name}'", hint=f"{similar} {installed}" if similar else installed)
 
 
 def unreadable_distributions() -> list[Broken]:
-    """Every installed distribution whose metadata is malformed, whether it has to do with rlcli or not."""
+    """Return every installed distribution whose metadata is malformed, also those that are no plugins of rlcli."""
     found: dict[str, Broken] = {}
     for distribution in metadata.distributions():
         folder = Path(str(getattr(distribution, "_path", "?")))
         try:
             _entry_points(distribution)
-            if not distribution.metadata["Name"] or not distribution.version:
-                raise ValueError("no Name and Version in its METADATA")
+            _name_and_version(distribution)
         except Exception as error:
             reason = f"malformed metadata ({type(error).__name__}: {error}) in {folder}"
             found.setdefault(folder.name, Broken(folder.name, reason))
@@ -118,7 +137,7 @@ def unreadable_distributions() -> list[Broken]:
 
 
 def unknown_wanted() -> list[str]:
-    """Names of plugins to use, of the variable or the user's settings, that have no tasks or trainers here."""
+    """Return the names in RLCLI_PLUGINS or the user's settings that are not installed plugins."""
     wanted = _enabled_distributions()
     if not wanted:
         return []
@@ -128,16 +147,16 @@ def unknown_wanted() -> list[str]:
 
 
 def plugins_chosen_by() -> str:
-    """What says which plugins to use: the variable, or the user's settings."""
+    """Return the source of the list of plugins, for messages: the environment variable or the user's settings."""
     return "RLCLI_PLUGINS" if os.environ.get("RLCLI_PLUGINS", "").strip() else f"plugins in {settings_file()}"
 
 
 @contextlib.contextmanager
 def malformed_metadata_ignored() -> Iterator[None]:
-    """Malformed metadata of an installed package stops nobody who reads the entry points of all packages.
+    """Make distributions with malformed metadata appear as distributions without entry points in the `with` block.
 
-    torch does when it is imported, TensorBoard too; without this one bad file of a stranger ends every command.
-    `catalog` says which distribution it is.
+    torch and TensorBoard read the entry points of all packages when they are imported. Without this, one malformed file
+    of an unrelated package would end every command. `catalog` reports which distribution it is.
     """
     before = vars(metadata.Distribution)["entry_points"]
 
@@ -155,7 +174,10 @@ def malformed_metadata_ignored() -> Iterator[None]:
 
 
 def _enabled_distributions() -> set[str] | None:
-    """Distributions that RLCLI_PLUGINS or the user's settings allow (`none` leaves the built-ins), or None for all."""
+    """Return the distributions that RLCLI_PLUGINS or the user's settings allow; None means all.
+
+    The name `none` allows only the built-in tasks and trainers.
+    """
     value = os.environ.get("RLCLI_PLUGINS", "").strip()
     names = value.split(",") if value else setting("plugins")
     if names is None:

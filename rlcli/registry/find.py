@@ -1,4 +1,4 @@
-"""Tasks as a command line names them."""
+"""Lookup of a task by the name or path that the user typed."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from rlcli.registry.source import TaskSource
 
 
 def find_task(name: str) -> TaskSource:
-    """A task by name, by `distribution:name`, by the path of its folder, or, in Python, as `file.py:attribute`.
+    """Return a task by name, by `distribution:name`, by the path of its folder, or as `file.py:attribute`.
 
-    A name is looked up among the installed tasks first: a folder of the same name needs a slash, `./cartpole`.
+    Installed tasks are searched first: a folder with the name of an installed task needs a slash, `./cartpole`.
 
     Raises:
-        TaskError: unknown, ambiguous, broken, or built for a newer rlcli.
+        TaskError: if the task is unknown, ambiguous, broken, or needs a newer rlcli.
     """
-    place, _, attribute = name.rpartition(":")
-    if place.endswith(".py") or (attribute and os.sep not in attribute and "/" in place and Path(place).is_dir()):
+    path_part, _, attribute = name.rpartition(":")
+    is_package = attribute and os.sep not in attribute and "/" in path_part and Path(path_part).is_dir()
+    if path_part.endswith(".py") or is_package:
         return python_task(name)
     if name in (".", "..") or any(mark in name for mark in ("/", os.sep)):
         path = Path(name)
@@ -35,7 +36,7 @@ def find_task(name: str) -> TaskSource:
     try:
         entry = find_entry(TASKS, name, what="task")
     except TaskError:
-        if name and Path(name).is_dir() and not _offered(name):
+        if name and Path(name).is_dir() and all(entry.name != name for entry in catalog()[0]):
             return folder_task(Path(name))
         if "=" in name:
             raise TaskError(f"no task '{name}'", hint="overrides come after the task: TASK key.path=value") from None
@@ -43,20 +44,16 @@ def find_task(name: str) -> TaskSource:
     return installed_task(entry)
 
 
-def _offered(name: str) -> bool:
-    return any(entry.name == name for entry in catalog()[0])
-
-
 def task_source(target: str) -> TaskSource:
-    """Find a task by its name, its folder, or any YAML file that describes one.
+    """Return a task by its name, its folder, or any YAML file that describes a task.
 
     Raises:
-        TaskError: if there is none.
+        TaskError: if there is no such task.
     """
     file = Path(target)
     if file.suffix not in (".yaml", ".yml"):
         return find_task(target)
     if not file.is_file():
         raise TaskError(f"no file '{target}'")
-    # a YAML of an installed task keeps that task's terms and class
+    # for a YAML file of an installed task return that task: a folder task would not have its terms and its class
     return task_of_file(file) or replace(folder_task(file.parent, file.name), name=file.stem)

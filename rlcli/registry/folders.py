@@ -1,4 +1,4 @@
-"""Tasks of no installed package: a folder with a YAML, or a configuration in a Python file or package."""
+"""Tasks that are not installed: a folder with a YAML file, or a configuration in a Python file or package."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from rlcli.registry.source import TaskSource
 
 
 def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
-    """Return the task of a folder: a `task.yaml`, and optionally `terms.py` and `task.py` (a class `Task`).
+    """Return the task of a folder.
 
-    Or a task in another format that is installed. Without either the configuration is in Python: `TASK` in `task.py`,
-    or what the package registers.
+    The folder has a `task.yaml`, and optionally `terms.py` and `task.py` (with a class `Task`). Or it has a task in an
+    installed format of another framework. Else the configuration is in Python: `TASK` in `task.py`, or the task that
+    the package registers with Gymnasium.
 
     Raises:
-        TaskError: if it is none, or holds several.
-        DependencyError: if it has a known format whose plugin is not installed.
+        TaskError: if the folder has no task, or several tasks.
+        DependencyError: if the task has a known format whose plugin is not installed.
     """
     root = folder.resolve()
     config = root / file
@@ -43,8 +44,6 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
         name=root.name,
         root=root,
         config=config,
-        distribution=None,
-        version=None,
         term_files=(terms,) if terms.is_file() else (),
         term_modules=(str(terms),) if terms.is_file() else (),
         task=f"{task}:Task" if task.is_file() else None,
@@ -53,7 +52,10 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
 
 
 def python_config(root: Path) -> TaskSource | None:
-    """Return the task of a folder without a YAML: `TASK` in its `task.py`, or what the package registers."""
+    """Return the task of a folder without a YAML file; None if it has none.
+
+    The configuration is `TASK` in the folder's `task.py`, or what the package registers with Gymnasium.
+    """
     if _defines(root / "task.py", "TASK"):
         return python_task(f"{root / 'task.py'}:TASK", root.name)
     if (root / "__init__.py").is_file() and b"register(" in (root / "__init__.py").read_bytes():
@@ -62,9 +64,10 @@ def python_config(root: Path) -> TaskSource | None:
 
 
 def python_task(reference: str, name: str | None = None) -> TaskSource:
-    """A task whose configuration is a Python object: `file.py:attribute`, or a package's `folder` or `folder:ID`.
+    """Return a task whose configuration is a Python object.
 
-    Of a package the configuration is the `TASK` of its `task.py`, or what it registered with gymnasium (as `ID`).
+    `reference` is `file.py:attribute`, or the folder of a package: `folder` or `folder:ID`. The configuration of a
+    package is `TASK` in its `task.py`, or what it registers with Gymnasium under `ID`.
 
     Raises:
         TaskError: if there is no such file.
@@ -77,40 +80,31 @@ def python_task(reference: str, name: str | None = None) -> TaskSource:
     if not file.is_file():
         raise TaskError(f"there is no file '{file}'")
     if file == path and not attribute:
-        raise TaskError(f"'{reference}' does not say which object", hint=f"{reference}:TASK, for example")
+        raise TaskError(f"'{reference}' does not name an object in the file", hint=f"{reference}:TASK, for example")
     return TaskSource(
         name=name or re.sub(r"[^A-Za-z0-9_.-]", "-", label),
         root=file.parent,
         config=file,
-        distribution=None,
-        version=None,
-        term_files=(),
-        term_modules=(),
-        task=None,
-        task_file=None,
         python=f"{path}:{attribute}" if attribute else str(path),
     )
 
 
 def python_place(reference: str) -> tuple[Path, str]:
-    """The file or folder of a configuration in Python, links resolved, and the name in it ('' if it has none)."""
-    place, _, attribute = reference.rpartition(":")
-    if not place or Path(reference).exists():
+    """Return the file or folder of a Python configuration (links resolved) and the attribute in it ('' if none)."""
+    path, _, attribute = reference.rpartition(":")
+    if not path or Path(reference).exists():
         return Path(reference).resolve(), ""
-    return Path(place).resolve(), attribute
+    return Path(path).resolve(), attribute
 
 
 def _defines(file: Path, name: str) -> bool:
-    """Whether a Python file has a top-level assignment or definition of this name."""
-    for node in _body(file):
+    """Return whether a Python file has a top-level assignment or definition of this name."""
+    try:
+        body = ast.parse(file.read_bytes()).body
+    except (OSError, SyntaxError, ValueError):
+        return False
+    for node in body:
         targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
         if getattr(node, "name", None) == name or any(isinstance(t, ast.Name) and t.id == name for t in targets):
             return True
     return False
-
-
-def _body(file: Path) -> list[ast.stmt]:
-    try:
-        return ast.parse(file.read_bytes()).body
-    except (OSError, SyntaxError, ValueError):
-        return []

@@ -1,4 +1,4 @@
-"""Installed formats (entry-point group `rlcli.formats`), and known ones whose plugin is not installed."""
+"""Installed formats (entry-point group `rlcli.formats`), and known formats whose plugin is not installed."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from typing import Any
 from rlcli.errors import DependencyError, TaskError
 from rlcli.formats import FormatSpec
 from rlcli.registry.entries import FORMATS, OWN, Entry, catalog, find_entry
-from rlcli.registry.imports import load_entry
+from rlcli.registry.imports import load_entry, load_spec
 from rlcli.registry.source import TaskSource
-from rlcli.task import API_VERSION
 
 _log = logging.getLogger(__name__)
 
 _KNOWN = Path(__file__).with_name("known_plugins.json")
 _LARGEST = 1024 * 1024
-"""Bytes of a file that is searched for the patterns of a known format."""
+"""Files above this size [bytes] are not searched for the patterns of known formats."""
 _MOST_FILES = 100
 
 
@@ -35,11 +34,11 @@ class Format:
 
     @property
     def name(self) -> str:
-        """The name of its entry point."""
+        """The name of the format's entry point."""
         return self.entry.name
 
     def load(self, reference: str) -> Any:
-        """Import a part of the format by the reference of its spec.
+        """Import a part of the format by a reference of its spec.
 
         Raises:
             TaskError: if the plugin is broken.
@@ -49,34 +48,37 @@ class Format:
 
 @dataclass(frozen=True, slots=True)
 class KnownFormat:
-    """A format that exists in a plugin, as `known_plugins.json` describes it."""
+    """A format that some plugin offers, as `known_plugins.json` describes it."""
 
     install: str
-    """The line for pip."""
+    """The arguments of `pip install`."""
     summary: str
     key: str = ""
     modules: Sequence[str] = ()
-    """Modules that only tasks of this format import."""
+    """Modules that are imported only by tasks of this format."""
     files: Sequence[str] = ()
     """Patterns of file names."""
     all_of: Sequence[str] = ()
-    """Regular expressions that are all found in such a file."""
+    """Regular expressions: a file of this format matches all of them."""
     none_of: Sequence[str] = ()
-    """Regular expressions of which none is."""
+    """Regular expressions: a file of this format matches none of them."""
 
     def matches(self, file: Path) -> bool:
-        """Whether a file looks like one of this format."""
+        """Return whether a file looks like one of this format."""
         try:
             if not file.is_file() or file.stat().st_size > _LARGEST:
                 return False
             text = file.read_text(encoding="utf-8", errors="replace")
         except OSError:
             return False
-        found = [bool(re.search(pattern, text, re.MULTILINE)) for pattern in (*self.all_of, *self.none_of)]
-        return all(found[: len(self.all_of)]) and not any(found[len(self.all_of) :])
+
+        def occurs(pattern: str) -> bool:
+            return re.search(pattern, text, re.MULTILINE) is not None
+
+        return all(map(occurs, self.all_of)) and not any(map(occurs, self.none_of))
 
     def missing(self, what: str = "") -> DependencyError:
-        """Return the error that the plugin is not installed; `what` needs it."""
+        """Return the error that the plugin is not installed. `what` names the file or import that needs the plugin."""
         message = f"the plugin that reads {self.summary} is not installed"
         return DependencyError(f"{what}: {message}" if what else message, hint=f"pip install {self.install}")
 
@@ -85,7 +87,7 @@ def load_format(name: str) -> Format:
     """Return an installed format by its name.
 
     Raises:
-        TaskError: unknown, broken, or built for a newer rlcli.
+        TaskError: if the format is unknown, broken, or needs a newer rlcli.
     """
     return _load(find_entry(FORMATS, name, what="format"))
 
@@ -94,13 +96,13 @@ def installed_formats() -> Iterator[Format]:
     """Yield every installed format.
 
     Raises:
-        TaskError: if one is broken, or built for a newer rlcli.
+        TaskError: if a format is broken, or needs a newer rlcli.
     """
     yield from map(_load, catalog(FORMATS)[0])
 
 
 def usable_formats() -> Iterator[Format]:
-    """Yield every installed format but broken ones, of which a warning tells."""
+    """Yield every installed format that works. For a broken format, log a warning instead."""
     for entry in catalog(FORMATS)[0]:
         try:
             yield _load(entry)
@@ -109,7 +111,7 @@ def usable_formats() -> Iterator[Format]:
 
 
 def find_in_formats(path: Path) -> TaskSource | None:
-    """Return the task of a folder or file that an installed format recognises; broken formats are left out."""
+    """Return the task of a folder or file in an installed format; None if no working format recognises it."""
     for form in usable_formats():
         found: TaskSource | None = form.load(form.spec.find)(path) if form.spec.find else None
         if found is not None:
@@ -118,35 +120,35 @@ def find_in_formats(path: Path) -> TaskSource | None:
 
 
 def format_of_key(keys: Mapping[str, Any]) -> Format | None:
-    """Return the format whose key is among these, if one with a value is."""
-    given = {key for key, value in keys.items() if value}
-    return next((form for form in installed_formats() if form.spec.key in given), None) if given else None
+    """Return the installed format whose key has a non-empty value here; None if there is none."""
+    used = {key for key, value in keys.items() if value}
+    return next((form for form in installed_formats() if form.spec.key in used), None) if used else None
 
 
 def format_of_module(module: str) -> Format | None:
-    """Return the format whose package a module belongs to."""
+    """Return the installed format that a module belongs to; None if it belongs to none."""
     top = module.partition(".")[0]
-    return next((_load(entry) for entry in catalog(FORMATS)[0] if _package(entry) == top), None)
+    return next((_load(entry) for entry in catalog(FORMATS)[0] if entry.package == top), None)
 
 
 def is_framework(module: str) -> bool:
-    """Whether a module is rlcli's own or an installed format's, and not the user's, a library's or another plugin's."""
+    """Return whether a module belongs to rlcli or to an installed format, and not to the user or another package."""
     return module.partition(".")[0] in _framework_packages()
 
 
 @functools.cache
 def _framework_packages() -> frozenset[str]:
-    return frozenset((OWN, *(_package(entry) for entry in catalog(FORMATS, hidden=True)[0])))
+    return frozenset((OWN, *(entry.package for entry in catalog(FORMATS, hidden=True)[0])))
 
 
 def known_trainers() -> dict[str, str]:
-    """Return the trainers that exist in plugins, each with the line for pip."""
+    """Return the trainers that plugins offer, each with the arguments of `pip install`."""
     trainers: dict[str, str] = _known_plugins()["trainers"]
     return trainers
 
 
 def known_formats() -> dict[str, KnownFormat]:
-    """Return the formats that exist in plugins, by name."""
+    """Return the formats that plugins offer, by name."""
     return {name: KnownFormat(**values) for name, values in _known_plugins()["formats"].items()}
 
 
@@ -157,16 +159,16 @@ def missing_formats() -> dict[str, KnownFormat]:
 
 
 def format_keys() -> set[str]:
-    """Return the keys of task files that belong to a format, installed or known."""
+    """Return the top-level keys of task files that belong to an installed or known format."""
     known = {form.key for form in known_formats().values()}
     return (known | {form.spec.key for form in installed_formats()}) - {""}
 
 
 def require_format(path: Path) -> None:
-    """Check that a folder or file is of no known format whose plugin is not installed.
+    """Check that a folder or file does not need the plugin of a known format that is not installed.
 
     Raises:
-        DependencyError: if it is, with the line for pip.
+        DependencyError: if it needs one, with the `pip install` command.
     """
     for form in missing_formats().values():
         if path.is_dir():
@@ -178,10 +180,10 @@ def require_format(path: Path) -> None:
 
 
 def require_module(error: BaseException) -> None:
-    """Check that a failed import is not one of a known format's module whose plugin is not installed.
+    """Check that a failed import does not need the plugin of a known format that is not installed.
 
     Raises:
-        DependencyError: if it is, with the line for pip.
+        DependencyError: if it needs one, with the `pip install` command.
     """
     name = error.name if isinstance(error, ModuleNotFoundError) else None
     for form in missing_formats().values() if name else ():
@@ -190,22 +192,12 @@ def require_module(error: BaseException) -> None:
 
 
 def format_aliases() -> dict[str, str]:
-    """Return the aliases of installed formats: module name -> the module it stands for."""
+    """Return the aliases of installed formats: module name -> the module that is imported instead."""
     return {alias: module for form in usable_formats() for alias, module in form.spec.aliases.items()}
 
 
 def _load(entry: Entry) -> Format:
-    spec: FormatSpec = load_entry(entry, FormatSpec)
-    if spec.api > API_VERSION:
-        raise TaskError(
-            f"format '{entry.qualified}' ({entry.version}) needs plugin API {spec.api}; this rlcli has {API_VERSION}",
-            hint="pip install --upgrade rlcli",
-        )
-    return Format(entry, spec)
-
-
-def _package(entry: Entry) -> str:
-    return entry.value.partition(":")[0].partition(".")[0]
+    return Format(entry, load_spec(entry, FormatSpec, "format"))
 
 
 @functools.cache

@@ -1,23 +1,49 @@
-"""Import of plugins: what their code prints and raises is contained."""
+"""Import of plugins, protected against what their code prints, raises or changes."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
-import importlib.util
+import operator
 import os
 import re
 import sys
+import traceback
 from collections.abc import Iterator
 from importlib import metadata
-from typing import Any
+from typing import Any, TypeVar
 
 from rlcli.errors import DependencyError, TaskError
+from rlcli.formats import FormatSpec
 from rlcli.registry.entries import Entry
+from rlcli.task import API_VERSION, TaskSpec
+from rlcli.trainers import TrainerSpec
+
+_Spec = TypeVar("_Spec", TaskSpec, TrainerSpec, FormatSpec)
+
+
+def load_spec(entry: Entry, kind: type[_Spec], what: str) -> _Spec:
+    """Import the specification of a plugin. `what` is task, trainer or format, for messages.
+
+    Raises:
+        TaskError: if the plugin is broken, or needs a newer plugin interface.
+    """
+    spec: _Spec = load_entry(entry, kind)
+    if spec.api > API_VERSION:
+        raise TaskError(
+            f"{what} '{entry.qualified}' ({entry.version}) needs plugin API {spec.api}; this rlcli has {API_VERSION}",
+            hint="pip install --upgrade rlcli",
+        )
+    return spec
 
 
 def load_entry(entry: Entry, kind: type) -> Any:
-    """Import what an entry point names; whatever the plugin raises is said with its owner."""
+    """Import the object that an entry point names, and check its type.
+
+    Raises:
+        TaskError: for any error of the plugin, with the name of its distribution.
+        DependencyError: raised by the plugin itself, passed on.
+    """
     try:
         value = import_object(entry.value)
     except DependencyError:
@@ -25,10 +51,10 @@ def load_entry(entry: Entry, kind: type) -> Any:
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
             raise
-        said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise TaskError(
             f"plugin {entry.distribution} {entry.version} is broken: '{entry.name}' = {entry.value}:"
-            f" {said}{place_of(error)}",
+            f" {reason}{error_location(error)}",
             hint=_newer_rlcli(entry),
         ) from error
     if not isinstance(value, kind):
@@ -40,40 +66,35 @@ def load_entry(entry: Entry, kind: type) -> Any:
 
 
 def import_object(reference: str) -> Any:
-    """Return the object of `package.module:Name`. What the import prints goes to stderr."""
+    """Return the object of `package.module:Name`. Output of the import goes to stderr."""
     name, _, attributes = reference.rpartition(":")
-    with contained():
-        value: Any = importlib.import_module(name)
-    for attribute in attributes.split("."):
-        value = getattr(value, attribute)
-    return value
+    with contain_side_effects():
+        module = importlib.import_module(name)
+    return operator.attrgetter(attributes)(module)
 
 
 @contextlib.contextmanager
-def contained() -> Iterator[None]:
-    """What a plugin prints while it is imported, from C too, goes to stderr; where it went with chdir is undone."""
-    folder = _folder_now()
+def contain_side_effects() -> Iterator[None]:
+    """Send output of the `with` block to stderr (also output of C code) and restore the current folder at its end."""
+    folder = _current_folder()
     with contextlib.redirect_stdout(sys.stderr), _descriptor_to_stderr():
         try:
             yield
         finally:
-            if folder is not None and _folder_now() != folder:
+            if folder is not None and _current_folder() != folder:
                 os.chdir(folder)
 
 
-def place_of(error: BaseException) -> str:
-    """The line of code that raised, in brackets; nothing where the message has it already."""
-    traceback = error.__traceback__
-    last = None
-    while traceback is not None:
-        last = (traceback.tb_frame.f_code.co_filename, traceback.tb_lineno)
-        traceback = traceback.tb_next
-    own = isinstance(error, SyntaxError) or last is None or last[0].startswith("<frozen")
-    return "" if own or last is None else f" ({last[0]}:{last[1]})"
+def error_location(error: BaseException) -> str:
+    """Return ` (file:line)` of the code that raised an error; empty if the message has it already (SyntaxError)."""
+    frames = traceback.extract_tb(error.__traceback__)
+    if isinstance(error, SyntaxError) or not frames or frames[-1].filename.startswith("<frozen"):
+        return ""
+    return f" ({frames[-1].filename}:{frames[-1].lineno})"
 
 
 def _newer_rlcli(entry: Entry) -> str | None:
-    """What to do about a plugin that asks for a newer rlcli in its metadata."""
+    """Return the hint for a plugin whose metadata requires a newer rlcli; None if it does not."""
     import rlcli
 
     requirements: list[str] = []
@@ -81,31 +102,32 @@ def _newer_rlcli(entry: Entry) -> str | None:
         requirements = metadata.requires(entry.distribution) or []
     for line in requirements:
         wanted = re.match(r"rlcli\s*(?:\[[^]]*\])?\s*\(?(?:>=|==|~=|>)\s*([0-9]+(?:\.[0-9]+)*)", line)
-        if wanted and _numbers(wanted[1]) > _numbers(rlcli.__version__):
-            return f"it asks for rlcli {wanted[1]}, this is {rlcli.__version__}: pip install --upgrade rlcli"
+        if wanted and release_numbers(wanted[1]) > release_numbers(rlcli.__version__):
+            return f"it needs rlcli {wanted[1]}, this is {rlcli.__version__}: pip install --upgrade rlcli"
     return None
 
 
-def _numbers(version: str) -> list[int]:
-    return [int(number) for number in re.findall(r"[0-9]+", version)]
+def release_numbers(version: str) -> list[int]:
+    """Return the numbers of a version without its local part: `2.13.0+cpu` -> [2, 13, 0]."""
+    return [int(number) for number in re.findall(r"[0-9]+", version.partition("+")[0])]
 
 
-def _folder_now() -> str | None:
+def _current_folder() -> str | None:
     try:
         return os.getcwd()
-    except OSError:  # it was removed
+    except OSError:  # the folder was removed
         return None
 
 
 @contextlib.contextmanager
 def _descriptor_to_stderr() -> Iterator[None]:
-    """For what writes to file descriptor 1 without asking Python."""
+    """Redirect file descriptor 1 to stderr, for C code that writes to it directly."""
     try:
         if sys.__stdout__ is not None:
             sys.__stdout__.flush()
         kept = os.dup(1)
         os.dup2(2, 1)
-    except (OSError, ValueError):  # one of them is closed
+    except (OSError, ValueError):  # stdout or stderr is closed
         yield
         return
     try:

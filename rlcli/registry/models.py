@@ -1,38 +1,37 @@
-"""The file of a robot's model: in a task's folder, another task's, a package's, or one of the user's."""
+"""Lookup of a robot model: in the task's folder, another task's folder, a package, or a folder of the user."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from pathlib import Path
 
 from rlcli.errors import MissingModelError, TaskError, listing
 from rlcli.registry.entries import TASKS, find_entry
-from rlcli.registry.packages import installed_task
+from rlcli.registry.packages import installed_task, package_folders
 
 MODELS = "RLCLI_MODELS"
-"""Environment variable: folders in which the user keeps models of robots, as PATH lists its folders."""
+"""Environment variable with the user's folders of robot models, separated like the folders of PATH."""
 
 
 def model_file(root: Path, model: str) -> Path:
-    """Where a task in `root` finds a model.
+    """Return the file of a model for a task in `root`.
 
-    In its own folder; as `TASK:FILE` in that of an installed task; as `package:PACKAGE/FILE` in an installed package,
-    which is not imported; as `models:FILE` in a folder that the environment variable RLCLI_MODELS names. Of several
-    with ` | ` between them it is the first that is there.
+    `FILE` is in the task's own folder; `TASK:FILE` in the folder of an installed task; `package:PACKAGE/FILE` in an
+    installed package, which is not imported; `models:FILE` in a folder of the environment variable RLCLI_MODELS. If
+    ` | ` separates several alternatives, the first existing one is used.
 
     Raises:
-        MissingModelError: if a model that the user is to have is nowhere.
-        TaskError: if there is no such task or package, or the file is not in its folder.
+        MissingModelError: if a model that the user must provide is not found.
+        TaskError: if there is no such task or package, or the file is outside of its folder.
     """
     return _model_file(root, chosen_model(root, model))
 
 
 def chosen_model(root: Path, model: str) -> str:
-    """Of alternatives with ` | ` between them the first that is there; a single one as it is.
+    """Return the first existing model of alternatives separated by ` | `. A single model is returned unchecked.
 
     Raises:
-        MissingModelError: if none is there.
+        MissingModelError: if none of the alternatives exists.
     """
     choices = [choice.strip() for choice in model.split(" | ")]
     if len(choices) == 1:
@@ -50,12 +49,12 @@ def chosen_model(root: Path, model: str) -> str:
 
 
 def _install_hint(model: str) -> str:
-    """What makes a model available."""
+    """Return what the user can do to make a model available."""
     kind, _, file = model.partition(":")
     if kind == "models":
         return f"set {MODELS} to a folder that holds {file}"
     if kind == "package":
-        return f"install the package {file.partition('/')[0]}, which carries it"
+        return f"install the package {file.partition('/')[0]}, which contains it"
     return f"install the task {kind}"
 
 
@@ -78,28 +77,24 @@ def _inside(folder: Path, file: str, what: str) -> Path:
 
 
 def _file_of_user_models(file: str) -> Path:
-    """A file in one of the folders that the user keeps models in."""
-    named = [Path(place).expanduser() for place in os.environ.get(MODELS, "").split(os.pathsep) if place]
-    for place in named:
-        found = _inside(place, file, f"the folder {place} of {MODELS}")
+    """Return a file from one of the folders of RLCLI_MODELS."""
+    folders = [Path(folder).expanduser() for folder in os.environ.get(MODELS, "").split(os.pathsep) if folder]
+    for folder in folders:
+        found = _inside(folder, file, f"the folder {folder} of {MODELS}")
         if found.is_file():
             return found
-    where = f"no file '{file}' in {listing(map(str, named))} of {MODELS}" if named else f"{MODELS} is not set"
-    raise MissingModelError(where, hint=_install_hint(f"models:{file}"))
+    reason = f"no file '{file}' in {listing(map(str, folders))} of {MODELS}" if folders else f"{MODELS} is not set"
+    raise MissingModelError(reason, hint=_install_hint(f"models:{file}"))
 
 
 def _package_file(model: str) -> Path:
-    """A file in a package, by `PACKAGE/FILE`."""
+    """Return a file of an installed package by `PACKAGE/FILE`."""
     package, _, file = model.partition("/")
-    try:
-        found = importlib.util.find_spec(package) if package.isidentifier() else None
-    except (ImportError, ValueError):
-        found = None
-    places = [Path(place) for place in (found.submodule_search_locations or ())] if found else []
-    if not places:
+    folders = package_folders(package)
+    if not folders:
         raise TaskError(f"no Python package '{package}' is installed", hint="write package:PACKAGE/FILE")
-    place = next((place for place in places if (place / file).is_file()), places[0])
-    path = _inside(place, file, f"the package '{package}' in {place}")
+    folder = next((folder for folder in folders if (folder / file).is_file()), folders[0])
+    path = _inside(folder, file, f"the package '{package}' in {folder}")
     if not path.is_file():
-        raise TaskError(f"no file '{file}' in the package '{package}' in {place}")
+        raise TaskError(f"no file '{file}' in the package '{package}' in {folder}")
     return path

@@ -1,4 +1,4 @@
-"""Tasks of installed packages: where their files lie, and which files and modules are theirs."""
+"""Tasks of installed packages: their files, and the packages that a configuration may name."""
 
 from __future__ import annotations
 
@@ -8,28 +8,26 @@ from pathlib import Path
 
 from rlcli.errors import TaskError
 from rlcli.registry.entries import GROUPS, Entry, catalog
-from rlcli.registry.imports import contained, load_entry, place_of
+from rlcli.registry.imports import contain_side_effects, error_location, load_spec
 from rlcli.registry.source import TaskSource
-from rlcli.task import API_VERSION, TaskSpec
+from rlcli.task import TaskSpec
 
 
 def installed_task(entry: Entry) -> TaskSource:
-    """The task of an entry point, imported as far as its `TaskSpec`.
+    """Return the task of an entry point. Only the module of its `TaskSpec` is imported.
 
     Raises:
-        TaskError: broken, or built for a newer rlcli.
+        TaskError: if the task is broken, or needs a newer rlcli.
     """
-    spec = load_entry(entry, TaskSpec)
-    if spec.api > API_VERSION:
-        raise TaskError(
-            f"task '{entry.qualified}' ({entry.version}) needs plugin API {spec.api}; this rlcli has {API_VERSION}",
-            hint="pip install --upgrade rlcli",
-        )
-    return packaged_task(entry, spec)
+    return packaged_task(entry, load_spec(entry, TaskSpec, "task"))
 
 
 def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
-    """The files of a task in an installed package."""
+    """Return the task of an installed package with its files.
+
+    Raises:
+        TaskError: if a file or module of the task does not exist.
+    """
     root = _folder(spec.package, entry)
     in_python = ":" in spec.config
     config = _module_file(spec.config.partition(":")[0], entry) if in_python else root / spec.config
@@ -54,9 +52,9 @@ def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
 
 
 def task_of_file(file: Path) -> TaskSource | None:
-    """The installed task that a YAML file belongs to; only plugins whose package holds the file are imported."""
+    """Return the installed task whose configuration is this YAML file; None if there is none."""
     for entry in catalog()[0]:
-        package = package_folder(entry)
+        package = package_folder(entry)  # plugins whose package does not contain the file are not imported
         if package is not None and file.resolve().is_relative_to(package.resolve()):
             try:
                 source = installed_task(entry)
@@ -68,32 +66,28 @@ def task_of_file(file: Path) -> TaskSource | None:
 
 
 def package_folder(entry: Entry) -> Path | None:
-    """Where the top-level package of an entry point lies, without importing it."""
+    """Return the folder of the top-level package of an entry point, without importing it; None if there is none."""
+    return next(iter(package_folders(entry.package)), None)
+
+
+def package_folders(package: str) -> list[Path]:
+    """Return the folders of a top-level package (several for a namespace package), without importing it."""
     try:
-        found = importlib.util.find_spec(entry.value.partition(":")[0].partition(".")[0])
+        found = importlib.util.find_spec(package) if package.isidentifier() else None
     except (ImportError, ValueError):
-        return None
-    places = list(found.submodule_search_locations or ()) if found else []
-    return Path(places[0]) if places else None
+        return []
+    return [Path(folder) for folder in (found.submodule_search_locations or ())] if found else []
 
 
 def is_offered(module: str, source: TaskSource) -> bool:
-    """Whether a configuration may name a module: one of a task's own package, or of an installed plugin's.
+    """Return whether a configuration may name a module: one of the task's own package or of an installed plugin.
 
-    Nothing is imported: a configuration is data, and may be a stranger's.
+    Nothing is imported, because the configuration may come from an untrusted file.
     """
     top = module.partition(".")[0]
-    if not top.isidentifier():
-        return False
-    entries = [entry for group in GROUPS for entry in catalog(group)[0]]
-    if top in {entry.value.partition(":")[0].partition(".")[0] for entry in entries}:
-        return True
-    try:
-        found = importlib.util.find_spec(top)
-    except (ImportError, ValueError):
-        return False
-    places = [Path(place).resolve() for place in (found.submodule_search_locations or ())] if found else []
-    return any(source.root.resolve().is_relative_to(place) for place in places)
+    if top in {entry.package for group in GROUPS for entry in catalog(group)[0]}:
+        return top.isidentifier()
+    return any(source.root.resolve().is_relative_to(folder.resolve()) for folder in package_folders(top))
 
 
 def _folder(package: str, entry: Entry) -> Path:
@@ -111,13 +105,13 @@ def _module_file(module: str, entry: Entry) -> Path:
 
 
 def _find(module: str, entry: Entry) -> ModuleSpec | None:
-    """Where a module lies; its parent packages are imported for that."""
+    """Return the spec of a module; None if there is none. Its parent packages are imported."""
     try:
-        with contained():
+        with contain_side_effects():
             return importlib.util.find_spec(module)
     except KeyboardInterrupt:
         raise
     except BaseException as error:
         raise TaskError(
-            f"task '{entry.qualified}' is broken: {type(error).__name__}: {error}{place_of(error)}"
+            f"task '{entry.qualified}' is broken: {type(error).__name__}: {error}{error_location(error)}"
         ) from error

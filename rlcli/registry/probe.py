@@ -1,7 +1,7 @@
-"""What `list-tasks` knows of a task beyond its name, without importing it: a cache that `--probe` fills.
+"""Details of tasks for `list-tasks`, read from a cache that `list-tasks --probe` fills.
 
-A distribution may ship it as `index.json` in its top-level package, as the built-in tasks do. The others' lies in the
-user's cache folder, keyed by distribution, version and the state of its files.
+A distribution may ship the details as `index.json` in its top-level package, as the built-in tasks do. The details of
+other tasks are in the user's cache folder, keyed by distribution, version and the time at which it was installed.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ from rlcli.registry import OWN, TASKS, Entry, package_folder
 
 TIMEOUT_S = 30.0
 _BUILDER = "rlcli.envs.task_index"
-"""Run in a process of its own: it stands above this module, and it builds what may hang or crash."""
+"""Module that loads the tasks. It runs in a separate process because plugins may hang or crash, and because the layer
+`envs` must not be imported from here."""
 
 
 @dataclass(frozen=True, slots=True)
 class Details:
-    """What is known of a task; None and empty where nothing is."""
+    """Details of a task; None or an empty string means unknown."""
 
     summary: str = ""
     workflow: str | None = None
@@ -41,12 +42,13 @@ class Details:
     num_envs: int | None = None
     agent: str | None = None
     policy: bool = False
-    """Whether a trained policy is shipped with it."""
+    """Whether a trained policy is shipped with the task."""
     broken: str | None = None
+    """Why the task cannot be loaded; None: it can, or nobody has tried."""
 
     @property
     def status(self) -> str:
-        """In a few words: `ok`, `ok, policy`, `broken: WHY`, or `?` where nobody has looked yet."""
+        """`ok`, `ok, policy`, `broken: REASON`, or `?` if the task has not been probed."""
         if self.broken:
             return f"broken: {self.broken}"
         if self.workflow is None:
@@ -54,29 +56,32 @@ class Details:
         return "ok, policy" if self.policy else "ok"
 
     def record(self) -> dict[str, Any]:
-        """As plain JSON."""
+        """Return the details as JSON data."""
         return asdict(self)
 
 
-_KINDS: dict[str, Any] = {
+_TYPES: dict[str, Any] = {
     **dict.fromkeys(("observation_size", "action_size", "num_envs"), int | None),
     **dict.fromkeys(("workflow", "agent", "broken"), str | None),
     "summary": str,
     "policy": bool,
 }
+"""Types of the fields of `Details`. They are checked by hand: importing pydantic would slow `list-tasks` down."""
 
 
-def cached(entries: Iterable[Entry]) -> dict[str, Details]:
-    """What is known already, by qualified name."""
-    own = _raw(_cache_file())
-    rows = {entry.qualified: _known(entry, own) for entry in entries}
+def cached_details(entries: Iterable[Entry]) -> dict[str, Details]:
+    """Return the known details of tasks by qualified name; tasks without details are left out."""
+    cache = _read_json(_cache_file())
+    rows = {entry.qualified: _known_details(entry, cache) for entry in entries}
     return {name: row for name, row in rows.items() if row is not None}
 
 
-def _known(entry: Entry, own: dict[str, Any]) -> Details | None:
-    shipped, probed = _details(_shipped(entry)), _details(own.get(_key(entry)))
+def _known_details(entry: Entry, cache: dict[str, Any]) -> Details | None:
+    folder = package_folder(entry)
+    shipped = _parse_details(_read_json(folder / "index.json").get(entry.name)) if folder else None
+    probed = _parse_details(cache.get(_key(entry)))
     if entry.distribution != OWN and probed is not None and probed.broken:
-        return probed  # its authors did not ship this
+        return probed  # the task is broken on this machine, whatever the plugin's own index says
     return shipped or probed
 
 
@@ -87,11 +92,21 @@ def probe(
     stop: threading.Event | None = None,
     without: Iterable[str] = (),
 ) -> dict[str, Details]:
-    """Load every task in a process other than this one, and remember what it says. A broken one is a row with a reason.
+    """Load every entry in another process, cache the details of tasks, and return the details by qualified name.
 
-    The tasks of a distribution share a process; who ends it, or takes longer than `timeout_s`, is alone to blame, and
-    the others go on in a new one. Several distributions are loaded at a time. `stop` ends it early. `without` names
-    variables of the environment that the processes are not to see.
+    A broken entry has `Details.broken` with the reason. The entries of one distribution share a process. If an entry
+    ends the process or exceeds the time limit, only this entry is broken; the others continue in a new process. Several
+    distributions are loaded at the same time.
+
+    Args:
+        entries: the entries to load.
+        timeout_s: time limit for one entry [s].
+        group: the entry-point group.
+        stop: ends the probe early when it is set.
+        without: environment variables that are removed for the processes.
+
+    Raises:
+        InterruptedError: if `stop` was set before the end.
     """
     entries = list(entries)
     owners: dict[str, list[Entry]] = {}
@@ -100,48 +115,47 @@ def probe(
     stop = stop or threading.Event()
     env = {name: value for name, value in os.environ.items() if name not in without}
     with ThreadPoolExecutor(max(1, min(len(owners), available_cores()))) as pool:
-        try:  # around the start as well: the first process may run before the last thread does
+        try:  # Ctrl-C may come while `map` still starts threads, and the first process may already run then
             rows = pool.map(lambda owned: _probe_distribution(owned, timeout_s, group, stop, env), owners.values())
             found = {name: row for part in rows for name, row in part.items()}
         except BaseException:  # Ctrl-C
             stop.set()
             raise
     if stop.is_set():
-        raise InterruptedError("the probe was ended before it was done")
+        raise InterruptedError("the probe was stopped before its end")
     if group == TASKS:
-        _remember({_key(entry): found[entry.qualified].record() for entry in entries})
+        _update_cache({_key(entry): found[entry.qualified].record() for entry in entries})
     return {entry.qualified: found[entry.qualified] for entry in entries}
 
 
-def _remember(known: dict[str, Any]) -> None:
+def _update_cache(details: dict[str, Any]) -> None:
     file = _cache_file()
-    try:
+    with contextlib.suppress(OSError):  # without the cache `list-tasks` only shows fewer details
         file.parent.mkdir(parents=True, exist_ok=True)
         temporary = file.with_suffix(f".{os.getpid()}.tmp")
-        temporary.write_text(json.dumps({**_raw(file), **known}, indent=1), encoding="utf-8")
+        temporary.write_text(json.dumps({**_read_json(file), **details}, indent=1), encoding="utf-8")
         temporary.replace(file)
-    except OSError:
-        pass  # a cache that cannot be kept is only slower
 
 
 def _probe_distribution(
     entries: list[Entry], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str]
 ) -> dict[str, Details]:
+    """Load the entries of one distribution, in as many processes as needed."""
     found: dict[str, Details] = {}
-    while left := [entry.qualified for entry in entries if entry.qualified not in found]:
+    while remaining := [entry.qualified for entry in entries if entry.qualified not in found]:
         if stop.is_set():
             break
-        found.update(_probe_names(left, timeout_s, group, stop, env))
+        found.update(_probe_names(remaining, timeout_s, group, stop, env))
     return found
 
 
 def _probe_names(
     names: list[str], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str]
 ) -> dict[str, Details]:
-    """What one process says of the first of these, and of as many more as it comes to."""
+    """Load entries in one process and return details of the first one and of all further ones that it reached."""
     with tempfile.TemporaryDirectory(prefix="rlcli-probe-", ignore_cleanup_errors=True) as folder:
-        file, said = Path(folder) / "rows", Path(folder) / "stderr"
-        with said.open("wb") as stderr:
+        file, log = Path(folder) / "rows", Path(folder) / "stderr"
+        with log.open("wb") as stderr:
             process = subprocess.Popen(
                 [sys.executable, "-m", _BUILDER, group, str(file), *names],
                 stdin=subprocess.DEVNULL,
@@ -153,21 +167,20 @@ def _probe_names(
         try:
             code = _wait(process, file, len(names), timeout_s, stop)
         finally:
-            _end(process)
+            _kill(process)
         rows = _rows(file)
-        lines = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     found = dict(zip(names, rows, strict=False))
     if len(found) == len(names):
         if code is None:
-            reason = (
-                f"loaded, but a process that loads it did not end within {timeout_s:g} s (does a thread still run?)"
-            )
-            found[names[-1]] = replace(found[names[-1]], broken=found[names[-1]].broken or reason)
+            last = found[names[-1]]
+            reason = f"loaded, but its process did not end within {timeout_s:g} s (does a thread still run?)"
+            found[names[-1]] = replace(last, broken=last.broken or reason)
         return found
     if code is None:
         reason = f"did not load within {timeout_s:g} s"
     elif code < 0:
-        reason = f"crashed ({_signal(-code)})"
+        reason = f"crashed ({signal_name(-code)})"
     else:
         reason = f"ended the process (exit {code})"
     if code and lines and not lines[-1].startswith(" "):
@@ -179,7 +192,10 @@ def _probe_names(
 def _wait(
     process: subprocess.Popen[bytes], file: Path, wanted: int, timeout_s: float, stop: threading.Event
 ) -> int | None:
-    """The exit code of a process that adds rows to a file; None if it took too long for one, or to end."""
+    """Wait for a process that appends rows to a file, and return its exit code.
+
+    Return None if a row, or the end after the last row, takes longer than `timeout_s`, or if `stop` is set.
+    """
     rows, deadline = 0, time.monotonic() + timeout_s
     while process.poll() is None:
         if rows < wanted and len(_rows(file)) > rows:
@@ -190,8 +206,8 @@ def _wait(
     return process.returncode
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a process and what it started."""
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process and the processes that it started."""
     with contextlib.suppress(OSError):
         if hasattr(os, "killpg"):
             os.killpg(process.pid, signal.SIGKILL)
@@ -201,24 +217,19 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _rows(file: Path) -> list[Details]:
-    """The complete lines of a file that are rows."""
-    try:
-        lines = file.read_bytes().split(b"\n")[:-1]
-    except OSError:
-        return []
+    """Return the rows of a file up to the first line that is not a valid row."""
     rows = []
-    for line in lines:
-        try:
-            row = _details(json.loads(line))
-        except ValueError:
-            row = None
-        if row is None:
-            break
-        rows.append(row)
+    with contextlib.suppress(OSError, ValueError):
+        for line in file.read_bytes().split(b"\n")[:-1]:  # the process may still be writing the last line
+            row = _parse_details(json.loads(line))
+            if row is None:
+                break
+            rows.append(row)
     return rows
 
 
-def _signal(number: int) -> str:
+def signal_name(number: int) -> str:
+    """Return the name of a signal, such as SIGSEGV."""
     try:
         return signal.Signals(number).name
     except ValueError:
@@ -230,16 +241,12 @@ def _key(entry: Entry) -> str:
 
 
 def _fingerprint(distribution: str) -> str:
+    """Return the modification time of the distribution's RECORD, which changes when it is installed again."""
     try:
-        place = Path(str(getattr(metadata.distribution(distribution), "_path", "")))
-        return str((place / "RECORD").stat().st_mtime_ns)
+        folder = Path(str(getattr(metadata.distribution(distribution), "_path", "")))
+        return str((folder / "RECORD").stat().st_mtime_ns)
     except (OSError, metadata.PackageNotFoundError):
         return "0"
-
-
-def _shipped(entry: Entry) -> Any:
-    folder = package_folder(entry)
-    return _raw(folder / "index.json").get(entry.name) if folder else None
 
 
 def _cache_file() -> Path:
@@ -248,7 +255,8 @@ def _cache_file() -> Path:
     return Path(platformdirs.user_cache_dir("rlcli")) / "tasks.json"
 
 
-def _raw(file: Path) -> dict[str, Any]:
+def _read_json(file: Path) -> dict[str, Any]:
+    """Return the mapping in a JSON file; an empty one if the file cannot be read."""
     try:
         value = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -256,10 +264,10 @@ def _raw(file: Path) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _details(row: object) -> Details | None:
-    """A row of a file that somebody else may have written; None if it is not one."""
+def _parse_details(row: object) -> Details | None:
+    """Return the details in JSON data of an untrusted file; None if a value has the wrong type."""
     if not isinstance(row, dict):
         return None
     known = {f.name: row[f.name] for f in fields(Details) if f.name in row}
-    good = all(isinstance(value, _KINDS[name]) for name, value in known.items())
-    return Details(**known) if good else None
+    valid = all(isinstance(value, _TYPES[name]) for name, value in known.items())
+    return Details(**known) if valid else None

@@ -1,4 +1,4 @@
-"""A task that was found, wherever it was: what everything that reads, checks and builds it needs to know."""
+"""Location of a task: the files and modules from which it is read, checked and built."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class TaskSource:
-    """A task that was found: its name, its files, and what imports its code."""
+    """Location of a task: its name, its files, and the references that import its code."""
 
     name: str
     root: Path
     config: Path
-    distribution: str | None
-    version: str | None
-    term_files: tuple[Path, ...]
-    term_modules: tuple[str, ...]
-    task: str | None
-    task_file: Path | None
+    distribution: str | None = None
+    version: str | None = None
+    term_files: tuple[Path, ...] = ()
+    term_modules: tuple[str, ...] = ()
+    task: str | None = None
+    task_file: Path | None = None
     python: str | None = None
-    """`module:attribute`, `file.py:attribute` or a package's folder that holds the configuration, if Python does."""
+    """A configuration in Python: `module:attribute`, `file.py:attribute` or the folder of a package; None: in YAML."""
     agents: tuple[tuple[str, str], ...] = ()
     """Further agents of a configuration in Python: (name, `module:attribute`)."""
     value: Any = None
-    """The configuration itself, where it exists in memory only."""
+    """The configuration itself, if it exists in memory only."""
     policy: Path | None = None
-    """The folder of the policy that is shipped with the task; None: none is."""
+    """The folder of the trained policy that is shipped with the task; None: there is none."""
 
     @property
     def label(self) -> str:
-        """How messages name the file."""
+        """Name of the configuration file in messages: relative to the current folder if possible."""
         try:
             return str(self.config.relative_to(Path.cwd()))
         except ValueError:
             return str(self.config)
 
     def record(self) -> dict[str, str | None]:
-        """What a run stores to find the task again."""
+        """Return the data that a run stores to find the task again."""
         folder = None if self.distribution else str(self.root)
         record = {"name": self.name, "distribution": self.distribution, "version": self.version, "folder": folder}
         return record | ({"python": self.python} if self.python and folder else {})

@@ -1,4 +1,4 @@
-"""Import of task files: modules by name or path, with the aliases of installed formats."""
+"""Import of task files by module name or path, with the aliases of installed formats."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import importlib
 import importlib.util
+import operator
 import sys
 from collections.abc import Iterator
 from importlib.machinery import ModuleSpec
@@ -13,21 +14,21 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.registry.aliases import aliases_resolved
-from rlcli.registry.imports import contained
+from rlcli.registry.imports import contain_side_effects
 
 
 def load_object(reference: str) -> Any:
-    """`package.module:Name` or `/path/file.py:Name` -> the object."""
+    """Import the object of `package.module:Name` or `/path/file.py:Name`."""
     module_name, _, attribute = reference.rpartition(":")
-    value: Any = load_module(module_name)
-    for part in attribute.split("."):
-        value = getattr(value, part)
-    return value
+    return operator.attrgetter(attribute)(load_module(module_name))
 
 
 def load_module(name: str) -> Any:
-    """Import a module by its dotted name, or a file of a task folder by its path. Its prints go to stderr."""
-    with contained(), aliases_resolved():
+    """Import a module by its dotted name, or a file of a task folder by its path. Its output goes to stderr.
+
+    The module name of a file is derived from its path, so that `task.py` of two folders are two modules.
+    """
+    with contain_side_effects(), aliases_resolved():
         if not name.endswith(".py"):
             return importlib.import_module(name)
         file = Path(name)
@@ -49,11 +50,11 @@ def load_module(name: str) -> Any:
 
 
 def import_file(file: Path) -> Any:
-    """Import a file as part of the package that its folder is, so that its relative imports work.
+    """Import a file as a module of its folder's package, so that its relative imports work.
 
-    Modules beside a file of no package are importable too, as for a script.
+    If the folder is no package, the file can import the modules beside it, as a script can.
     """
-    with contained(), aliases_resolved():
+    with contain_side_effects(), aliases_resolved():
         top = file.parent
         while (top.parent / "__init__.py").is_file() and (top / "__init__.py").is_file():
             top = top.parent
@@ -68,7 +69,10 @@ def import_file(file: Path) -> Any:
 
 @contextlib.contextmanager
 def _sibling_modules(folder: Path) -> Iterator[None]:
-    """A file of a task folder may import the files beside it, which two tasks may call the same."""
+    """Let a file of a task folder import the files beside it.
+
+    Afterwards the imported files are removed from `sys.modules`, because another task may have files of the same names.
+    """
     before = set(sys.modules)
     sys.path.insert(0, str(folder))
     importlib.invalidate_caches()
@@ -77,20 +81,19 @@ def _sibling_modules(folder: Path) -> Iterator[None]:
     finally:
         sys.path.remove(str(folder))
         for name in set(sys.modules) - before:
-            place = getattr(sys.modules[name], "__file__", None)
-            if place and Path(place).is_relative_to(folder) and not name.startswith("rlcli_folder_task_"):
+            file = getattr(sys.modules[name], "__file__", None)
+            if file and Path(file).is_relative_to(folder) and not name.startswith("rlcli_folder_task_"):
                 del sys.modules[name]
 
 
 def _package(folder: Path) -> str:
-    """The name under which a folder is a package: its own, unless that is taken."""
+    """Import a folder as a package and return its module name: the folder's name, or a unique one if that is taken."""
     digest = hashlib.blake2b(str(folder).encode(), digest_size=8).hexdigest()
-    alias = f"rlcli_folder_{digest}"
-    name = alias
+    name = f"rlcli_folder_{digest}"
     if folder.name.isidentifier():
-        known = sys.modules.get(folder.name)
-        mine = known is not None and str(folder) in list(getattr(known, "__path__", ()))
-        if mine or (known is None and importlib.util.find_spec(folder.name) is None):
+        existing = sys.modules.get(folder.name)
+        is_folder = existing is not None and str(folder) in list(getattr(existing, "__path__", ()))
+        if is_folder or (existing is None and importlib.util.find_spec(folder.name) is None):
             name = folder.name
     if name in sys.modules:
         return name
@@ -108,8 +111,8 @@ def _package(folder: Path) -> str:
         try:
             spec.loader.exec_module(module)
         except BaseException:
-            for known_name in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
-                del sys.modules[known_name]
+            for imported in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
+                del sys.modules[imported]
             raise
         finally:
             sys.path.remove(str(folder))

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from rlcli.config import strict_yaml
 from rlcli.config.dump import origins
-from rlcli.config.foreign_keys import with_foreign
+from rlcli.config.foreign_keys import move_foreign_keys
 from rlcli.config.layers import leaves
 from rlcli.config.load import resolve
 from rlcli.config.messages import dotted
@@ -119,7 +119,7 @@ def _card(run: Run, document: strict_yaml.Document | None, checkpoint: Path | No
         if document is None:
             raise
     # pydantic is strict about lists and tuples but where it reads JSON
-    task = TaskConfig.model_validate_json(json.dumps(with_foreign(document.data)), context={"open_scene": True})
+    task = TaskConfig.model_validate_json(json.dumps(move_foreign_keys(document.data)), context={"open_scene": True})
     return card(task, Vocabulary(), name=str(run.record["task"]["name"]), layout=layout)
 
 

@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from rlcli.errors import CheckpointError
-from rlcli.machine import memory
+from rlcli.machine import available_memory
 from rlcli.rl.policy import Policy, blank_policy, filled, size_of
 from rlcli.rl.trainer import Rows, TrainerState
 from rlcli.runs.safe_io import JSON_LIMIT, Count, FileModel, check_json, parse_json, read_file
@@ -155,7 +155,7 @@ class Checkpoint:
         """
         name = f"{part}.safetensors"
         if limit is None:
-            limit = min(_LIMITS.get(part.partition(".")[0], _UNLIMITED), memory() // 3)
+            limit = min(_LIMITS.get(part.partition(".")[0], _UNLIMITED), available_memory() // 3)
         return _tensors(self._data(name, limit), self.folder / name)
 
     def policy(self) -> Policy:
@@ -234,7 +234,7 @@ class Checkpoint:
         begins = [shard.start for shard in shards] + [stop]
         if [shard.stop for shard in shards] != begins[1:] or begins[0] > first:
             raise CheckpointError(f"{self.folder}/manifest.json is corrupt: rows of '{name}' are missing")
-        held, most = sum(shard.size for shard in shards), memory() // 3
+        held, most = sum(shard.size for shard in shards), available_memory() // 3
         if held > most:
             raise CheckpointError(f"{self.folder}: '{name}' has {held:,} bytes; this machine has memory for {most:,}")
 
@@ -253,7 +253,8 @@ class Checkpoint:
 
     def _shard(self, name: str, shard: Shard) -> dict[str, Tensor]:
         file = self.folder.parent / LOG_FOLDER / name / shard.file
-        columns = _tensors(_verified(file, shard.size, shard.sha256, min(_MOST_OF_A_SHARD, memory() // 3)), file)
+        most = min(_MOST_OF_A_SHARD, available_memory() // 3)
+        columns = _tensors(_verified(file, shard.size, shard.sha256, most), file)
         for column, values in columns.items():
             if values.shape[:1] != (shard.stop - shard.start,):
                 raise CheckpointError(f"{file} is corrupt: '{column}' has not the rows of its name")

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from rlcli.errors import CheckpointError, one_line
-from rlcli.machine import memory
+from rlcli.machine import available_memory
 from rlcli.runs.safe_io import read_file
 
 _MAX_BYTES = 4 * 2**30
@@ -43,7 +43,7 @@ VEC_NORMALIZE_HINT = (
 def read_archive_file(file: Path) -> bytes:
     """Read a whole file, up to a share of the memory."""
     try:
-        return read_file(file.resolve(), min(_MAX_BYTES, memory() // 4))
+        return read_file(file.resolve(), min(_MAX_BYTES, available_memory() // 4))
     except FileNotFoundError:
         raise CheckpointError(f"there is no file {file}") from None
 
@@ -85,7 +85,7 @@ def _archive(data: bytes, where: str) -> zipfile.ZipFile:
             raise CheckpointError(f"{where} has a member {shown}, which is packed in an uncommon way")
         if member.file_size > _MAX_RATIO * max(member.compress_size, 1):
             raise CheckpointError(f"{where} has a member {shown}, which grows more than {_MAX_RATIO} times unpacked")
-    total, most = sum(member.file_size for member in members), min(_MAX_BYTES, memory() // 4)
+    total, most = sum(member.file_size for member in members), min(_MAX_BYTES, available_memory() // 4)
     if total > most:
         raise CheckpointError(f"{where} holds {total:,} bytes, at most {most:,} are read")
     return archive

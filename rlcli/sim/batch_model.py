@@ -134,7 +134,7 @@ def _require_memory(model: mujoco.MjModel, num_envs: int) -> None:
         DeviceError: if they do not fit.
     """
     each = _MIN_STATES_PER_ENV * 8 * mujoco.mj_stateSize(model, INTEGRATION_STATE)
-    free = min(machine.memory(), machine.memory_limit() or sys.maxsize)
+    free = min(machine.available_memory(), machine.memory_limit() or sys.maxsize)
     if each * num_envs > free:
         raise DeviceError(
             f"{num_envs} environments need at least {each * num_envs / 2**30:.1f} GiB,"

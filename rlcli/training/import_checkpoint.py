@@ -17,7 +17,7 @@ from rlcli.config.dump import to_data, to_yaml
 from rlcli.deploy.env_description import describe
 from rlcli.envs.make import make_env
 from rlcli.errors import CheckpointError, one_line
-from rlcli.machine import memory
+from rlcli.machine import available_memory
 from rlcli.rl.optimizers import below
 from rlcli.rl.policy import blank_policy, filled
 from rlcli.rl.trainer import TrainerState
@@ -191,7 +191,7 @@ def _named_tensors(saved: object, where: str) -> dict[str, Tensor]:
     if not isinstance(saved, Mapping):
         raise CheckpointError(f"{where} has no mapping of weights where it is expected")
     named: dict[str, Tensor] = {}
-    total, limit = 0, memory() // 4  # bytes
+    total, limit = 0, available_memory() // 4  # bytes
     for name, value in saved.items():
         if not isinstance(name, str) or type(value) not in (Tensor, torch.nn.Parameter):
             raise CheckpointError(f"{where}: '{str(name)[:60]}' is not a tensor")

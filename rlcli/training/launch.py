@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlcli.config.dump import given, to_data, to_yaml
+from rlcli.config.dump import explicit_values, to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
 from rlcli.errors import CheckpointError, DeviceError, UsageError
 from rlcli.machine import choose_device
@@ -136,7 +136,7 @@ def prepare_run(folder: Path, request: TrainingRequest, changes: Sequence[str] =
     resolved, device = request.resolve(changes)
     if (folder / RECORD).is_file():
         recorded = open_run(folder).record.get("given")
-        if recorded is not None and _overrides_in(recorded) != _overrides_in(given(resolved)):
+        if recorded is not None and _overrides_in(recorded) != _overrides_in(explicit_values(resolved)):
             message = f"{folder} is a run of another sweep, with other settings"
             raise UsageError(message, hint="start a new sweep with another --name")
         return device
@@ -173,7 +173,7 @@ def run_record(request: TrainingRequest, resolved: Resolved, device: str) -> dic
         "video_every": request.video_every or 0,
         "init_from": str(initial) if initial else None,
         "init_from_sha256": file_digest(initial / "policy.safetensors") if initial else None,
-        "given": given(resolved),
+        "given": explicit_values(resolved),
         **environment_record(resolved, *threads(resolved)),
     }
 

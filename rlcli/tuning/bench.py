@@ -19,7 +19,7 @@ import torch
 
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError
-from rlcli.machine import available_cores, memory, resident
+from rlcli.machine import available_cores, available_memory, resident_memory
 from rlcli.training.job import threads
 from rlcli.training.setup import make_trainer
 
@@ -226,7 +226,7 @@ class Bench:
                 blocks = list(_blocks(step, self._pace))
             physics = (env.seconds["physics"] - before["physics"]) / (env.seconds["step"] - before["step"])
             middle = statistics.median(blocks)
-            return Stepped(num_envs, engine_threads, num_envs / middle, physics, _spread(blocks), resident())
+            return Stepped(num_envs, engine_threads, num_envs / middle, physics, _spread(blocks), resident_memory())
         finally:
             env.close()
 
@@ -238,7 +238,7 @@ class Bench:
         each = _ENV_BYTES
         if last is not None and last.resident is not None and known[0].resident is not None and last is not known[0]:
             each = max(4096, (last.resident - known[0].resident) // (last.num_envs - known[0].num_envs))
-        if each * num_envs > memory() // 2:
+        if each * num_envs > available_memory() // 2:
             return f"it would take about {each * num_envs / 2**30:.1f} GiB"
         if last is not None and last.steps_per_s and num_envs / last.steps_per_s > self._pace.longest_s:
             return f"a step would take about {num_envs / last.steps_per_s:.0f} s"
@@ -302,7 +302,7 @@ class Bench:
         names = dict.fromkeys(name for each in parts for name in each)
         shares = {name: sum(each.get(name, 0.0) for each in parts) / total for name in names}
         middle, spread = statistics.median(blocks), _spread(blocks)
-        return Trained(setting, alike, trainer.steps_per_iteration, middle, shares, spread, resident())
+        return Trained(setting, alike, trainer.steps_per_iteration, middle, shares, spread, resident_memory())
 
     def _build(self, setting: Setting) -> tuple[VecEnv, Trainer]:
         resolved = self._resolve(self.changes(setting))

@@ -1,4 +1,4 @@
-"""The environments as Gymnasium sees them."""
+"""Gymnasium adapter: spaces, autoreset modes, seeds, rendering, registration."""
 
 import gymnasium as gym
 import numpy as np
@@ -19,7 +19,7 @@ torch.set_num_threads(1)
 MODES = list(AutoresetMode)
 TASKS = ["cartpole", "cartpole-direct"]
 UNBOUNDED = "ignore:.*A Box observation space m.*imum value is -?infinity:UserWarning"
-"""The checker's opinion on observations without limits."""
+"""Warning of Gymnasium's checker about unbounded observations."""
 
 
 def vector(name="cartpole", num_envs=3, **settings):
@@ -30,32 +30,32 @@ def single(task="cartpole", **settings):
     return gym.make(f"rlcli.gym:rlcli/{task}", **settings)
 
 
-def short(steps, task="cartpole"):
-    """A configuration whose episodes end by time after so many steps."""
+def short_episodes(steps, task="cartpole"):
+    """Return changes of the configuration with which episodes time out after `steps` steps."""
     return {"episode_length_s": steps * resolve(find_task(task)).task.step_dt}
 
 
-def lives(task, mode, episodes):
-    """The first episodes of three environments, each a list of observations; actions depend on the step in it."""
-    envs = vector(task, autoreset_mode=mode, cfg=short(5, task))
+def first_episodes(task, mode, episodes):
+    """Return the first episodes of three environments as lists of observations; actions depend on the step."""
+    envs = vector(task, autoreset_mode=mode, cfg=short_episodes(5, task))
     obs, _ = envs.reset(seed=7)
-    told, running = [[] for _ in range(3)], [[row] for row in obs]
+    finished, running = [[] for _ in range(3)], [[row] for row in obs]
     ended = np.zeros(3, dtype=bool)
-    while min(map(len, told)) < episodes:
-        actions = np.array([[0.3 * len(life) - 0.5] for life in running], dtype=np.float32)
+    while min(map(len, finished)) < episodes:
+        actions = np.array([[0.3 * len(episode) - 0.5] for episode in running], dtype=np.float32)
         obs, reward, terminated, truncated, infos = envs.step(actions)
-        waited, ended = ended, terminated | truncated
+        was_ended, ended = ended, terminated | truncated
         if mode is AutoresetMode.NEXT_STEP:
-            assert not reward[waited].any()
-            assert not ended[waited].any()
+            assert not reward[was_ended].any()
+            assert not ended[was_ended].any()
         for world in range(3):
-            if mode is AutoresetMode.NEXT_STEP and waited[world]:
+            if mode is AutoresetMode.NEXT_STEP and was_ended[world]:
                 running[world] = [obs[world]]
             elif not ended[world]:
                 running[world].append(obs[world])
             else:
                 same_step = mode is AutoresetMode.SAME_STEP
-                told[world].append([*running[world], infos["final_obs"][world] if same_step else obs[world]])
+                finished[world].append([*running[world], infos["final_obs"][world] if same_step else obs[world]])
                 running[world] = [obs[world]]
         if mode is AutoresetMode.DISABLED and ended.any():
             obs, _ = envs.reset(options={"reset_mask": ended})
@@ -63,22 +63,22 @@ def lives(task, mode, episodes):
                 running[world] = [obs[world]]
         ended = ended if mode is AutoresetMode.NEXT_STEP else np.zeros(3, dtype=bool)
     envs.close()
-    return [life[:episodes] for life in told]
+    return [episode[:episodes] for episode in finished]
 
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
-def test_environments_live_the_same_episodes_in_every_autoreset_mode(task, mode):
-    expected, found = lives(task, AutoresetMode.SAME_STEP, 4), lives(task, mode, 4)
+def test_episodes_are_equal_in_every_autoreset_mode(task, mode):
+    expected, found = first_episodes(task, AutoresetMode.SAME_STEP, 4), first_episodes(task, mode, 4)
     for world in range(3):
         for ours, theirs in zip(expected[world], found[world], strict=True):
             np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_the_mode_is_declared_and_what_a_step_gives_has_the_form_of_gymnasiums_own(mode):
-    ours = vector(autoreset_mode=mode, cfg=short(3))
-    theirs = SyncVectorEnv([lambda: single(cfg=short(3))] * 3, autoreset_mode=mode)
+def test_step_results_have_gymnasium_form_in_each_mode(mode):
+    ours = vector(autoreset_mode=mode, cfg=short_episodes(3))
+    theirs = SyncVectorEnv([lambda: single(cfg=short_episodes(3))] * 3, autoreset_mode=mode)
     assert ours.metadata["autoreset_mode"] is mode
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
@@ -96,8 +96,8 @@ def test_the_mode_is_declared_and_what_a_step_gives_has_the_form_of_gymnasiums_o
                 assert (mine.dtype, mine.shape) == (own.dtype, own.shape)
 
 
-def test_the_final_observations_are_where_episodes_ended_and_nowhere_else():
-    envs = vector(cfg=short(2))
+def test_final_obs_only_for_ended_episodes():
+    envs = vector(cfg=short_episodes(2))
     envs.reset(seed=1)
     assert "final_obs" not in envs.step(envs.action_space.sample())[4]
     obs, _, _, truncated, infos = envs.step(envs.action_space.sample())
@@ -108,7 +108,7 @@ def test_the_final_observations_are_where_episodes_ended_and_nowhere_else():
         assert bool(infos["final_info"]["success"][world]) is False
 
 
-def test_what_a_step_gave_is_not_written_to_again():
+def test_step_results_are_copies():
     envs = vector()
     kept = [envs.reset(seed=1)[0]]
     copies = [kept[0].copy()]
@@ -119,20 +119,20 @@ def test_what_a_step_gave_is_not_written_to_again():
         np.testing.assert_array_equal(ours, copy)
 
 
-def test_a_seed_gives_the_same_again_and_another_something_else():
+def test_seed_determines_episodes():
     envs = vector()
     first, again, other = (envs.reset(seed=seed)[0] for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
 
 
-def test_a_seed_for_each_environment_is_refused():
+def test_list_of_seeds_is_refused():
     with pytest.raises(TypeError, match="one number"):
         vector().reset(seed=[1, 2, 3])
 
 
-def test_without_autoreset_an_ended_environment_does_not_step_and_a_running_one_is_not_reset():
-    envs = vector(autoreset_mode="Disabled", cfg=short(2))
+def test_disabled_autoreset_refuses_step_and_early_reset():
+    envs = vector(autoreset_mode="Disabled", cfg=short_episodes(2))
     envs.reset(seed=1)
     envs.step(envs.action_space.sample())
     with pytest.raises(ValueError, match=r"\[1\], whose episodes have not ended"):
@@ -151,18 +151,18 @@ def test_without_autoreset_an_ended_environment_does_not_step_and_a_running_one_
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.filterwarnings(UNBOUNDED)
-def test_gymnasiums_checker_accepts_the_single_environment(task):
+def test_gymnasium_checker_accepts_single_env(task):
     check_env(single(task).unwrapped, skip_render_check=True)
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_sb3s_checker_accepts_the_single_environment_without_a_warning(task):
+def test_sb3_checker_accepts_single_env_without_warning(task):
     check_env_of_sb3(single(task))
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings(UNBOUNDED)
-def test_gymnasiums_checker_accepts_the_pictures():
+def test_gymnasium_checker_accepts_rendering():
     env = single(render_mode="rgb_array", cfg={"viewer.width": 64, "viewer.height": 48})
     check_env(env.unwrapped)
     env.reset()
@@ -170,8 +170,8 @@ def test_gymnasiums_checker_accepts_the_pictures():
     assert env.render().std() > 0
 
 
-def test_an_ended_episode_of_the_single_environment_wants_a_reset():
-    env = single(cfg=short(1)).unwrapped
+def test_single_env_requires_reset_after_episode():
+    env = single(cfg=short_episodes(1)).unwrapped
     env.reset(seed=2)
     last, _, _, truncated, info = env.step(env.action_space.sample())
     assert truncated
@@ -181,8 +181,8 @@ def test_an_ended_episode_of_the_single_environment_wants_a_reset():
     assert not np.array_equal(env.reset()[0], last)
 
 
-def test_the_single_environment_lives_as_the_first_of_many():
-    one, many = single(cfg=short(4)), vector(cfg=short(4))
+def test_single_env_equals_first_of_vector_env():
+    one, many = single(cfg=short_episodes(4)), vector(cfg=short_episodes(4))
     a, b = one.reset(seed=5)[0], many.reset(seed=5)[0][0]
     for _ in range(9):
         np.testing.assert_array_equal(a, b)
@@ -192,8 +192,8 @@ def test_the_single_environment_lives_as_the_first_of_many():
             a = one.reset()[0]
 
 
-def test_the_single_environment_is_of_one_world():
-    with pytest.raises(ValueError, match="2 worlds"):
+def test_single_env_requires_one_environment():
+    with pytest.raises(ValueError, match="takes 1 environment, found 2"):
         GymnasiumEnv(open_task("cartpole", 2))
 
 
@@ -201,36 +201,36 @@ def test_the_single_environment_is_of_one_world():
     "cfg", [{"episode_length_s": 1.0, "sim.dt": 0.01}, {"episode_length_s": 1.0, "sim": {"dt": 0.01}},
             ["episode_length_s=1.0", "sim.dt=0.01"]],
 )  # fmt: skip
-def test_the_configuration_is_changed_by_keys_or_overrides(cfg):
+def test_cfg_as_mapping_or_overrides(cfg):
     env = open_task("cartpole", 2, cfg)
     assert (env.num_envs, env.config.episode_length_s, env.physics_dt) == (2, 1.0, 0.01)
 
 
-def test_the_configuration_may_be_a_whole_one():
+def test_cfg_as_whole_configuration():
     task = resolve(find_task("cartpole"), overrides=["episode_length_s=2.0"])
     for cfg in (task, task.task):
         env = open_task("cartpole", 2, cfg)
         assert (env.num_envs, env.config.episode_length_s) == (2, 2.0)
 
 
-def test_a_mistake_in_the_configuration_is_said_with_its_key():
+def test_cfg_mistake_is_reported_with_key():
     with pytest.raises(Exception, match="episode_lenght_s"):
         vector(cfg={"episode_lenght_s": 1.0})
     with pytest.raises(TypeError, match="list of overrides"):
         vector(cfg="episode_length_s=1.0")
 
 
-def test_the_action_space_is_the_one_that_is_asked_for():
+def test_action_space_bounds():
     assert single(action_bound=None).action_space.high.tolist() == [np.inf]
     assert single(action_bound=2.0).action_space.high.tolist() == [2.0]
 
 
-def test_a_folder_is_made_by_its_path(tmp_path):
+def test_make_env_by_folder_path(tmp_path):
     folder = write(tmp_path / "swing", PENDULUM_TASK, pendulum_xml=PENDULUM)
     assert vector("task", task=str(folder)).num_envs == 3
 
 
-def test_all_installed_tasks_are_registered_and_a_name_that_two_share_with_its_distribution(tmp_path, monkeypatch):
+def test_register_all_qualifies_shared_names(tmp_path, monkeypatch):
     for name in ("first-plugin", "second_plugin"):
         metadata = tmp_path / f"{name.replace('-', '_')}-1.0.dist-info"
         metadata.mkdir()
@@ -250,8 +250,8 @@ def test_all_installed_tasks_are_registered_and_a_name_that_two_share_with_its_d
             gym.registry.pop(name, None)
 
 
-def test_episode_statistics_of_gymnasium_count_whole_episodes():
-    envs = gym.wrappers.vector.RecordEpisodeStatistics(vector(cfg=short(4)))
+def test_gymnasium_episode_statistics_count_whole_episodes():
+    envs = gym.wrappers.vector.RecordEpisodeStatistics(vector(cfg=short_episodes(4)))
     envs.reset(seed=1)
     for _ in range(12):
         envs.step(envs.action_space.sample())

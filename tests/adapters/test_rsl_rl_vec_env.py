@@ -1,4 +1,4 @@
-"""The environment as RSL-RL sees it."""
+"""RSL-RL adapter: sizes, observations, time-outs, resets."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ def steps(vec, count, action=0.1):
     return [vec.step(torch.full((3, 1), action)) for _ in range(count)]
 
 
-def test_sizes_and_groups_are_those_of_the_task(vec):
+def test_sizes_and_observation_groups(vec):
     assert (vec.num_envs, vec.num_actions, vec.max_episode_length) == (3, 1, 6)
     obs = vec.get_observations()
     assert {group: tuple(values.shape) for group, values in obs.items()} == {"policy": (3, 4), "critic": (3, 3)}
@@ -31,7 +31,7 @@ def test_sizes_and_groups_are_those_of_the_task(vec):
     }
 
 
-def test_looking_twice_starts_one_episode(vec):
+def test_get_observations_twice_starts_one_episode(vec):
     first = vec.get_observations()["policy"].clone()
     assert torch.equal(vec.get_observations()["policy"], first)
     steps(vec, 2)
@@ -39,7 +39,7 @@ def test_looking_twice_starts_one_episode(vec):
     assert not torch.equal(vec.get_observations()["policy"], first)
 
 
-def test_time_outs_are_marked_and_the_true_last_observations_come_along(vec):
+def test_time_outs_and_final_obs_in_extras(vec):
     *before, last = steps(vec, 6)
     for _, _, dones, extras in before:
         assert not dones.any()
@@ -53,20 +53,20 @@ def test_time_outs_are_marked_and_the_true_last_observations_come_along(vec):
     assert set(extras["log"]) >= {"Train/mean_reward", "Episode_Reward/alive"}
 
 
-def test_episode_lengths_can_be_set_as_the_runner_does_at_its_start(vec):
+def test_episode_length_buf_can_be_set(vec):
     vec.get_observations()
     vec.episode_length_buf = torch.tensor([5, 0, 3])
     *_, dones, _ = steps(vec, 1)[0]
     assert dones.tolist() == [1, 0, 0]
 
 
-def test_actions_are_clipped(vec):
+def test_clip_actions(vec):
     vec.get_observations()
     steps(vec, 1, action=7.0)
     assert vec.get_observations()["critic"][:, 2].tolist() == [0.5, 0.5, 0.5]
 
 
-def test_a_reset_starts_other_episodes(vec):
+def test_reset_starts_other_episodes(vec):
     first = vec.get_observations()["policy"].clone()
     obs, _ = vec.reset()
     assert not torch.equal(obs["policy"], first)

@@ -10,12 +10,12 @@ PROBE = """
 import gc, sys
 from rlcli import machine
 usual = gc.get_threshold()
-as_usual, seen = machine.collect_as_usual, []
+as_usual, seen = machine.restore_garbage_collection, []
 def told():
     seen.append(gc.get_threshold())
     as_usual()
     seen.append(gc.get_threshold())
-machine.collect_as_usual = told
+machine.restore_garbage_collection = told
 from rlcli.cli.app import main
 code = main()
 assert code == 0, code

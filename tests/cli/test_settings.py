@@ -13,7 +13,7 @@ from rlcli.cli.ui import viewer_choice
 from rlcli.config.settings_file import read_settings
 from rlcli.config.settings_schema import UserSettings
 from rlcli.runs.run_ref import default_runs_dir
-from rlcli.settings import applied, settings_file
+from rlcli.settings import settings_file, use_settings
 from rlcli.training.loggers import LOGGERS
 
 
@@ -85,14 +85,14 @@ def test_a_preferred_viewer_is_opened_only_where_play_may_choose(monkeypatch):
     def first(viewer, port=None, headless=False):
         return viewer_choice.choose_viewers(viewer, port, headless=headless)[0][0]
 
-    with applied({"viewer": "web"}):
+    with use_settings({"viewer": "web"}):
         assert first(None) == "web"
         assert first("auto") == "none", "no terminal asks"
         assert first("none") == "none"
         assert first(None, headless=True) == "none", "a file is written"
-    with applied({"viewer": "native"}):
+    with use_settings({"viewer": "native"}):
         assert first(None) == "none", "there is no display"
-    with applied({"viewer": "none"}):
+    with use_settings({"viewer": "none"}):
         assert first(None, port=8080) == "web", "a port is a viewer in the browser"
 
 

@@ -240,9 +240,12 @@ def test_what_rlcli_itself_raises_is_a_bug_with_its_traceback(in_process, monkey
     [
         (["train", "--task", "cartpole"], "rlcli train cartpole"),
         (["play", "--load_run", "x"], "--checkpoint RUN"),
-        (["train", "cartpole", "env.scene.num_envs=8"], "leave 'env.' out"),
-        (["train", "cartpole", "sim.device=cpu"], "it is an option: --device cpu"),
-        (["train", "cartpole", "events.reset_cart.params.position=[0,1]"], "stand beside its 'func'"),
+        (["train", "cartpole", "env.scene.num_envs=8"], "remove 'env.'"),
+        (["train", "cartpole", "sim.device=cpu"], "the device is an option: --device cpu"),
+        (
+            ["train", "cartpole", "events.reset_cart.params.position=[0,1]"],
+            "write the parameters of a term beside its 'func'",
+        ),
     ],
 )
 def test_habits_of_other_programs_are_answered_with_what_is_written_here(in_process, arguments, said):

@@ -1,4 +1,4 @@
-"""A small task in a folder, and what reading it gives."""
+"""Fixtures: a small task in a folder, and the problems of its configuration."""
 
 import textwrap
 
@@ -12,7 +12,7 @@ from rlcli.registry import folder_task
 
 @pytest.fixture
 def task(tmp_path):
-    """task(yaml, terms.py=..., ...) -> the source of a task folder."""
+    """task(yaml, terms.py=..., ...) -> the source of a new task folder."""
 
     def make(text=TASK, **files):
         folder = tmp_path / "small"
@@ -28,7 +28,7 @@ def task(tmp_path):
 
 @pytest.fixture
 def problems_of(task):
-    """problems_of(yaml, overrides...) -> the messages of phase 1."""
+    """problems_of(yaml, overrides...) -> the problems of the configuration, as text."""
 
     def find(text, *overrides, files=None, **options):
         with pytest.raises(ConfigError) as caught:

@@ -1,4 +1,4 @@
-"""Which agent is chosen, what addresses it, and what a task must have: each in its own words."""
+"""Choice of the agent, changes of the agent, and sections that a task must have."""
 
 import pytest
 from support.small_task import TASK
@@ -35,7 +35,7 @@ BY_DEVICE = with_agents(f"{{default: {{cpu: a, cuda: b}}, a: {AGENT}, b: {AGENT}
         (with_agents(f"{{default: {{cuda: b}}, a: {AGENT}, b: {AGENT}}}"), {"device": "cpu"}, None),
     ],
 )
-def test_the_agent_is_the_one_that_was_asked_for_or_the_default_or_the_only_one(task, text, options, name):
+def test_agent_choice_by_name_default_or_device(task, text, options, name):
     resolved = resolve(task(text), **options)
     assert resolved.agent_name == name
     assert (resolved.agent is None) == (name is None)
@@ -44,7 +44,7 @@ def test_the_agent_is_the_one_that_was_asked_for_or_the_default_or_the_only_one(
         resolved.require_agent()
 
 
-def test_the_names_of_agents_leave_out_the_default(task):
+def test_agent_names_exclude_default(task):
     assert agent_names(resolve(task()).layers) == ["one", "two"]
     assert agent_names(resolve(task(HEAD)).layers) == []
 
@@ -99,19 +99,19 @@ def test_the_names_of_agents_leave_out_the_default(task):
         ),
     ],
 )
-def test_each_mistake_about_agents_is_said_once_and_hides_no_other(problems_of, text, overrides, said):
+def test_agent_mistakes_are_reported_once_with_all_others(problems_of, text, overrides, said):
     found = problems_of(text, *overrides)
     assert len(found) == len(said)
     for line, expected in zip(sorted(found), sorted(said), strict=True):
         assert line.endswith(expected) or expected in line
 
 
-def test_removing_what_is_there_or_is_like_nothing_is_no_mistake(task):
+def test_null_override_of_missing_term_is_ignored(task):
     resolved = resolve(task(), overrides=["rewards.near=null", "rewards.zzzzzz=null"])
     assert set(resolved.task.rewards) == {"alive"}
 
 
-def test_a_config_file_addresses_the_chosen_agent_and_its_own_patches(task, tmp_path, problems_of):
+def test_config_file_changes_chosen_agent_and_patches(task, tmp_path, problems_of):
     config = tmp_path / "mine.yaml"
     config.write_text("agent: {gamma: 0.5}\nagents: {two: {gae_lambda: 0.25}}\nplay: {decimation: 7}\n")
     resolved = resolve(task(), agent="two", config_file=config, play=True)
@@ -127,12 +127,12 @@ def test_a_config_file_addresses_the_chosen_agent_and_its_own_patches(task, tmp_
         assert said in message
 
 
-def test_flags_are_written_as_they_are_typed(problems_of):
+def test_problem_of_flag_shows_flag_name(problems_of):
     (message,) = problems_of(TASK, flags={"scene.num_envs": 0})
     assert message.startswith("--num-envs: scene.num_envs: expected a whole number >= 1")
 
 
-def test_overrides_that_are_none_are_all_said_with_the_rest(problems_of):
+def test_malformed_overrides_are_all_reported(problems_of):
     found = problems_of(TASK, "decimation", "sim.dt=[", "scene.num_envs=0")
     assert len(found) == 3
     assert "is not of the form key.path=value" in found[0]
@@ -158,7 +158,7 @@ def test_overrides_that_are_none_are_all_said_with_the_rest(problems_of):
         ("observations:\n  policy:\n    pos: {func: joint_pos_rel}\n", "", "observations: needs a group 'policy'"),
     ],
 )
-def test_a_manager_based_task_needs_actions_rewards_and_observations(problems_of, old, new, said):
+def test_manager_based_task_requires_sections(problems_of, old, new, said):
     assert old in TASK
     found = problems_of(TASK.replace(old, new))
     assert any(said in line for line in found), found
@@ -179,13 +179,13 @@ def test_a_manager_based_task_needs_actions_rewards_and_observations(problems_of
         ("terminations.time_out.func=is_terminated", "no termination term 'is_terminated'", "is a term of rewards"),
     ],
 )
-def test_a_term_that_is_not_there_is_told_by_its_nearest_name_or_its_section(problems_of, override, said, hint):
+def test_unknown_term_suggests_name_or_section(problems_of, override, said, hint):
     (message,) = problems_of(TASK, override)
     assert said in message
     assert hint in message
 
 
-def test_the_terms_of_a_configuration_are_listed_with_their_sections():
+def test_term_entries_returns_section_and_path():
     data = {
         "success": {"func": "s"},
         "rewards": {"a": {"func": "r"}, "b": 3, "c": None},
@@ -200,7 +200,7 @@ def test_the_terms_of_a_configuration_are_listed_with_their_sections():
     }
 
 
-def test_a_term_that_is_removed_is_gone_and_the_others_keep_their_order(task):
+def test_removed_term_keeps_order_of_others(task):
     text = TASK.replace("rewards:\n", "rewards:\n  gone: null\n")
     resolved = resolve(task(text), overrides=["observations.policy.vel={func: joint_vel_rel}", "rewards.alive=null"])
     assert list(resolved.task.rewards) == ["near"]
@@ -215,7 +215,7 @@ OWN = """
 """
 
 
-def test_a_tasks_own_terms_are_checked_by_their_signatures(task, problems_of):
+def test_own_terms_are_checked_by_signature(task, problems_of):
     text = TASK.replace("{func: is_alive, weight: 1.0}", "{func: mine, weight: 1.0, gain: 3}")
     assert resolve(task(text, terms=OWN)).task.rewards["alive"].params == {"gain": 3.0}
     (message,) = problems_of(text.replace("gain: 3", "gian: 3"), files={"terms": OWN})
@@ -250,7 +250,7 @@ PARAMS = (
 DIRECT = HEAD.partition("actions:")[0]
 
 
-def test_a_direct_tasks_parameters_are_checked_against_its_class(task, problems_of):
+def test_direct_params_are_checked_against_class(task, problems_of):
     given = f"{DIRECT}params: {{steps: 3}}\n"
     assert resolve(task(given, task=PARAMS)).task.params == {"gain": 2.0, "steps": 3}
     assert extensions(task(given, task=PARAMS))[1] is not None
@@ -260,15 +260,15 @@ def test_a_direct_tasks_parameters_are_checked_against_its_class(task, problems_
     assert "missing key 'steps'" in message
 
 
-def test_a_direct_task_has_no_terms_and_only_declared_parameters(task, problems_of):
+def test_direct_task_refuses_terms_and_undeclared_params(task, problems_of):
     assert resolve(task(DIRECT, task=PLAIN)).task.params == {}
     (message,) = problems_of(f"{DIRECT}params: {{x: 1}}\n", files={"task": PLAIN})
-    assert "params: this task's class declares no Params" in message
+    assert "params: the class of this task has no Params" in message
     (message,) = problems_of(f"{DIRECT}rewards: {{a: {{func: is_alive, weight: 1}}}}\n", files={"task": PLAIN})
-    assert "rewards: a direct task has no rewards terms; its class does this" in message
+    assert "rewards: a direct task has no rewards terms; its class implements them" in message
 
 
-def test_checking_all_tries_every_agent_and_play(task):
+def test_check_all_covers_every_agent_and_play(task):
     text = SEVERAL.replace("play: {scene: {num_envs: 2}}", "play: {decimation: -1}")
     with pytest.raises(ConfigError) as caught:
         check_all(task(text))
@@ -278,7 +278,7 @@ def test_checking_all_tries_every_agent_and_play(task):
         check_all(task(), overrides=["scene.num_envs=0"])
 
 
-def test_the_agents_patch_is_applied_before_plays_and_after_the_task(task):
+def test_agent_patch_is_applied_before_play_patch(task):
     text = TASK.replace("play: {scene: {num_envs: 2}}", "play: {decimation: 9}")
     assert resolve(task(text)).task.decimation == 3
     assert resolve(task(text), play=True).task.decimation == 9
@@ -289,7 +289,7 @@ def test_the_agents_patch_is_applied_before_plays_and_after_the_task(task):
     assert resolve(task(text), play=True, overrides=["play.decimation=6"]).task.decimation == 6
 
 
-def test_a_known_trainer_that_is_there_but_cannot_be_found_is_not_called_missing(task, monkeypatch):
+def test_ambiguous_trainer_is_not_reported_as_missing(task, monkeypatch):
     from rlcli.config import validation
 
     def two(*_, **__):
@@ -300,16 +300,12 @@ def test_a_known_trainer_that_is_there_but_cannot_be_found_is_not_called_missing
         resolve(task(TASK.replace("one: {trainer: sb3", "one: {trainer: ppo")))
 
 
-def test_a_trainer_of_a_newer_api_is_refused(task, monkeypatch):
+def test_trainer_with_newer_api_is_refused(task, monkeypatch):
     from dataclasses import replace
 
-    from rlcli.config import validation
+    from rlcli.registry import imports
 
-    real = validation.load_entry
-    monkeypatch.setattr(
-        validation, "load_entry", lambda entry, kind: replace(real(entry, kind), api=validation.API_VERSION + 1)
-    )
-    with pytest.raises(
-        TaskError, match=rf"needs plugin API {validation.API_VERSION + 1}; this rlcli has {validation.API_VERSION}"
-    ):
+    real, newer = imports.load_entry, imports.API_VERSION + 1
+    monkeypatch.setattr(imports, "load_entry", lambda entry, kind: replace(real(entry, kind), api=newer))
+    with pytest.raises(TaskError, match=rf"needs plugin API {newer}; this rlcli has {imports.API_VERSION}"):
         resolve(task())

@@ -1,4 +1,4 @@
-"""What `show` prints: YAML that reads back as the same configuration, origins, and a JSON Schema."""
+"""Output of `show`: YAML that reads back as the same configuration, origins, and a JSON Schema."""
 
 import copy
 
@@ -58,12 +58,12 @@ _DATA = st.dictionaries(
 )
 
 
-def same(a, b):
-    """Equal, and of equal types all the way down."""
+def equal_with_types(a, b):
+    """Return whether two values are equal and have equal types at every level."""
     if isinstance(a, dict):
-        return type(b) is dict and list(a) == list(b) and all(same(a[k], b[k]) for k in a)
+        return type(b) is dict and list(a) == list(b) and all(equal_with_types(a[k], b[k]) for k in a)
     if isinstance(a, list):
-        return type(b) is list and len(a) == len(b) and all(map(same, a, b))
+        return type(b) is list and len(a) == len(b) and all(map(equal_with_types, a, b))
     return type(a) is type(b) and a == b
 
 
@@ -72,13 +72,13 @@ def same(a, b):
 @example({"a": 1e-05, "b": 1e22, "c": -0.0, "d": 5e-324, "e": 1.7976931348623157e308, "f": 1.0})
 @example({"<<": "<<"})
 @example({"on": "on", "010": "010", "x": ["1e-3", "null", ""], "y": {}, "z": []})
-def test_plain_data_reads_back_unchanged(data):
-    assert same(strict_yaml.load(to_yaml(data)).data, data)
+def test_to_yaml_round_trips_plain_data(data):
+    assert equal_with_types(strict_yaml.load(to_yaml(data)).data, data)
 
 
 @pytest.mark.parametrize("name", ["ant-direct", "cartpole", "cartpole-direct"])
 @pytest.mark.parametrize("play", [False, True])
-def test_a_built_in_task_reads_back_as_the_same_configuration(name, play, tmp_path):
+def test_to_yaml_round_trips_built_in_task(name, play, tmp_path):
     from dataclasses import replace
 
     source = find_task(name)
@@ -99,7 +99,7 @@ def test_a_built_in_task_reads_back_as_the_same_configuration(name, play, tmp_pa
 @example(summary="", weight=1e22, joint="null")
 @example(summary="two\nlines", weight=1.0, joint="a\nb: c")
 @example(summary="?", weight=1.0, joint="a joint with a long name " * 8)
-def test_any_values_read_back(tmp_path_factory, summary, weight, joint):
+def test_to_yaml_round_trips_any_values(tmp_path_factory, summary, weight, joint):
     from rlcli.registry import folder_task
 
     folder = tmp_path_factory.mktemp("t")
@@ -120,13 +120,13 @@ def test_any_values_read_back(tmp_path_factory, summary, weight, joint):
     assert resolved[0].task.rewards["near"].params["joints"] == [joint]
 
 
-def test_a_removed_term_stays_removed_and_a_null_stays_null(task):
+def test_to_data_keeps_removed_terms_and_null(task):
     data = to_data(resolve(task(), overrides=["rewards.near=null", "scene.ground=null"]))
     assert list(data["rewards"]) == ["alive"]
     assert data["scene"]["ground"] is None
 
 
-def test_every_value_has_an_origin(task):
+def test_origins_cover_every_value(task):
     overrides = ["sim.gravity=[0, 0, -1]", "sim.gravity.2=-3", "rewards.alive.weight=2", 'summary="two\\nlines"']
     resolved = resolve(task(), overrides=overrides, flags={"scene.num_envs": 3})
     label = resolved.source.label
@@ -150,7 +150,7 @@ def validator(source):
 
 
 @pytest.mark.parametrize("name", ["ant-direct", "cartpole", "cartpole-direct"])
-def test_the_schema_accepts_the_built_in_tasks_as_written_and_as_shown(name):
+def test_json_schema_accepts_built_in_tasks(name):
     source = find_task(name)
     check = validator(source)
     written = strict_yaml.load(source.config.read_bytes()).data
@@ -172,7 +172,7 @@ def test_the_schema_accepts_the_built_in_tasks_as_written_and_as_shown(name):
         (("success", "tolerance"), None),
     ],
 )
-def test_the_schema_refuses_what_the_program_refuses(path, value):
+def test_json_schema_refuses_invalid_values(path, value):
     source = find_task("cartpole")
     data = copy.deepcopy(strict_yaml.load(source.config.read_bytes()).data)
     target = data
@@ -182,7 +182,7 @@ def test_the_schema_refuses_what_the_program_refuses(path, value):
     assert list(validator(source).iter_errors(data))
 
 
-def test_the_schema_knows_the_terms_and_the_params_of_a_task(task):
+def test_json_schema_contains_own_terms_and_params(task):
     terms = 'def mine(env, *, x: float = 2.0):\n    """My term."""\ndef odd(env, *, weight: float): ...\n'
     schema = json_schema(*extensions(task(terms=terms)))
     rewards = {

@@ -1,4 +1,4 @@
-"""Mistakes in a configuration: all at once, each with its place, what is allowed and the nearest right thing."""
+"""Messages for mistakes in a configuration: all at once, each with location, allowed values and a suggestion."""
 
 import pytest
 from support.small_task import TASK
@@ -18,7 +18,7 @@ TYPOS = [
     ("sim.dt=nan", "sim.dt: expected a number, found 'nan'", None),
     ("sim.dt=.nan", "sim.dt: .nan is not allowed", None),
     ("sim.dt=1/0", "sim.dt: expected a number, found '1/0'", None),
-    ('sim.dt="0.01"', "sim.dt: expected a number, found '0.01'", "drop the quotes"),
+    ('sim.dt="0.01"', "sim.dt: expected a number, found '0.01'", "remove the quotes"),
     ("sim.dt=true", "sim.dt: expected a number, found true", None),
     (
         "sim.integrator=rk5",
@@ -94,14 +94,14 @@ TYPOS = [
 
 
 @pytest.mark.parametrize(("override", "said", "hint"), TYPOS, ids=[t[0] for t in TYPOS])
-def test_one_mistake_is_one_message(problems_of, override, said, hint):
+def test_one_mistake_gives_one_message(problems_of, override, said, hint):
     (message,) = problems_of(TASK, override, play=True)
     assert message.startswith(f"override '{override}': ")
     assert said in message
     assert hint is None or hint in message
 
 
-def test_all_problems_are_reported_at_once_each_at_its_place(problems_of, tmp_path):
+def test_all_problems_are_reported_with_location(problems_of, tmp_path):
     config = tmp_path / "mine.yaml"
     config.write_text("viewer:\n  width: wide\nagent:\n  gamma: 2\n")
     text = TASK.replace("decimation: 2", "decimation: -2").replace(
@@ -124,18 +124,18 @@ def test_all_problems_are_reported_at_once_each_at_its_place(problems_of, tmp_pa
     )
 
 
-def test_a_relation_between_keys_is_said_of_their_owner(problems_of):
+def test_relation_of_keys_is_reported_at_their_mapping(problems_of):
     (message,) = problems_of(TASK, "agent.max_iterations=null")
-    assert "task.yaml:22:3: agents.one: one of max_iterations and max_steps is needed" in message
+    assert "task.yaml:22:3: agents.one: set max_iterations or max_steps" in message
 
 
-def test_an_unknown_agent_does_not_hide_other_mistakes(problems_of):
+def test_unknown_agent_does_not_hide_other_mistakes(problems_of):
     found = problems_of(TASK, "decimation=0", agent="on")
     assert any("no agent 'on'; did you mean 'one'" in line for line in found)
     assert any("decimation" in line for line in found)
 
 
-def test_a_known_trainer_that_is_not_installed_names_the_pip_line(task, monkeypatch):
+def test_missing_trainer_plugin_gives_pip_command(task, monkeypatch):
     monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")
     source = task(TASK.replace("two: {trainer: sb3", "two: {trainer: rsl-rl"))
     with pytest.raises(DependencyError) as caught:
@@ -146,7 +146,7 @@ def test_a_known_trainer_that_is_not_installed_names_the_pip_line(task, monkeypa
         resolve(source, agent="two", overrides=["decimation=0"])
 
 
-def test_every_agent_and_the_play_patch_are_checked_at_once(task):
+def test_check_all_reports_all_agents_and_play_patch(task):
     text = TASK.replace("gamma: 0.9", "gamma: 9").replace(
         "play: {scene: {num_envs: 2}}", "play: {scene: {num_envs: -2}}"
     )
@@ -155,7 +155,7 @@ def test_every_agent_and_the_play_patch_are_checked_at_once(task):
     assert [problem.path for problem in caught.value.problems] == ["scene.num_envs", "agents.two.gamma"]
 
 
-def test_agents_that_cannot_be_checked_are_named(task, monkeypatch):
+def test_check_all_returns_unchecked_agents(task, monkeypatch):
     monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")
     assert check_all(task(TASK.replace("two: {trainer: sb3", "two: {trainer: rsl-rl"))) == ["two"]
     assert check_all(task()) == []
@@ -172,7 +172,7 @@ def test_agents_that_cannot_be_checked_are_named(task, monkeypatch):
         ),
     ],
 )
-def test_training_without_an_agent_says_what_to_do(task, agents, message, hint):
+def test_require_agent_gives_hint(task, agents, message, hint):
     resolved = resolve(task(TASK.partition("agents:")[0] + agents + "\n"))
     with pytest.raises(ConfigError) as caught:
         resolved.require_agent()
@@ -189,7 +189,7 @@ def test_training_without_an_agent_says_what_to_do(task, agents, message, hint):
         ("rewards:\n", None),
     ],
 )
-def test_missing_sections_are_named(problems_of, missing, said):
+def test_missing_section_is_reported(problems_of, missing, said):
     text = TASK.replace(", decimation: 3", "")
     if missing == "rewards:\n":
         text = text.replace(text[text.index("rewards:") : text.index("terminations:")], "")
@@ -199,7 +199,7 @@ def test_missing_sections_are_named(problems_of, missing, said):
     assert said in found[0]
 
 
-def test_a_fraction_is_a_number_only_where_a_number_is_expected(task):
+def test_fraction_is_number_only_for_number_keys(task):
     resolved = resolve(
         task(), overrides=["sim.dt=1/240", "summary=1/2", "rewards.near.target=-1/4", "viewer.eye=[1/8, 0, 0]"]
     )
@@ -209,5 +209,5 @@ def test_a_fraction_is_a_number_only_where_a_number_is_expected(task):
     assert resolved.task.viewer.eye[0] == 0.125
 
 
-def test_a_file_that_cannot_be_parsed_is_named_with_its_position(problems_of):
+def test_unparsable_file_is_reported_with_position(problems_of):
     assert "task.yaml:2:1: duplicate key 'a'" in problems_of("a: 1\na: 2\n")[0]

@@ -1,53 +1,53 @@
-"""Layers: what wins, and where each value was written."""
+"""Layers of a configuration: merging, setting values, origins."""
 
 import os
 import threading
 
 import pytest
 
-from rlcli.config.layers import Layers, Origin, marked, parse_address, parse_override, read
+from rlcli.config.layers import Layers, Origin, document_origins, parse_address, parse_override, read
 from rlcli.config.strict_yaml import Document, load
 from rlcli.errors import ConfigError
 
 TASK, PATCH, OVERRIDE = Origin("task", "task.yaml:1:1"), Origin("agent", "task.yaml:9:1"), Origin("override", "x=1")
 
 
-def layered(data, origin=TASK):
+def make_layers(data, origin=TASK):
     layers = Layers()
     layers.merge(data, lambda path: origin)
     return layers
 
 
-def test_mappings_are_merged_key_by_key_and_everything_else_is_replaced():
-    layers = layered({"a": {"x": 1, "y": [1, 2]}, "b": 1, "c": {"z": 1}})
+def test_merge_merges_mappings_and_replaces_other_values():
+    layers = make_layers({"a": {"x": 1, "y": [1, 2]}, "b": 1, "c": {"z": 1}})
     layers.merge({"a": {"y": [3], "w": {"v": 4}}, "b": {"q": 1}, "c": 5}, lambda path: PATCH)
     assert layers.data == {"a": {"x": 1, "y": [3], "w": {"v": 4}}, "b": {"q": 1}, "c": 5}
     from_patch = [("a", "y"), ("a", "y", 0), ("a", "w"), ("a", "w", "v"), ("b",), ("b", "q"), ("c",)]
     assert {path for path, origin in layers.origins.items() if origin is PATCH} == set(from_patch)
     assert layers.origins["a", "x"] is layers.origins["a",] is layers.origins[()] is TASK
-    assert ("a", "y", 1) not in layers.origins, "of what is gone nothing is remembered"
+    assert ("a", "y", 1) not in layers.origins, "origins of replaced values are removed"
     assert ("c", "z") not in layers.origins
 
 
-def test_a_mapping_in_the_place_of_a_list_takes_what_was_known_of_it():
-    layers = layered({"a": [1, 2]})
+def test_merge_of_mapping_over_list_removes_item_origins():
+    layers = make_layers({"a": [1, 2]})
     layers.merge({"a": {"x": 1}}, lambda path: PATCH)
     assert layers.data == {"a": {"x": 1}}
     assert {path: origin for path, origin in layers.origins.items() if path} == {("a",): PATCH, ("a", "x"): PATCH}
 
 
-def test_a_patch_is_asked_for_its_own_paths_and_lands_where_it_should():
-    layers, asked = layered({"agents": {"ppo": {"gamma": 0.9}}}), []
-    layers.merge({"lr": {"start": 1}}, lambda path: asked.append(path) or PATCH, ("agents", "ppo", "deep"))
+def test_merge_at_path_calls_origin_with_patch_paths():
+    layers, paths = make_layers({"agents": {"ppo": {"gamma": 0.9}}}), []
+    layers.merge({"lr": {"start": 1}}, lambda path: paths.append(path) or PATCH, ("agents", "ppo", "deep"))
     assert layers.data == {"agents": {"ppo": {"gamma": 0.9, "deep": {"lr": {"start": 1}}}}}
-    assert ("lr", "start") in asked
-    assert ("agents",) not in asked
+    assert ("lr", "start") in paths
+    assert ("agents",) not in paths
     assert layers.origins["agents", "ppo", "deep"] is PATCH
     assert layers.origins["agents", "ppo"] is TASK
 
 
-def test_where_a_patch_lands_is_made_a_mapping():
-    layers = layered({"agents": {"ppo": None}})
+def test_merge_at_path_creates_mapping():
+    layers = make_layers({"agents": {"ppo": None}})
     layers.merge({"lr": 1}, lambda path: PATCH, ("agents", "ppo", "deep"))
     assert layers.data == {"agents": {"ppo": {"deep": {"lr": 1}}}}
     assert layers.origins["agents", "ppo"] is layers.origins["agents", "ppo", "deep"] is PATCH
@@ -55,9 +55,9 @@ def test_where_a_patch_lands_is_made_a_mapping():
     assert layers.place(("agents", "ppo", "deep", "lr")) == PATCH.where
 
 
-def test_what_was_merged_is_a_copy():
+def test_merge_copies_data():
     data = {"a": {"x": [{"y": 1}]}}
-    layers = layered(data)
+    layers = make_layers(data)
     layers.set(("a", "x", "0", "y"), 2, OVERRIDE)
     assert data == {"a": {"x": [{"y": 1}]}}
     assert layers.data == {"a": {"x": [{"y": 2}]}}
@@ -75,18 +75,18 @@ def test_what_was_merged_is_a_copy():
         (("a", "l"), [], {"a": {"x": 1, "l": []}}),
     ],
 )
-def test_one_value_is_set_and_its_origin_with_it(path, value, data):
-    layers = layered({"a": {"x": 1, "l": [1, {"k": 2}]}})
+def test_set_changes_value_and_origin(path, value, data):
+    layers = make_layers({"a": {"x": 1, "l": [1, {"k": 2}]}})
     layers.set(path, value, OVERRIDE)
     assert layers.data == data
     own = tuple(int(step) if str(step).isdigit() else step for step in path)
     assert layers.origin(own) is OVERRIDE
     assert layers.origin(()) is TASK
-    assert all(p[: len(own)] != own or p == own for p in layers.origins), "nothing of what was below is remembered"
+    assert all(p[: len(own)] != own or p == own for p in layers.origins), "origins below the replaced value are removed"
 
 
-def test_a_mapping_that_is_made_on_the_way_comes_from_the_override():
-    layers = layered({"a": None, "b": {"old": 1}})
+def test_set_creates_mappings_with_override_origin():
+    layers = make_layers({"a": None, "b": {"old": 1}})
     layers.set(("a", "x", "y"), {"k": [5]}, OVERRIDE)
     assert layers.data["a"] == {"x": {"y": {"k": [5]}}}
     made = [("a",), ("a", "x"), ("a", "x", "y"), ("a", "x", "y", "k"), ("a", "x", "y", "k", 0)]
@@ -108,16 +108,16 @@ def test_a_mapping_that_is_made_on_the_way_comes_from_the_override():
         (("l", "0", "y"), "'0' is a value, not a mapping"),
     ],
 )
-def test_a_path_into_something_that_has_no_such_member_is_refused(path, said):
-    layers = layered({"l": [1, 2], "n": 3})
+def test_set_refuses_path_without_member(path, said):
+    layers = make_layers({"l": [1, 2], "n": 3})
     with pytest.raises(LookupError) as caught:
         layers.set(path, 1, OVERRIDE)
     assert caught.value.args[0].replace("'0' is", "'0' is") == said
     assert layers.data == {"l": [1, 2], "n": 3}
 
 
-def test_a_value_is_got_or_the_default():
-    layers = layered({"a": {"x": 0, "n": None}, "l": [1]})
+def test_get_returns_value_or_default():
+    layers = make_layers({"a": {"x": 0, "n": None}, "l": [1]})
     assert layers.get(("a", "x"), 5) == 0
     assert layers.get(("a", "n"), 5) is None
     assert layers.get(("a", "y"), 5) == 5
@@ -127,8 +127,8 @@ def test_a_value_is_got_or_the_default():
     assert layers.get(("b",)) is None
 
 
-def test_a_place_is_that_of_the_nearest_thing_around():
-    layers = layered({"a": {"x": 1}})
+def test_place_falls_back_to_enclosing_value():
+    layers = make_layers({"a": {"x": 1}})
     layers.set(("a", "y"), 2, OVERRIDE)
     assert layers.place(("a", "y", "z", "w")) == OVERRIDE.where
     assert layers.place(("a", "nothing")) == TASK.where
@@ -140,19 +140,22 @@ def test_a_place_is_that_of_the_nearest_thing_around():
 # --- files ---
 
 
-def test_a_part_of_a_document_knows_its_lines():
+def test_document_origins_of_part_have_lines():
     document = load("a: 1\nagent:\n  lr: 2\n  net: {h: [3]}\n")
-    whole, part = marked(document, "f.yaml", "config"), marked(document, "f.yaml", "config", ("agent",))
+    whole, part = (
+        document_origins(document, "f.yaml", "config"),
+        document_origins(document, "f.yaml", "config", ("agent",)),
+    )
     assert whole(("a",)) == Origin("config", "f.yaml:1:1")
     assert part(("lr",)) == Origin("config", "f.yaml:3:3")
     assert part(("net", "h", 0)) == Origin("config", "f.yaml:4:13")
     assert part(("net", "none")) == part(("net",)) == Origin("config", "f.yaml:4:3")
     assert part(("other",)) == part(()) == Origin("config", "f.yaml:2:1")
     assert whole(("other",)) == Origin("config", "f.yaml:1:1")
-    assert marked(Document({"a": 1}), "task.py", "task")(("a",)) == Origin("task", "task.py")
+    assert document_origins(Document({"a": 1}), "task.py", "task")(("a",)) == Origin("task", "task.py")
 
 
-def test_a_file_that_cannot_be_read_or_parsed_is_a_problem_at_its_place(tmp_path):
+def test_read_reports_unreadable_file_with_position(tmp_path):
     (tmp_path / "bad.yaml").write_text("a: 1\na: 2\n")
     with pytest.raises(ConfigError) as caught:
         read(tmp_path / "bad.yaml", "mine")
@@ -167,10 +170,12 @@ def test_a_file_that_cannot_be_read_or_parsed_is_a_problem_at_its_place(tmp_path
     (tmp_path / "big.yaml").write_text("a: 1\n" * 60_000)
     with pytest.raises(ConfigError) as caught:
         read(tmp_path / "big.yaml", pipe=True)
-    assert [p.where for p in caught.value.problems] == [str(tmp_path / "big.yaml")], "the file as a whole has no line"
+    assert [p.where for p in caught.value.problems] == [str(tmp_path / "big.yaml")], (
+        "a problem of the whole file has no line"
+    )
 
 
-def test_a_pipe_is_read_only_where_one_may_be(tmp_path):
+def test_read_accepts_pipe_only_if_allowed(tmp_path):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     with pytest.raises(ConfigError, match="cannot be read"):
@@ -195,17 +200,17 @@ def test_a_pipe_is_read_only_where_one_may_be(tmp_path):
         ("a={x: 1,\n y: 2}", ("a",), {"x": 1, "y": 2}),
     ],
 )
-def test_an_override_is_a_path_and_a_value(text, path, value):
+def test_parse_override_returns_path_and_value(text, path, value):
     assert parse_override(text) == (path, value)
 
 
 @pytest.mark.parametrize("text", ["a", "=1", "a..b=1", ".a=1", "a.=1", "a b=1", '"a=1', ""])
-def test_what_is_no_override_is_refused(text):
+def test_parse_override_refuses_other_forms(text):
     with pytest.raises(ConfigError, match=r"is not of the form key\.path=value"):
         parse_override(text)
 
 
-def test_a_value_that_is_no_yaml_is_a_problem_at_its_key():
+def test_parse_override_reports_bad_yaml_at_key():
     with pytest.raises(ConfigError) as caught:
         parse_override("a.b=[1")
     (problem,) = caught.value.problems

@@ -1,4 +1,4 @@
-"""Layers: who wins, what each value's origin says, and what overrides address."""
+"""Precedence of the layers, origins of values, and targets of overrides."""
 
 import pytest
 import yaml
@@ -11,7 +11,7 @@ from rlcli.config.load import resolve
 from rlcli.errors import ConfigError
 
 
-def test_each_layer_wins_over_the_ones_before_it(task, tmp_path):
+def test_later_layers_win(task, tmp_path):
     source = task(TASK.replace("  num_envs: 8\n", ""))
     config = tmp_path / "mine.yaml"
 
@@ -30,12 +30,12 @@ def test_each_layer_wins_over_the_ones_before_it(task, tmp_path):
     assert num_envs(config_file=config, overrides=["scene.num_envs=32"], flags={"scene.num_envs": 64}) == 64
 
 
-def test_a_later_override_wins(task):
+def test_later_override_wins(task):
     resolved = resolve(task(), overrides=["decimation=4", "decimation=5"])
     assert resolved.task.decimation == 5
 
 
-def test_every_value_knows_where_it_was_written(task, tmp_path):
+def test_place_of_values_from_each_layer(task, tmp_path):
     source = task()
     config = tmp_path / "mine.yaml"
     config.write_text("viewer:\n  eye: [1, 2, 3]\nagent: {gamma: 0.5}\n")
@@ -67,17 +67,17 @@ def test_every_value_knows_where_it_was_written(task, tmp_path):
         ('a="1e-3"', ("a",), "1e-3"),
     ],
 )
-def test_overrides_are_keys_and_yaml_values(text, path, value):
+def test_parse_override_reads_keys_and_yaml_values(text, path, value):
     assert parse_override(text) == (path, value)
 
 
 @pytest.mark.parametrize("text", ["a", "=1", "a.=1", ".a=1", "a..b=1", 'a."b=1', "a b=1", ""])
-def test_what_is_not_an_override_is_refused_by_its_text(text):
+def test_parse_override_refuses_malformed_text(text):
     with pytest.raises(ConfigError, match=r"is not of the form key\.path=value"):
         parse_override(text)
 
 
-def test_items_of_lists_are_addressed_by_index(task):
+def test_override_of_list_item_by_index(task):
     resolved = resolve(
         task(), overrides=["sim.gravity=[0, 0, -1]", "sim.gravity.2=-3.7", "rewards.near.joints.0=hinge"]
     )
@@ -86,17 +86,17 @@ def test_items_of_lists_are_addressed_by_index(task):
 
 
 @pytest.mark.parametrize("index", ["1", "-1", "x", "²"])
-def test_an_index_that_is_not_there_is_refused(problems_of, index):
+def test_override_of_missing_index_is_refused(problems_of, index):
     (said,) = problems_of(TASK, f"rewards.near.joints.{index}=hinge")
     assert "is a list of 1" in said
 
 
-def test_a_quoted_key_may_hold_a_dot(task):
+def test_quoted_key_may_contain_dot(task):
     resolved = resolve(task(), overrides=['scene.entities.robot.joints.".*".damping=7'])
     assert resolved.task.scene.entities["robot"].joints[".*"].damping == 7.0
 
 
-def test_agent_addresses_the_chosen_agent(task):
+def test_agent_override_changes_chosen_agent(task):
     source = task()
     assert resolve(source, overrides=["agent.gamma=0.5"]).agent.gamma == 0.5
     two = resolve(source, agent="two", overrides=["agent.gamma=0.5", "agents.one.gamma=0.1"])
@@ -104,32 +104,32 @@ def test_agent_addresses_the_chosen_agent(task):
     assert resolve(source, overrides=["agents.default=two"]).agent_name == "two"
 
 
-def test_patches_can_be_overridden_where_they_stand(task):
+def test_patches_can_be_overridden(task):
     source = task()
     assert resolve(source, overrides=["agent.task.decimation=7"]).task.decimation == 7
     assert resolve(source, overrides=["play.scene.num_envs=5"]).task.scene.num_envs == 4
     assert resolve(source, play=True, overrides=["play.scene.num_envs=5"]).task.scene.num_envs == 5
 
 
-def test_a_config_file_may_bring_an_agent_of_its_own(task, tmp_path):
+def test_config_file_may_add_agent(task, tmp_path):
     config = tmp_path / "mine.yaml"
     config.write_text("agents: {mine: {trainer: sb3, algorithm: ppo, max_steps: 9, task: {decimation: 6}}}\n")
     resolved = resolve(task(), agent="mine", config_file=config)
     assert (resolved.agent.max_steps, resolved.task.decimation) == (9, 6)
 
 
-def test_the_default_agent_may_differ_by_device(task):
+def test_default_agent_may_differ_by_device(task):
     source = task(TASK.replace("default: one", "default: {cpu: one, cuda: two}"))
     assert resolve(source).agent_name == "one"
     assert resolve(source, device="cuda:1").agent_name == "two"
 
 
-def test_null_removes_a_term_and_sections_keep_their_order(task):
+def test_null_removes_term_and_order_is_kept(task):
     resolved = resolve(task(), overrides=["rewards.alive=null", "rewards.more={func: is_alive, weight: 2}"])
     assert list(resolved.task.rewards) == ["near", "more"]
 
 
-def test_a_mapping_is_merged_and_a_list_is_replaced(task, tmp_path):
+def test_config_file_merges_mappings_and_replaces_lists(task, tmp_path):
     config = tmp_path / "mine.yaml"
     config.write_text("rewards: {near: {weight: -3.0, joints: [hinge]}}\n")
     near = resolve(task(), config_file=config).task.rewards["near"]
@@ -154,7 +154,7 @@ _VALUES = {
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_an_override_equals_editing_the_yaml(task, data):
+def test_override_equals_edited_yaml(task, data):
     from rlcli.config.dump import to_yaml
 
     raw = yaml.safe_load(TASK)

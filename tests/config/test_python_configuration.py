@@ -1,4 +1,4 @@
-"""A task that is built in Python is the task that its YAML describes."""
+"""Configurations in Python: equal to the YAML form, terms as functions, messages."""
 
 import shutil
 import subprocess
@@ -45,7 +45,7 @@ def cart_vel(env, *, entity: Entity = "robot", joints: Joints = ".*", factor: fl
 
 
 def cartpole(**changes):
-    """The task `cartpole` in Python, its agents left out."""
+    """Return the task `cartpole` as a Python configuration without agents."""
     parts = {
         "summary": "Balance a pole on a cart (manager-based, Isaac Lab's numbers).",
         "sim": SimConfig(dt=1 / 120, render_interval=2),
@@ -109,19 +109,19 @@ def _reset(joint, position, velocity):
 
 @pytest.fixture
 def root(tmp_path):
-    """A folder with the model."""
+    """Folder with the model of cartpole."""
     shutil.copy(find_task("cartpole").root / "cartpole.xml", tmp_path)
     return tmp_path
 
 
-def test_the_python_form_of_cartpole_resolves_to_its_yaml_form(root):
+def test_python_cartpole_resolves_to_yaml_cartpole(root):
     from_yaml = to_data(resolve(find_task("cartpole"), flags={"scene.num_envs": 8}))
     from_python = to_data(resolve(source_of(cartpole(), root)))
     from_yaml.pop("agents")
     assert from_python == from_yaml
 
 
-def test_the_python_form_of_cartpole_takes_the_same_steps_bit_by_bit(root):
+def test_python_cartpole_steps_are_bit_identical(root):
     ours = make_env(cartpole(), root=root, seed=7)
     other = make_env(resolve(find_task("cartpole"), flags={"scene.num_envs": 8}), seed=7)
     ours.reset(seed=7), other.reset(seed=7)
@@ -136,7 +136,7 @@ def test_the_python_form_of_cartpole_takes_the_same_steps_bit_by_bit(root):
     assert ended > 0  # resets were compared too
 
 
-def test_a_function_is_a_term_and_its_parameters_are_checked(root):
+def test_function_is_term_with_checked_parameters(root):
     terms = {"own": RewardConfig(func=cart_vel, weight=1.0, joints="slider_to_cart", factor=3.0)}
     env = make_env(cartpole(rewards=terms), root=root)
     env.reset(seed=0)
@@ -149,7 +149,7 @@ def test_a_function_is_a_term_and_its_parameters_are_checked(root):
         make_env(cartpole(rewards={"own": RewardConfig(func=cart_vel, weight=1.0, factr=1.0)}), root=root)
 
 
-def test_a_function_that_gives_another_shape_is_named_by_its_key(root):
+def test_function_with_wrong_shape_is_reported_by_key(root):
     def column(env, *, entity: Entity = "robot"):
         return entity.data.joint_pos
 
@@ -159,7 +159,7 @@ def test_a_function_that_gives_another_shape_is_named_by_its_key(root):
     assert str(refusal.value).count("own") == 1
 
 
-def test_two_functions_of_one_name_stay_two(root):
+def test_functions_with_same_name_stay_separate(root):
     def other():
         def cart_vel(env):
             """Zero. (num_envs,)"""
@@ -178,7 +178,7 @@ def test_two_functions_of_one_name_stay_two(root):
     assert torch.equal(sums[1], torch.zeros(8))
 
 
-def test_a_function_that_is_no_term_is_refused_with_its_key(root):
+def test_function_that_is_no_term_is_refused(root):
     def positional(env, factor: float):
         return factor
 
@@ -199,7 +199,7 @@ def write_task(root, body="TASK = cartpole()"):
     )
 
 
-def test_a_folder_may_hold_a_task_in_python(root):
+def test_folder_with_python_task_is_found(root):
     write_task(root)
     source = find_task(f"{root}")
     assert source.name == root.name
@@ -208,7 +208,7 @@ def test_a_folder_may_hold_a_task_in_python(root):
     assert to_data(resolve(again)) == to_data(resolve(source))
 
 
-def test_what_is_not_a_configuration_is_refused(root):
+def test_object_that_is_no_configuration_is_refused(root):
     write_task(root, "TASK = 3\nBROKEN = lambda: 1 / 0\n")
     with pytest.raises(ConfigError, match="expected a TaskConfig, found a int"):
         resolve(find_task(str(root)))
@@ -220,7 +220,7 @@ def test_what_is_not_a_configuration_is_refused(root):
         find_task(f"{root / 'no.py'}:TASK")
 
 
-def test_a_model_of_an_installed_task_is_named_by_that_task(root):
+def test_model_of_installed_task_by_task_name(root):
     entity = EntityConfig(model="cartpole:cartpole.xml")
     scene = SceneConfig(num_envs=2, entities={"robot": entity})
     assert make_env(cartpole(scene=scene), root=root).entities["robot"].joint_names == [
@@ -234,7 +234,7 @@ def test_a_model_of_an_installed_task_is_named_by_that_task(root):
 
 
 @pytest.mark.slow
-def test_a_run_of_a_python_task_is_resumed_and_evaluated_from_its_folder(root):
+def test_run_of_python_task_is_resumed_and_evaluated(root):
     agent = (
         'from rlcli.rl.ppo.config import PpoConfig\nTASK = cartpole(rewards={"own": RewardConfig(func=cart_vel,'
         ' weight=-0.1)}, agents={"ppo": PpoConfig(trainer="ppo", algorithm="ppo", max_iterations=2)})\n'

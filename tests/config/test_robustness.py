@@ -1,4 +1,4 @@
-"""Whatever stands in a task file, the answer is a configuration or a list of problems."""
+"""Any task file gives a configuration or a list of problems, and no other exception."""
 
 import copy
 import random
@@ -33,7 +33,7 @@ VALUES = [
 
 
 def problems_of(source, **options):
-    """None for a configuration, else its problems; any other exception is a failure."""
+    """Return None for a valid configuration, else its problems. Any other exception fails the test."""
     try:
         resolve(source, **options)
     except ConfigError as error:
@@ -66,7 +66,7 @@ def mutate(data, draw):
 
 
 @pytest.mark.parametrize("name", ["cartpole", "cartpole-direct"])
-def test_mutated_tasks_give_a_configuration_or_problems(name, tmp_path):
+def test_mutated_task_gives_configuration_or_problems(name, tmp_path):
     draw = random.Random(1)
     source = find_task(name)
     original = strict_yaml.load(source.config.read_bytes()).data
@@ -85,7 +85,7 @@ def test_mutated_tasks_give_a_configuration_or_problems(name, tmp_path):
     assert 0 < accepted < 100
 
 
-def test_any_override_gives_a_configuration_or_problems():
+def test_any_override_gives_configuration_or_problems():
     draw = random.Random(2)
     source = find_task("cartpole")
     original = strict_yaml.load(source.config.read_bytes()).data

@@ -1,4 +1,4 @@
-"""The JSON Schema says what the source says below a setting."""
+"""Docstrings below fields become descriptions in the JSON Schema."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ def described(model):
     return {name: field.get("description") for name, field in model.model_json_schema()["properties"].items()}
 
 
-def test_texts_below_settings_are_their_descriptions():
+def test_field_docstrings_become_descriptions():
     assert described(Outer.Settings) == {"gain": "Of the motors [N m / rad].\n\nIts sign is kept.", "bare": None}
 
 
-def test_what_is_inherited_is_described_by_whoever_says_it_first():
+def test_inherited_field_uses_first_docstring_in_mro():
     gain = "Of the motors [N m / rad].\n\nIts sign is kept."
     assert described(Further) == {"gain": gain, "bare": None, "more": "Whatever else."}
 
 
-def test_a_class_inside_a_function_is_read_too():
+def test_class_in_function_is_described():
     class Inner(StrictModel):
         size: int = 1
         """In metres."""
@@ -49,7 +49,7 @@ def test_a_class_inside_a_function_is_read_too():
     assert described(Inner) == {"size": "In metres."}
 
 
-def test_a_model_may_have_an_alias_and_a_say_of_its_own_in_the_schema():
+def test_alias_and_own_description_are_kept():
     class Own(StrictModel):
         model_config = ConfigDict(json_schema_extra={"title": "Mine"})
 
@@ -79,7 +79,7 @@ else:
 """
 
 
-def test_the_source_of_a_module_that_is_imported_no_more_is_read(tmp_path, monkeypatch):
+def test_removed_module_is_still_described(tmp_path, monkeypatch):
     (tmp_path / "found_once.py").write_text(FOUND)
     monkeypatch.syspath_prepend(tmp_path)
     module = importlib.import_module("found_once")
@@ -88,11 +88,11 @@ def test_the_source_of_a_module_that_is_imported_no_more_is_read(tmp_path, monke
     assert described(module.Twice) == {"size": None}  # nothing rather than the wrong one
 
 
-def test_a_class_without_source_has_no_descriptions():
+def test_class_without_source_has_no_descriptions():
     scope = {"StrictModel": StrictModel, "__name__": "typed"}
     exec('class Typed(StrictModel):\n    size: int = 1\n    """In metres."""\n', scope)
     assert described(scope["Typed"]) == {"size": None}
 
 
-def test_every_section_of_a_task_is_described():
+def test_every_task_section_has_description():
     assert all(section.get("description") for section in json_schema(Vocabulary())["properties"].values())

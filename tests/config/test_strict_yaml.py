@@ -1,4 +1,4 @@
-"""What strict YAML reads, and what it refuses and where."""
+"""Strict YAML: values, positions, and refused input."""
 
 import time
 
@@ -54,7 +54,7 @@ block: |
         ("[1, a, {b: c}]", [1, "a", {"b": "c"}]),
     ],
 )
-def test_scalars_are_read_as_yaml_1_2_reads_them(text, value):
+def test_scalars_follow_yaml_1_2(text, value):
     found = load_value(text)
     assert found == value
     assert type(found) is type(value)
@@ -72,7 +72,7 @@ def test_scalars_are_read_as_yaml_1_2_reads_them(text, value):
         ("a: &x 1\nb: 2\n", 1, 4, "anchors and aliases"),
         ("a: 1\nb: *x\n", 2, 4, "anchors and aliases"),
         ("a: 1\nb:\n  <<: {c: 1}\n", 3, 3, "merge keys"),
-        ("a: 010\n", 1, 4, "drop the leading 0 or quote it"),
+        ("a: 010\n", 1, 4, "remove the leading 0 or quote it"),
         ("a: [on]\n", 1, 5, "true or false, or quote it"),
         ("a: No\n", 1, 4, "true or false, or quote it"),
         ("a: .nan\n", 1, 4, "null for none"),
@@ -89,14 +89,14 @@ def test_scalars_are_read_as_yaml_1_2_reads_them(text, value):
         (b"a: 1\nb: \xff\n", 2, 4, "not UTF-8"),
     ],
 )
-def test_what_is_refused_is_refused_where_it_stands(text, line, column, said):
+def test_refused_text_is_reported_with_position(text, line, column, said):
     with pytest.raises(YamlError) as caught:
         load(text)
     assert said in caught.value.message
     assert (caught.value.line, caught.value.column) == (line, column)
 
 
-def test_positions_point_at_the_key_or_the_item():
+def test_positions_of_keys_and_items():
     marks = load(SAMPLE).marks
     assert marks["sim", "dt"] == (3, 7)
     assert marks["sim", "gravity", 2] == (3, 33)
@@ -116,7 +116,7 @@ def test_positions_point_at_the_key_or_the_item():
         (b"a: " + b"x" * 20_000, "longer than"),
     ],
 )
-def test_what_could_exhaust_the_reader_is_refused_quickly(data, said):
+def test_oversized_input_is_refused_quickly(data, said):
     start = time.process_time()
     with pytest.raises(YamlError, match=said):
         load(data)
@@ -134,20 +134,20 @@ def test_what_could_exhaust_the_reader_is_refused_quickly(data, said):
     ],
     ids=["bytes", "scalar", "depth", "items"],
 )
-def test_what_is_as_large_as_allowed_is_read_and_no_more(most, one_more, said):
+def test_largest_allowed_input_is_read(most, one_more, said):
     assert set(load(most).data) == {"a"}
     with pytest.raises(YamlError, match=said) as caught:
         load(one_more)
     assert (caught.value.line, caught.value.column) == (0, 0) if "bytes" in said else caught.value.line == 1
 
 
-def test_a_key_that_is_a_list_is_not_repeated_and_the_error_is_its_message():
+def test_list_as_key_is_refused_without_printing_it():
     with pytest.raises(YamlError) as caught:
         load("? [a, b]\n: 1\n")
     assert str(caught.value) == caught.value.message == "keys must be text"
 
 
-def test_a_byte_order_mark_and_an_empty_file_are_harmless():
+def test_byte_order_mark_and_empty_file_are_read():
     assert load("\ufeffa: 1".encode()).data == {"a": 1}
     assert load(b"").data == {}
     assert load(b"# nothing\n").data == {}
@@ -162,5 +162,5 @@ def _only_a_document_or_a_yaml_error(data):
 
 @settings(max_examples=300, deadline=None)
 @given(st.one_of(st.binary(max_size=200), st.text(max_size=200)))
-def test_any_input_gives_a_document_or_a_yaml_error(data):
+def test_any_input_gives_document_or_yaml_error(data):
     assert _only_a_document_or_a_yaml_error(data)

@@ -1,4 +1,4 @@
-"""Term signatures, read from source without running it."""
+"""Signatures of terms, read from source text without running it."""
 
 import subprocess
 import sys
@@ -29,7 +29,7 @@ OWN = TASK.replace(
 
 @pytest.fixture
 def model(tmp_path):
-    """model("a: int = 3") -> the reward model of a term with these keyword-only parameters."""
+    """model("a: int = 3") -> the model of a reward term with these keyword-only parameters."""
 
     def make(parameters):
         file = tmp_path / "terms.py"
@@ -66,14 +66,14 @@ def accepts(model, value):
         ("list[tuple[str, float]]", [[("a", 1.0)]], [[("a",)]]),
     ],
 )
-def test_annotations_that_yaml_can_express(model, annotation, good, bad):
+def test_supported_annotations(model, annotation, good, bad):
     made = model(f"x: {annotation}")
     assert [accepts(made, value) for value in good] == [True] * len(good)
     assert [accepts(made, value) for value in bad] == [False] * len(bad)
 
 
 @pytest.mark.parametrize("alias", ["Joints", "Bodies", "Sites", "Sensors", "Actuators", "'Joints'", "Joints | None"])
-def test_selectors_are_names_or_lists_of_names(model, alias):
+def test_selectors_accept_names_or_lists(model, alias):
     made = model(f'entity: Entity = "robot", x: {alias} = ".*"')
     assert accepts(made, "a.*")
     assert accepts(made, ["a", "b"])
@@ -85,7 +85,7 @@ def test_selectors_are_names_or_lists_of_names(model, alias):
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
-        ("x: dict", "annotation 'dict' is not one that YAML can express; use float"),
+        ("x: dict", "YAML cannot express the annotation 'dict'; use float"),
         ("x: Tensor", "annotation 'Tensor'"),
         ("x: list", "annotation 'list'"),
         ("x: list[dict]", "annotation 'dict'"),
@@ -95,11 +95,11 @@ def test_selectors_are_names_or_lists_of_names(model, alias):
         ("x: 'float['", "annotation 'float[' is not valid Python"),
         ("x: float = math.pi", "'math.pi' is not a literal"),
         ("x: Joints", "the term also needs 'entity: Entity'"),
-        ("weight: float", "every term of rewards has a key of this name already"),
+        ("weight: float", "every term of rewards already has a key of this name"),
         ("_x: float", "underscore"),
     ],
 )
-def test_signatures_that_yaml_cannot_express_say_what_to_write(problems_of, parameters, said):
+def test_unsupported_signatures_are_refused_with_hint(problems_of, parameters, said):
     (message,) = problems_of(OWN, files={"terms": f"def own(env, *, {parameters}): ...\n"})
     assert "terms.py:1:1: own: " in message
     assert said in message
@@ -112,12 +112,12 @@ def test_positional_parameters_are_refused(problems_of):
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", ["copy", "json", "schema", "model_config_", "model_x", "dict"])
-def test_a_parameter_may_have_the_name_of_a_method_of_the_model(task, name):
+def test_parameter_may_have_name_of_pydantic_method(task, name):
     source = task(OWN.replace("func: own,", f"func: own, {name}: 2.0,"), terms=f"def own(env, *, {name}: float): ...")
     assert resolve(source).task.rewards["near"].params == {name: 2.0}
 
 
-def test_defaults_are_filled_in_and_required_parameters_demanded(model):
+def test_defaults_and_required_parameters(model):
     made = model("a: int, b: float = -1.5, c: tuple[int, ...] = (1, 2), d: str | None = None")
     term = made.model_validate({"func": "own", "weight": 1.0, "a": 3})
     assert (term.a, term.b, term.c, term.d) == (3, -1.5, (1, 2), None)
@@ -125,7 +125,7 @@ def test_defaults_are_filled_in_and_required_parameters_demanded(model):
         made.model_validate({"func": "own", "weight": 1.0})
 
 
-def test_only_public_terms_are_read(tmp_path):
+def test_read_terms_skips_private_names(tmp_path):
     file = tmp_path / "terms.py"
     file.write_text(
         "def a(env): 'First line.\\nmore'\n"
@@ -144,7 +144,7 @@ def test_only_public_terms_are_read(tmp_path):
     assert (goal.attribute, goal.is_class, goal.summary) == ("HTTPGoal2D", True, "Aim.")
 
 
-def test_class_names_become_snake_case():
+def test_snake_case():
     assert [snake_case(n) for n in ("JointEffort", "A", "HTTPServer", "Pose")] == [
         "joint_effort",
         "a",
@@ -153,7 +153,7 @@ def test_class_names_become_snake_case():
     ]
 
 
-def test_every_built_in_term_can_be_used_in_its_section():
+def test_every_built_in_term_fits_its_section():
     for section in SECTIONS:
         terms = builtin_terms(section)
         assert terms
@@ -162,7 +162,7 @@ def test_every_built_in_term_can_be_used_in_its_section():
             assert signature.summary
 
 
-def test_own_terms_come_before_built_in_ones(task):
+def test_own_terms_override_built_in_terms(task):
     source = task(
         TASK.replace("is_alive, weight: 1.0", "is_alive, weight: 1.0, extra: 2"),
         terms="def is_alive(env, *, extra: int): ...",
@@ -180,7 +180,7 @@ def test_own_terms_come_before_built_in_ones(task):
         (b"x = " + b"-" * 200_000 + b"1", "1", ""),
     ],
 )
-def test_a_terms_file_that_is_not_python_is_a_problem_with_its_place(task, source, place, said):
+def test_invalid_terms_file_is_reported_with_position(task, source, place, said):
     import re
 
     folder = task(terms="")
@@ -193,7 +193,7 @@ def test_a_terms_file_that_is_not_python_is_a_problem_with_its_place(task, sourc
     assert re.search(said, message)
 
 
-def test_files_are_checked_without_running_them(task):
+def test_term_files_are_not_executed(task):
     source = task(
         OWN.replace("func: own,", "func: own, x: 1,"), terms="raise SystemExit\ndef own(env, *, x: int): ...\n"
     )
@@ -232,13 +232,13 @@ class Task(DirectTask):
         ("3", "params: expected a mapping, found 3"),
     ],
 )
-def test_params_of_a_direct_task_are_checked_from_its_source(problems_of, params, said):
+def test_direct_params_are_checked_from_source(problems_of, params, said):
     (message,) = problems_of(DIRECT.replace("{gain: 2.0}", params), files={"task": CLASS})
     assert "task.yaml:9:" in message
     assert said in message
 
 
-def test_params_of_a_direct_task_are_filled_in(task):
+def test_direct_params_have_defaults(task):
     source = task(DIRECT.replace("{gain: 2.0}", "{gain: 1/2, count: 4}"), task=CLASS)
     assert resolve(source).task.params == {"gain": 0.5, "mode": "a", "limits": None, "count": 4}
     assert read_params(source.task_file, "Task").model_fields["gain"].description == "Gain [1]."
@@ -247,12 +247,12 @@ def test_params_of_a_direct_task_are_filled_in(task):
 
 HEIR = """
 from .common import Hovering as Base
-class Heir(Base):
+class Child(Base):
     class Params(Base.Params):
         gain: float = 3.0
         own: int = 1
-class Plain(Heir): ...
-class Stranger(Missing):
+class Plain(Child): ...
+class Unresolved(Missing):
     class Params(Missing.Params):
         own: int = 2
 class Round(Round):
@@ -261,20 +261,20 @@ class Round(Round):
 """
 
 
-def test_params_are_inherited_in_a_file_and_from_its_neighbours(tmp_path):
+def test_params_are_inherited_across_files(tmp_path):
     (tmp_path / "common.py").write_text(
         "class Hovering:\n    class Params(StrictModel):\n        gain: float = 1.0\n        height: float = 2.0\n"
     )
     file = tmp_path / "task.py"
     file.write_text(HEIR)
-    for name in ("Heir", "Plain"):
+    for name in ("Child", "Plain"):
         assert read_params(file, name)().model_dump() == {"gain": 3.0, "height": 2.0, "own": 1}
     assert read_params(file, "Base")().model_dump() == {"gain": 1.0, "height": 2.0}
-    assert read_params(file, "Stranger")().model_dump() == {"own": 2}
+    assert read_params(file, "Unresolved")().model_dump() == {"own": 2}
     assert read_params(file, "Round")().model_dump() == {"own": 4}
 
 
-def test_files_whose_classes_inherit_in_a_circle_are_read_to_an_end(tmp_path):
+def test_circular_inheritance_across_files_terminates(tmp_path):
     for name, other in (("a", "b"), ("b", "a")):
         bases = ", ".join(f"T{i}.Params" for i in range(40))
         imports = ", ".join(f"T{i}" for i in range(40))
@@ -286,30 +286,30 @@ def test_files_whose_classes_inherit_in_a_circle_are_read_to_an_end(tmp_path):
 @pytest.mark.parametrize(
     ("source", "said"),
     [
-        (CLASS.replace("count: int", "count: dict"), "line 8: 'count': annotation 'dict'"),
+        (CLASS.replace("count: int", "count: dict"), "line 8: 'count': YAML cannot express the annotation 'dict'"),
         (CLASS.replace("count: int", "count: int = COUNT"), "line 8: 'count': 'COUNT' is not a literal"),
         (CLASS + "   )", "not valid Python"),
-        ("class Task: ...", "declares no Params"),
+        ("class Task: ...", "has no Params"),
     ],
 )
-def test_params_that_cannot_be_read_are_a_problem_of_the_source(problems_of, source, said):
+def test_unreadable_params_are_reported_at_source(problems_of, source, said):
     (message,) = problems_of(DIRECT, files={"task": source})
     assert said in message
 
 
-def test_a_direct_task_has_no_manager_terms(problems_of):
+def test_direct_task_refuses_manager_terms(problems_of):
     text = DIRECT.replace("{gain: 2.0}", "{count: 1}") + "rewards: {alive: {func: is_alive, weight: 1.0}}\n"
     (message,) = problems_of(text, files={"task": CLASS})
-    assert "rewards: a direct task has no rewards terms; its class does this" in message
+    assert "rewards: a direct task has no rewards terms; its class implements them" in message
 
 
-def test_an_unknown_success_condition_is_called_by_its_section(tmp_path):
+def test_unknown_success_term_names_its_section(tmp_path):
     task = edited(PENDULUM_TASK, success={"func": "joints_nera", "tolerance": 0.1})
     with pytest.raises(ConfigError, match="no success term 'joints_nera'; did you mean 'joints_near'"):
         build(pendulum(tmp_path, task))
 
 
-def test_a_class_has_the_parameters_of_a_base_in_the_same_file(tmp_path):
+def test_class_inherits_parameters_in_same_file(tmp_path):
     file = tmp_path / "terms.py"
     file.write_text(
         "class _Base:\n    def __init__(self, env, *, gain: float = 2.0): ...\n"
@@ -354,7 +354,7 @@ class Positional:
 """
 
 
-def test_the_fields_of_a_dataclass_are_its_parameters(tmp_path):
+def test_dataclass_fields_are_parameters(tmp_path):
     file = tmp_path / "terms.py"
     file.write_text(DATACLASSES)
     terms = read_terms(file)
@@ -368,7 +368,7 @@ def test_the_fields_of_a_dataclass_are_its_parameters(tmp_path):
     assert terms["positional"].error == "parameter 'gain' must be keyword-only: put it after a '*'"
 
 
-def test_a_class_has_the_parameters_of_a_base_in_rlcli_mdp(tmp_path):
+def test_class_inherits_parameters_from_rlcli_mdp(tmp_path):
     file = tmp_path / "terms.py"
     file.write_text(
         "from rlcli.mdp.actions import JointEffort\nfrom rlcli.mdp.randomization import RandomizeBodyMass as Mass\n"
@@ -381,6 +381,6 @@ def test_a_class_has_the_parameters_of_a_base_in_rlcli_mdp(tmp_path):
     assert terms["heavier"].parameters == builtin_terms("events")["randomize_body_mass"].parameters
 
 
-def test_a_term_given_as_a_class_has_the_parameters_that_it_inherits():
+def test_class_object_has_inherited_parameters():
     own, built_in = signature_of(RandomizeJointDamping, "damping"), builtin_terms("events")["randomize_joint_damping"]
     assert own.parameters == built_in.parameters

@@ -1,4 +1,4 @@
-"""`rlcli doctor`: what works is said to work, and what is broken ends it with 9."""
+"""`rlcli doctor` on this machine, and with broken plugins and settings."""
 
 import json
 
@@ -16,7 +16,7 @@ def checks(done):
 
 
 @pytest.mark.slow
-def test_a_sound_installation_is_healthy_and_every_part_is_named(plugins, cli):
+def test_sound_installation_is_healthy(plugins, cli):
     plugins("good", SPEC, files=FILES)
     done = cli("doctor", "--json", "--probe-timeout", "100", MUJOCO_GL="", RLCLI_PLUGINS="good, nmae")
     found = checks(done)
@@ -33,7 +33,7 @@ def test_a_sound_installation_is_healthy_and_every_part_is_named(plugins, cli):
 
 
 @pytest.mark.slow
-def test_broken_plugins_are_rows_with_their_reason(broken_plugins, plugins, cli):
+def test_broken_plugins_are_reported_with_reason(broken_plugins, plugins, cli):
     names = ["crashes", "exits-with-0", "hangs", "leaves-a-process", "points-malformed", "foreign-points-malformed"]
     broken_plugins(*names, "takes-a-built-in-name", "shares-a-name")
     trainer = "from rlcli.trainers import TrainerSpec\nSPEC = TrainerSpec('mine', {'a': 'mine:Gone'}, 'mine:Gone')\n"
@@ -56,7 +56,7 @@ def test_broken_plugins_are_rows_with_their_reason(broken_plugins, plugins, cli)
 
 
 @pytest.mark.slow
-def test_a_runs_folder_and_graphics_that_cannot_work_are_broken(cli, tmp_path):
+def test_bad_runs_folder_and_graphics_are_broken(cli, tmp_path):
     (tmp_path / "file").write_text("")
     done = cli("doctor", "--json", RLCLI_RUNS_DIR=str(tmp_path / "file" / "runs"), MUJOCO_GL="glfw", DISPLAY="")
     found = checks(done)
@@ -91,7 +91,7 @@ def test_a_runs_folder_and_graphics_that_cannot_work_are_broken(cli, tmp_path):
         ("nonsense\n", {}, None),
     ],
 )
-def test_the_quota_of_a_container_is_the_smallest_on_the_way_up(tmp_path, own, files, quota):
+def test_core_quota_is_smallest_of_parent_groups(tmp_path, own, files, quota):
     (tmp_path / "own").write_text(own)
     for name, text in files.items():
         file = tmp_path / "groups" / name
@@ -100,12 +100,12 @@ def test_the_quota_of_a_container_is_the_smallest_on_the_way_up(tmp_path, own, f
     assert core_quota(tmp_path / "groups", tmp_path / "own") == quota
 
 
-def test_without_control_groups_there_is_no_quota(tmp_path):
+def test_core_quota_without_control_groups(tmp_path):
     assert core_quota(tmp_path / "none", tmp_path / "none") is None
 
 
 @pytest.mark.parametrize(("granted", "cores"), [("50000", 1), ("100000", 1), ("190000", 1), ("100000000000", None)])
-def test_the_cores_of_a_process_are_those_that_its_control_group_grants_whole(tmp_path, monkeypatch, granted, cores):
+def test_available_cores_round_quota_down(tmp_path, monkeypatch, granted, cores):
     monkeypatch.delenv("LOCAL_WORLD_SIZE", raising=False)
     (tmp_path / "own").write_text("0::/\n")
     (tmp_path / "cpu.max").write_text(f"{granted} 100000\n")
@@ -113,7 +113,7 @@ def test_the_cores_of_a_process_are_those_that_its_control_group_grants_whole(tm
     assert available_cores(tmp_path, tmp_path / "own") == (cores or unlimited)
 
 
-def test_processes_started_together_share_what_the_control_group_grants(tmp_path, monkeypatch):
+def test_available_cores_are_divided_by_local_world_size(tmp_path, monkeypatch):
     have = available_cores(tmp_path, tmp_path / "none")
     (tmp_path / "own").write_text("0::/\n")
     (tmp_path / "cpu.max").write_text(f"{have}00000 100000\n")

@@ -1,4 +1,4 @@
-"""What `rlcli doctor` says of each planted fault: what was found, and the line that mends it."""
+"""Checks of `rlcli doctor` on planted faults: state, finding and hint."""
 
 import json
 import os
@@ -6,7 +6,7 @@ import os
 import pytest
 
 from rlcli.doctor import isolated_checks
-from rlcli.doctor.installation import installation_checks, unmet
+from rlcli.doctor.installation import installation_checks, violates_bounds
 from rlcli.doctor.isolated_checks import compute_checks, gpu_checks, graphics_check, run_isolated, shared_memory_check
 from rlcli.doctor.machine import machine_checks, memory_check
 from rlcli.doctor.settings import harmful_variables, settings_checks
@@ -14,13 +14,13 @@ from rlcli.machine import memory_limit
 from rlcli.settings import settings_file
 
 
-def named(checks):
+def by_name(checks):
     return {check.name: check for check in checks}
 
 
 @pytest.fixture
 def package(tmp_path, monkeypatch):
-    """package(name, version) plants the metadata of an installed distribution before all others."""
+    """package(name, version) adds metadata of a distribution that Python finds before all others."""
     site = tmp_path / "planted"
     site.mkdir()
     monkeypatch.syspath_prepend(str(site))
@@ -38,34 +38,34 @@ def package(tmp_path, monkeypatch):
     return plant
 
 
-def test_packages_of_mujoco_that_agree_are_fine():
-    check = named(installation_checks())["mujoco packages"]
+def test_equal_mujoco_packages_are_ok():
+    check = by_name(installation_checks())["mujoco packages"]
     assert (check.state, check.hint) == ("ok", None)
     assert set(check.details) == {"mujoco", "mujoco-core", "mujoco-studio"}
 
 
-def test_a_mujoco_core_of_another_version_is_named_with_both_versions_and_the_mending_line(package):
-    mine = named(installation_checks())["mujoco packages"].details["mujoco"]
+def test_other_mujoco_core_version_is_reported(package):
+    mine = by_name(installation_checks())["mujoco packages"].details["mujoco"]
     package("mujoco-core", "3.13.0")
-    check = named(installation_checks())["mujoco packages"]
+    check = by_name(installation_checks())["mujoco packages"]
     assert check.state == "broken"
     assert f"mujoco {mine} needs mujoco-core {mine}, but mujoco-core 3.13.0 is installed" in check.found
-    assert "mujoco-core is there 2 times" in check.found
+    assert "mujoco-core is installed 2 times" in check.found
     assert check.hint == f'pip uninstall -y mujoco mujoco-core mujoco-studio && pip install "mujoco=={mine}"'
 
 
-def test_a_mujoco_from_before_it_was_split_is_found_beside_the_new_one(package):
+def test_old_single_mujoco_package_is_reported(package):
     package("mujoco", "3.3.0", "numpy")
-    check = named(installation_checks())["mujoco packages"]
+    check = by_name(installation_checks())["mujoco packages"]
     assert check.state == "broken"
-    assert "mujoco is there 2 times: 3.3.0 in" in check.found
-    assert "mujoco 3.3.0 does not fit" in named(installation_checks())["packages"].found
+    assert "mujoco is installed 2 times: 3.3.0 in" in check.found
+    assert "mujoco 3.3.0 does not fit" in by_name(installation_checks())["packages"].found
 
 
-def test_a_package_too_old_and_one_that_is_missing_are_named(package, monkeypatch):
+def test_old_and_missing_packages_are_reported(package, monkeypatch):
     package("torch", "1.13.0")
     package("rlcli", "0.1.0", "torch>=2.10", "numpy>=2.0", "no-such-package>=1", 'onnx>=99; extra == "export"')
-    check = named(installation_checks())["packages"]
+    check = by_name(installation_checks())["packages"]
     assert check.state == "broken"
     assert "torch 1.13.0 does not fit, >=2.10 is needed" in check.found
     assert "no-such-package is missing" in check.found
@@ -73,12 +73,12 @@ def test_a_package_too_old_and_one_that_is_missing_are_named(package, monkeypatc
     assert "numpy" not in check.found
 
 
-def test_an_extra_is_there_absent_or_half_installed(package):
+def test_states_of_extras(package):
     package(
         "rlcli", "0.1.0", 'numpy>=2; extra == "one"', 'no-such-package; extra == "two"', 'numpy; extra == "three"',
         'no-such-package; extra == "three"', 'rlcli[one]; extra == "all"', 'no-such-package; extra == "dev"',
     )  # fmt: skip
-    found = named(installation_checks())
+    found = by_name(installation_checks())
     assert {name for name in found if name.startswith("extra ")} == {"extra one", "extra two", "extra three"}
     assert (found["extra one"].state, found["extra one"].hint) == ("ok", None)
     assert (found["extra two"].state, found["extra two"].hint) == ("absent", 'pip install "rlcli[two]"')
@@ -100,13 +100,13 @@ def test_an_extra_is_there_absent_or_half_installed(package):
         ("~=1.0", "7", False),
     ],
 )
-def test_bounds_of_versions(wanted, found, bad):
-    assert unmet(wanted, found) == bad
+def test_violates_bounds(wanted, found, bad):
+    assert violates_bounds(wanted, found) == bad
 
 
-def test_a_library_of_another_version_than_its_package_is_told():
+def test_mujoco_library_and_package_versions_differ():
     answer = {"torch": "2", "cuda": None, "threads": 2, "mujoco": "3.3.0", "mujoco_package": "4.0.0", "cores": [8, 8]}
-    check = named(compute_checks(answer, ""))["mujoco"]
+    check = by_name(compute_checks(answer, ""))["mujoco"]
     assert (check.state, check.hint) == ("broken", isolated_checks.REINSTALL)
     assert "4.0.0" in check.found
     assert "3.3.0" in check.found
@@ -120,32 +120,32 @@ def test_a_library_of_another_version_than_its_package_is_told():
         ("no answer within 30 s", isolated_checks.BUSY),
     ],
 )
-def test_what_does_not_answer_is_mended_by_what_it_said(reason, hint):
+def test_failed_compute_check_has_matching_hint(reason, hint):
     (check,) = compute_checks(None, reason)
     assert (check.state, check.hint) == ("broken", hint)
 
 
 @pytest.mark.slow
-def test_openmp_that_pins_the_process_is_found_by_trying(monkeypatch):
+def test_openmp_pinning_is_detected(monkeypatch):
     cores = len(os.sched_getaffinity(0))
     if cores < 2:
-        pytest.skip("on one core there is nothing to be pinned to")
+        pytest.skip("pinning cannot be seen on one core")
     monkeypatch.setenv("OMP_PROC_BIND", "true")
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    check = named(compute_checks(*run_isolated("compute", 120.0)))["pinning"]
+    check = by_name(compute_checks(*run_isolated("compute", 120.0)))["pinning"]
     assert (check.state, check.hint) == ("warning", "unset OMP_PROC_BIND")
     assert f"1 of {cores} cores" in check.found
 
 
 @pytest.mark.slow
-def test_a_graphics_library_that_crashes_ends_its_own_process_alone(tmp_path, monkeypatch):
+def test_crashing_graphics_library_is_isolated(tmp_path, monkeypatch):
     (tmp_path / "OpenGL").mkdir()
     (tmp_path / "OpenGL" / "__init__.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
     assert run_isolated("egl", 120.0) == (None, "crashed (SIGSEGV)")
 
 
-def test_a_library_that_hangs_is_given_up(tmp_path, monkeypatch):
+def test_hanging_library_times_out(tmp_path, monkeypatch):
     (tmp_path / "mujoco").mkdir()
     (tmp_path / "mujoco" / "__init__.py").write_text("import time\ntime.sleep(600)\n")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
@@ -164,7 +164,7 @@ def test_a_library_that_hangs_is_given_up(tmp_path, monkeypatch):
         ("disable", ("egl",), "ok", None),
     ],
 )
-def test_graphics_are_judged_by_what_draws_and_what_is_chosen(monkeypatch, chosen, works, state, used):
+def test_graphics_check_states(monkeypatch, chosen, works, state, used):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
         monkeypatch.delenv(name, raising=False)
     if chosen is not None:
@@ -188,35 +188,35 @@ WARP = {"version": "1.19.0", "devices": ["H200"], "error": ""}
         (
             {"torch_cuda": "13.0"},
             "warning",
-            "torch is built for CUDA 13.0, the driver offers CUDA 12.9",
+            "torch is built for CUDA 13.0, the driver supports CUDA 12.9",
             "update the driver",
         ),
-        ({"devices": []}, "warning", "torch sees no device", "nvidia-smi"),
+        ({"devices": []}, "warning", "torch finds no device", "nvidia-smi"),
         (
             {"torch_error": ": no kernel image"},
             "warning",
-            "cannot compute there: no kernel image",
+            "cannot compute on it: no kernel image",
             "built for this GPU",
         ),
-        ({"warp": None}, "warning", "without", 'pip install "rlcli[gpu]"'),
-        ({"warp": {**WARP, "devices": []}}, "warning", "Warp 1.19.0 sees no GPU", "warp-lang"),
-        ({"warp": {**WARP, "error": "E: x"}}, "warning", "sees no GPU: E: x", "warp-lang"),
+        ({"warp": None}, "warning", "warp-lang is not installed", 'pip install "rlcli[gpu]"'),
+        ({"warp": {**WARP, "devices": []}}, "warning", "Warp 1.19.0 finds no GPU", "warp-lang"),
+        ({"warp": {**WARP, "error": "E: x"}}, "warning", "finds no GPU: E: x", "warp-lang"),
     ],
 )
-def test_driver_torch_and_warp_are_compared(monkeypatch, change, state, said, hint):
+def test_gpu_checks_compare_driver_torch_and_warp(monkeypatch, change, state, said, hint):
     monkeypatch.setattr(isolated_checks, "version", lambda _: "4.0.0")
     check = gpu_checks(({**GPU, "warp": WARP, **change}, ""))[0]
     assert (check.state, said in check.found) == (state, True), check.found
     assert hint is None or hint in check.hint
 
 
-def test_without_a_driver_nothing_is_wrong_and_with_one_that_crashes_it_is_said():
+def test_gpu_checks_without_driver_and_with_crash():
     assert gpu_checks(None)[0].state == "ok"
     check = gpu_checks((None, "crashed (SIGSEGV)"))[0]
     assert (check.state, "SIGSEGV" in check.found) == ("warning", True)
 
 
-def test_little_memory_and_little_shared_memory_are_warnings():
+def test_low_memory_gives_warnings():
     assert memory_check(8 << 30, None).state == "ok"
     assert memory_check(8 << 30, 16 << 30).state == "ok"
     limited = memory_check(8 << 30, 512 << 20)
@@ -235,7 +235,7 @@ def test_little_memory_and_little_shared_memory_are_warnings():
         ("nonsense", {}, None),
     ],
 )
-def test_the_memory_of_a_container_is_the_smallest_on_the_way_up(tmp_path, own, files, limit):
+def test_memory_limit_is_smallest_of_parent_groups(tmp_path, own, files, limit):
     (tmp_path / "own").write_text(own)
     for name, text in files.items():
         file = tmp_path / "groups" / name
@@ -255,38 +255,38 @@ def test_the_memory_of_a_container_is_the_smallest_on_the_way_up(tmp_path, own, 
         ({"LOCAL_WORLD_SIZE": "1", "DISPLAY": ":0"}, set()),
     ],
 )
-def test_variables_that_slow_training_down_are_named(given, bad):
+def test_harmful_variables(given, bad):
     assert set(harmful_variables(given, 4)) == bad
 
 
-def test_the_settings_file_is_shown_and_a_broken_one_is_named(monkeypatch, tmp_path):
+def test_settings_checks_show_file_or_mistakes(monkeypatch, tmp_path):
     file = tmp_path / "settings.yaml"
     monkeypatch.setenv("RLCLI_SETTINGS", str(file))
     file.write_text("viewer: web\n")
-    check = named(settings_checks())["settings"]
+    check = by_name(settings_checks())["settings"]
     assert (check.state, check.found) == ("ok", f"{file}: viewer: web")
     file.write_text("viewer: wbe\n")
-    check = named(settings_checks())["settings"]
+    check = by_name(settings_checks())["settings"]
     assert check.state == "broken"
     assert f"{file}:1:1: viewer: expected" in check.found
     assert f"edit {settings_file()}" in check.hint
     monkeypatch.setenv("RLCLI_SETTINGS", "none")
-    assert named(settings_checks())["settings"].state == "ok"
+    assert by_name(settings_checks())["settings"].state == "ok"
     monkeypatch.setenv("OMP_WAIT_POLICY", "active")
-    assert named(settings_checks())["variables"].hint == "unset OMP_WAIT_POLICY"
+    assert by_name(settings_checks())["variables"].hint == "unset OMP_WAIT_POLICY"
 
 
-def test_a_runs_folder_that_is_no_folder_is_broken_and_names_what_to_set(tmp_path):
+def test_runs_folder_that_is_file_is_broken(tmp_path):
     (tmp_path / "file").write_text("")
-    check = named(machine_checks(tmp_path / "file" / "runs"))["runs folder"]
+    check = by_name(machine_checks(tmp_path / "file" / "runs"))["runs folder"]
     assert check.state == "broken"
     assert "RLCLI_RUNS_DIR" in check.hint
-    assert named(machine_checks(tmp_path / "new" / "runs"))["runs folder"].state == "ok"
+    assert by_name(machine_checks(tmp_path / "new" / "runs"))["runs folder"].state == "ok"
     assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.slow
-def test_many_faults_at_once_are_each_named_with_their_mending_line_and_end_it_with_9(package, cli, tmp_path):
+def test_doctor_reports_many_faults_and_exits_with_9(package, cli, tmp_path):
     site = package("mujoco-core", "3.13.0")
     (site / "OpenGL").mkdir()
     (site / "OpenGL" / "__init__.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n")

@@ -1,4 +1,4 @@
-"""The lists of dependencies agree with each other."""
+"""Dependencies of the packages and the pinned versions agree."""
 
 import tomllib
 
@@ -20,7 +20,7 @@ def pinned():
 
 
 @pytest.mark.parametrize("extra", [None, *EXTRAS])
-def test_what_is_asked_for_is_pinned_within_its_bounds(extra):
+def test_dependencies_are_pinned_within_bounds(extra):
     pins = pinned()
     wanted = [Requirement(line) for line in (PROJECT["dependencies"] if extra is None else EXTRAS[extra])]
     assert wanted
@@ -32,13 +32,13 @@ def test_what_is_asked_for_is_pinned_within_its_bounds(extra):
             assert requirement.specifier.contains(pins[name]), name
 
 
-def test_bounds_are_lower_bounds():
+def test_dependency_bounds_are_lower_bounds():
     every = [Requirement(line) for lines in (PROJECT["dependencies"], *EXTRAS.values()) for line in lines]
     assert {bound.operator for requirement in every for bound in requirement.specifier} == {">="}
 
 
 @pytest.mark.parametrize("name", ["rlcli-rsl-rl", "rlcli-rl-games"])
-def test_what_a_trainer_plugin_asks_for_is_pinned_within_its_bounds(name):
+def test_trainer_plugin_dependencies_are_pinned(name):
     project = tomllib.loads((REPOSITORY / "plugins" / name / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     wanted = [Requirement(line) for line in project["dependencies"]]
     library = [requirement for requirement in wanted if requirement.name != "rlcli"]

@@ -1,4 +1,4 @@
-"""The plugin of Gymnasium's tasks as a user gets it: its wheel beside rlcli's, and its own tests against both."""
+"""The plugin with Gymnasium's tasks, installed from wheels: its contents, its own tests, its README."""
 
 import json
 import os
@@ -39,14 +39,14 @@ def python(site, folder, *arguments):
     return done.stdout
 
 
-def test_the_wheel_has_the_task_files_and_no_model(wheels):
+def test_wheel_has_task_files_and_no_model(wheels):
     with zipfile.ZipFile(wheels[1]) as archive:
         inside = archive.namelist()
     assert len([name for name in inside if name.endswith(".yaml")]) == 11
     assert not [name for name in inside if name.endswith(".xml")]
 
 
-def test_the_plugins_own_tests_pass_against_the_wheels(site, tmp_path):
+def test_plugin_tests_pass_against_wheels(site, tmp_path):
     ignored = shutil.ignore_patterns("__pycache__")
     shutil.copytree(REPOSITORY / "benchmarks", tmp_path / "benchmarks", ignore=ignored)  # its scores are tested too
     place = tmp_path / "plugins" / PLUGIN.name
@@ -60,12 +60,12 @@ def test_the_plugins_own_tests_pass_against_the_wheels(site, tmp_path):
     assert len([row for row in rows if row["distribution"] == "rlcli-gymnasium"]) == 11
 
 
-def test_gymnasium_makes_the_plugins_tasks(site, tmp_path):
+def test_gymnasium_makes_plugin_tasks(site, tmp_path):
     script = "import gymnasium; print(gymnasium.make('rlcli.gym:rlcli/gym-humanoid').action_space.high[0])"
     assert python(site, tmp_path, "-c", script).strip() == "0.4"
 
 
-def test_the_commands_of_its_readme_run(site, tmp_path):
+def test_readme_commands_run(site, tmp_path):
     folder, own = tmp_path / "rlcli-gymnasium", tmp_path / "site"
     shutil.copytree(PLUGIN, folder, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(site, own)

@@ -22,12 +22,12 @@ from test_wheels import build
 VERSIONS = ("3.11", "3.12", "3.13")
 PLUGINS = ("rlcli-example-acrobot", "rlcli-gymnasium", "rlcli-menagerie")
 TORCH = {"torch", "stable-baselines3"}
-"""What is not to be had without torch."""
+"""Packages that cannot be installed without torch."""
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
 
 def interpreter(version):
-    """An interpreter of this version that can make environments."""
+    """Return a Python interpreter of this version that can create environments; skip the test without one."""
     found = shutil.which(f"python{version}")
     versions = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     places = [Path(found)] if found else []
@@ -43,7 +43,7 @@ def interpreter(version):
 class Installed:
     python: Path
     torch: str | None
-    """Why there is none; None if there is."""
+    """Why torch is not installed; None: it is installed."""
     folder: Path
 
     def run(self, *words, code=0):
@@ -97,14 +97,14 @@ def installed(request, wheels, tmp_path_factory):
 
 
 def required(wheel):
-    """What a wheel needs without any extra."""
+    """Return the requirements of a wheel without extras."""
     with zipfile.ZipFile(wheel) as archive:
         (name,) = [n for n in archive.namelist() if n.endswith(".dist-info/METADATA")]
         lines = Parser().parsestr(archive.read(name).decode()).get_all("Requires-Dist")
     return [wanted for wanted in map(Requirement, lines) if wanted.marker is None]
 
 
-def test_what_is_installed_fits_together(installed):
+def test_installed_packages_fit_together(installed):
     done = installed.run("-m", "pip", "check", code=0 if installed.torch is None else 1)
     if installed.torch is not None:
         missing = set(re.findall(r"requires ([\w-]+), which is not installed", done.stdout))
@@ -114,13 +114,13 @@ def test_what_is_installed_fits_together(installed):
         assert "No broken requirements found" in done.stdout
 
 
-def test_every_module_compiles_without_a_remark(installed):
+def test_every_module_compiles_without_warning(installed):
     place = installed.run("-c", "import rlcli, pathlib; print(pathlib.Path(rlcli.__file__).parents[1])").stdout.strip()
     found = [Path(place) / name for name in ("rlcli", "rlcli_tasks", "rlcli_gymnasium", "rlcli_menagerie")]
     installed.run("-W", "error", "-m", "compileall", "-f", "-q", *found)
 
 
-def test_commands_that_need_no_torch_work(installed):
+def test_commands_without_torch_work(installed):
     assert installed.rlcli("--version").stdout.startswith("rlcli 0.")
     rows = json.loads(installed.rlcli("list-tasks", "--json").stdout)["tasks"]
     owners = {row["distribution"] for row in rows}
@@ -131,7 +131,7 @@ def test_commands_that_need_no_torch_work(installed):
     assert "rewards.alive.wieght" in installed.rlcli("train", "cartpole", "rewards.alive.wieght=2", code=3).stderr
 
 
-def test_a_policy_is_trained_played_and_evaluated(installed):
+def test_train_play_and_eval_work(installed):
     installed.need_torch()
     small = ("--max-iterations", 2, "--num-envs", 16)
     for task in ("cartpole", "cartpole-direct", "acrobot"):
@@ -146,8 +146,8 @@ def test_a_policy_is_trained_played_and_evaluated(installed):
     assert 'pip install "rlcli[sweep]"' in lacking.stderr
 
 
-def test_the_simulation_runs(installed):
-    """What torch does not stand in the way of: MuJoCo's batch on a built-in model."""
+def test_simulation_runs(installed):
+    """Step a built-in model with MuJoCo's batch, which does not need torch."""
     script = (
         "import mujoco, rlcli_tasks, pathlib\n"
         "file = pathlib.Path(rlcli_tasks.__file__).parent / 'cartpole' / 'cartpole.xml'\n"

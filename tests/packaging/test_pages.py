@@ -1,4 +1,4 @@
-"""What the documentation tells to do works as it stands there."""
+"""Commands and examples of the documentation work as written."""
 
 import re
 import subprocess
@@ -22,7 +22,7 @@ EVALUATION = DOCS / "guides" / "evaluate.md"
 
 
 @pytest.mark.slow
-def test_the_page_on_evaluation_works_as_written(tmp_path):
+def test_evaluation_page_works(tmp_path):
     train = Block("sh", None, "rlcli train cartpole --max-iterations 2 --logger none\n")
     found = [replace(b, text=re.sub("(episodes) [0-9]+ --fail-under .*", r"\1 4", b.text)) for b in blocks(EVALUATION)]
     output = run_commands([train, *found], tmp_path)
@@ -31,29 +31,29 @@ def test_the_page_on_evaluation_works_as_written(tmp_path):
     assert (tmp_path / "map.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_the_page_on_evaluation_names_every_parameter():
+def test_evaluation_page_lists_every_stress_parameter():
     text = EVALUATION.read_text(encoding="utf-8")
     assert all(f"`{name}`" in text for name in (*PHYSICAL, *SIGNALS))
 
 
 @pytest.mark.slow
-def test_the_page_on_determinism_works_as_written(tmp_path):
+def test_determinism_page_works(tmp_path):
     assert run_commands(blocks(DOCS / "explanation" / "determinism.md"), tmp_path).count("no difference") == 2
 
 
 @pytest.mark.slow
-def test_the_page_on_plots_and_reports_works_as_written(tmp_path):
+def test_plots_and_reports_page_works(tmp_path):
     for seed in (1, 2):
         write_run(tmp_path / "runs", seed=seed, rows=learning())
     page = DOCS / "guides" / "plots-and-reports.md"
-    output = run_commands(blocks(page, "## Learning curves", "## A run as a page"), tmp_path)
-    output += run_commands(blocks(page, "## A run as a page", "## The card"), tmp_path)
+    output = run_commands(blocks(page, "## Learning curves", "## A report of a run"), tmp_path)
+    output += run_commands(blocks(page, "## A report of a run", "## The card"), tmp_path)
     for file in ("curves.svg", "curves.png", "losses.pdf", "cartpole.html"):
         assert file in output
         assert (tmp_path / file).stat().st_size > 5_000
 
 
-def test_the_card_of_the_page_is_printed(capsys):
+def test_task_card_of_page_is_printed(capsys):
     (block,) = blocks(DOCS / "guides" / "plots-and-reports.md", "## The card of a task")
     exec(compile(block.text, "plots-and-reports.md", "exec"), {})
     assert "| `pole_pos` | -1 | Squared joint deviation" in capsys.readouterr().out
@@ -61,7 +61,7 @@ def test_the_card_of_the_page_is_printed(capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("page", "folder"), [("first-task.md", "my_task"), ("direct-task.md", "my_arm")])
-def test_the_task_of_a_page_checks_trains_and_learns(page, folder, tmp_path):
+def test_task_of_page_checks_trains_and_learns(page, folder, tmp_path):
     found = blocks(DOCS / page)
     write_files(found, tmp_path)
     output = run_commands(found, tmp_path)
@@ -70,7 +70,7 @@ def test_the_task_of_a_page_checks_trains_and_learns(page, folder, tmp_path):
 
 
 @pytest.mark.parametrize("number", range(3))
-def test_the_scenes_of_the_page_build_and_run(number, tmp_path):
+def test_scenes_of_page_build_and_run(number, tmp_path):
     found = [
         b
         for b in blocks(DOCS / "tutorials" / "first-task.md", "## Scenes", "## Events and randomisation")
@@ -92,8 +92,8 @@ def test_the_scenes_of_the_page_build_and_run(number, tmp_path):
     assert (env.terrain is None) == ("terrain" not in part["scene"])
 
 
-def test_the_sections_on_what_is_seen_asked_driven_and_changed_work_together(tmp_path):
-    found = blocks(DOCS / "tutorials" / "first-task.md", "## Observations", "## Check it")
+def test_sections_of_task_page_work_together(tmp_path):
+    found = blocks(DOCS / "first-task.md", "## Observations", "## Check it")
     parts = [yaml.safe_load(block.text) for block in found if block.language == "yaml"]
     (terms,) = [block.text for block in found if block.language == "python"]
     assert [list(part) for part in parts] == [
@@ -124,14 +124,14 @@ def test_the_sections_on_what_is_seen_asked_driven_and_changed_work_together(tmp
 
 
 def merged(task, part):
-    """A mapping with another one laid over it, nested ones within."""
+    """Return a mapping merged with another one, nested mappings included."""
     both = {key: merged(task[key], part[key]) for key in task.keys() & part.keys() if isinstance(part[key], dict)}
     return {**task, **part, **both}
 
 
 @pytest.mark.slow
-def test_the_examples_for_isaac_labs_users_train_as_written(tmp_path):
-    found = blocks(DOCS / "guides" / "isaac-lab.md")
+def test_isaac_lab_examples_train(tmp_path):
+    found = blocks(DOCS / "isaac-lab.md")
     write_files(found, tmp_path)
     output = run_commands(found, tmp_path)
     assert "swing_env_cfg.py: valid (files and model)" in output
@@ -140,8 +140,8 @@ def test_the_examples_for_isaac_labs_users_train_as_written(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(3))
-def test_the_scripts_for_other_libraries_run_as_written(number, tmp_path):
-    found = [block.text for block in blocks(DOCS / "guides" / "external-environments.md") if block.language == "python"]
+def test_scripts_for_other_libraries_run(number, tmp_path):
+    found = [block.text for block in blocks(DOCS / "external-environments.md") if block.language == "python"]
     assert len(found) == 3
     done = subprocess.run([sys.executable, "-c", found[number]], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -149,13 +149,13 @@ def test_the_scripts_for_other_libraries_run_as_written(number, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_readmes_task_of_your_own_works_as_written(tmp_path):
+def test_readme_example_task_works(tmp_path):
     found = blocks(README, "## A task of your own", "## Licence")
     write_files(found, tmp_path)
     assert "./my_task: 0 errors, 0 warnings" in run_commands(found, tmp_path)
 
 
-def test_the_page_of_exit_codes_has_every_code_and_kind_that_errors_have():
+def test_exit_code_page_lists_every_code_and_kind():
     text = (DOCS / "reference" / "exit-codes.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| (\d+) \| `(\w+)` \|", text, re.MULTILINE))
     errors = [e for e in vars(rlcli.errors).values() if isinstance(e, type) and issubclass(e, rlcli.errors.RlcliError)]
@@ -165,14 +165,14 @@ def test_the_page_of_exit_codes_has_every_code_and_kind_that_errors_have():
     assert set(rows) == {*map(str, range(1, 11)), "75", "130"}
 
 
-def test_the_page_on_plugins_lists_every_check():
-    text = (DOCS / "tutorials" / "first-plugin.md").read_text(encoding="utf-8")
+def test_plugin_page_lists_every_check():
+    text = (DOCS / "first-plugin.md").read_text(encoding="utf-8")
     listed = [
         name for cell in re.findall(r"^\| (`.*?`) \|", text, re.MULTILINE) for name in re.findall(r"`(.+?)`", cell)
     ]
     assert set(CHECKS) <= set(listed)
 
 
-def test_the_page_on_lint_lists_every_rule():
+def test_lint_page_lists_every_rule():
     text = (DOCS / "guides" / "check-and-lint.md").read_text(encoding="utf-8")
     assert re.findall(r"^\| `(.*?)` \|", text.partition("## Lint")[2], re.MULTILINE) == list(RULES)

@@ -1,4 +1,4 @@
-"""What a release promises: names that stay, licences that are known, one version, archives that hold what is due."""
+"""Release checks: public names, licences, versions, contents of the archives."""
 
 import importlib.metadata
 import importlib.util
@@ -30,21 +30,21 @@ def script(name):
     return module
 
 
-def said_of(distribution):
-    """What a package's metadata says of its licence."""
+def licence_of(distribution):
+    """Return the licence in the metadata of a package."""
     metadata = importlib.metadata.metadata(distribution)
     classified = [line.rpartition("::")[2] for line in metadata.get_all("Classifier") or [] if "License ::" in line]
     return metadata.get("License-Expression") or " ".join(classified) or metadata.get("License") or ""
 
 
-def test_no_term_key_command_or_option_has_gone_or_come_unnoticed():
+def test_public_words_are_up_to_date():
     reference = script("reference")
     known, now = set(reference.WORDS.read_text().splitlines()), set(reference.public_words())
-    assert not known - now, "somebody's files may say it: note it in the changelog, then `python docs/reference.py`"
+    assert not known - now, "user files may contain it: note it in the changelog, then `python docs/reference.py`"
     assert not now - known, "`python docs/reference.py` notes what is new"
 
 
-def test_a_name_that_is_removed_is_noticed(monkeypatch):
+def test_removed_public_name_is_detected(monkeypatch):
     import rlcli.errors
     from rlcli.cli import app
 
@@ -59,21 +59,21 @@ def test_a_name_that_is_removed_is_noticed(monkeypatch):
     assert {"option rlcli train --seeds", "key sb3.ppo.learning_rate", "key Task.episode_length_s"} <= words
 
 
-def test_the_page_of_licences_is_that_of_these_dependencies():
+def test_licences_page_is_up_to_date():
     licences = script("licences")
     assert licences.PAGE.read_text(encoding="utf-8") == licences.page(), "python docs/licences.py writes it anew"
     named = {canonicalize_name(Requirement(line).name) for _, line in licences.requirements()}
     assert set(licences.LICENCES) == named, "a licence of what is not needed any more"
 
 
-def test_licences_are_what_the_packages_say():
+def test_licences_match_package_metadata():
     licences = script("licences")
     checked = 0
     for name, (licence, _) in licences.LICENCES.items():
         try:
-            said = said_of(name)
+            said = licence_of(name)
         except importlib.metadata.PackageNotFoundError:
-            continue  # the trackers, which nobody installs all of
+            continue  # not all trackers are installed
         family = re.match(r"MIT|BSD|Apache|PSF|MPL|LGPL|ISC", licence)[0]
         family = {"PSF": "PSF|Python Software", "MPL": "MPL|Mozilla"}.get(family, family)
         assert re.search(family, said), f"{name}: {said}"
@@ -81,11 +81,11 @@ def test_licences_are_what_the_packages_say():
     assert checked > 35
 
 
-def test_nothing_that_is_installed_along_is_under_a_licence_that_would_bind_rlcli():
+def test_no_dependency_has_copyleft_licence():
     checked = 0
     for name in pinned().keys() - ONLY_TESTED_WITH:
         try:
-            said = said_of(name)
+            said = licence_of(name)
         except importlib.metadata.PackageNotFoundError:
             continue
         assert FREE.search(said), f"{name}: {said[:200]}"
@@ -112,14 +112,14 @@ def archives(tmp_path_factory):
     return {place: folder / f"{place}-out" for place in ("one", "another")}
 
 
-def only(folder, pattern):
+def single_file(folder, pattern):
     (file,) = folder.glob(pattern)
     return file
 
 
 @pytest.mark.slow
-def test_the_source_archive_holds_what_a_release_is_made_and_tested_from_and_nothing_else(archives):
-    with tarfile.open(only(archives["one"], "*.tar.gz")) as archive:
+def test_source_archive_contents(archives):
+    with tarfile.open(single_file(archives["one"], "*.tar.gz")) as archive:
         names = {member.name.partition("/")[2] for member in archive.getmembers() if member.isfile()}
     tracked = subprocess.run(["git", "ls-files"], cwd=REPOSITORY, capture_output=True, text=True)
     if tracked.returncode == 0:
@@ -132,8 +132,8 @@ def test_the_source_archive_holds_what_a_release_is_made_and_tested_from_and_not
 
 
 @pytest.mark.slow
-def test_a_wheel_is_the_same_wherever_it_is_built_and_names_no_place(archives):
-    one, another = (only(archives[place], "*.whl") for place in ("one", "another"))
+def test_wheel_is_reproducible_without_paths(archives):
+    one, another = (single_file(archives[place], "*.whl") for place in ("one", "another"))
     with zipfile.ZipFile(one) as left, zipfile.ZipFile(another) as right:
         assert left.namelist() == right.namelist()
         places = [str(archives["one"].parent).encode(), str(REPOSITORY).encode(), b"/root/", b"/home/"]
@@ -145,8 +145,8 @@ def test_a_wheel_is_the_same_wherever_it_is_built_and_names_no_place(archives):
 
 
 @pytest.mark.slow
-def test_the_metadata_say_what_it_is(archives):
-    with zipfile.ZipFile(only(archives["one"], "*.whl")) as archive:
+def test_wheel_metadata(archives):
+    with zipfile.ZipFile(single_file(archives["one"], "*.whl")) as archive:
         (name,) = [n for n in archive.namelist() if n.endswith(".dist-info/METADATA")]
         metadata = Parser().parsestr(archive.read(name).decode())
         assert [n for n in archive.namelist() if n.endswith("licenses/LICENSE")]
@@ -162,7 +162,7 @@ def test_the_metadata_say_what_it_is(archives):
         assert f"Programming Language :: Python :: 3.{minor}" in metadata.get_all("Classifier")
 
 
-def test_the_changelog_begins_with_this_version_and_the_packages_beside_it_agree():
+def test_changelog_and_package_versions_agree():
     changelog = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.search(r"^## (\S+)", changelog, re.MULTILINE)[1] == rlcli.__version__
     release = tuple(map(int, rlcli.__version__.split(".")[:2]))

@@ -1,4 +1,4 @@
-"""rlcli's wheel and a stranger's, built and installed together, used from another folder."""
+"""Wheels of rlcli and of a plugin, built and installed together, used from another folder."""
 
 import json
 import os
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 
 def build(source, folder):
-    """Build a wheel from a copy, so that nothing is left in the sources."""
+    """Build a wheel from a copy of the sources, so that no build files are left in them."""
     copy = folder / "source" / source.name
     ignored = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", "tests", ".*_cache", ".hypothesis")
     shutil.copytree(source, copy, ignore=ignored)
@@ -49,7 +49,7 @@ def wheels(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def site(wheels, tmp_path_factory):
-    """A folder with the two wheels and nothing else; what they depend on comes from this environment."""
+    """Folder in which only the two wheels are installed; their dependencies come from this environment."""
     folder = tmp_path_factory.mktemp("site")
     install(wheels, folder)
     return folder
@@ -57,7 +57,7 @@ def site(wheels, tmp_path_factory):
 
 @pytest.fixture
 def elsewhere(site, tmp_path):
-    """Run a command in a folder that is not the repository, with only the installed rlcli."""
+    """Run a command outside of the repository, with the installed rlcli."""
     environment = {
         **os.environ,
         "PYTHONPATH": str(site),
@@ -76,7 +76,7 @@ def elsewhere(site, tmp_path):
     return run
 
 
-def test_our_wheel_is_pure_small_and_pins_nothing(wheels):
+def test_rlcli_wheel_is_pure_small_and_unpinned(wheels):
     ours = wheels[0]
     assert ours.name.endswith("-py3-none-any.whl")
     with zipfile.ZipFile(ours) as archive:
@@ -91,7 +91,7 @@ def test_our_wheel_is_pure_small_and_pins_nothing(wheels):
     assert [r for r in requirements if "==" in r.partition(";")[0]] == []
 
 
-def test_our_wheel_holds_every_file_of_the_tasks_and_nothing_of_the_tests(wheels):
+def test_rlcli_wheel_has_task_files_and_no_tests(wheels):
     with zipfile.ZipFile(wheels[0]) as archive:
         inside = set(archive.namelist())
     for root, package in ((REPOSITORY / "tasks", "rlcli_tasks"), (REPOSITORY, "rlcli")):
@@ -101,7 +101,7 @@ def test_our_wheel_holds_every_file_of_the_tasks_and_nothing_of_the_tests(wheels
     assert {name.split("/")[0] for name in inside} == {"rlcli", "rlcli_tasks", f"rlcli-{rlcli.__version__}.dist-info"}
 
 
-def test_plugin_wheel_holds_its_task_and_asks_for_rlcli(wheels):
+def test_plugin_wheel_has_task_and_requires_rlcli(wheels):
     with zipfile.ZipFile(wheels[1]) as archive:
         inside = archive.namelist()
         metadata = archive.read(next(n for n in inside if n.endswith("METADATA"))).decode()
@@ -109,7 +109,7 @@ def test_plugin_wheel_holds_its_task_and_asks_for_rlcli(wheels):
     assert "Requires-Dist: rlcli>=0.1" in metadata
 
 
-def test_the_installed_pair_lists_checks_trains_and_plays(elsewhere, site):
+def test_installed_wheels_list_check_train_and_play(elsewhere, site):
     place = elsewhere("-c", "import rlcli, rlcli_tasks; print(rlcli.__file__); print(rlcli_tasks.__file__)").stdout
     assert [line.startswith(str(site)) for line in place.splitlines()] == [True, True]
     rows = json.loads(elsewhere("-m", "rlcli", "list-tasks", "--json").stdout)["tasks"]
@@ -124,7 +124,7 @@ def test_the_installed_pair_lists_checks_trains_and_plays(elsewhere, site):
 
 
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
-def test_a_built_in_task_is_seen_right_after_the_installation(elsewhere, tmp_path, task):
+def test_built_in_task_works_after_installation(elsewhere, tmp_path, task):
     done = elsewhere("-m", "rlcli", "play", task, "--video")
     assert f"(the policy shipped with rlcli {rlcli.__version__})" in done.stderr
     assert (tmp_path / "play.mp4").stat().st_size > 10_000
@@ -134,7 +134,7 @@ def test_a_built_in_task_is_seen_right_after_the_installation(elsewhere, tmp_pat
     assert not (tmp_path / "runs").exists()
 
 
-def test_every_command_of_the_plugins_readme_runs(site, tmp_path):
+def test_plugin_readme_commands_run(site, tmp_path):
     folder = tmp_path / "rlcli-example-acrobot"
     shutil.copytree(ACROBOT, folder, ignore=shutil.ignore_patterns("__pycache__"))
     own = tmp_path / "site"
@@ -148,7 +148,7 @@ def test_every_command_of_the_plugins_readme_runs(site, tmp_path):
     assert (folder / "acrobot.gif").stat().st_size > 10_000
 
 
-def test_the_plugins_of_the_page_are_made_installed_and_learned_as_written(site, tmp_path):
+def test_plugins_of_page_are_installed_and_train(site, tmp_path):
     own = tmp_path / "site"
     shutil.copytree(site, own)
     found = blocks(REPOSITORY / "docs" / "tutorials" / "first-plugin.md")
@@ -166,7 +166,7 @@ def test_the_plugins_of_the_page_are_made_installed_and_learned_as_written(site,
 
 
 @pytest.mark.parametrize("name", TRAINERS)
-def test_the_tests_of_a_trainer_plugin_pass_against_the_wheels(name, site, tmp_path):
+def test_trainer_plugin_tests_pass_against_wheels(name, site, tmp_path):
     own = tmp_path / "site"
     shutil.copytree(site, own)
     build(REPOSITORY / "plugins" / name, tmp_path)
@@ -186,7 +186,7 @@ def test_the_tests_of_a_trainer_plugin_pass_against_the_wheels(name, site, tmp_p
 
 
 @pytest.mark.parametrize("name", ["rlcli-isaaclab", "rlcli-oige"])
-def test_the_wheel_of_a_format_holds_every_file_of_it_and_its_entry_point(name, wheels, tmp_path):
+def test_format_wheel_has_files_and_entry_point(name, wheels, tmp_path):
     package = name.replace("-", "_")
     build(REPOSITORY / "plugins" / name, tmp_path)
     (wheel,) = tmp_path.glob("*.whl")
@@ -203,7 +203,7 @@ def test_the_wheel_of_a_format_holds_every_file_of_it_and_its_entry_point(name, 
 
 
 def with_plugin_left_out(name, site, folder):
-    """A copy of the plugin in `folder`, and of `site` beside it; there its README says how to install it."""
+    """Return copies of the plugin and of `site` in `folder`, for the installation steps of the plugin's README."""
     ignored = shutil.ignore_patterns("__pycache__")
     shutil.copytree(REPOSITORY / "plugins" / name, folder / name, ignore=ignored)
     shutil.copytree(site, folder / "site")
@@ -218,7 +218,7 @@ def with_plugin_left_out(name, site, folder):
         ("rlcli-rl-games", ["cartpole-direct", "ant-direct", "ball-balance"]),
     ],
 )
-def test_the_readme_of_a_trainer_plugin_works_as_written(name, trained, site, tmp_path):
+def test_trainer_plugin_readme_works(name, trained, site, tmp_path):
     folder, found = with_plugin_left_out(name, site, tmp_path)
     (agents,) = [block.text for block in found if block.language == "yaml"]
     (folder / "agents.yaml").write_text(agents)
@@ -234,7 +234,7 @@ def test_the_readme_of_a_trainer_plugin_works_as_written(name, trained, site, tm
         assert json.loads((run / "run.json").read_text())["state"] == "finished"
 
 
-def test_the_commands_of_menageries_readme_run_on_a_stand_in(site, tmp_path):
+def test_menagerie_readme_commands_run_with_stand_in(site, tmp_path):
     folder, found = with_plugin_left_out("rlcli-menagerie", site, tmp_path)
     robot = runpy.run_path(str(folder / "tests" / "conftest.py"))["go1"](driven=True)
     for file in ("unitree_go1/go1.xml", "my_go1/scene_free.xml"):
@@ -250,7 +250,7 @@ def test_the_commands_of_menageries_readme_run_on_a_stand_in(site, tmp_path):
     assert len(list((folder / "runs" / "go1-velocity").iterdir())) == 2
 
 
-def test_the_trainer_of_the_page_works_as_written(site, tmp_path):
+def test_trainer_of_page_works(site, tmp_path):
     own = tmp_path / "site"
     shutil.copytree(site, own)
     found = blocks(REPOSITORY / "docs" / "guides" / "write-a-trainer.md")

@@ -1,4 +1,4 @@
-"""What a broken plugin costs: its own row. Everything else goes on as if it were not there."""
+"""A broken plugin affects only its own row; everything else works as without it."""
 
 import json
 import os
@@ -24,8 +24,8 @@ def document(done):
     return json.loads(done.stdout)
 
 
-def of(listed, name):
-    """The row of a broken plugin in what `list-tasks --json` printed."""
+def row_of(listed, name):
+    """Return the row of a broken plugin in the output of `list-tasks --json`."""
     (row,) = [row for row in listed["tasks"] if row["distribution"] == name]
     return row
 
@@ -38,15 +38,15 @@ def check_listed(listed, names):
     assert unreadable == {f"{name}-1.0.dist-info" for name in names if BROKEN[name].unreadable}
     for name in names:
         if not (BROKEN[name].unreadable or BROKEN[name].foreign):
-            assert of(listed, name)["name"] == BROKEN[name].options.get("task", f"{name}-task")
+            assert row_of(listed, name)["name"] == BROKEN[name].options.get("task", f"{name}-task")
 
 
-def test_there_are_at_least_24_broken_plugins():
+def test_broken_plugins_are_at_least_24():
     assert len(BROKEN) >= 24
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_plugin_leaves_the_list_whole(broken_plugins, cli, name):
+def test_list_tasks_works_beside_broken_plugin(broken_plugins, cli, name):
     broken_plugins(name)
     check_listed(document(cli("list-tasks", "--json")), [name])
     listed = cli("list-tasks")
@@ -57,14 +57,14 @@ def test_a_broken_plugin_leaves_the_list_whole(broken_plugins, cli, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_plugin_leaves_training_whole(broken_plugins, cli, name):
+def test_train_works_beside_broken_plugin(broken_plugins, cli, name):
     broken_plugins(name)
     trained = document(cli(*TRAIN, "--json"))
     assert (trained["state"], trained["iteration"]) == ("finished", 1)
 
 
 @pytest.mark.slow
-def test_all_together_break_nothing_either(broken_plugins, cli, capsys):
+def test_all_broken_plugins_together(broken_plugins, cli, capsys):
     broken_plugins(*BROKEN)
     start = time.perf_counter()
     done = cli("list-tasks")
@@ -81,22 +81,22 @@ def test_all_together_break_nothing_either(broken_plugins, cli, capsys):
 
 
 @pytest.mark.slow
-def test_probing_says_of_each_what_is_wrong_with_it(broken_plugins, cli):
+def test_probe_reports_reason_of_each_broken_plugin(broken_plugins, cli):
     broken_plugins(*BROKEN)
     listed = document(cli("list-tasks", "--probe", "--probe-timeout", "20", "--json"))
     check_listed(listed, BROKEN)
     for name, case in BROKEN.items():
         if case.said is not None:
-            assert case.said in of(listed, name)["broken"], name
+            assert case.said in row_of(listed, name)["broken"], name
         elif not (case.unreadable or case.foreign):
-            assert (of(listed, name)["broken"], of(listed, name)["observation_size"]) == (None, 2), name
+            assert (row_of(listed, name)["broken"], row_of(listed, name)["observation_size"]) == (None, 2), name
     assert {row["broken"] for row in listed["tasks"] if row["distribution"] in ("rlcli", "good")} == {None}
     again = document(cli("list-tasks", "--json"))
     assert again == listed
 
 
 @pytest.mark.parametrize("name", ["exits-with-0", "raises", "newer-api", "unknown-field", "api-is-text"])
-def test_a_broken_plugin_that_is_asked_for_ends_with_its_reason(broken_plugins, cli, name):
+def test_use_of_broken_plugin_fails_with_reason(broken_plugins, cli, name):
     broken_plugins(name)
     done = cli("show", f"{name}-task", "--json")
     error = json.loads(done.stdout)["error"]
@@ -106,14 +106,14 @@ def test_a_broken_plugin_that_is_asked_for_ends_with_its_reason(broken_plugins, 
 
 
 @pytest.mark.parametrize("name", ["prints", "prints-from-c"])
-def test_what_a_plugin_prints_is_not_in_the_document(broken_plugins, cli, name):
+def test_output_of_plugin_is_not_in_json(broken_plugins, cli, name):
     broken_plugins(name)
     done = cli("show", f"{name}-task", "--json")
     assert document(done)["config"]["summary"] == "Slide."
     assert "hubbub" in done.stderr
 
 
-def test_what_a_task_prints_while_it_runs_is_not_in_the_document(plugins, cli):
+def test_output_of_running_task_is_not_in_json(plugins, cli):
     terms = "def one(env):\n    import torch\n    print('hubbub')\n    return torch.ones(env.num_envs)\n"
     from support.broken_plugins import FILES, IMPORT
 
@@ -125,7 +125,7 @@ def test_what_a_task_prints_while_it_runs_is_not_in_the_document(plugins, cli):
     assert "hubbub" in done.stderr
 
 
-def test_a_built_in_task_keeps_its_name(broken_plugins, cli):
+def test_built_in_task_wins_over_plugin_of_same_name(broken_plugins, cli):
     broken_plugins("takes-a-built-in-name")
     assert "on a cart" in cli("show", "cartpole").stdout
     listed = cli("list-tasks")
@@ -135,26 +135,26 @@ def test_a_built_in_task_keeps_its_name(broken_plugins, cli):
     assert not ambiguous["cartpole"]
 
 
-def test_a_hidden_plugin_is_said_to_be_hidden(broken_plugins, cli):
+def test_excluded_plugin_is_named_in_error(broken_plugins, cli):
     broken_plugins()
     done = cli("show", "good-task", RLCLI_PLUGINS="none")
     assert done.returncode == 4
-    assert "RLCLI_PLUGINS=none leaves its plugin out" in done.stderr
+    assert "RLCLI_PLUGINS=none excludes its plugin" in done.stderr
     assert cli("show", "good-task", RLCLI_PLUGINS="GOOD").returncode == 0
     assert "RLCLI_PLUGINS names 'nmae'" in cli("list-tasks", RLCLI_PLUGINS="good,nmae").stderr
 
 
-def test_a_plugin_that_wants_a_newer_rlcli_is_told_which(plugins, cli):
+def test_plugin_needing_newer_rlcli_gives_version(plugins, cli):
     metadata = "Metadata-Version: 2.1\nName: early\nVersion: 1.0\nRequires-Dist: rlcli>=99.1\n"
     plugins("early", "from rlcli.task import Wings\n", metadata=metadata)
     done = cli("show", "early-task")
     assert done.returncode == 4
-    assert "it asks for rlcli 99.1, this is" in done.stderr
+    assert "it needs rlcli 99.1, this is" in done.stderr
 
 
 @pytest.mark.parametrize("command", ["doctor", "list-tasks"])
-def test_ctrl_c_ends_the_probes_too(broken_plugins, tmp_path, command):
-    """A plugin that hangs is not waited for, and its process does not stay."""
+def test_ctrl_c_kills_probe_processes(broken_plugins, tmp_path, command):
+    """Ctrl-C does not wait for a plugin that hangs, and kills its process."""
     broken_plugins("hangs")
     here = tmp_path / "here"
     here.mkdir()
@@ -176,8 +176,8 @@ def test_ctrl_c_ends_the_probes_too(broken_plugins, tmp_path, command):
     assert not list(here.glob("rlcli-probe-*"))
 
 
-def test_ctrl_c_while_probes_start_ends_them(broken_plugins, monkeypatch):
-    """The first process runs before the last thread is started: an interrupt may come in between."""
+def test_ctrl_c_during_probe_start_kills_processes(broken_plugins, monkeypatch):
+    """The first process runs before the last thread starts, so Ctrl-C may come between the two."""
     broken_plugins("hangs")
     submit = ThreadPoolExecutor.submit
 

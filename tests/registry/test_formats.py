@@ -1,4 +1,4 @@
-"""Formats of other frameworks: installed, not installed, broken, and their modules' former names."""
+"""Formats of other frameworks: installed, not installed, broken, and their module aliases."""
 
 import json
 import os
@@ -21,7 +21,7 @@ sys.meta_path.insert(0, Absent())
 from rlcli.cli.app import main
 sys.exit(main(sys.argv[1:]))
 """
-"""A program that is `rlcli` where neither plugin is installed."""
+"""Program that runs `rlcli` as if neither format plugin were installed."""
 
 OIGE = "name: Arm\nphysics_engine: physx\nenv: {numEnvs: 4}\nsim: {dt: 0.01}\nmjcf: {Arm: arm.xml}\n"
 IMPORTED = """
@@ -41,7 +41,7 @@ class ArmEnvCfg(ManagerBasedRLEnvCfg):
 
 @pytest.fixture
 def core(tmp_path):
-    """core(words...) -> the finished process of `rlcli` without the plugins."""
+    """core(words...) -> the finished process of `rlcli` without the format plugins."""
 
     def run(*words):
         command = [sys.executable, "-c", CORE, *map(str, words)]
@@ -52,7 +52,7 @@ def core(tmp_path):
 
 @pytest.fixture
 def folders(tmp_path):
-    """Tasks of each known format, in every way in which they lie in folders."""
+    """Folders with tasks of each known format, in every layout."""
     files = {
         "own/Arm.yaml": OIGE,
         "package/cfg/task/Arm.yaml": OIGE,
@@ -77,7 +77,7 @@ def folders(tmp_path):
     ],
 )
 @pytest.mark.parametrize("command", ["validate", "train"])
-def test_a_task_of_a_format_that_is_not_installed_is_answered_with_the_pip_line(core, folders, target, plugin, command):
+def test_task_of_missing_format_gives_pip_command(core, folders, target, plugin, command):
     done = core(command, target, "--json")
     assert done.returncode == 7, done.stderr
     error = json.loads(done.stdout)["error"]
@@ -85,14 +85,14 @@ def test_a_task_of_a_format_that_is_not_installed_is_answered_with_the_pip_line(
     assert error["hint"] == f"pip install {plugin}"
 
 
-def test_an_importer_that_is_not_installed_is_answered_with_the_pip_line(core):
+def test_missing_importer_gives_pip_command(core):
     done = core("import", "isaaclab", "env.yaml", "--model", "robot=robot.xml")
     assert done.returncode == 7, done.stderr
     assert "pip install rlcli-isaaclab" in done.stderr
     assert "isaaclab" not in core("import", "--help").stdout
 
 
-def test_without_the_plugins_the_other_tasks_are_as_they_were(core, tmp_path):
+def test_other_tasks_work_without_format_plugins(core, tmp_path):
     assert core("validate", "cartpole").returncode == 0
     assert "format" not in core("show", "cartpole").stdout
     wrong = tmp_path / "wrong"
@@ -103,7 +103,7 @@ def test_without_the_plugins_the_other_tasks_are_as_they_were(core, tmp_path):
     assert core("validate", "./wrong").returncode == 0
 
 
-def test_plugins_left_out_by_the_user_are_not_asked(folders):
+def test_excluded_format_plugins_are_not_used(folders):
     command = [sys.executable, "-m", "rlcli", "validate", "./own"]
     env = {**os.environ, "RLCLI_PLUGINS": "none"}
     done = subprocess.run(command, cwd=folders, env=env, capture_output=True, text=True)
@@ -122,10 +122,10 @@ HANDS = 2
 def read(document, source):
     if "seconds" not in document.data:
         return None
-    from rlcli.config.layers import marked
+    from rlcli.config.layers import document_origins
     data = {{"episode_length_s": document.data["seconds"], "elsewhere": {{"hands": HANDS}}}}
     data |= {{key: value for key, value in document.data.items() if key != "seconds"}}
-    return Translation(data, marked(document, source.label, "task"), [Note("", "seconds", "mapped")])
+    return Translation(data, document_origins(document, source.label, "task"), [Note("", "seconds", "mapped")])
 
 
 def check(block):
@@ -158,7 +158,7 @@ def task(tmp_path):
     return folder
 
 
-def test_a_format_of_an_installed_plugin_is_read_checked_and_shown(plugins, cli, task):
+def test_installed_format_is_read_checked_and_shown(plugins, cli, task):
     plugins("elsewhere", FORMAT.format(more=""), entry_points=POINTS)
     done = cli("validate", str(task))
     assert done.returncode == 0, done.stderr
@@ -171,7 +171,7 @@ def test_a_format_of_an_installed_plugin_is_read_checked_and_shown(plugins, cli,
     assert "elsewhere.hands: a robot here has two" in wrong.stderr
 
 
-def test_an_alias_resolves_while_a_tasks_file_is_imported_and_not_otherwise(plugins, cli, task):
+def test_alias_resolves_only_during_task_import(plugins, cli, task):
     plugins("elsewhere", FORMAT.format(more=""), entry_points=POINTS)
     program = f"""
         from rlcli.registry import load_object
@@ -187,14 +187,14 @@ def test_an_alias_resolves_while_a_tasks_file_is_imported_and_not_otherwise(plug
     assert done.stdout.splitlines() == ["No module named 'another_world'", "True elsewhere"], done.stderr
 
 
-def test_a_format_for_a_newer_rlcli_is_refused_with_both_numbers(plugins, cli, task):
+def test_format_with_newer_api_is_refused(plugins, cli, task):
     plugins("elsewhere", FORMAT.format(more=", api=99"), entry_points=POINTS)
     done = cli("validate", str(task))
     assert done.returncode == 4, done.stderr
     assert "needs plugin API 99; this rlcli has 1" in done.stderr
 
 
-def test_a_broken_format_stops_no_task_of_rlclis_own(plugins, cli, task):
+def test_broken_format_does_not_stop_own_tasks(plugins, cli, task):
     plugins("elsewhere", "raise RuntimeError('torn')", entry_points=POINTS)
     shown = cli("show", "cartpole")
     assert shown.returncode == 0, shown.stderr

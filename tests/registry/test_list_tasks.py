@@ -1,4 +1,4 @@
-"""`list-tasks` and its cache: what is said of installed tasks without importing them."""
+"""`list-tasks` and its cache: details of installed tasks without importing them."""
 
 import json
 import subprocess
@@ -18,7 +18,7 @@ def rows(done):
     return {row["name"]: row for row in document["tasks"]}
 
 
-def test_the_index_of_the_built_in_tasks_is_up_to_date():
+def test_index_of_built_in_tasks_is_up_to_date():
     import rlcli_tasks
 
     file = Path(rlcli_tasks.__file__).with_name("index.json")
@@ -27,7 +27,7 @@ def test_the_index_of_the_built_in_tasks_is_up_to_date():
     assert json.loads(file.read_text()) == json.loads(fresh), f"run: {' '.join(command[1:])} > {file}"
 
 
-def test_built_in_tasks_come_with_their_details(cli):
+def test_built_in_tasks_have_details(cli):
     found = rows(cli("list-tasks", "--json"))
     cartpole = found["cartpole"]
     assert cartpole["workflow"] == "managed"
@@ -36,7 +36,7 @@ def test_built_in_tasks_come_with_their_details(cli):
     assert found["cartpole-direct"]["workflow"] == "direct"
 
 
-def test_listing_imports_no_plugin_and_nothing_heavy(plugins, cli):
+def test_list_tasks_imports_no_plugin_and_no_heavy_module(plugins, cli):
     for number in range(20):
         plugins(f"plug{number}", "raise SystemExit('imported')\n")
     program = (
@@ -62,7 +62,7 @@ def test_light_commands_are_fast_with_twenty_plugins(plugins, spec, cli, argumen
     assert min(times) < 3 * bound_s
 
 
-def test_a_pattern_shows_only_names_and_summaries_that_contain_it(cli):
+def test_pattern_filters_names_and_summaries(cli):
     everything = rows(cli("list-tasks", "--json"))
     wanted = [name for name, row in everything.items() if "direct" in f"{name} {row['summary']}".lower()]
     assert "cartpole-direct" in wanted
@@ -79,14 +79,14 @@ def test_a_pattern_shows_only_names_and_summaries_that_contain_it(cli):
         ("zzz", "rlcli list-tasks shows all"),
     ],
 )
-def test_a_pattern_that_nothing_contains_is_answered_with_what_to_do(cli, pattern, advice):
+def test_pattern_without_match_gives_hint(cli, pattern, advice):
     done = cli("list-tasks", pattern)
     assert (done.returncode, done.stdout) == (0, "")
     assert done.stderr.startswith(f"no task's name or summary contains '{pattern}'; {advice}")
     assert json.loads(cli("list-tasks", pattern, "--json").stdout)["tasks"] == []
 
 
-def test_shared_names_are_shown_with_their_distribution(plugins, spec, cli):
+def test_shared_names_show_their_distribution(plugins, spec, cli):
     plugins("a", spec, task="walk")
     plugins("b", spec, task="walk")
     done = cli("list-tasks")
@@ -94,7 +94,7 @@ def test_shared_names_are_shown_with_their_distribution(plugins, spec, cli):
     assert "b:walk" in done.stdout
 
 
-def test_an_unreadable_distribution_is_a_warning_and_a_row_of_the_document(plugins, cli):
+def test_unreadable_distribution_is_warning_and_json_row(plugins, cli):
     plugins("bad", entry_points="[rlcli.tasks]\nnonsense\n")
     done = cli("list-tasks", "--json")
     assert "bad-1.0.dist-info" in done.stderr
@@ -102,7 +102,7 @@ def test_an_unreadable_distribution_is_a_warning_and_a_row_of_the_document(plugi
     assert "cartpole" in rows(done)
 
 
-def test_probing_fills_the_cache_and_reports_broken_tasks_as_rows(plugins, spec, cli):
+def test_probe_fills_cache_and_reports_broken_tasks(plugins, spec, cli):
     plugins("good", "print('hello')\n" + spec, files={"task.yaml": TASK.format(summary="Slide."), "model.xml": MODEL})
     plugins("exits", "import sys\nsys.exit(3)\n")
     plugins("crashes", "import os\nos._exit(7)\n")
@@ -124,13 +124,13 @@ def test_probing_fills_the_cache_and_reports_broken_tasks_as_rows(plugins, spec,
     assert "broken: ended the process (exit 7)" in cli("list-tasks").stdout
 
 
-def test_a_task_that_hangs_is_given_up(plugins, cli):
+def test_probe_stops_hanging_task(plugins, cli):
     plugins("hangs", "import time\ntime.sleep(600)\n")
     found = rows(cli("list-tasks", "hangs", "--probe", "--probe-timeout", "1.5", "--json"))
     assert found["hangs-task"]["broken"] == "did not load within 1.5 s"
 
 
-def test_a_new_version_of_a_plugin_is_probed_anew(plugins, spec, tmp_path):
+def test_new_plugin_version_invalidates_cache(plugins, spec, tmp_path):
     import os
 
     from rlcli.registry import catalog
@@ -144,7 +144,7 @@ def test_a_new_version_of_a_plugin_is_probed_anew(plugins, spec, tmp_path):
     assert _key(entry) != before
 
 
-def test_the_status_says_whether_a_task_works_and_ships_a_policy(plugins, spec, cli):
+def test_status_shows_state_and_policy(plugins, spec, cli):
     details = {"summary": "Fine.", "workflow": "direct", "observation_size": 3, "action_size": 1}
     index = json.dumps({"good-task": {**details, "policy": True}})
     plugins("good", spec, files={"index.json": index})
@@ -152,16 +152,16 @@ def test_the_status_says_whether_a_task_works_and_ships_a_policy(plugins, spec, 
     done = cli("list-tasks")
     head, *lines = done.stdout.splitlines()
     assert head.split()[2:8] == ["WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "STATUS"]
-    told = {line.split()[0]: line for line in lines}
-    assert "  ok, policy  " in told["good-task"]
-    assert "  ok, policy  " in told["cartpole"]
-    assert "  ?  " in told["plain-task"]
+    shown = {line.split()[0]: line for line in lines}
+    assert "  ok, policy  " in shown["good-task"]
+    assert "  ok, policy  " in shown["cartpole"]
+    assert "  ?  " in shown["plain-task"]
     found = rows(cli("list-tasks", "--json"))
     assert [found[name]["status"] for name in ("good-task", "cartpole", "plain-task")] == ["ok, policy"] * 2 + ["?"]
     assert (found["cartpole"]["policy"], found["ant-direct"]["policy"]) == (True, found["ant-direct"]["status"] != "ok")
 
 
-def test_a_plugin_may_ship_its_details(plugins, spec, cli):
+def test_plugin_may_ship_details(plugins, spec, cli):
     index = json.dumps({"good-task": {"summary": "Shipped.", "workflow": "direct", "observation_size": 3}})
     plugins("good", spec, files={"index.json": index})
     row = rows(cli("list-tasks", "--json"))["good-task"]
@@ -172,7 +172,7 @@ def test_a_plugin_may_ship_its_details(plugins, spec, cli):
     "index",
     ["", "[]", "{", '{"good-task": 3}', '{"good-task": {"summary": ["x"]}}', '{"good-task": {"num_envs": "x"}}'],
 )
-def test_details_that_are_not_details_are_left_out(plugins, spec, cli, index, tmp_path):
+def test_invalid_details_are_ignored(plugins, spec, cli, index, tmp_path):
     plugins("good", spec, files={"index.json": index})
     (tmp_path / "cache" / "rlcli").mkdir(parents=True)
     (tmp_path / "cache" / "rlcli" / "tasks.json").write_text(index)
@@ -181,7 +181,7 @@ def test_details_that_are_not_details_are_left_out(plugins, spec, cli, index, tm
     assert "good-task" in done.stdout
 
 
-def test_a_plugin_that_prints_does_not_spoil_the_document(plugins, spec, cli):
+def test_printing_plugin_keeps_json_valid(plugins, spec, cli):
     plugins(
         "loud",
         "print('hello')\nimport sys; sys.stdout.write('again')\n" + spec,
@@ -193,7 +193,7 @@ def test_a_plugin_that_prints_does_not_spoil_the_document(plugins, spec, cli):
 
 
 @pytest.mark.parametrize("source", ["import sys\nsys.exit(0)\n", "def f(:\n", "import no_such_module\n", "SPEC = 3\n"])
-def test_a_broken_plugin_exits_with_4_and_no_traceback(plugins, cli, source):
+def test_broken_plugin_exits_with_4_without_traceback(plugins, cli, source):
     plugins("odd", source)
     done = cli("show", "odd-task", "--json")
     error = json.loads(done.stdout)["error"]
@@ -203,7 +203,7 @@ def test_a_broken_plugin_exits_with_4_and_no_traceback(plugins, cli, source):
     assert cli("show", "cartpole").returncode == 0
 
 
-def test_what_a_probe_found_broken_is_said_whatever_the_plugin_ships(plugins, cli):
+def test_broken_probe_result_wins_over_shipped_details(plugins, cli):
     plugins("bad", "raise ValueError('out of cheese')\n", files={"index.json": '{"bad-task": {"summary": "Fine."}}'})
     assert rows(cli("list-tasks", "--json"))["bad-task"]["broken"] is None
     assert "out of cheese" in rows(cli("list-tasks", "bad", "--probe", "--json"))["bad-task"]["broken"]

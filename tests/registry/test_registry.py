@@ -1,4 +1,4 @@
-"""Finding tasks and trainers among installed distributions, and what a broken one costs."""
+"""Lookup of tasks and trainers in installed distributions, with broken ones among them."""
 
 import pytest
 
@@ -19,7 +19,7 @@ def failure(name):
     return f"{caught.value.message} | {caught.value.hint}"
 
 
-def test_a_task_is_found_by_its_name_and_by_its_distribution(plugins, spec):
+def test_find_task_by_name_and_distribution(plugins, spec):
     folder = plugins("robots", spec, task="walk", files=HERE)
     for name in ("walk", "robots:walk"):
         source = find_task(name)
@@ -27,7 +27,7 @@ def test_a_task_is_found_by_its_name_and_by_its_distribution(plugins, spec):
         assert source.config == folder / "task.yaml"
 
 
-def test_an_unknown_task_is_answered_with_the_nearest_and_the_list(plugins, spec):
+def test_unknown_task_suggests_name_and_lists_tasks(plugins, spec):
     plugins("robots", spec, task="walk", files=HERE)
     said = failure("cartpol")
     assert "no task 'cartpol'" in said
@@ -38,7 +38,7 @@ def test_an_unknown_task_is_answered_with_the_nearest_and_the_list(plugins, spec
     assert "overrides come after the task" in failure("sim.dt=1")
 
 
-def test_two_owners_of_a_name_are_both_named(plugins, spec):
+def test_ambiguous_name_lists_owners(plugins, spec):
     plugins("robots", spec, task="walk", files=HERE)
     plugins("animals", spec, task="walk", version="2.0", files=HERE)
     said = failure("walk")
@@ -47,7 +47,7 @@ def test_two_owners_of_a_name_are_both_named(plugins, spec):
     assert find_task("animals:walk").version == "2.0"
 
 
-def test_the_first_of_two_copies_of_a_distribution_counts(plugins, spec):
+def test_first_copy_of_distribution_wins(plugins, spec):
     plugins("my-robots", spec, task="walk", files=HERE)
     plugins("my_robots", spec, task="walk", version="2.0", files=HERE)
     assert names().count("walk") == 1
@@ -61,7 +61,7 @@ def test_the_first_of_two_copies_of_a_distribution_counts(plugins, spec):
         {"metadata": "Metadata-Version: 2.1\nName: bad\n"},
     ],
 )
-def test_a_distribution_with_bad_metadata_hides_nothing_else(plugins, spec, broken):
+def test_bad_metadata_does_not_hide_other_plugins(plugins, spec, broken):
     plugins("bad", spec, **broken)
     plugins("good", spec, files=HERE)
     entries, unreadable = catalog()
@@ -70,7 +70,7 @@ def test_a_distribution_with_bad_metadata_hides_nothing_else(plugins, spec, brok
     assert "malformed metadata" in unreadable[0].reason
 
 
-def test_a_foreign_distribution_without_metadata_is_no_concern_of_ours(plugins):
+def test_unrelated_distribution_without_metadata_is_ignored(plugins):
     plugins("leftover", metadata="", entry_points="[console_scripts]\nx = y:z\n")
     assert catalog()[1] == []
 
@@ -97,7 +97,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_plugin_says_what_and_whose_and_breaks_nothing_else(plugins, name):
+def test_broken_plugin_error_names_plugin_and_reason(plugins, name):
     source, said = BROKEN[name]
     plugins(name, source, task="odd")
     message = failure("odd")
@@ -107,12 +107,12 @@ def test_a_broken_plugin_says_what_and_whose_and_breaks_nothing_else(plugins, na
     assert {"cartpole", "odd"} <= set(names())
 
 
-def test_the_place_in_a_plugin_that_raised_is_named(plugins):
+def test_error_of_plugin_has_file_and_line(plugins):
     folder = plugins("raises", BROKEN["raises"][0])
     assert f"({folder / '__init__.py'}:3)" in failure("raises-task")
 
 
-def test_an_entry_point_without_an_object_is_a_broken_plugin(plugins):
+def test_entry_point_without_object_is_broken(plugins):
     plugins("half", entry_points="[rlcli.tasks]\nhalf = half\n")
     assert "plugin half 1.0 is broken" in failure("half")
 
@@ -126,7 +126,7 @@ def test_an_entry_point_without_an_object_is_a_broken_plugin(plugins):
         ("", ["cartpole", "a-task", "b-b-task"], []),
     ],
 )
-def test_rlcli_plugins_chooses_distributions(plugins, spec, monkeypatch, value, there, gone):
+def test_rlcli_plugins_selects_distributions(plugins, spec, monkeypatch, value, there, gone):
     plugins("a", spec)
     plugins("b-b", spec)
     monkeypatch.setenv("RLCLI_PLUGINS", value)
@@ -136,7 +136,7 @@ def test_rlcli_plugins_chooses_distributions(plugins, spec, monkeypatch, value, 
     assert find_entry(TRAINERS, "sb3", what="trainer").distribution == "rlcli"
 
 
-def test_a_folder_is_a_task(tmp_path, monkeypatch):
+def test_folder_is_task(tmp_path, monkeypatch):
     folder = tmp_path / "hop"
     folder.mkdir()
     (folder / "task.yaml").write_text("{}")
@@ -151,7 +151,7 @@ def test_a_folder_is_a_task(tmp_path, monkeypatch):
     assert source.task == f"{folder / 'task.py'}:Task"
 
 
-def test_an_installed_name_wins_over_a_folder_of_that_name(tmp_path, monkeypatch):
+def test_installed_task_wins_over_folder(tmp_path, monkeypatch):
     (tmp_path / "cartpole").mkdir()
     (tmp_path / "cartpole" / "task.yaml").write_text("{}")
     monkeypatch.chdir(tmp_path)
@@ -159,15 +159,15 @@ def test_an_installed_name_wins_over_a_folder_of_that_name(tmp_path, monkeypatch
     assert find_task("./cartpole").distribution is None
 
 
-def test_what_is_not_a_task_folder_says_what_is_there(tmp_path):
+def test_folder_without_task_lists_its_files(tmp_path):
     (tmp_path / "notes.txt").write_text("x")
     assert "it has no task.yaml (notes.txt)" in failure(str(tmp_path))
     assert "no such folder" in failure(str(tmp_path / "nowhere"))
     assert "is a file, not a task's folder" in failure(str(tmp_path / "notes.txt"))
 
 
-def test_files_of_a_folder_shadow_no_module(tmp_path):
-    """terms.py and task.py are common names: each folder's own is imported, and nothing else finds them."""
+def test_folder_files_do_not_shadow_modules(tmp_path):
+    """terms.py and task.py are common names: each folder imports its own files, and other modules do not find them."""
     import sys
 
     from rlcli.registry import load_module, load_object
@@ -187,7 +187,7 @@ def test_files_of_a_folder_shadow_no_module(tmp_path):
     assert "task" not in sys.modules
 
 
-def test_the_owner_of_a_file_is_found_without_importing_others(plugins, spec):
+def test_task_of_file_imports_only_its_plugin(plugins, spec):
     import sys
 
     folder = plugins("robots", spec, files=HERE)
@@ -197,8 +197,8 @@ def test_the_owner_of_a_file_is_found_without_importing_others(plugins, spec):
     assert "loud" not in sys.modules
 
 
-def test_two_processes_give_a_folder_task_the_same_module_name(tmp_path):
-    """What a process names a module must not depend on its hash seed: pickled classes cross processes."""
+def test_folder_task_module_name_is_deterministic(tmp_path):
+    """The module name must not depend on the hash seed, because pickled classes are sent between processes."""
     import os
     import subprocess
     import sys
@@ -229,15 +229,15 @@ SPEC = TrainerSpec("mine", MODELS, "")
 """
 
 
-def trained_by(algorithm):
+def with_algorithm(algorithm):
     from rlcli.config.load import resolve
 
     return resolve(find_task("cartpole"), overrides=[f"agent={{trainer: mine, algorithm: {algorithm}, max_steps: 1}}"])
 
 
-def test_a_trainer_plugin_brings_its_own_settings(plugins):
+def test_trainer_plugin_has_own_settings(plugins):
     plugins("mine", TRAINER, entry_points="[rlcli.trainers]\nmine = mine:SPEC\n")
-    resolved = trained_by("good")
+    resolved = with_algorithm("good")
     assert resolved.agent.speed == 3
     assert resolved.trainer.summary == "mine"
 
@@ -245,7 +245,7 @@ def test_a_trainer_plugin_brings_its_own_settings(plugins):
 @pytest.mark.parametrize(
     ("algorithm", "said"), [("gone", "AttributeError"), ("odd", "No module"), ("int", "AgentConfig")]
 )
-def test_a_broken_trainer_plugin_is_named(plugins, algorithm, said):
+def test_broken_trainer_plugin_is_reported(plugins, algorithm, said):
     plugins("mine", TRAINER, entry_points="[rlcli.trainers]\nmine = mine:SPEC\n")
     with pytest.raises(TaskError, match=f"plugin mine 1.0 is broken: .*{said}"):
-        trained_by(algorithm)
+        with_algorithm(algorithm)

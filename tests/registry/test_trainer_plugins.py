@@ -1,4 +1,4 @@
-"""Trainers from installed distributions: two of one name, one for a newer rlcli, one that is not installed."""
+"""Trainers of plugins: ambiguous names, newer API versions, missing plugins."""
 
 import textwrap
 
@@ -14,7 +14,7 @@ POINTS = "[rlcli.trainers]\n%s = %s:SPEC\n"
 
 @pytest.fixture
 def mine(tmp_path, cli):
-    """mine(command, settings, words...) runs it with an agent of these settings."""
+    """mine(command, settings, words...) runs a command with an agent that has these settings."""
 
     def run(command, settings, *words, **environment):
         file = tmp_path / "agents.yaml"
@@ -36,7 +36,7 @@ def two(plugins):
         plugins(name, TRAINER % "", entry_points=POINTS % ("learner", package))
 
 
-def test_two_trainers_of_one_name_are_both_named_and_one_can_be_chosen(two, mine):
+def test_ambiguous_trainer_is_reported_and_can_be_qualified(two, mine):
     done = train(mine, "learner")
     assert done.returncode == 3, done.stderr
     assert "offered by first-learner 1.0 and second-learner 1.0" in done.stderr
@@ -45,7 +45,7 @@ def test_two_trainers_of_one_name_are_both_named_and_one_can_be_chosen(two, mine
     assert chosen.returncode == 0, chosen.stderr
 
 
-def test_two_trainers_of_one_name_leave_other_agents_alone(two, cli):
+def test_ambiguous_trainer_does_not_affect_other_agents(two, cli):
     done = cli(
         "train", "cartpole", "--agent", "ppo", "--num-envs", "2", "--max-iterations", "1", "--device", "cpu", "-q"
     )
@@ -53,7 +53,7 @@ def test_two_trainers_of_one_name_leave_other_agents_alone(two, cli):
     assert cli("list-tasks").returncode == 0
 
 
-def test_a_trainer_for_a_newer_rlcli_is_refused_with_both_numbers(plugins, mine):
+def test_trainer_with_newer_api_is_refused_in_train(plugins, mine):
     plugins("late-learner", TRAINER % ", api=99", entry_points=POINTS % ("late", "late_learner"))
     done = train(mine, "late")
     assert done.returncode == 4, done.stderr
@@ -69,7 +69,7 @@ def test_a_trainer_for_a_newer_rlcli_is_refused_with_both_numbers(plugins, mine)
         ("rl-games", "sac", "pip install rlcli-rl-games"),
     ],
 )
-def test_a_known_trainer_that_is_not_installed_comes_with_the_pip_line(mine, name, form, line):
+def test_missing_trainer_gives_pip_command(mine, name, form, line):
     settings = f"{{trainer: {name}, algorithm: {form}, params: {{config: {{max_epochs: 3}}}}}}"
     done = mine("train", settings, RLCLI_PLUGINS="rlcli")
     assert done.returncode == 7, done.stderr
@@ -77,14 +77,14 @@ def test_a_known_trainer_that_is_not_installed_comes_with_the_pip_line(mine, nam
     assert line in done.stderr
 
 
-def test_a_trainer_that_nobody_knows_is_no_dependency(mine):
+def test_unknown_trainer_is_config_error(mine):
     done = train(mine, "skrl")
     assert done.returncode == 3
     assert "no trainer 'skrl'" in done.stderr
     assert "pip" not in done.stderr
 
 
-def test_the_built_in_tasks_train_their_other_agents_without_those_trainers(cli):
+def test_built_in_tasks_train_without_trainer_plugins(cli):
     for task in ("cartpole", "cartpole-direct"):
         done = cli("train", task, "--num-envs", "2", "--max-iterations", "1", "-q", RLCLI_PLUGINS="rlcli")
         assert done.returncode == 0, done.stderr
@@ -93,7 +93,7 @@ def test_the_built_in_tasks_train_their_other_agents_without_those_trainers(cli)
         assert "not checked" in checked.stderr + checked.stdout or "not installed" in checked.stderr + checked.stdout
 
 
-def test_an_algorithm_in_a_librarys_own_form_is_named_by_its_class(plugins, mine):
+def test_algorithm_mapping_is_selected_by_class_name(plugins, mine):
     source = """
     from typing import Any
     from rlcli.config.schema import AgentConfig

@@ -182,8 +182,8 @@ def test_trajectory_with_objects_is_independent_of_num_envs(tmp_path):
     [
         ({}, "robot: an entity is a model (an MJCF file) or a shape: write one of the two"),
         ({"model": "cart.xml", "shape": "box"}, "robot: an entity is a model (an MJCF file) or a shape"),
-        ({"model": "cart.xml", "mass": 1.0}, "robot: 'mass' belongs to a shape"),
-        ({"model": "cart.xml", "free": True}, "robot: 'free' belongs to a shape"),
+        ({"model": "cart.xml", "mass": 1.0}, "robot: 'mass' is a key of a shape"),
+        ({"model": "cart.xml", "free": True}, "robot: 'free' is a key of a shape"),
         ({"shape": "box"}, "robot: size of a box is [x, y, z], its edges [m]; found none"),
         ({"shape": "box", "size": [1.0]}, "robot: size of a box is [x, y, z], its edges [m]; found 1 numbers"),
         ({"shape": "capsule", "size": [1.0, 2.0, 3.0]}, "size of a capsule is [radius, length]"),

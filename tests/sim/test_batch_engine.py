@@ -44,7 +44,7 @@ def scatter(engine, seed=0):
 
 
 def test_engine_refuses_more_worlds_than_memory_holds(monkeypatch):
-    monkeypatch.setattr("rlcli.machine.memory", lambda: 2**30)
+    monkeypatch.setattr("rlcli.machine.available_memory", lambda: 2**30)
     with pytest.raises(DeviceError, match=r"^1000000 environments need at least \d\.\d GiB, 1\.0 GiB are") as no:
         engine_of(model_of(), 1_000_000)
     assert no.value.hint == "use fewer environments: --num-envs"

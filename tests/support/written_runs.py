@@ -3,7 +3,7 @@
 import functools
 import json
 
-from rlcli.config.dump import given, to_data, to_yaml
+from rlcli.config.dump import explicit_values, to_data, to_yaml
 from rlcli.config.load import resolve
 from rlcli.registry import find_task
 from rlcli.runs.run import create_run
@@ -17,7 +17,7 @@ def write_run(runs, task="cartpole", *, seed=1, overrides=(), rows=(), agent=Non
         "task": {**source.record(), "file": source.config.name},
         "agent": resolved.agent_name,
         "device": "cpu",
-        "given": given(resolved),
+        "given": explicit_values(resolved),
         "rlcli": "0.1.0",
         "versions": {"mujoco": "4.0.0"},
         "command": ["rlcli", "train", source.name, "--seed", str(seed)],

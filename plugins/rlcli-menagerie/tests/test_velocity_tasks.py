@@ -95,7 +95,7 @@ def test_without_a_model_one_message_says_what_to_set_or_to_install(task, tmp_pa
     assert "the model is not on this machine: RLCLI_MODELS is not set; no Python package 'mjlab'" in error["message"]
     assert error["hint"] == (
         f"set RLCLI_MODELS to a folder that holds unitree_{robot}/{robot}.xml, or install the package mjlab,"
-        " which carries it"
+        " which contains it"
     )
     assert len(done.stderr.splitlines()) <= 2
     shown = rlcli("show", task, PYTHONPATH=_without_mjlab())

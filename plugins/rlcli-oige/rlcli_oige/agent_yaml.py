@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rlcli.config.layers import Origin, marked
+from rlcli.config.layers import Origin, document_origins
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli.formats import Note, Status
@@ -111,7 +111,7 @@ class _Translator:
         self._config(params["config"])
         if self.problems:
             raise ConfigError(self.problems)
-        origin = marked(self.document, self.label, "task")
+        origin = document_origins(self.document, self.label, "task")
 
         def written(path: Path) -> Origin:
             for length in range(len(path), 0, -1):
@@ -287,7 +287,7 @@ class _Translator:
         self.sources[target] = source
 
     def _where(self, path: Path) -> str:
-        return marked(self.document, self.label, "task")(path).where
+        return document_origins(self.document, self.label, "task")(path).where
 
     def _note(self, path: Path, status: Status, text: str = "") -> None:
         self.notes.append(Note(self._where(path), ".".join(str(step) for step in path), status, text))

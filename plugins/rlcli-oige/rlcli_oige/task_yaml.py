@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Any
 
-from rlcli.config.layers import Origin, marked, read
+from rlcli.config.layers import Origin, document_origins, read
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli.formats import Note, Status, Translation
@@ -212,7 +212,7 @@ class _Translator:
         self._put(("oige",), own, ())
         self._put(("summary",), f"{task.get('name', 'A task')}, a task written for OmniIsaacGymEnvs", ("name",))
         self.data["scene"].setdefault("entities", {})
-        origin = marked(self.document, self.label, "task")
+        origin = document_origins(self.document, self.label, "task")
 
         def written(path: Path) -> Origin:
             for length in range(len(path), -1, -1):
@@ -378,7 +378,7 @@ class _Translator:
         self.sources[target] = source
 
     def _where(self, path: Path) -> str:
-        return marked(self.document, self.label, "task")(path).where
+        return document_origins(self.document, self.label, "task")(path).where
 
     def _note(self, path: Path, status: Status, text: str = "") -> None:
         self.notes.append(Note(self._where(path), ".".join(str(step) for step in path), status, text))

@@ -39,10 +39,10 @@ def command(
     """Measure a task here, and recommend sizes and threads."""
     from rlcli.config.layers import flags
     from rlcli.config.load import resolve
-    from rlcli.machine import wait_calmly
+    from rlcli.machine import limit_openmp_spinning
     from rlcli.runs.trusted_tasks import named_task
 
-    wait_calmly()
+    limit_openmp_spinning()
     file = None if save_preset is None else _preset_file(save_preset, overwrite)
     source = named_task(task)
 
@@ -135,7 +135,7 @@ def _preset_file(word: str, overwrite: bool) -> Path:
 def _machine(resolved: Resolved) -> dict[str, Any]:
     """Return the facts of the machine, and warn if it is busy."""
     import rlcli
-    from rlcli.machine import available_cores, core_quota, memory, processor
+    from rlcli.machine import available_cores, available_memory, core_quota, processor
     from rlcli.runs.provenance import versions
     from rlcli.tuning.bench import load
 
@@ -146,7 +146,7 @@ def _machine(resolved: Resolved) -> dict[str, Any]:
         "cpu": processor()["model"],
         "cores": cores,
         "quota": core_quota(),
-        "memory": memory(),
+        "memory": available_memory(),
         "load": busy,
         "versions": {"rlcli": rlcli.__version__, **{name: v for name, v in versions(resolved).items() if v}},
     }

@@ -12,7 +12,7 @@ from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import ProbeTimeout
 from rlcli.errors import did_you_mean
 from rlcli.registry import OWN, Entry, catalog, plugins_chosen_by, unknown_wanted
-from rlcli.registry.probe import TIMEOUT_S, Details, cached, probe
+from rlcli.registry.probe import TIMEOUT_S, Details, cached_details, probe
 
 
 def command(
@@ -28,7 +28,7 @@ def command(
     by_name = Counter(entry.name for entry in entries)
     shared = {name for name, count in by_name.items() if count > 1}
     built_in = {entry.name for entry in entries if entry.distribution == OWN}
-    details = cached(entries)
+    details = cached_details(entries)
     if pattern:
         entries = [entry for entry in entries if _matches(entry, details, pattern.lower())]
     if probe_all:

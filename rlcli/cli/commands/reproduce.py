@@ -32,10 +32,10 @@ def command(
 ) -> None:
     """Train a run again, and compare."""
     from rlcli.cli.ui.difference_table import report_differences
-    from rlcli.machine import wait_calmly
+    from rlcli.machine import limit_openmp_spinning
     from rlcli.runs.run_ref import default_runs_dir, find_run
 
-    wait_calmly()  # as in training
+    limit_openmp_spinning()  # as in training
     runs = runs_dir or default_runs_dir()
     original, why = find_run(reference, runs)
     console.info(f"reproducing {original.folder} ({why})")

@@ -71,7 +71,7 @@ def command(
 ) -> None:
     """Train a policy."""
     from rlcli.config.layers import flags
-    from rlcli.machine import wait_calmly
+    from rlcli.machine import limit_openmp_spinning
     from rlcli.rl import distributed
     from rlcli.runs.run_ref import default_runs_dir
     from rlcli.training.launch import TrainingRequest, process_device
@@ -79,7 +79,7 @@ def command(
     from rlcli.training.subprocesses import stop_with_parent
 
     stop_with_parent()
-    wait_calmly()
+    limit_openmp_spinning()
     console.follows = not distributed.is_rank_zero()
     request = TrainingRequest(runs_dir or default_runs_dir(), None, resume, agent, device, gpus, config)
     request.overrides, request.flags = overrides or [], flags(scene__num_envs=num_envs)

@@ -25,10 +25,10 @@ def words(*choices: str) -> Callable[[str], list[str]]:
 def tasks(incomplete: str) -> list[Offer]:
     """The installed tasks; a folder is for the shell to complete."""
     from rlcli.registry import OWN, catalog
-    from rlcli.registry.probe import Details, cached
+    from rlcli.registry.probe import Details, cached_details
 
     entries, _ = catalog()
-    known = cached(entries)
+    known = cached_details(entries)
     found = []
     for entry in entries:
         shared = entry.distribution != OWN and sum(other.name == entry.name for other in entries) > 1
@@ -106,12 +106,12 @@ def _saved(ctx: typer.Context, run: str) -> list[str]:
 def _agents(task: str) -> list[str]:
     from rlcli.config.layers import read
     from rlcli.registry import OWN, TASKS, find_entry, find_task
-    from rlcli.registry.probe import cached
+    from rlcli.registry.probe import cached_details
 
     if not any(mark in task for mark in ("/", "\\")) and not (Path(task) / "task.yaml").is_file():
         entry = find_entry(TASKS, task, what="task")
         if entry.distribution != OWN:  # its file is found by importing it, which is not done for a key press
-            known = cached([entry]).get(entry.qualified)
+            known = cached_details([entry]).get(entry.qualified)
             return [known.agent] if known and known.agent else []
     source = find_task(task)
     if source.config.suffix not in (".yaml", ".yml"):

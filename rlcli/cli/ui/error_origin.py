@@ -44,7 +44,7 @@ def _packages() -> dict[str, str]:
     entries = []
     with contextlib.suppress(Exception):  # what cannot be read is not blamed
         entries = [entry for group in (TASKS, TRAINERS) for entry in catalog(group)[0]]
-    return {entry.value.partition(":")[0].partition(".")[0]: entry.distribution for entry in entries}
+    return {entry.package: entry.distribution for entry in entries}
 
 
 def _libraries() -> list[Path]:

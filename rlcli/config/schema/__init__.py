@@ -1,4 +1,4 @@
-"""The schema of a task: every key of a `task.yaml` with its unit, its range and its default."""
+"""Schema of a task: every key of a `task.yaml` with its meaning, unit, range and default."""
 
 from rlcli.config.schema.agent import *
 from rlcli.config.schema.base import *

@@ -1,4 +1,4 @@
-"""Settings that all trainers have."""
+"""Settings that all trainers share."""
 
 from __future__ import annotations
 
@@ -10,49 +10,50 @@ from rlcli.config.schema.base import Count, Positive, StrictModel, Threads, _Fra
 
 
 class AutopsyConfig(StrictModel):
-    """What is kept, while training, of episodes that ended badly or unlike the others; `rlcli autopsy RUN` shows it."""
+    """Recording of failed and unusual episodes during training; `rlcli autopsy RUN` shows the recordings."""
 
     seconds: Annotated[float, Field(gt=0, le=60), _FractionString()] = 2.0
-    """How much of an episode's end [s]."""
+    """Length of the recorded end of an episode [s]."""
     keep: Annotated[int, Field(ge=1, le=1000)] = 32
-    """Episodes that stay: the newest, of every kind of end some."""
+    """Number of recordings to keep: the newest ones, with some of every kind of termination."""
     memory_mib: Annotated[int, Field(ge=1, le=1_000_000)] = 256
-    """What the last seconds of all environments may take [MiB]; where they do not fit, fewer seconds are kept."""
+    """Memory for the last seconds of all environments [MiB]. If it is too small, fewer seconds are recorded."""
 
 
 class AgentConfig(StrictModel):
-    """What every trainer's settings have in common; a trainer's own model extends it."""
+    """Settings that all trainers share; the settings of each trainer extend them."""
 
     trainer: str
-    """Name of a trainer (entry-point group rlcli.trainers)."""
+    """Name of the trainer, for example ppo or sb3 (entry-point group rlcli.trainers)."""
     algorithm: str
-    """Algorithm of that trainer."""
+    """Name of an algorithm of the trainer."""
     task: dict[str, Any] = {}
-    """Patch of the task for what this agent was tuned for."""
+    """Changes of the task for this agent: keys of the task with other values."""
     max_iterations: Count | None = None
-    """Iterations to train for."""
+    """Number of training iterations; null: no limit, then `max_steps` is needed."""
     max_steps: Count | None = None
-    """Environment steps to train for."""
+    """Number of environment steps of the training, summed over all environments; null: no limit."""
     save_interval: Count | None = None
-    """Iterations between checkpoints; null: every 60 s and at the end."""
+    """Iterations between two checkpoints; null: a checkpoint every 60 s and one at the end."""
     keep_last: Count | None = None
-    """Newest checkpoints that stay, beside the first and the best; null: 10, or all where `save_interval` is set."""
+    """Number of newest checkpoints to keep, besides the first and the best; null: 10, or all if `save_interval` is
+    set."""
     keep_every: Count | None = None
-    """Checkpoints of every such iteration are written, and stay."""
+    """A checkpoint of every iteration divisible by this number is written and always kept; null: none."""
     eval_interval: Count | None = None
-    """Iterations between evaluations of the policy, as `rlcli eval` does it; the best one's checkpoint is RUN@best.
-    null: none."""
+    """Iterations between two evaluations of the policy, as `rlcli eval` does them; null: no evaluations. RUN@best is
+    the checkpoint with the best evaluation."""
     eval_episodes: Count = 100
-    """Episodes of such an evaluation."""
+    """Number of episodes of each of these evaluations."""
     autopsy: AutopsyConfig | None = AutopsyConfig()
-    """Ends of episodes that are kept while training on a CPU; null: none."""
+    """Recording of failed and unusual episodes during training on a CPU; null: no recording."""
     torch_threads: Threads | None = None
-    """Threads of the update; null: min(4, cores). Results are equal only for an equal number."""
+    """Number of CPU threads of the policy update; null: min(4, cores). Another number gives other rounding errors."""
     action_bound: Positive | None = 1.0
-    """The policy's actions are clipped to +-this in training, play and export alike; null: unbounded."""
+    """Actions of the policy are clipped to +-`action_bound` in training, play and export; null: no clipping."""
 
     @model_validator(mode="after")
     def _budget(self) -> AgentConfig:
         if self.max_iterations is None and self.max_steps is None:
-            raise ValueError("one of max_iterations and max_steps is needed")
+            raise ValueError("set max_iterations or max_steps")
         return self

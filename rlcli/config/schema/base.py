@@ -1,4 +1,4 @@
-"""Number types and the base class of every configuration model."""
+"""Number types and the base class of all configuration models."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _fraction(value: object) -> Any:
 
 
 class _FractionString:
-    """Annotation of a number that may be written as a fraction; it adds the pattern to the JSON Schema."""
+    """Annotation of a number that may be written as a fraction such as `1/120`, also in the JSON Schema."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_before_validator_function(_fraction, handler(source))
@@ -34,20 +34,25 @@ class _FractionString:
         return {"anyOf": [handler(schema), {"type": "string", "pattern": "^" + _FRACTION.pattern.replace(r"\Z", "$")}]}
 
 
-def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+def _check_order(value: tuple[float, float]) -> tuple[float, float]:
     if value[0] > value[1]:
         raise ValueError(f"the lower end {value[0]:g} is above the upper end {value[1]:g}")
     return value
 
 
-def _rotation(value: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    if math.hypot(*value) < 1e-6:
-        raise ValueError("a quaternion must not be zero; no rotation is [1, 0, 0, 0]")
-    return value
+def _nonzero(message: str) -> AfterValidator:
+    """Return a validator that refuses a vector of (almost) zero length."""
+
+    def check(value: tuple[float, ...]) -> tuple[float, ...]:
+        if math.hypot(*value) < 1e-6:
+            raise ValueError(message)
+        return value
+
+    return AfterValidator(check)
 
 
 class _TermFunction:
-    """Annotation of a term's name: a configuration in Python may hold the function instead."""
+    """Annotation of the name of a term. A configuration in Python may have the function instead of its name."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         name = core_schema.str_schema(strict=True)
@@ -58,12 +63,6 @@ class _TermFunction:
         return {"type": "string"}
 
 
-def _nonzero_direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
-    if math.hypot(*value) < 1e-6:
-        raise ValueError("a direction must not be zero; straight down is [0, 0, -1]")
-    return value
-
-
 Number = Annotated[float, _FractionString()]
 Positive = Annotated[float, Field(gt=0), _FractionString()]
 NotNegative = Annotated[float, Field(ge=0), _FractionString()]
@@ -71,18 +70,21 @@ Count = Annotated[int, Field(ge=1)]
 Threads = Annotated[int, Field(ge=1, le=4096)]
 Share = Annotated[float, Field(ge=0, le=1), _FractionString()]
 Vec3 = tuple[Number, Number, Number]
-Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_rotation)]
-Direction = Annotated[Vec3, AfterValidator(_nonzero_direction)]
-Range = Annotated[tuple[Number, Number], AfterValidator(_ordered)]
-ShareRange = Annotated[tuple[Share, Share], AfterValidator(_ordered)]
-StepRange = Annotated[
-    tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0, le=1000)]], AfterValidator(_ordered)
+Quaternion = Annotated[
+    tuple[Number, Number, Number, Number],
+    _nonzero("a quaternion must not be zero; no rotation is [1, 0, 0, 0]"),
 ]
+Direction = Annotated[Vec3, _nonzero("a direction must not be zero; straight down is [0, 0, -1]")]
+Range = Annotated[tuple[Number, Number], AfterValidator(_check_order)]
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_check_order)]
+ShareRange = Annotated[tuple[Share, Share], AfterValidator(_check_order)]
+_Steps = Annotated[int, Field(ge=0, le=1000)]
+StepRange = Annotated[tuple[Annotated[int, Field(ge=0)], _Steps], AfterValidator(_check_order)]
 Names = str | Annotated[list[str], Field(min_length=1)]
 
 
 class StrictModel(BaseModel):
-    """Base of every configuration model: unknown keys, wrong types, NaN and later changes are refused."""
+    """Base class of all configuration models. It refuses unknown keys, wrong types, NaN and later changes."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
     _defined_in: ClassVar[ModuleType | None]
@@ -93,8 +95,10 @@ class StrictModel(BaseModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        """Read docstrings only when somebody asks for a schema: pydantic would while the models are made, which then
-        takes half as long again.
+        """Add the docstrings below the fields to the JSON Schema.
+
+        They are read only when a schema is generated. Pydantic's `use_attribute_docstrings` reads them when the classes
+        are created, which then takes 1.5 times as long.
         """
         from rlcli.config.docstrings import describe
 
@@ -104,4 +108,4 @@ class StrictModel(BaseModel):
 
 
 Columns = Number | Annotated[list[Number], Field(min_length=1)]
-"""One number for all columns of a term, or one each."""
+"""One number for all columns of a term, or one number for each column."""

@@ -1,4 +1,4 @@
-"""Contact sensors, ray sensors and cameras."""
+"""Schema of contact sensors, ray sensors and cameras."""
 
 from __future__ import annotations
 
@@ -10,64 +10,67 @@ from rlcli.config.schema.base import Count, Direction, Names, NotNegative, Posit
 
 
 class TouchedConfig(StrictModel):
-    """What a contact sensor listens to contacts with."""
+    """The other side of the contacts that a contact sensor measures."""
 
     entity: str
     """Name of an entity."""
     bodies: Names | None = None
-    """Names or regexes of its bodies; null: all of them."""
+    """Names or regexes of its bodies; null: all bodies."""
 
 
 class ContactSensorConfig(StrictModel):
-    """What touches bodies of an entity: net force, and how long they have been in contact or in the air."""
+    """Contact sensor of bodies of an entity: net contact force, and time in contact and in the air."""
 
     kind: Literal["contact"]
-    """contact."""
+    """Always contact."""
     entity: str = "robot"
     """Name of an entity."""
     bodies: Names
-    """Names or regexes of its bodies, one slot each in the order written."""
+    """Names or regexes of its bodies. Each body has one column, in this order."""
     against: Literal["ground"] | TouchedConfig | None = None
-    """Only contacts with this: ground (the plane or the terrain), or bodies of an entity; null: with anything."""
+    """The other side of the contacts: ground (the plane or the terrain) or bodies of an entity; null: everything."""
     history: Count = 1
-    """Steps that `force_history` keeps."""
+    """Number of environment steps in `force_history`."""
     force_threshold: NotNegative = 0.0
-    """Net force from which on a body counts as in contact [N]; 0: any contact does."""
+    """Smallest net force with which a body counts as in contact [N]; 0: every contact counts."""
 
 
 class GridPatternConfig(StrictModel):
-    """Parallel rays that start from a grid about the sensor, x running fastest."""
+    """Parallel rays that start from a grid around the sensor. x changes fastest in the order of the rays."""
 
     size: tuple[NotNegative, NotNegative]
-    """Extent along x and y [m]."""
+    """Size of the grid along x and y [m]."""
     resolution: Positive
     """Distance between neighbouring rays [m]."""
     direction: Direction = (0.0, 0.0, -1.0)
-    """Where the rays go, in the sensor's frame."""
+    """Direction of the rays in the sensor's frame; it is normalised."""
 
 
 class RaySensorConfig(StrictModel):
-    """Distances along rays from a body, as a height scanner or a lidar gives them."""
+    """Ray sensor: distances along rays from a body, like those of a height scanner or a lidar."""
 
     kind: Literal["rays"]
-    """rays."""
+    """Always rays."""
     entity: str = "robot"
     """Name of an entity."""
     body: str | None = None
-    """The body that carries the sensor; null: the root."""
+    """The body to which the sensor is attached; null: the root body."""
     pattern: GridPatternConfig | Annotated[list[Direction], Field(min_length=1)]
-    """A grid of parallel rays, or a list of directions from one point, in the sensor's frame."""
+    """A grid of parallel rays, or a list of directions of rays that start in one point, in the sensor's frame."""
     offset: Vec3 = (0.0, 0.0, 0.0)
-    """Where the sensor sits in its frame [m]."""
+    """Position of the sensor in its frame [m]."""
     alignment: Literal["base", "yaw", "world"] = "base"
-    """Axes of the sensor's frame: those of the body, those of the body's heading with z up, or the world's."""
+    """Axes of the sensor's frame. base: the axes of the body; yaw: the body's heading with z up; world: the world's
+    axes."""
     max_distance: Positive = 10.0
-    """Range [m]; what lies farther is missed."""
+    """Range of the sensor [m]; objects beyond it are not detected."""
     sees: Literal["ground", "all"] | Annotated[list[Annotated[int, Field(ge=0, le=5)]], Field(min_length=1)] = "ground"
-    """ground: the plane or the terrain; all: every geom but those of the body; or a list of geom groups."""
+    """What rays can hit. ground: the plane or the terrain; all: every geom except those of the body; or a list of
+    MuJoCo geom groups (0 to 5)."""
     lookup: bool = False
-    """Rays straight down find the ground in the table of the terrain's heights instead of among geoms: the same to
-    rounding, and much faster on a GPU. For a terrain without boxes, and alignment yaw or world."""
+    """true: rays that point straight down read the ground from the terrain's table of heights. The distances are equal
+    up to rounding, and the sensor is much faster on a GPU. It needs a terrain without boxes, and alignment yaw or
+    world."""
 
     @model_validator(mode="after")
     def _straight_down(self) -> RaySensorConfig:
@@ -76,52 +79,55 @@ class RaySensorConfig(StrictModel):
         pattern = self.pattern
         directions = [pattern.direction] if isinstance(pattern, GridPatternConfig) else pattern
         if any(x or y or z >= 0.0 for x, y, z in directions) or self.alignment == "base":
-            raise ValueError("lookup is for rays straight down: directions [0, 0, -1], alignment yaw or world")
+            raise ValueError("lookup needs rays straight down: directions [0, 0, -1], alignment yaw or world")
         if self.sees != "ground":
-            raise ValueError("lookup is for rays that see the ground alone: sees: ground")
+            raise ValueError("lookup needs rays that see only the ground: sees: ground")
         return self
 
 
 class CameraSensorConfig(StrictModel):
-    """Pictures of every environment, drawn offscreen once an environment step: colours, or how far things are."""
+    """Camera sensor: images of every environment, rendered offscreen once in each environment step."""
 
     kind: Literal["camera"]
-    """camera."""
+    """Always camera."""
     data: Literal["rgb", "depth", "distance"] = "rgb"
-    """rgb: red, green and blue, 0 to 255; depth: along the camera's axis [m]; distance: from the camera's place [m]."""
+    """rgb: red, green and blue in 0 to 255; depth: distance along the camera's axis [m]; distance: distance from the
+    camera's position [m]."""
     width: Annotated[int, Field(ge=1, le=1024)]
-    """Columns of the picture."""
+    """Image width [pixels]."""
     height: Annotated[int, Field(ge=1, le=1024)]
-    """Rows of the picture."""
+    """Image height [pixels]."""
     entity: str | None = None
-    """The entity that the camera belongs to; null: it stands in the environment."""
+    """The entity to which the camera is attached; null: the camera is fixed in the environment."""
     camera: str | None = None
-    """A camera of the entity's MJCF, with its place and its field of view; null: what follows says them."""
+    """A camera of the entity's MJCF, which defines position and field of view; null: the keys below define them."""
     body: str | None = None
-    """The body of the entity that carries the camera; null: its root."""
+    """The body of the entity to which the camera is attached; null: the root body."""
     eye: Vec3 = (-3.0, 0.0, 1.0)
-    """Where the camera sits, in the frame of what carries it [m]."""
+    """Position of the camera in the frame of the body, or of the environment [m]."""
     lookat: Vec3 = (0.0, 0.0, 0.0)
-    """A point in the middle of the picture, in the same frame [m]. The frame's z axis is up in it, or x if the camera
-    looks along z."""
+    """The point in the centre of the image, in the same frame [m]. The frame's z axis points up in the image, or its x
+    axis if the camera looks along z."""
     fov: Annotated[float, Field(gt=0, lt=180)] = 45.0
-    """Field of view from the lower to the upper edge [degrees]."""
+    """Vertical field of view [degrees]."""
     clip: tuple[Positive, Positive] = (0.01, 20.0)
-    """What is nearer or farther than this along the camera's axis is not seen [m]."""
+    """[near, far] distances along the camera's axis [m]; the camera does not see objects outside of them."""
     samples: Annotated[int, Field(ge=1, le=8)] = 1
-    """Each pixel is the mean of so many by so many: edges are soft, and things smaller than a pixel show."""
+    """Each pixel is the mean of `samples` x `samples` samples, which smooths edges and shows objects smaller than a
+    pixel."""
 
     @model_validator(mode="after")
     def _relations(self) -> CameraSensorConfig:
         if self.entity is None and (self.camera or self.body):
-            raise ValueError("camera and body are those of an entity: name it")
+            raise ValueError("camera and body belong to an entity: set entity")
         placed = sorted({"body", "eye", "lookat", "fov"} & self.model_fields_set)
         if self.camera is not None and placed:
-            raise ValueError(f"a camera of the MJCF has its own place and field of view: leave {', '.join(placed)} out")
+            keys = ", ".join(placed)
+            raise ValueError(f"a camera of the MJCF has its own position and field of view: remove {keys}")
         if self.clip[0] >= self.clip[1]:
             raise ValueError(f"clip: {self.clip[0]:g} is not below {self.clip[1]:g}")
         if self.eye == self.lookat:
-            raise ValueError("eye and lookat are one point: the camera has no direction")
+            raise ValueError("eye and lookat are the same point: the camera has no direction")
         return self
 
 

@@ -1,4 +1,4 @@
-"""A whole task, with its simulation and its camera."""
+"""Schema of a whole task, of its simulation and of its viewer camera."""
 
 from __future__ import annotations
 
@@ -22,80 +22,82 @@ from rlcli.config.schema.terms import (
 
 
 class SimConfig(StrictModel):
-    """The simulation."""
+    """Physics simulation."""
 
     dt: Annotated[float, Field(gt=0, le=0.1), _FractionString()]
     """Physics time step [s]."""
     render_interval: Count = 1
-    """Physics steps between two frames of a video; never less than one environment step."""
+    """Physics steps between two frames of a video. Videos have at most one frame for each environment step."""
     gravity: Vec3 = (0.0, 0.0, -9.81)
     """Gravity in the world frame [m/s^2]."""
     integrator: Literal["euler", "rk4", "implicit", "implicitfast"] | None = None
-    """MuJoCo's integrator; null takes the first entity's MJCF."""
+    """MuJoCo's integrator; null: the one in the MJCF of the first entity."""
     iterations: Count | None = None
-    """Solver iterations; null takes the first entity's MJCF."""
+    """Largest number of solver iterations; null: the one in the MJCF of the first entity."""
     ls_iterations: Count | None = None
-    """Line-search iterations of the solver; null takes the first entity's MJCF."""
+    """Largest number of line-search iterations of the solver; null: the one in the MJCF of the first entity."""
     engine: Literal["auto", "batch", "warp"] = "auto"
-    """What steps the worlds: auto is batch (MuJoCo's threads) on a CPU and warp (MuJoCo Warp) on a GPU."""
+    """Physics engine. batch: MuJoCo on CPU threads; warp: MuJoCo Warp on a GPU; auto: batch on a CPU, warp on a GPU."""
     engine_threads: Threads | None = None
-    """Threads that step physics; null is every core this process may use."""
+    """Number of CPU threads that step the physics; null: one for each core that this process may use."""
     forces_after_reset: bool = True
-    """Compute accelerations and forces of a start state; false: they are 0 until an episode's first step, which saves
-    a GPU that reads them a forward pass over all environments a step."""
+    """true: compute accelerations and forces also for the start state of an episode; false: they are 0 until the first
+    step. On a GPU, false saves one forward pass over all environments in each step if terms read them."""
     derived_fields: Literal["current", "substep"] = "current"
-    """What is read of the fields that MuJoCo derives from the state (xpos, cvel, sensordata, ...): current is that of
-    the state after the step; substep is what the last physics step left, which describes the state before it, and
-    saves computing them anew: as one reads them after `mj_step`."""
+    """State that MuJoCo's derived fields (xpos, cvel, sensordata, ...) belong to. current: the state after the
+    environment step; substep: the state before the last physics step, as after `mj_step`, which saves computing them
+    again."""
     external_forces: bool = False
-    """Compute `cfrc_ext`, the forces of contacts on bodies, after every step, as `mj_rnePostConstraint` does; they are
-    0 in a start state. On a CPU it takes about 15 us for each environment that touches something."""
+    """true: compute `cfrc_ext`, the contact forces on bodies, after every step, as `mj_rnePostConstraint` does. They
+    are 0 in a start state. On a CPU this takes about 15 us for each environment that has contacts."""
     max_velocity: Positive | None = None
-    """Speed of a joint or a free body [m/s, rad/s] beyond which an environment counts as diverged, after an environment
-    step; null: MuJoCo's own bound, 1e10. A contact that throws a body at a finite 1e6 m/s ruins a learner."""
+    """Speed of a joint or a free body [m/s or rad/s] above which an environment counts as diverged; checked after every
+    environment step. null: MuJoCo's own limit, 1e10. A body that a contact accelerates to a finite 1e6 m/s would spoil
+    the training."""
     contacts_per_env: Count | None = None
-    """Room for contacts that warp sets aside, an environment; null estimates it from the model."""
+    """Number of contacts for each environment that warp allocates memory for; null: estimated from the model."""
     constraints_per_env: Count | None = None
-    """Room for constraint rows (limits, friction, contacts) likewise."""
+    """Number of constraint rows (limits, friction, contacts) for each environment that warp allocates memory for; null:
+    estimated from the model."""
 
 
 class ViewerConfig(StrictModel):
-    """Where the camera stands."""
+    """Camera of viewers, images and videos."""
 
     eye: Vec3 = (4.0, 4.0, 3.0)
-    """Camera position [m], world frame of the environment shown."""
+    """Position of the camera [m], world frame of the environment that is shown."""
     lookat: Vec3 = (0.0, 0.0, 0.0)
-    """Point the camera looks at [m]."""
+    """Point at which the camera looks [m], in the same frame."""
     follow: str | None = None
-    """Entity that the camera of pictures and videos goes along with, as far as its root is from where the entity's
-    default state has it; null: the camera stands still."""
+    """Entity that the camera of images and videos follows: the camera moves by the displacement of the entity's root
+    from its default position. null: the camera does not move."""
     width: Annotated[int, Field(ge=16, le=3840)] = 640
-    """Picture width [pixels]."""
+    """Image width [pixels]."""
     height: Annotated[int, Field(ge=16, le=2160)] = 480
-    """Picture height [pixels]."""
+    """Image height [pixels]."""
 
 
 class TaskConfig(StrictModel):
-    """A whole task. Manager-based tasks fill actions ... terminations, direct tasks `params`."""
+    """A whole task. Manager-based tasks have sections of terms (actions to curriculum), direct tasks have `params`."""
 
     summary: str = ""
-    """One line that says what the task is."""
+    """One line that describes the task."""
     sim: SimConfig
-    """Physics."""
+    """Physics simulation."""
     decimation: Count
-    """Physics steps an environment step; step_dt = dt x decimation."""
+    """Number of physics steps in an environment step; step_dt = dt x decimation."""
     episode_length_s: Positive
-    """Length of an episode [s]; it is truncated there."""
+    """Largest length of an episode [s]; longer episodes are truncated."""
     scene: SceneConfig
-    """Environments, ground, lights, robots."""
+    """Environments, ground, lights, robots and objects."""
     viewer: ViewerConfig = ViewerConfig()
-    """Camera of videos and windows."""
+    """Camera of viewers, images and videos."""
     actions: dict[str, ActionConfig | None] = {}
-    """Action terms, in the order of the policy's output; null removes one."""
+    """Action terms, in the order of the policy's output. null removes a term."""
     commands: dict[str, CommandConfig | None] = {}
     """Command terms."""
     observations: dict[str, ObservationGroupConfig] = {}
-    """Groups of observation terms; the policy reads the group `policy`."""
+    """Groups of observation terms. The group `policy` is the input of the policy."""
     events: dict[str, EventConfig | None] = {}
     """Event terms."""
     rewards: dict[str, RewardConfig | None] = {}
@@ -105,23 +107,27 @@ class TaskConfig(StrictModel):
     curriculum: dict[str, CurriculumConfig | None] = {}
     """Curriculum terms."""
     success: SuccessConfig | None = None
-    """What makes an episode a success in `eval`."""
+    """Condition under which an episode counts as a success in `eval`."""
     reward_dt_scaling: bool = True
-    """Multiply manager-based rewards by step_dt, so that returns do not depend on the control rate."""
+    """true: rewards of manager-based tasks are multiplied by step_dt, so that returns do not depend on the control
+    rate."""
     divergence_reward: Number | None = None
-    """Reward of the step in which an environment diverged; null: that of its last finite state, terminated."""
+    """Reward of the step in which an environment diverged; null: the reward of its last finite state. The episode is
+    terminated."""
     params: dict[str, Any] = {}
-    """Parameters of a direct task, checked by the task's own Params."""
+    """Parameters of a direct task, checked by the class `Params` of the task."""
     foreign: dict[str, dict[str, Any]] = {}
-    """Key of another framework's format -> what only its environment reads. In a file the key stands at the top."""
+    """Key of another framework's format -> settings that only the format's environment reads. In a file this key is
+    written at the top level."""
     clip_actions: Positive | None = None
-    """Direct tasks: actions are clamped to +-this before pre_physics_step."""
+    """Direct tasks: actions are clamped to +-`clip_actions` before pre_physics_step; null: not clamped."""
     clip_observations: Positive | None = None
-    """Direct tasks: observations are clamped to +-this."""
+    """Direct tasks: observations are clamped to +-`clip_observations`; null: not clamped."""
     play: dict[str, Any] = {}
-    """Patch of this configuration for play and eval."""
+    """Changes of this configuration for play and eval."""
     agents: dict[str, Any] = {}
-    """Name -> settings of a trainer; `default` names the one to use, by itself or by device."""
+    """Name -> settings of a trainer. The key `default` names the default agent, or the default agent for each
+    device."""
 
     @field_validator("episode_length_s")
     @classmethod
@@ -134,7 +140,7 @@ class TaskConfig(StrictModel):
 
     @field_validator("viewer")
     @classmethod
-    def _something_to_follow(cls, value: ViewerConfig, info: ValidationInfo) -> ViewerConfig:
+    def _check_followed_entity(cls, value: ViewerConfig, info: ValidationInfo) -> ViewerConfig:
         scene = info.data.get("scene")
         if value.follow is not None and scene is not None and value.follow not in scene.entities:
             have = ", ".join(scene.entities)
@@ -148,5 +154,5 @@ class TaskConfig(StrictModel):
 
     @property
     def max_episode_length(self) -> int:
-        """Steps of an episode; the small slack absorbs rounding, so that 5 s at 1/60 s is 300 steps."""
+        """Largest number of steps in an episode. A tolerance absorbs rounding: 5 s at 1/60 s are 300 steps."""
         return math.ceil(self.episode_length_s / self.step_dt - 1e-6)

@@ -1,20 +1,20 @@
-"""Terms of a manager-based task: the keys that all terms of a section have.
+"""Schema of the terms of manager-based tasks: the keys that all terms of a section share.
 
-Terms are open here: their parameters are the keyword-only parameters of the function they name, checked by
-`rlcli.config.term_signatures`.
+Each term has further keys, the keyword-only parameters of its function. `rlcli.config.term_signatures` checks them.
 """
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from rlcli.config.schema.base import (
     Columns,
     Count,
     NotNegative,
     Number,
+    PositiveRange,
     Range,
     Share,
     StepRange,
@@ -24,53 +24,53 @@ from rlcli.config.schema.base import (
 
 
 class TermConfig(StrictModel):
-    """One term: the function it calls, and that function's parameters as further keys."""
+    """A term: the function that it calls. The parameters of the function are further keys."""
 
     model_config = ConfigDict(extra="allow")
 
     func: Annotated[str, _TermFunction()]
-    """Name of the function, looked up in the task's own terms, then in rlcli.mdp; in Python also the function."""
+    """Name of the function, searched in the task's own terms, then in rlcli.mdp. In Python also the function itself."""
 
     @property
     def params(self) -> dict[str, Any]:
-        """The parameters of the function, validated, defaults filled in."""
+        """The validated parameters of the function, with defaults."""
         return dict(self.model_extra or {})
 
 
 class RewardConfig(TermConfig):
-    """A reward term; its contribution a step is weight x value x step_dt."""
+    """A reward term. It adds weight x value x step_dt to the reward of each step."""
 
     weight: Number
-    """Signed weight."""
+    """Weight; negative for a penalty."""
     while_alive: bool = False
-    """True: pays nothing in the step in which the episode is terminated."""
+    """true: the term is 0 in the step in which the episode is terminated."""
 
 
 class TerminationConfig(TermConfig):
     """A termination term."""
 
     time_out: bool = False
-    """True: ends the episode as truncated (the value of the last state is bootstrapped), not as terminated."""
+    """true: the episode is truncated (the value of the last state is bootstrapped); false: it is terminated."""
 
 
 class EventConfig(TermConfig):
-    """Something that happens to some environments at some time."""
+    """A change of environments at certain times, for example a reset, a push or a randomization."""
 
     mode: Literal["startup", "reset", "interval"]
-    """startup: once; reset: when an episode starts; interval: again and again."""
-    interval_range_s: Range | None = None
-    """[low, high] time between two firings [s], drawn an environment; required by mode interval."""
+    """startup: once at the start; reset: when an episode starts; interval: repeatedly."""
+    interval_range_s: PositiveRange | None = None
+    """[low, high] time between two events [s], drawn for each environment; required by mode interval."""
     global_time: bool = False
-    """Mode interval: one timer for all environments, which resets do not restart."""
+    """Mode interval: true: one timer for all environments, which resets do not restart."""
     min_steps_between: Annotated[int, Field(ge=0)] = 0
-    """Mode reset: environment steps that must have passed since the last firing; the first reset always fires."""
+    """Mode reset: smallest number of environment steps between two events. The first reset always triggers the
+    event."""
 
     @model_validator(mode="after")
     def _interval(self) -> EventConfig:
         if (self.mode == "interval") != (self.interval_range_s is not None):
             raise ValueError("interval_range_s belongs to mode interval, and mode interval needs it")
-        if self.interval_range_s is not None and self.interval_range_s[0] <= 0:
-            raise ValueError("interval_range_s must be above 0")
+
         if self.global_time and self.mode != "interval":
             raise ValueError("global_time belongs to mode interval")
         if self.min_steps_between and self.mode != "reset":
@@ -80,7 +80,7 @@ class EventConfig(TermConfig):
 
 class _NoiseConfig(StrictModel):
     operation: Literal["add", "scale", "set"] = "add"
-    """add: value + draw; scale: value x draw; set: the draw alone."""
+    """add: value + sample; scale: value x sample; set: the sample replaces the value."""
 
 
 class UniformNoiseConfig(_NoiseConfig):
@@ -88,9 +88,9 @@ class UniformNoiseConfig(_NoiseConfig):
 
     kind: Literal["uniform"]
     low: Columns = -1.0
-    """Lower end of each draw, in the term's unit (a factor, to scale)."""
+    """Lower end of the samples, in the unit of the term (for `operation: scale` a factor)."""
     high: Columns = 1.0
-    """Upper end."""
+    """Upper end of the samples, in the same unit."""
 
 
 class GaussianNoiseConfig(_NoiseConfig):
@@ -98,24 +98,24 @@ class GaussianNoiseConfig(_NoiseConfig):
 
     kind: Literal["gaussian"]
     mean: Columns = 0.0
-    """Mean of each draw, in the term's unit (a factor, to scale)."""
+    """Mean of the samples, in the unit of the term (for `operation: scale` a factor)."""
     std: Columns = 1.0
-    """Standard deviation."""
+    """Standard deviation of the samples, in the same unit."""
 
 
 class ConstantNoiseConfig(_NoiseConfig):
-    """The same value in every step."""
+    """A constant value, the same in every step."""
 
     kind: Literal["constant"]
     value: Columns = 0.0
-    """What is added, multiplied or set, in the term's unit (a factor, to scale)."""
+    """The value, in the unit of the term (for `operation: scale` a factor)."""
 
 
 NoiseConfig = Annotated[UniformNoiseConfig | GaussianNoiseConfig | ConstantNoiseConfig, Field(discriminator="kind")]
 
 
 class ScaleModifierConfig(StrictModel):
-    """value x factor."""
+    """Multiply: value x factor."""
 
     kind: Literal["scale"]
     factor: Columns
@@ -123,33 +123,33 @@ class ScaleModifierConfig(StrictModel):
 
 
 class BiasModifierConfig(StrictModel):
-    """value + offset."""
+    """Add: value + offset."""
 
     kind: Literal["bias"]
     offset: Columns
-    """What is added, in the term's unit."""
+    """Offset, in the unit of the term."""
 
 
 class ClipModifierConfig(StrictModel):
-    """The value within bounds."""
+    """Limit the value to a range."""
 
     kind: Literal["clip"]
     bounds: Range
-    """[low, high], in the term's unit."""
+    """[low, high] limits, in the unit of the term."""
 
 
 class DigitalFilterModifierConfig(StrictModel):
-    """y[i] = sum_j b[j] x[i-j] - sum_j a[j] y[i-1-j], with zeros before an episode's first step."""
+    """Digital filter: y[i] = sum_j b[j] x[i-j] - sum_j a[j] y[i-1-j], with zeros before an episode's first step."""
 
     kind: Literal["digital_filter"]
     a: list[Number] = []
-    """Weights of past outputs, the last one first; none for a filter without feedback."""
+    """Coefficients of past outputs, the newest output first; empty for a filter without feedback."""
     b: Annotated[list[Number], Field(min_length=1)]
-    """Weights of the input of this step and of those before."""
+    """Coefficients of the input of this step and of past inputs, the newest first."""
 
 
 class IntegratorModifierConfig(StrictModel):
-    """Integral over the episode by the trapezoidal rule."""
+    """Integral of the value over the episode, by the trapezoidal rule."""
 
     kind: Literal["integrator"]
 
@@ -165,43 +165,44 @@ ModifierConfig = Annotated[
 
 
 class DelayConfig(StrictModel):
-    """What the policy sees is some steps old; in an episode's first steps it is the first value."""
+    """Delay of an observation. In the first steps of an episode the policy gets the first value."""
 
     steps: StepRange
-    """[low, high] environment steps, drawn an environment at the start of each episode; both ends included."""
+    """[low, high] delay in environment steps, both included; drawn for each environment at the start of an episode."""
     redraw: Share = 0.0
-    """Chance that an environment draws its delay anew in a step."""
+    """Probability that an environment draws a new delay in a step, in [0, 1]."""
 
 
 class ObservationConfig(TermConfig):
-    """An observation term: value, modifiers, noise, bias, clip, scale, delay, history, in this order."""
+    """An observation term. The steps are applied in the order of the keys: modifiers, noise, bias, ..., history."""
 
     modifiers: list[ModifierConfig] = []
-    """What is done to the value first, in order."""
+    """Operations on the value, applied first and in this order."""
     noise: NoiseConfig | None = None
-    """Drawn anew in every step."""
+    """Noise, sampled in every step; null: none."""
     bias: NoiseConfig | None = None
-    """Drawn at the start of every episode, from nothing but its own distribution: it does not drift."""
+    """Constant error of an episode, sampled at its start; null: none. It does not accumulate over episodes."""
     clip: Range | None = None
-    """[low, high] limits."""
+    """[low, high] limits of the value, in its unit; null: none."""
     scale: Columns | None = None
-    """Factor, one for all columns or one each."""
+    """Factor for all columns, or one factor for each column; null: 1."""
     delay: DelayConfig | None = None
-    """How old what is seen is."""
+    """Delay with which the policy gets the value; null: none."""
     history: Count | None = None
-    """Steps kept: columns of the oldest first; an episode begins with its first value in all of them."""
+    """Number of steps that the observation contains, the oldest first. In the first steps of an episode the missing
+    values are copies of the first one. null: only the current step."""
 
 
 class ObservationGroupConfig(StrictModel):
-    """A group of observation terms, side by side in order; further keys are its terms."""
+    """A group of observation terms. All further keys are terms; their values are concatenated in this order."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, ObservationConfig | None] = Field(init=False)
 
     enable_corruption: bool = True
-    """false: the terms' noise, bias and delay are left out."""
+    """false: noise, bias and delay of the terms are switched off."""
     history: Count | None = None
-    """History of every term, over the terms' own; null leaves it to them."""
+    """History of every term, instead of the terms' own values; null: the terms' own values."""
 
     @property
     def terms(self) -> dict[str, ObservationConfig | None]:
@@ -210,29 +211,23 @@ class ObservationGroupConfig(StrictModel):
 
 
 class ActionConfig(TermConfig):
-    """An action term; it takes its columns of the policy's output."""
+    """An action term. It applies its columns of the policy's output."""
 
 
 class CommandConfig(TermConfig):
-    """Something that the policy is asked to do, drawn anew from time to time."""
+    """A command for the policy, for example a target velocity, which is sampled again from time to time."""
 
-    resampling_time_s: Range
-    """[low, high] time until the next draw [s], drawn an environment; each episode begins with a new one."""
-
-    @field_validator("resampling_time_s")
-    @classmethod
-    def _some_time(cls, value: tuple[float, float]) -> tuple[float, float]:
-        if value[0] <= 0:
-            raise ValueError("resampling_time_s must be above 0")
-        return value
+    resampling_time_s: PositiveRange
+    """[low, high] time until the next sample [s], drawn for each environment. Each episode starts with a new
+    command."""
 
 
 class CurriculumConfig(TermConfig):
-    """Something that changes while training goes on."""
+    """A change of the task during training, for example of its difficulty."""
 
 
 class SuccessConfig(TermConfig):
-    """When an episode counts as a success: the term held during its last `hold_s` seconds and time ran out."""
+    """Condition of success: the episode times out, and the term was true during its last `hold_s` seconds."""
 
     hold_s: NotNegative = 1.0
-    """How long the condition must have held when the episode times out [s]."""
+    """How long the term must be true before the time-out [s]."""

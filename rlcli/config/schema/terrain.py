@@ -1,4 +1,4 @@
-"""Uneven ground: a generator of patches, or a height field from a file."""
+"""Schema of uneven ground: a generator of patches, or a height field from a file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rlcli.config.schema.base import Count, NotNegative, Positive, Range, ShareR
 
 
 class PatchConfig(StrictModel):
-    """What all sub-terrains have in common. Pairs of values are those of difficulty 0 and of difficulty 1."""
+    """Keys that all sub-terrains share. The two values of a pair belong to difficulty 0 and to difficulty 1."""
 
     proportion: NotNegative = 1.0
     """Share of the columns (without curriculum: of the patches), relative to the other sub-terrains."""
@@ -20,104 +20,106 @@ class FlatPatchConfig(PatchConfig):
     """Flat ground."""
 
     kind: Literal["flat"]
-    """flat."""
+    """Always flat."""
 
 
 class NoisePatchConfig(PatchConfig):
-    """Uneven ground: uniform random heights."""
+    """Uneven ground with uniform random heights."""
 
     kind: Literal["noise"]
-    """noise."""
+    """Always noise."""
     height: Range = (0.02, 0.1)
-    """Heights lie within +-this [m]."""
+    """Heights are drawn from +-`height` [m]."""
     spacing: Positive = 0.2
-    """Distance between two random heights; between them the ground is straight [m]."""
+    """Distance between two random heights [m]; heights between them are interpolated linearly."""
 
 
 class SlopePatchConfig(PatchConfig):
     """A pyramid of four slopes."""
 
     kind: Literal["slope"]
-    """slope."""
+    """Always slope."""
     slope: Range = (0.0, 0.4)
-    """Rise over run."""
+    """Rise divided by run."""
     platform: NotNegative = 2.0
-    """Edge of the flat middle [m]."""
+    """Edge length of the flat square in the middle [m]."""
     inverted: bool = False
-    """Down to the middle instead of up."""
+    """true: the slopes go down to the middle; false: up."""
 
 
 class WavesPatchConfig(PatchConfig):
     """Sine waves along x and y."""
 
     kind: Literal["waves"]
-    """waves."""
+    """Always waves."""
     amplitude: Range = (0.05, 0.2)
-    """Half the height from trough to crest [m]."""
+    """Half of the height between trough and crest [m]."""
     count: Count = 2
-    """Waves along an edge."""
+    """Number of waves along an edge."""
 
 
 class ObstaclesPatchConfig(PatchConfig):
-    """Low blocks and pits in random places."""
+    """Low blocks and pits at random positions."""
 
     kind: Literal["obstacles"]
-    """obstacles."""
+    """Always obstacles."""
     height: Range = (0.05, 0.2)
-    """Height of blocks, depth of pits [m]."""
+    """Height of blocks and depth of pits [m]."""
     width: Range = (0.25, 1.0)
-    """[narrowest, widest] edge of an obstacle [m]."""
+    """[smallest, largest] edge length of an obstacle [m]."""
     count: Count = 40
-    """Obstacles in a patch."""
+    """Number of obstacles in a patch."""
     platform: NotNegative = 2.0
-    """Edge of the flat middle [m]."""
+    """Edge length of the flat square in the middle [m]."""
 
 
 class StonesPatchConfig(PatchConfig):
     """Stepping stones over a pit."""
 
     kind: Literal["stones"]
-    """stones."""
+    """Always stones."""
     width: Range = (0.25, 1.0)
-    """[narrowest, widest] edge of a stone [m]; at difficulty 0 stones are wide."""
+    """[smallest, largest] edge length of a stone [m]; the stones of difficulty 0 are the largest."""
     gap: Range = (0.05, 0.3)
     """Distance between stones [m]."""
     depth: Positive = 1.0
     """Depth of the pit [m]."""
     platform: NotNegative = 2.0
-    """Edge of the flat middle [m]."""
+    """Edge length of the flat square in the middle [m]."""
 
 
 class StairsPatchConfig(PatchConfig):
     """Stairs on four sides."""
 
     kind: Literal["stairs"]
-    """stairs."""
+    """Always stairs."""
     step_height: Range = (0.05, 0.2)
     """Height of a step [m]."""
     step_width: Positive = 0.3
     """Depth of a step [m]."""
     platform: NotNegative = 2.0
-    """Edge of the flat middle [m]."""
+    """Edge length of the flat square in the middle [m]."""
     inverted: bool = False
-    """Down to the middle instead of up."""
+    """true: the stairs go down to the middle; false: up."""
     boxes: bool = False
-    """Boxes with upright faces; false: part of the height field, whose faces lean by one cell. Boxes cost time."""
+    """true: boxes with vertical faces, which are slower to simulate; false: part of the height field, whose faces are
+    inclined by one cell."""
 
 
 class GridPatchConfig(PatchConfig):
-    """A grid of cells of random heights."""
+    """A grid of square cells with random heights."""
 
     kind: Literal["grid"]
-    """grid."""
+    """Always grid."""
     cell: Positive = 0.5
-    """Edge of a cell [m]."""
+    """Edge length of a cell [m]."""
     height: Range = (0.02, 0.15)
-    """Heights lie within +-this [m]."""
+    """Heights are drawn from +-`height` [m]."""
     platform: NotNegative = 2.0
-    """Edge of the flat middle [m]."""
+    """Edge length of the flat square in the middle [m]."""
     boxes: bool = False
-    """Boxes with upright faces; false: part of the height field, whose faces lean by one cell. Boxes cost time."""
+    """true: boxes with vertical faces, which are slower to simulate; false: part of the height field, whose faces are
+    inclined by one cell."""
 
 
 SubTerrainConfig = Annotated[
@@ -134,52 +136,55 @@ SubTerrainConfig = Annotated[
 
 
 class TerrainGeneratorConfig(StrictModel):
-    """Patches in rows of rising difficulty, a kind of ground in each column; environments start in their middles."""
+    """Terrain generator: a grid of patches. Difficulty rises by row, and each column has one kind of ground.
+
+    Environments start in the middle of a patch.
+    """
 
     kind: Literal["generator"]
-    """generator."""
+    """Always generator."""
     rows: Count = 10
-    """Levels of difficulty, along x."""
+    """Number of rows along x, which are the levels of difficulty."""
     columns: Count = 10
-    """Patches of a level, along y; environment i has column i modulo this."""
+    """Number of patches along y; environment i uses column i modulo `columns`."""
     patch: tuple[Positive, Positive] = (8.0, 8.0)
-    """Extent of a patch along x and y [m]."""
+    """Size of a patch along x and y [m]."""
     border: NotNegative = 10.0
-    """Flat ground about the patches [m]."""
+    """Width of the flat ground around the patches [m]."""
     resolution: Positive = 0.1
-    """Distance between two heights of the height field [m]."""
+    """Distance between two points of the height field [m]."""
     sub_terrains: Annotated[dict[str, SubTerrainConfig], Field(min_length=1)]
     """Name -> a kind of ground."""
     difficulty: ShareRange = (0.0, 1.0)
     """Difficulty of the first and of the last row, in [0, 1]."""
     curriculum: bool = True
-    """A kind of ground for each column, difficulty by row; false: both are drawn for each patch."""
+    """true: one kind of ground for each column, difficulty by row; false: both are drawn for each patch."""
     max_start_level: Annotated[int, Field(ge=0)] | None = None
-    """Environments begin at random levels up to this one; null: the last."""
+    """Environments start at random levels from 0 to this one; null: to the last level."""
     seed: int = 0
-    """Of the terrain's random heights."""
+    """Seed of the terrain's random heights."""
     friction: NotNegative = 1.0
-    """Sliding friction."""
+    """Coefficient of sliding friction."""
 
     @field_validator("sub_terrains")
     @classmethod
-    def _some_ground(cls, value: dict[str, SubTerrainConfig]) -> dict[str, SubTerrainConfig]:
+    def _check_proportions(cls, value: dict[str, SubTerrainConfig]) -> dict[str, SubTerrainConfig]:
         if sum(patch.proportion for patch in value.values()) <= 0.0:
             raise ValueError("the proportions of the sub-terrains sum to 0; one must be above 0")
         return value
 
 
 class TerrainHeightsConfig(StrictModel):
-    """Ground of one's own: a height field from a file. All environments start in its middle."""
+    """Terrain from a file: a height field. All environments start in its middle."""
 
     kind: Literal["heights"]
-    """heights."""
+    """Always heights."""
     file: str
-    """A NumPy file (.npy) in the task's folder: heights [m], one row along y for each x."""
+    """A NumPy file (.npy) in the task's folder: heights [m], an array (x, y)."""
     resolution: Positive
     """Distance between two heights [m]."""
     friction: NotNegative = 1.0
-    """Sliding friction."""
+    """Coefficient of sliding friction."""
 
 
 TerrainConfig = Annotated[TerrainGeneratorConfig | TerrainHeightsConfig, Field(discriminator="kind")]

@@ -73,20 +73,20 @@ def test_the_schema_knows_the_tasks_own_terms_and_finds_mistakes(in_process, her
         ("my_arm", "did you mean 'my-arm'?"),
         ("my--arm", "did you mean 'my-arm'?"),
         ("9-lives", "did you mean 'lives'?"),
-        ("größe", "small letters a-z"),
-        ("arm\n", "small letters a-z"),
+        ("größe", "only letters a-z"),
+        ("arm\n", "only letters a-z"),
         ("../arm", "did you mean 'arm'?"),
-        ("", "small letters a-z"),
+        ("", "only letters a-z"),
         ("a" * 65, "at most 64"),
-        ("class", "a word of Python's own"),
+        ("class", "a keyword of Python"),
         ("random", "Python's standard library"),
-        ("tests", "folders of tests"),
-        ("con", "what Windows calls a device"),
-        ("cartpole", "is a task of rlcli 0.1.0 already"),
+        ("tests", "a usual name of test folders"),
+        ("con", "the name of a device on Windows"),
+        ("cartpole", "rlcli 0.1.0 already has a task 'cartpole'"),
         ("rlcli", "rlcli"),
-        ("stable-baselines3", "is installed already"),
+        ("stable-baselines3", "is already installed"),
         ("torch", "torch"),
-        ("rlcli-tasks", "there is a Python module 'rlcli_tasks' already"),
+        ("rlcli-tasks", "a Python module 'rlcli_tasks' already exists"),
     ],
 )
 def test_a_name_that_cannot_be_is_refused_and_nothing_is_written(in_process, here, name, said):
@@ -106,7 +106,7 @@ def test_a_folder_that_holds_something_is_left_alone(in_process, here):
     (here / "my-arm").mkdir()
     (here / "my-arm" / "notes.txt").write_text("mine")
     code, _, err = in_process("new", "my-arm")
-    assert (code, "holds files already (notes.txt)" in err) == (2, True)
+    assert (code, "is not empty (notes.txt)" in err) == (2, True)
     (here / "file").write_text("mine")
     code, _, err = in_process("new", "my-arm", "-o", "file")
     assert (code, "is not a folder" in err) == (2, True)
