@@ -13,7 +13,7 @@ import pytest
 import torch
 import yaml
 from support.consoles import commands
-from support.fenced import REPOSITORY, Block, all_blocks, blocks, run_commands, shortened, write_files
+from support.fenced import REPOSITORY, Block, all_blocks, blocks, page_path, run_commands, shortened, write_files
 from support.worlds import CRITTER, CRITTER_TASK, edited, write
 from support.worlds import build as build_env
 
@@ -68,6 +68,7 @@ RUN_BY = {
     "direct-task.md": f"{OF_PAGES}::test_task_of_page_checks_trains_and_learns",
     "first-plugin.md": f"{OF_WHEELS}::test_plugins_of_page_are_installed_and_train",
     "first-task.md": f"{OF_PAGES}::test_task_of_page_checks_trains_and_learns",
+    "training-does-not-learn.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
     "first-task.md: Scenes": f"{OF_PAGES}::test_scenes_of_page_build_and_run",
     "first-task.md: Events and randomisation": f"{HERE}::test_randomised_models_of_the_page_differ",
     **dict.fromkeys(
@@ -88,12 +89,6 @@ NEED_A_RUN = {"analyse-failures.md": 12, "play.md": 2, "security.md": 2, "monito
 NEED_A_TASK = ("check-and-lint.md", "security.md")
 LANGUAGES = {"record-episodes.md": ("sh", "python"), "check-and-lint.md": ("sh", "python")}
 PLUGINS = {"choose-a-trainer.md": "rlcli_rsl_rl"}
-
-
-def page_path(name):
-    """Return the page with a file name, on whichever shelf it is."""
-    (page,) = [page for page in PAGES if page.name == name]
-    return page
 
 
 def is_code(block):

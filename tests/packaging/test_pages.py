@@ -62,7 +62,7 @@ def test_task_card_of_page_is_printed(capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize(("page", "folder"), [("first-task.md", "my_task"), ("direct-task.md", "my_arm")])
 def test_task_of_page_checks_trains_and_learns(page, folder, tmp_path):
-    found = blocks(DOCS / page)
+    found = blocks(page_path(page))
     write_files(found, tmp_path)
     output = run_commands(found, tmp_path)
     assert f"./{folder}: 0 errors, 0 warnings" in output
@@ -93,7 +93,7 @@ def test_scenes_of_page_build_and_run(number, tmp_path):
 
 
 def test_sections_of_task_page_work_together(tmp_path):
-    found = blocks(DOCS / "first-task.md", "## Observations", "## Check it")
+    found = blocks(page_path("first-task.md"), "## Observations", "## Check it")
     parts = [yaml.safe_load(block.text) for block in found if block.language == "yaml"]
     (terms,) = [block.text for block in found if block.language == "python"]
     assert [list(part) for part in parts] == [
@@ -131,7 +131,7 @@ def merged(task, part):
 
 @pytest.mark.slow
 def test_isaac_lab_examples_train(tmp_path):
-    found = blocks(DOCS / "isaac-lab.md")
+    found = blocks(page_path("isaac-lab.md"))
     write_files(found, tmp_path)
     output = run_commands(found, tmp_path)
     assert "swing_env_cfg.py: valid (files and model)" in output
@@ -141,7 +141,7 @@ def test_isaac_lab_examples_train(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(3))
 def test_scripts_for_other_libraries_run(number, tmp_path):
-    found = [block.text for block in blocks(DOCS / "external-environments.md") if block.language == "python"]
+    found = [block.text for block in blocks(page_path("external-environments.md")) if block.language == "python"]
     assert len(found) == 3
     done = subprocess.run([sys.executable, "-c", found[number]], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -166,7 +166,7 @@ def test_exit_code_page_lists_every_code_and_kind():
 
 
 def test_plugin_page_lists_every_check():
-    text = (DOCS / "first-plugin.md").read_text(encoding="utf-8")
+    text = (page_path("first-plugin.md")).read_text(encoding="utf-8")
     listed = [
         name for cell in re.findall(r"^\| (`.*?`) \|", text, re.MULTILINE) for name in re.findall(r"`(.+?)`", cell)
     ]

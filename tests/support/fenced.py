@@ -47,6 +47,12 @@ def blocks(page, below="", above=None):
     return [block for block in all_blocks(page, below, above) if block.not_run is None]
 
 
+def page_path(name):
+    """Return the path of a page in docs/ by its file name, which is unique."""
+    (path,) = [path for path in (REPOSITORY / "docs").rglob(name) if "_build" not in path.parts]
+    return path
+
+
 def write_files(found, folder):
     for block in found:
         if block.file:
