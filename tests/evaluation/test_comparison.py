@@ -92,7 +92,7 @@ def test_runs_whose_tasks_differ_are_refused_with_what_differs(cli, trained):
     one, other = trained("cartpole"), trained("changed")
     done = cli("eval", "--compare", one, other)
     assert done.code == 3
-    assert "episode_length_s: 2.0, and in" in done.err
+    assert "episode_length_s: 2.0, but 10.0 in" in done.err
     assert "rewards.alive.weight: 3.0" in done.err
     assert done.err.count("error: ") == 2
     problems = json.loads(cli("eval", "--compare", one, other, "--json").out)["error"]["problems"]
@@ -110,7 +110,7 @@ def test_runs_of_other_tasks_are_refused(cli, trained):
     one, other = trained("cartpole"), trained("direct")
     done = cli("eval", "--compare", one, other)
     assert done.code == 2
-    assert "of the task cartpole, and" in done.err
+    assert "is for the task cartpole, but" in done.err
     assert "of cartpole-direct" in done.err
 
 
@@ -126,9 +126,9 @@ def test_the_first_policy_is_the_one_that_must_not_fall_short(cli, trained):
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        ((), 2, "--compare: with what?"),
-        (("nowhere",), 2, "--compare nowhere: with what?"),
-        (("lqr", "zero"), 2, "none of these is a run"),
+        ((), 2, "--compare needs at least two policies, found: (none)"),
+        (("nowhere",), 2, "--compare needs at least two policies, found: nowhere"),
+        (("lqr", "zero"), 2, "--compare needs at least one run"),
         (("nowhere", "zero"), 5, "no run 'nowhere'"),
         (("a", "b", "--checkpoint", "c"), 2, "as words"),
         (("a", "b", "--policy", "zero"), 2, "as words"),

@@ -90,14 +90,14 @@ def test_it_balances_the_cartpoles(name):
     ("overrides", "more", "said"),
     [
         (["success=null"], "", "defines no success"),
-        (["success.target=1.0"], "", "not where it succeeds"),
+        (["success.target=1.0"], "", "does not succeed at its default state"),
         (["observations.policy.pos=null"], "", "do not determine the state: slide"),
         (["observations.policy.vel=null", "observations.policy.pos.history=1"], "", "the velocity of slide"),
-        ([], '<body name="ball" pos="0 0 1"><joint type="ball"/><geom size="0.1"/></body>', "turns freely"),
+        ([], '<body name="ball" pos="0 0 1"><joint type="ball"/><geom size="0.1"/></body>', "a ball joint"),
         (
             [],
             '<body name="arm" pos="0 0 1"><joint name="swing" axis="0 1 0"/><geom size="0.1" pos="0.3 0 0"/></body>',
-            "no equilibrium: the velocity of swing moves",
+            "not an equilibrium: the velocity of swing moves",
         ),
     ],
 )

@@ -298,17 +298,17 @@ def test_what_floats_is_pushed_sideways(world):
         ("body_mas.arm=1:2", "there is no parameter 'body_mas'", "did you mean 'body_mass'"),
         ("body_mass.amr=1:2", "no body matches 'amr'", "did you mean 'arm'"),
         ("joint_damping.hing=1:2", "no joint matches 'hing'", "did you mean 'hinge'"),
-        ("joint_damping.hinge=1:2", "it is 0 of hinge", "abs:"),
-        ("body_mass.weightless=1:2", "0 of weightless", "abs:"),
+        ("joint_damping.hinge=1:2", "its value is 0 for hinge", "abs:"),
+        ("body_mass.weightless=1:2", "0 for weightless", "abs:"),
         ("effort_limit.slide=1:2", "no actuator matches 'slide'", "hinge"),
-        ("gravity.arm=1:2", "of the whole world", "leave the name out"),
+        ("gravity.arm=1:2", "to the whole world", "leave the name out"),
         ("tendon_stiffness=1:2", "the model has no tendons", None),
         ("geom_size.rod=abs:1:2", "3 values each", "leave out abs:"),
         ("observation_noise.poss=0:1", "no observation matches 'poss'", "did you mean 'pos'"),
         ("action_delay.trun=0:1", "no action matches 'trun'", "did you mean 'turn'"),
-        ("push=0:1", "nothing floats", "push.NAME"),
+        ("push=0:1", "no entity floats", "push.NAME"),
         ("push.hing=0:1", "matches 'hing'", "hinge"),
-        ("push..*=0:1", "names 2", "push one of them"),
+        ("push..*=0:1", "matches 2", "name one of them"),
     ],
 )
 def test_what_cannot_be_perturbed_is_named_with_what_can(world, text, said, hint):
@@ -321,5 +321,5 @@ def test_what_cannot_be_perturbed_is_named_with_what_can(world, text, said, hint
 
 def test_without_gravity_there_is_none_to_scale(world):
     env = world("sim.gravity=[0, 0, 0]")
-    with pytest.raises(UsageError, match="0 of the world"):
+    with pytest.raises(UsageError, match="0 for the world"):
         perturb(env, "gravity=1:2", 1.0, 1.0, 1.0, 1.0)

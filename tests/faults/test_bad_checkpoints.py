@@ -177,7 +177,7 @@ def test_a_run_is_read_from_its_newest_good_checkpoint_and_that_is_said(reader, 
     older = run / "checkpoints" / "000000000000"
     assert main([*command(reader, run), "-q"] if reader != "init" else command(reader, run)) == 0
     err = capfd.readouterr().err
-    assert f"warning: checkpoint {folder.name} is passed over: {folder}/policy.safetensors is corrupt" in err
+    assert f"warning: checkpoint {folder.name} is skipped: {folder}/policy.safetensors is corrupt" in err
     if reader == "resume":
         assert older.is_dir()
         open_checkpoint(run / "checkpoints" / "000000000256").state()

@@ -289,7 +289,7 @@ def test_an_episode_that_diverged_is_kept_with_where_it_went_wrong(tmp_path, nam
     assert replayed.difference is None
     assert replayed.diverged_at[2] == case.world.diverged_at
     if name == "reset writes nan":
-        with pytest.raises(CheckpointError, match="no state that is finite"):
+        with pytest.raises(CheckpointError, match="has no finite state"):
             stage_case(case, sick.resolved.source)
     else:
         assert np.isfinite(stage_case(case, sick.resolved.source).states).all()

@@ -68,7 +68,7 @@ def recorded(task, tmp_path):
     recorder.save(whole)
     env = made(task)
     start = start_episode(env, policy(env), WHO, EPISODE)
-    with EpisodeRecorder(env, 1, only=WHO) as recorder:
+    with EpisodeRecorder(env, 1, env_id=WHO) as recorder:
         run_episode(env, policy(env), start.obs, WHO)
     recorder.save(tmp_path / "one.safetensors")
     recording = read_trajectory(whole)
@@ -105,7 +105,7 @@ def test_what_connects_episodes_is_named_and_those_before_it_are_lived(what, tmp
     assert not [other for _, other in CONNECTED.values() if other != named and other in start.reasons]
     assert_same(whole, one)
     env = made(task)  # the name is not said for nothing: begun at once it is another episode
-    with EpisodeRecorder(env, 1, only=WHO) as recorder:
+    with EpisodeRecorder(env, 1, env_id=WHO) as recorder:
         run_episode(env, policy(env), env.reset(seed=SEED, episode=EPISODE)["policy"], WHO)
     recorder.save(tmp_path / "other.safetensors")
     other = parts(read_trajectory(tmp_path / "other.safetensors"), 0)

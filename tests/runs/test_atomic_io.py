@@ -70,7 +70,7 @@ def test_what_cannot_even_be_cleaned_away_is_the_disks_error_too(tmp_path):
 @pytest.mark.parametrize(
     ("code", "hint"),
     [
-        (errno.ENOSPC, "free some space, then go on with --resume"),
+        (errno.ENOSPC, "free some space, then continue with --resume"),
         (errno.EACCES, "choose another folder with --runs-dir"),
         (errno.EROFS, "choose another folder with --runs-dir"),
         (errno.EDQUOT, "the disk quota is used up"),

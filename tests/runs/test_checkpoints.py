@@ -17,7 +17,6 @@ from support.saved_states import SPEC, rehash, state_of
 
 from rlcli.errors import CheckpointError, MachineError
 from rlcli.runs import checkpoint
-from rlcli.runs.restore import policy_of
 from rlcli.training import checkpoint_writer
 
 
@@ -29,7 +28,7 @@ def saved(tmp_path):
 
 def load_all(folder):
     opened = checkpoint.open_checkpoint(folder)
-    return policy_of(opened), opened.state()
+    return opened.policy(), opened.state()
 
 
 def test_a_checkpoint_loads_what_was_saved(saved):
@@ -152,7 +151,7 @@ def change_policy(folder, change):
 def test_weights_that_do_not_fit_are_named(saved, change, message):
     change_policy(saved, change)
     with pytest.raises(CheckpointError, match=message):
-        policy_of(checkpoint.open_checkpoint(saved))
+        checkpoint.open_checkpoint(saved).policy()
 
 
 def test_a_critic_that_is_not_finite_is_named(saved):
@@ -177,7 +176,7 @@ def test_a_policy_description_that_makes_no_sense_is_refused(saved, change):
     (saved / "policy.json").write_text(json.dumps({**SPEC, **change}))
     rehash(saved, "policy.json")
     with pytest.raises(CheckpointError, match=r"policy\.(json|safetensors)"):
-        policy_of(checkpoint.open_checkpoint(saved))
+        checkpoint.open_checkpoint(saved).policy()
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS, errno.EDQUOT])

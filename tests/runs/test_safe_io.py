@@ -27,7 +27,7 @@ def test_a_file_is_read_up_to_its_limit_and_not_one_byte_further(file):
 
 @pytest.mark.parametrize("size", [7, 9])
 def test_a_file_of_another_size_is_corrupt(file, size):
-    with pytest.raises(CheckpointError, match=rf"is corrupt: .* \(8 bytes of {size}\)") as caught:
+    with pytest.raises(CheckpointError, match=rf"is corrupt: .* \(8 of {size} bytes\)") as caught:
         read_file(file, 100, size=size)
     assert caught.value.hint == "choose an older checkpoint with RUN@step:N"
 
@@ -51,7 +51,7 @@ def test_a_link_that_appears_after_the_check_is_not_followed(file, monkeypatch):
     link = file.with_name("link")
     link.symlink_to(file)
     monkeypatch.setattr(type(file), "is_symlink", lambda self: False)
-    with pytest.raises(CheckpointError, match="link cannot be read: it is no plain file"):
+    with pytest.raises(CheckpointError, match="link cannot be read: it is not a plain file"):
         read_file(link, 100)
 
 
@@ -64,7 +64,7 @@ def test_what_is_no_plain_file_is_refused_without_waiting(tmp_path, kind):
         os.mkfifo(odd)
     else:
         odd = type(odd)("/dev/zero")
-    with pytest.raises(CheckpointError, match="is no plain file"):
+    with pytest.raises(CheckpointError, match="is not a plain file"):
         read_file(odd, 100)
 
 
@@ -169,10 +169,10 @@ def test_it_may_have_32_levels_the_innermost_value_counted_and_no_more(file):
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (b'{"a": 1, "b": 2, "b": 3}', "key 'b' stands there twice"),
-        (b'{"c": {"xy": 1, "xy": 1}}', "key 'xy' stands there twice"),
-        (b'{"a": NaN}', "NaN is no number of JSON"),
-        (b'{"a": -Infinity}', "-Infinity is no number of JSON"),
+        (b'{"a": 1, "b": 2, "b": 3}', "key 'b' appears twice"),
+        (b'{"c": {"xy": 1, "xy": 1}}', "key 'xy' appears twice"),
+        (b'{"a": NaN}', "NaN is not a JSON number"),
+        (b'{"a": -Infinity}', "-Infinity is not a JSON number"),
         (b'{"a": 1e999}', "number 1e999 is out of range"),
         (b'{"a": 123456789012345678901}', "a number has 21 digits"),
         (b"[1]", "not a JSON object"),

@@ -63,8 +63,8 @@ def test_an_own_run_comes_first_and_shipped_names_the_other(cli, folder, only_ru
         (("play", "coin"), 5, "there is no run of coin"),
         (("eval", "coin", "--checkpoint", "shipped"), 5, "coin ships no policy"),
         (("eval", "cartpole", "--checkpoint", "latest"), 5, "there is no run of cartpole"),
-        (("eval", "--checkpoint", "shipped"), 2, "with which task?"),
-        (("export", "--checkpoint", "shipped"), 2, "with which task?"),
+        (("eval", "--checkpoint", "shipped"), 2, "needs a task"),
+        (("export", "--checkpoint", "shipped"), 2, "needs a task"),
         (("play", "cartpole-direct", "--checkpoint", "GIFT"), 2, "is a policy for cartpole, not for cartpole-direct"),
         (("play", "cartpole", "decimation=4"), 5, "step_dt  0.0166666667 s     0.0333333333 s"),
         (("export", "cartpole", "--format", "torch"), 2, "--output FILE"),
@@ -120,7 +120,7 @@ def test_a_run_becomes_a_bundle_with_the_evaluation_that_it_keeps(cli, only_run)
         (("--format", "bundle", "--output", "policy.onnx"), "--format onnx"),
         (("--format", "bundle", "--verify", "--output", "x"), "without rlcli"),
         (("--format", "bundel", "--output", "x"), "did you mean 'bundle'?"),
-        (("--format", "bundle", "--output", "gift/policy.json"), "is no folder"),
+        (("--format", "bundle", "--output", "gift/policy.json"), "is not a folder"),
     ],
 )
 def test_a_bundle_that_cannot_be_written_is_refused(cli, copied, words, said):
