@@ -1,4 +1,4 @@
-"""Evaluations in a run: what is read back, and what a stranger may have put there."""
+"""Evaluations stored in a run: round trip, and untrusted content."""
 
 import json
 
@@ -25,7 +25,7 @@ DOCUMENT = {
 }
 
 
-def test_what_was_kept_is_read_back_and_the_newest_wins(tmp_path):
+def test_read_evaluation_returns_the_newest_document(tmp_path):
     run = Run(tmp_path)
     assert read_evaluation(run, "000000000128") is None
     file = write_evaluation(run, "000000000128", DOCUMENT)
@@ -53,7 +53,7 @@ def test_what_was_kept_is_read_back_and_the_newest_wins(tmp_path):
         {"seed": -1},
     ],
 )
-def test_a_document_that_is_none_is_refused(tmp_path, change):
+def test_read_evaluation_refuses_a_malformed_document(tmp_path, change):
     run = Run(tmp_path)
     write_evaluation(run, "0", DOCUMENT | change)
     with pytest.raises(CheckpointError, match="is corrupt"):
@@ -61,7 +61,7 @@ def test_a_document_that_is_none_is_refused(tmp_path, change):
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"return": NaN}', "[" * 10_000, '{"a": 1, "a": 2}', " " * 2_000_000])
-def test_what_is_not_strict_json_of_some_size_is_refused(tmp_path, text):
+def test_read_evaluation_refuses_invalid_or_large_json(tmp_path, text):
     (tmp_path / "evaluations").mkdir()
     (tmp_path / "evaluations" / "7.json").write_text(text)
     with pytest.raises(CheckpointError):
@@ -69,13 +69,13 @@ def test_what_is_not_strict_json_of_some_size_is_refused(tmp_path, text):
 
 
 @pytest.mark.parametrize("name", ["../x", "", "7.json", "a", "7/../8", "7" * 31])
-def test_a_name_that_is_no_checkpoints_is_refused(tmp_path, name):
+def test_invalid_checkpoint_name_is_refused(tmp_path, name):
     for act in (lambda: read_evaluation(Run(tmp_path), name), lambda: write_evaluation(Run(tmp_path), name, DOCUMENT)):
         with pytest.raises(CheckpointError, match="not the name"):
             act()
 
 
-def test_links_are_followed_neither_to_read_nor_to_write(tmp_path):
+def test_links_are_not_followed(tmp_path):
     run, elsewhere = Run(tmp_path / "run"), tmp_path / "elsewhere"
     run.folder.mkdir()
     elsewhere.mkdir()
