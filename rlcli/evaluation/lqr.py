@@ -20,6 +20,7 @@ from rlcli.config.load import Resolved
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import UsageError, listing
+from rlcli.evaluation.stress import with_envs
 
 Matrix = NDArray[Any]
 _SPREAD = 1e-2
@@ -176,9 +177,8 @@ def _without_randomness(resolved: Resolved, count: int) -> Resolved:
     observations = {
         name: group.model_copy(update={"enable_corruption": False}) for name, group in task.observations.items()
     }
-    scene = task.scene.model_copy(update={"num_envs": count})
-    changes: dict[str, Any] = {"scene": scene, "events": {}, "curriculum": {}, "observations": observations}
-    return replace(resolved, task=task.model_copy(update=changes))
+    changes: dict[str, Any] = {"events": {}, "curriculum": {}, "observations": observations}
+    return with_envs(replace(resolved, task=task.model_copy(update=changes)), count)
 
 
 def _coordinates(env: VecEnv) -> list[str]:

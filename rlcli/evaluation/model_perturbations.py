@@ -10,19 +10,10 @@ from torch import Tensor
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import listing
 from rlcli.evaluation.stress_params import PHYSICAL, Sweep, unknown_parameter
+from rlcli.scene.entity import ELEMENT_KINDS
 from rlcli.scene.model_fields import DERIVED_FROM, FIELDS
 from rlcli.scene.names import NameProblem, match
 
-_OBJECTS = {
-    "Bodies": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
-    "Joints": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
-    "Geoms": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
-    "Sites": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
-    "Actuators": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
-    "Tendons": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
-    "Pairs": (mujoco.mjtObj.mjOBJ_PAIR, "npair"),
-}
-"""Kind of element -> MuJoCo's object type, and the model's field with the number of such elements."""
 _FIXED, _AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
 _NO_BIAS, _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
 
@@ -143,7 +134,7 @@ def _rows(env: VecEnv, field: str, pattern: str | None) -> tuple[list[int], list
     entities = [f"{name}/" for name in env.entities]
     ids: list[int] = []
     names: list[str] = []
-    object_type, count_field = _OBJECTS[kind]
+    object_type, count_field = ELEMENT_KINDS[kind]
     for number in range(1 if kind == "Bodies" else 0, getattr(model, count_field)):
         name = mujoco.mj_id2name(model, object_type, number) or ""
         short = next((name.removeprefix(prefix) for prefix in entities if name.startswith(prefix)), name)

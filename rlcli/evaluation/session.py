@@ -94,7 +94,7 @@ def find_policy(request: PolicyRequest, check: Callable[[Resolved], None] = lamb
     from rlcli.config.load import resolve
     from rlcli.formats import log_notes
 
-    require_policy(request.policy)
+    require_known(request.policy, POLICIES, "policy", "policies")
     task, overrides = split_overrides(request.task, request.overrides)
     if task is None and request.checkpoint is None:
         raise UsageError("no task or checkpoint given", hint="name a TASK, or --checkpoint RUN|latest")
@@ -153,21 +153,19 @@ def open_session(request: PolicyRequest, check: Callable[[Resolved], None] = lam
         check: called with the configuration; it may raise an error.
     """
     policy = find_policy(request, check)
-    session = _build(policy)
+    from rlcli.envs.make import make_env
+    from rlcli.random import derive
     from rlcli.replay.crash_dump import CrashDumper
+    from rlcli.rl.rng import seed_generators
 
+    make = make_actor(policy)
+    seed_generators(derive(policy.seed, "task"))  # some tasks draw from torch's, numpy's or Python's generator
+    # a derived seed: evaluation uses other episodes than training
+    env = make_env(policy.resolved, seed=derive(policy.seed, "evaluation"))
+    session = Session(env, make(env), policy)
     home = request.runs_dir or default_runs_dir() if policy.run is None else policy.run.folder
-    CrashDumper(session.env, home / "dumps")
+    CrashDumper(env, home / "dumps")
     return session
-
-
-def require_policy(policy: str) -> None:
-    """Check that a name is one of POLICIES.
-
-    Raises:
-        UsageError: with the valid names.
-    """
-    require_known(policy, POLICIES, "policy", "policies")
 
 
 def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:
@@ -176,7 +174,7 @@ def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:
     Raises:
         UsageError: if there is no such policy.
     """
-    require_policy(kind)
+    require_known(kind, POLICIES, "policy", "policies")
     if kind == "trained":
         raise UsageError(
             "--against trained: only a policy without training can be the reference", hint="lqr, zero or random"
@@ -225,18 +223,6 @@ def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
         return acting(env, trained, stochastic=policy.stochastic, generator=generator)
 
     return make
-
-
-def _build(policy: PolicyInTask) -> Session:
-    from rlcli.envs.make import make_env
-    from rlcli.random import derive
-    from rlcli.rl.rng import seed_generators
-
-    make = make_actor(policy)
-    seed_generators(derive(policy.seed, "task"))  # some tasks draw from torch's, numpy's or Python's generator
-    # a derived seed: evaluation uses other episodes than training
-    env = make_env(policy.resolved, seed=derive(policy.seed, "evaluation"))
-    return Session(env, make(env), policy)
 
 
 def check_record(record: Path | None, mode: str) -> None:

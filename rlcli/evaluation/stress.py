@@ -58,19 +58,22 @@ class StressResult:
         return "success" if "success" in self.nominal else "return"
 
     @property
+    def variants(self) -> dict[Point, Summary]:
+        """Summaries of the grid and of the search."""
+        return {**self.grid, **self.searched}
+
+    @property
     def worst(self) -> Point:
         """Point of the worst variant."""
-        variants = {**self.grid, **self.searched}
-        return min(variants, key=lambda point: score(variants[point]))
+        return min(self.variants, key=lambda point: score(self.variants[point]))
 
     def failures(self, limits: Sequence[Limit]) -> list[str]:
         """Return a sentence for each limit that fails in the variant with the worst value of its metric."""
-        variants = {**self.grid, **self.searched}
         found = []
         for limit in limits:
-            values = {point: limit.value_in(summary) for point, summary in variants.items()}
+            values = {point: limit.value_in(summary) for point, summary in self.variants.items()}
             worst = min(values, key=lambda point: -math.inf if (value := values[point]) is None else value)
-            failure = limit.failure(variants[worst])
+            failure = limit.failure(self.variants[worst])
             if failure is not None:
                 found.append(f"at {describe_point(self.sweeps, worst)}: {failure}")
         return found
@@ -91,7 +94,7 @@ class StressResult:
             "worst": {
                 "at": by_name(self.sweeps, worst),
                 "found": "search" if worst in self.searched else "grid",
-                **{**self.grid, **self.searched}[worst],
+                **self.variants[worst],
             },
             "against": None
             if not self.reference

@@ -67,11 +67,6 @@ class Sweep:
         return SIGNALS.get(self.parameter, "the model's unit" if self.absolute else "factor")
 
     @property
-    def is_integer(self) -> bool:
-        """Whether the values are whole numbers."""
-        return self.parameter in _INTEGER
-
-    @property
     def spacing(self) -> Literal["linear", "geometric"]:
         """Spacing of values in a range: factors have equal ratios, other values equal differences."""
         return "geometric" if self.neutral == 1.0 and min(self.values) > 0.0 else "linear"
@@ -79,7 +74,7 @@ class Sweep:
     def between(self, share: float) -> float:
         """Return the value at a share (0 to 1) of the way from the lowest to the highest value."""
         low, high = min(self.values), max(self.values)
-        if self.is_integer:
+        if self.parameter in _INTEGER:
             return float(round(low + (high - low) * share))
         value = low * (high / low) ** share if self.spacing == "geometric" else low + (high - low) * share
         return float(f"{value:.12g}")  # so that the middle of 0.8:1.25 is exactly 1

@@ -17,7 +17,7 @@ from rlcli.errors import CheckpointError
 from rlcli.machine import memory
 from rlcli.rl.policy import Policy, blank_policy, filled, size_of
 from rlcli.rl.trainer import Rows, TrainerState
-from rlcli.runs.safe_io import JSON_LIMIT, Count, FileModel, check_json, parse_json, read_file
+from rlcli.runs.safe_io import JSON_LIMIT, Count, FileModel, check_json, manifest_error, parse_json, read_file
 
 FORMAT = 1
 PARTS = ("policy", "trainer", "env", "rng")
@@ -303,7 +303,7 @@ def steps(checkpoints: Path) -> list[int]:
 
 
 def sha256(data: bytes) -> str:
-    """Return the hash of a file's content as it stands in a manifest."""
+    """Return the hash of a file's content that a manifest stores."""
     return hashlib.sha256(data).hexdigest()
 
 
@@ -314,28 +314,20 @@ def _verified(file: Path, size: int, digest: str, limit: int) -> bytes:
     except FileNotFoundError:
         raise CheckpointError(f"{file} is missing") from None
     if len(data) != size or sha256(data) != digest:
-        raise CheckpointError(
-            f"{file} is corrupt: it does not match the manifest ({len(data)} of {size} bytes)",
-            hint="choose an older checkpoint with RUN@step:N",
-        )
+        raise manifest_error(file, len(data), size)
     return data
 
 
 def _tensors(data: bytes, file: Path) -> dict[str, Tensor]:
-    _check_header(data, file)
+    """Return the tensors of a safetensors file after a check of its header."""
+    length = int.from_bytes(data[:8], "little")
+    if length > min(_HEADER_LIMIT, len(data) - 8):
+        raise CheckpointError(f"{file} is corrupt: it is not a safetensors file, or its header is too long")
+    check_json(_Header, parse_json(data[8 : 8 + length], file), file)  # shapes that torch accepts
     try:
         return safetensors.torch.load(data)
     except (SafetensorError, RuntimeError, ValueError, KeyError, MemoryError) as error:
         raise CheckpointError(f"{file} is corrupt: {' '.join(str(error).split())}") from None
-
-
-def _check_header(data: bytes, file: Path) -> None:
-    """Check that the header has shapes of a size that torch accepts; safetensors checks them against the data."""
-    length = int.from_bytes(data[:8], "little")
-    if length > min(_HEADER_LIMIT, len(data) - 8):
-        raise CheckpointError(f"{file} is corrupt: it is not a safetensors file, or its header is too long")
-    header = parse_json(data[8 : 8 + length], file)
-    check_json(_Header, header, file)
 
 
 def _check_state(values: dict[str, Any], step: int, file: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import stat
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -13,7 +15,7 @@ from typing import Any
 
 from rlcli.errors import CheckpointError
 from rlcli.runs.metric_rows import is_number, parse_row
-from rlcli.runs.run import CONFIG, RECORD, STUDY, WAITING, Run, is_locked, open_run
+from rlcli.runs.run import CONFIG, RECORD, WAITING, Run, is_locked, open_run, run_folders
 from rlcli.runs.safe_io import read_tail
 
 ENDED = {"finished", "stopped", "diverged", "failed"}
@@ -74,7 +76,7 @@ def overviews(runs_dir: Path, task: str | None = None) -> list[Overview]:
         runs_dir: the folder of runs.
         task: return only runs of this task.
     """
-    found = [overview(folder) for folder in _folders(runs_dir)]
+    found = [overview(folder) for folder in run_folders(runs_dir)]
     chosen = [run for run in found if task is None or run.task == task]
     return sorted(chosen, key=lambda run: (run.started or "", run.folder.name), reverse=True)
 
@@ -168,24 +170,6 @@ def _is_new(folder: Path) -> bool:
         return False
 
 
-def _folders(runs_dir: Path) -> Iterator[Path]:
-    """Yield the folders in which runs are expected: RUNS/TASK/RUN and RUNS/TASK/STUDY/RUN, without hidden ones."""
-    for task in _subfolders(runs_dir):
-        for folder in _subfolders(task):
-            if (folder / STUDY).is_file():
-                yield from _subfolders(folder)
-            else:
-                yield folder
-
-
-def _subfolders(folder: Path) -> list[Path]:
-    try:
-        with os.scandir(folder) as entries:
-            return [Path(entry.path) for entry in entries if not entry.name.startswith(".") and entry.is_dir()]
-    except OSError:
-        return []
-
-
 def _row(line: bytes) -> dict[str, Any] | None:
     row = parse_row(line)
     if row is None or any(count(row[key]) is None for key in ("iteration", "step")):
@@ -275,16 +259,13 @@ def _tags(record: Mapping[str, Any]) -> dict[str, Any]:
 
 def _size(folder: Path) -> int:
     """Return the total size of the files in a folder [bytes]; links are not followed."""
-    total, visited, pending = 0, 0, [str(folder)]
-    while pending and visited < _MAX_FILES:
-        try:
-            with os.scandir(pending.pop()) as entries:
-                for entry in entries:
-                    visited += 1
-                    if entry.is_dir(follow_symlinks=False):
-                        pending.append(entry.path)
-                    elif entry.is_file(follow_symlinks=False):
-                        total += entry.stat(follow_symlinks=False).st_size
-        except OSError:
-            continue
+    total = visited = 0
+    for parent, folders, files in os.walk(folder):
+        for name in files:
+            with contextlib.suppress(OSError):
+                status = os.lstat(os.path.join(parent, name))
+                total += status.st_size if stat.S_ISREG(status.st_mode) else 0
+        visited += len(folders) + len(files)
+        if visited >= _MAX_FILES:
+            break
     return total

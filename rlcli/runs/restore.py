@@ -84,16 +84,10 @@ def _untrusted_code_error(record: Mapping[str, Any], what: str, run: str | None)
 
 
 def resolve_run(
-    run: Run,
-    *,
-    play: bool,
-    config_file: Path | None = None,
-    overrides: Sequence[str] = (),
-    flags: Mapping[str, Any] | None = None,
-    named: TaskSource | None = None,
+    run: Run, *, play: bool, flags: Mapping[str, Any] | None = None, named: TaskSource | None = None
 ) -> Resolved:
-    """Return the configuration of a run, with changes from the command line; `named`: see `source_of`."""
-    return resolve(source_of(run, named), play=play, config_file=config_file, overrides=overrides, flags=flags)
+    """Return the configuration of a run, changed by flags of the command line; `named`: see `source_of`."""
+    return resolve(source_of(run, named), play=play, flags=flags)
 
 
 def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:

@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -172,6 +172,24 @@ def open_run(folder: Path) -> Run:
             raise CheckpointError(f"{part} is not a plain file")  # reading a pipe would block
     check_json(RunRecord, record, folder / RECORD)
     return Run(folder, record)
+
+
+def run_folders(runs_dir: Path) -> Iterator[Path]:
+    """Yield the folders in which runs are expected: RUNS/TASK/RUN and RUNS/TASK/STUDY/RUN, without hidden ones."""
+    for task in _subfolders(runs_dir):
+        for folder in _subfolders(task):
+            if (folder / STUDY).is_file():
+                yield from _subfolders(folder)
+            else:
+                yield folder
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    try:
+        with os.scandir(folder) as entries:
+            return [Path(entry.path) for entry in entries if not entry.name.startswith(".") and entry.is_dir()]
+    except OSError:
+        return []
 
 
 def is_locked(folder: Path) -> bool:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import re
 from pathlib import Path
 
 from rlcli.errors import CheckpointError, UsageError, did_you_mean, listing
-from rlcli.runs.run import RECORD, STUDY, Run, open_run
+from rlcli.runs.run import RECORD, STUDY, Run, open_run, run_folders
 from rlcli.settings import setting
 
 _log = logging.getLogger(__name__)
@@ -66,14 +67,11 @@ def _runs_of_task(reference: str, runs_dir: Path) -> list[Run]:
 def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
     """Return the runs under a folder, the oldest first; other folders and broken runs are skipped."""
     runs = []
-    studies = (file.parent for file in runs_dir.glob(f"*/*/{STUDY}") if file.is_file())
-    for file in (*runs_dir.glob(f"*/*/{RECORD}"), *(file for study in studies for file in study.glob(f"*/{RECORD}"))):
-        try:
-            run = open_run(file.parent)
-        except CheckpointError:
-            continue
-        if task is None or run.record["task"].get("name") == task:
-            runs.append(run)
+    for folder in run_folders(runs_dir):
+        with contextlib.suppress(CheckpointError):
+            runs.append(open_run(folder))
+    if task is not None:
+        runs = [run for run in runs if run.record["task"]["name"] == task]
     return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name))
 
 

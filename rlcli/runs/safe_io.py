@@ -79,13 +79,18 @@ def read_file(file: Path, limit: int, *, size: int | None = None) -> bytes:
     handle, status = _open(file)
     with os.fdopen(handle, "rb") as opened:
         if size is not None and status.st_size != size:
-            raise CheckpointError(
-                f"{file} is corrupt: it does not match the manifest ({status.st_size} of {size} bytes)",
-                hint="choose an older checkpoint with RUN@step:N",
-            )
+            raise manifest_error(file, status.st_size, size)
         if status.st_size > limit:
             raise CheckpointError(f"{file} is too large: {status.st_size:,} bytes, at most {limit:,} are read")
         return _read(opened, file, 0, status.st_size)
+
+
+def manifest_error(file: Path, found: int, size: int) -> CheckpointError:
+    """Return the error for a file of `found` bytes whose size or hash differs from the manifest."""
+    return CheckpointError(
+        f"{file} is corrupt: it does not match the manifest ({found} of {size} bytes)",
+        hint="choose an older checkpoint with RUN@step:N",
+    )
 
 
 def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
