@@ -10,7 +10,7 @@ from torch import Tensor
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import listing
 from rlcli.evaluation.stress_params import PHYSICAL, Sweep, unknown_parameter
-from rlcli.scene.entity import ELEMENT_KINDS
+from rlcli.scene.entity import KINDS
 from rlcli.scene.model_fields import DERIVED_FROM, FIELDS
 from rlcli.scene.names import NameProblem, match
 
@@ -134,7 +134,7 @@ def _rows(env: VecEnv, field: str, pattern: str | None) -> tuple[list[int], list
     entities = [f"{name}/" for name in env.entities]
     ids: list[int] = []
     names: list[str] = []
-    object_type, count_field = ELEMENT_KINDS[kind]
+    object_type, count_field = KINDS[kind]
     for number in range(1 if kind == "Bodies" else 0, getattr(model, count_field)):
         name = mujoco.mj_id2name(model, object_type, number) or ""
         short = next((name.removeprefix(prefix) for prefix in entities if name.startswith(prefix)), name)
