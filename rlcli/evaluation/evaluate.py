@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -81,7 +82,13 @@ class Evaluation:
         )
 
 
-def evaluate(env: VecEnv, act: Act, episodes: int, groups: int = 1) -> Evaluation:
+def evaluate(
+    env: VecEnv,
+    act: Act,
+    episodes: int,
+    on_step: Callable[[StepResult], None] = lambda _: None,
+    groups: int = 1,
+) -> Evaluation:
     """Run exactly `episodes` episodes; each environment contributes a number that is fixed beforehand.
 
     Counting the first episodes that finish in any environment would favour short episodes.
@@ -90,6 +97,7 @@ def evaluate(env: VecEnv, act: Act, episodes: int, groups: int = 1) -> Evaluatio
         env: the environments.
         act: the policy's action function.
         episodes: number of episodes of each group.
+        on_step: called with the result of every step.
         groups: number of groups: equal, consecutive parts of the environments.
 
     Raises:
@@ -108,6 +116,7 @@ def evaluate(env: VecEnv, act: Act, episodes: int, groups: int = 1) -> Evaluatio
             require_end(env, int(env.episode_length_buf.max()))
             step = env.step(act(obs))
             obs = step.obs["policy"]
+            on_step(step)
             if step.episodes is not None:
                 _add_episodes(result, step, quota, means)
         env.check()

@@ -65,7 +65,7 @@ def _environments(left: Run, right: Run) -> Section:
     rows = differences(left.record, right.record)
     resumed = [run.record.get("resumed") for run in (left, right)]
     if as_text(resumed[0]) != as_text(resumed[1]):
-        rows.append(("resumed", *resumed))
+        rows.append(("resumed", resumed[0], resumed[1]))
     complete = all("sources" in run.record and "cpu" in run.record for run in (left, right))
     compared = "versions, sources, processor, threads" if complete else "the entries that both have recorded"
     return Section("environment", compared, [Difference(*row) for row in rows])
@@ -175,8 +175,8 @@ def _compare_logs(one: Checkpoint, other: Checkpoint) -> Difference | None:
             return Difference(where, *rows)
         for start in range(left[name].first, left[name].stop, _ROWS):
             stop = min(start + _ROWS, left[name].stop)
-            columns = [side[name].read(start, stop) for side in (left, right)]
-            found = _compare_tensors(*columns, f"{where} from row {start}: ")
+            columns, other_columns = left[name].read(start, stop), right[name].read(start, stop)
+            found = _compare_tensors(columns, other_columns, f"{where} from row {start}: ")
             if found is not None:
                 return found
     return None

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from rlcli.envs.observers import StepObserver
 from rlcli.errors import ConfigError
 from rlcli.evaluation.evaluate import evaluate
 from rlcli.rl.acting import random_policy, zero_policy
@@ -38,13 +37,11 @@ def test_summary_has_means_of_command_metrics(make):
     env, _ = make("quadruped-flat", "scene.num_envs=4", "episode_length_s=0.2")
     seen = []
 
-    class Keep(StepObserver):
-        def on_step(self, record):
-            if record.episodes is not None:
-                seen.append(record.episodes.metrics["velocity/error_vel_xy"])
+    def keep(step):
+        if step.episodes is not None:
+            seen.append(step.episodes.metrics["velocity/error_vel_xy"])
 
-    with env.observers.added(Keep()):
-        result = evaluate(env, zero_policy(env), 8)
+    result = evaluate(env, zero_policy(env), 8, keep)
     errors = torch.cat(seen).tolist()
     assert len(set(errors)) == 8
     assert sorted(result.values["velocity/error_vel_xy"]) == pytest.approx(sorted(errors))
