@@ -20,7 +20,6 @@ from rlcli.config.load import Resolved
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import UsageError, listing
-from rlcli.evaluation.stress import with_envs
 
 Matrix = NDArray[Any]
 _SPREAD = 1e-2
@@ -177,8 +176,9 @@ def _without_randomness(resolved: Resolved, count: int) -> Resolved:
     observations = {
         name: group.model_copy(update={"enable_corruption": False}) for name, group in task.observations.items()
     }
-    changes: dict[str, Any] = {"events": {}, "curriculum": {}, "observations": observations}
-    return with_envs(replace(resolved, task=task.model_copy(update=changes)), count)
+    scene = task.scene.model_copy(update={"num_envs": count})
+    changes: dict[str, Any] = {"scene": scene, "events": {}, "curriculum": {}, "observations": observations}
+    return replace(resolved, task=task.model_copy(update=changes))
 
 
 def _coordinates(env: VecEnv) -> list[str]:
