@@ -17,6 +17,7 @@ import copy
 import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rlcli.config.load import resolve
 from rlcli.deploy.env_description import describe
 from rlcli.deploy.export import TOLERANCE
 from rlcli.deploy.onboard_program import PROGRAM, open_model, program, write_model, write_program
@@ -38,7 +40,7 @@ from rlcli.rl.acting import trained_policy
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators
 from rlcli.runs.checkpoint_manifest import deployment_differences
-from rlcli.runs.restore import policy_of, require_fit
+from rlcli.runs.restore import require_fit
 
 if TYPE_CHECKING:
     from rlcli.registry import TaskSource
@@ -147,11 +149,12 @@ def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | N
         checkpoint: its checkpoint.
         named: the task that the command line names, if it does.
     """
-    resolved = choice.configure(named)
+    configure = partial(resolve, choice.source(named), agent=choice.agent, play=True)
+    resolved = configure()
     corrupted = [name for name, group in resolved.task.observations.items() if group.enable_corruption]
     if corrupted:
         clean = [f"observations.{name}.enable_corruption=false" for name in corrupted]
-        resolved = choice.configure(named, overrides=clean)
+        resolved = configure(overrides=clean)
     torch.set_num_threads(1)
     seed_generators(derive(_SEED, "task"))
     env = make_env(resolved, seed=derive(_SEED, "evaluation"))
@@ -185,7 +188,7 @@ def verify(reference: ReferenceEnv, checkpoint: Checkpoint, file: Path, format_:
     differing = deployment_differences(checkpoint, env.layout.record(), reference.deployment, _may_randomize(env))
     space: dict[str, Any] = {"__name__": "run_policy"}
     exec(compile(code, "run_policy.py", "exec"), space)  # what has just been written, not what lies there
-    controller, policy = space["Controller"](file), policy_of(checkpoint)
+    controller, policy = space["Controller"](file), checkpoint.policy()
     initial = env.state_dict()
     seed_generators(derive(_SEED, "task"))
     evaluated = evaluate(env, trained_policy(env, policy), episodes)

@@ -26,7 +26,6 @@ from rlcli.rl.policy import Policy, PolicySpec
 from rlcli.runs.atomic_io import sync_folder, write_synced
 from rlcli.runs.checkpoint import Checkpoint
 from rlcli.runs.checkpoint_manifest import deployment_of, layout_of
-from rlcli.runs.restore import policy_of
 
 __all__ = ["BUNDLE", "FORMATS", "TOLERANCE", "Exported", "check_target", "export", "refusal", "require_self_contained"]
 
@@ -96,12 +95,12 @@ def export(
     """
     check_target(format_, file)
     formats.require(format_)
-    policy = policy_of(checkpoint)
+    policy = checkpoint.policy()
     reason = refusal(policy.spec)
     if reason is not None:
         raise UsageError(
             f"{checkpoint.folder} cannot be exported: its policy has {reason}",
-            hint="rlcli.runs.restore.policy_of opens it in Python",
+            hint="rlcli.runs.checkpoint.open_checkpoint(FOLDER).policy() opens it in Python",
         )
     layout = layout_of(checkpoint, policy)
     graph = Deployed(policy, layout.actions).eval().requires_grad_(False)

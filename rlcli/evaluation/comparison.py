@@ -8,15 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.config.layers import leaves
 from rlcli.config.messages import dotted
-from rlcli.errors import ConfigError, Problem, UsageError
-from rlcli.evaluation.session import (
-    POLICIES,
-    PolicyInTask,
-    PolicyRequest,
-    baseline,
-    find_policy,
-    make_actor,
-)
+from rlcli.errors import ConfigError, Problem, UsageError, listing
+from rlcli.evaluation.session import POLICIES, PolicyInTask, PolicyRequest, baseline, find_policy, make_actor
 from rlcli.safe_text import shorten
 
 if TYPE_CHECKING:
@@ -25,7 +18,7 @@ if TYPE_CHECKING:
 
 METRICS = ("success", "return", "length")
 _WITHOUT_EFFECT = (("scene", "num_envs"), ("sim", "engine_threads"), ("viewer",), ("play",), ("agents",), ("summary",))
-"""Settings that may differ between the tasks: they change no episode."""
+"""Settings that may differ between the tasks: they do not affect episodes."""
 _MISSING = "nothing"
 
 
@@ -66,14 +59,14 @@ class Comparison:
 
 
 def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyInTask]:
-    """Find the policy of each name; those without a checkpoint act in the first run's task.
+    """Find the policy of each name; policies without a checkpoint act in the first run's task.
 
     Args:
-        names: runs and other references of checkpoints, or zero, random, lqr.
-        request: everything but the names.
+        names: references of runs and checkpoints, or zero, random, lqr.
+        request: the other settings.
 
     Raises:
-        UsageError: for fewer than two policies, or if none is a run.
+        UsageError: for fewer than two policies, or if no name is a run.
         ConfigError: if the tasks differ.
     """
     from rlcli.runs.policy_ref import SHIPPED
@@ -81,13 +74,15 @@ def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyIn
     without_run = [name for name in names if name in POLICIES and name != "trained"]
     if len(names) < 2 or len(without_run) == len(names):
         raise UsageError(
-            " ".join(["--compare", *names]) + ": with what?"
+            f"--compare needs at least two policies, found: {listing(names)}"
             if len(names) < 2
-            else "none of these is a run, so that there is no task",
-            hint="rlcli eval --compare RUN1 RUN2 [...]; beside a run also shipped, lqr, zero or random",
+            else "--compare needs at least one run, whose task is used",
+            hint="rlcli eval --compare RUN1 RUN2 [...]; shipped, lqr, zero and random may follow a run",
         )
     found: dict[str, PolicyInTask] = {}
-    for name in sorted(dict.fromkeys(names), key=SHIPPED.__eq__):  # last: `shipped` is of the other runs' task
+    for name in sorted(
+        dict.fromkeys(names), key=SHIPPED.__eq__
+    ):  # `shipped` comes last: it is searched in the task of the runs
         if name not in without_run:
             task = next(iter(found.values())).resolved.source.name if name == SHIPPED and found else None
             found[name] = find_policy(replace(request, task=task, checkpoint=name))
@@ -102,9 +97,9 @@ def compare(names: Sequence[str], policies: Sequence[PolicyInTask], episodes: in
     """Evaluate the policies in the same episodes, and compare each with the first.
 
     Args:
-        names: of the policies.
-        policies: as `find_policies` returns them.
-        episodes: of each policy.
+        names: names of the policies.
+        policies: the policies, from `find_policies`.
+        episodes: number of episodes of each policy.
     """
     from rlcli.evaluation.stress import one_each, run_points
 
@@ -121,29 +116,29 @@ def compare(names: Sequence[str], policies: Sequence[PolicyInTask], episodes: in
 
 
 def _require_same_task(name: str, first: PolicyInTask, other_name: str, other: PolicyInTask) -> None:
-    """Check that two policies are in one task.
+    """Check that two policies act in the same task.
 
     Raises:
-        UsageError: if the tasks have other names.
+        UsageError: if the names of the tasks differ.
         ConfigError: with every setting that differs.
     """
     ours, theirs = first.resolved.source, other.resolved.source
     if (ours.distribution, ours.name) != (theirs.distribution, theirs.name):
-        raise UsageError(f"{name} is of the task {ours.name}, and {other_name} of {theirs.name}")
+        raise UsageError(f"{name} is for the task {ours.name}, but {other_name} for {theirs.name}")
     left, right = _settings(first.resolved), _settings(other.resolved)
     problems = []
     for path in sorted({*left, *right}):
         ours, theirs = left.get(path, _MISSING), right.get(path, _MISSING)
         if ours != theirs:
-            message = f"{shorten(theirs, 60)}, and in {name} {shorten(ours, 60)}"
+            message = f"{shorten(theirs, 60)}, but {shorten(ours, 60)} in {name}"
             problems.append(Problem(other_name, path, message))
     if problems:
-        hint = "KEY.PATH=VALUE makes both alike, where that is what you want to compare them in"
+        hint = "add KEY.PATH=VALUE to use the same value for both"
         raise ConfigError([*problems[:-1], replace(problems[-1], hint=hint)])
 
 
 def _settings(resolved: Resolved) -> dict[str, Any]:
-    """The task's values by dotted key, without those that change no episode."""
+    """Return the task's values by dotted key, without those that do not affect episodes."""
     from rlcli.config.dump import to_data
 
     values = leaves(to_data(resolved))
@@ -155,17 +150,12 @@ def _settings(resolved: Resolved) -> dict[str, Any]:
 
 
 def _compare_pair(left: Evaluation, right: Evaluation) -> dict[str, Any]:
-    """Paired differences and probabilities of improvement; equal places in the lists are the same episode."""
+    """Return paired differences and probabilities of improvement; entry i of both evaluations is the same episode."""
     from rlcli.rl.confidence import difference, improvement
 
-    values: dict[str, tuple[Sequence[float], Sequence[float]]] = {
-        "success": (left.successes, right.successes),
-        "return": (left.returns, right.returns),
-        "length": (left.lengths, right.lengths),
-    }
     found = {}
-    for metric in METRICS:
-        ours, theirs = ([float(value) for value in side] for side in values[metric])
+    for metric, field in zip(METRICS, ("successes", "returns", "lengths"), strict=True):
+        ours, theirs = ([float(value) for value in getattr(side, field)] for side in (left, right))
         if ours:
             found[metric] = {"difference": difference(ours, theirs), "improvement": improvement(ours, theirs)}
     return found

@@ -1,11 +1,11 @@
-"""Evaluation of a policy: each environment's first episodes, so that short ones do not count double."""
+"""Evaluation of a policy on a fixed number of first episodes of each environment, without a bias to short ones."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -13,15 +13,17 @@ from torch import Tensor
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.step import StepRecord, StepResult
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import ConfigError
 from rlcli.managers.termination import DIVERGED
-from rlcli.rl.acting import PATIENCE, Act
+from rlcli.replay.rerun_episode import require_end
+from rlcli.rl.acting import Act
 from rlcli.rl.confidence import mean, proportion
+
+T = TypeVar("T")
 
 
 @dataclass(slots=True)
 class Evaluation:
-    """Finished episodes, one entry each, in the order in which they ended."""
+    """Finished episodes. Each list has one entry for each episode, in the order in which they ended."""
 
     envs: list[int] = field(default_factory=list)
     returns: list[float] = field(default_factory=list)
@@ -32,13 +34,13 @@ class Evaluation:
     causes: dict[str, list[bool]] = field(default_factory=dict)
     diverged: int = 0
     diverged_by: dict[str, int] = field(default_factory=dict)
-    """Cause -> how often."""
+    """Cause of a divergence -> number of episodes."""
     values: dict[str, list[float]] = field(default_factory=dict)
-    """The task's own numbers -> their mean over each episode: what a direct task logs, by name, and what commands
-    measure, as `command/metric`."""
+    """Metric of the task -> its mean over each episode: values that a direct task logs, by name, and metrics of
+    commands, as `command/metric`."""
 
     def summary(self) -> dict[str, Any]:
-        """Means and shares with 95 % intervals, as plain JSON: Student's t of means, Wilson's of shares."""
+        """Return means and rates as plain JSON, with 95 % intervals: Student's t for means, Wilson's for rates."""
         result: dict[str, Any] = {
             "episodes": len(self.returns),
             "return": mean(self.returns),
@@ -54,26 +56,29 @@ class Evaluation:
         return result
 
     def part(self, first: int, stop: int) -> Evaluation:
-        """The episodes of some environments, numbered from `first` on."""
+        """Return the episodes of the environments `first` to `stop` - 1, which are numbered from 0."""
         rows = [row for row, env in enumerate(self.envs) if first <= env < stop]
         return self._rows(rows, first)
 
     def in_environment_order(self) -> Evaluation:
-        """Return the same episodes ordered by environment: those of equal random streams stand at equal places."""
-        return self._rows(sorted(range(len(self.envs)), key=lambda row: self.envs[row]), 0)  # the sort keeps the order
+        """Return the episodes ordered by environment: equal positions in two evaluations have equal random streams."""
+        return self._rows(sorted(range(len(self.envs)), key=lambda row: self.envs[row]), 0)  # a stable sort
 
     def _rows(self, rows: list[int], first: int) -> Evaluation:
-        causes = {name: [fired[row] for row in rows] for name, fired in self.causes.items()}
+        def take(values: list[T]) -> list[T]:
+            return [values[row] for row in rows] if values else []
+
+        causes = {name: take(fired) for name, fired in self.causes.items()}
         return Evaluation(
-            [self.envs[row] - first for row in rows],
-            [self.returns[row] for row in rows],
-            [self.lengths[row] for row in rows],
-            [self.successes[row] for row in rows] if self.successes else [],
-            [self.truncated[row] for row in rows],
-            {name: [values[row] for row in rows] for name, values in self.reward_terms.items()},
-            causes,
-            sum(causes.get(DIVERGED, [])),
-            values={name: [values[row] for row in rows] for name, values in self.values.items()},
+            envs=[env - first for env in take(self.envs)],
+            returns=take(self.returns),
+            lengths=take(self.lengths),
+            successes=take(self.successes),
+            truncated=take(self.truncated),
+            reward_terms={name: take(values) for name, values in self.reward_terms.items()},
+            causes=causes,
+            diverged=sum(causes.get(DIVERGED, [])),
+            values={name: take(values) for name, values in self.values.items()},
         )
 
 
@@ -84,19 +89,19 @@ def evaluate(
     on_step: Callable[[StepResult], None] = lambda _: None,
     groups: int = 1,
 ) -> Evaluation:
-    """Run exactly `episodes` episodes: how many each environment contributes is fixed beforehand.
+    """Run exactly `episodes` episodes; each environment contributes a number that is fixed beforehand.
 
-    Counting the first episodes to finish anywhere would favour short ones.
+    Counting the first episodes that finish in any environment would favour short episodes.
 
     Args:
         env: the environments.
-        act: what acts in them.
-        episodes: of each group.
-        on_step: sees every step.
-        groups: as many equal parts of the environments, one after the other, run so many episodes each.
+        act: the policy's action function.
+        episodes: number of episodes of each group.
+        on_step: called with the result of every step.
+        groups: number of groups: equal, consecutive parts of the environments.
 
     Raises:
-        ConfigError: if episodes go on and on because the task has no time-out.
+        ConfigError: if an episode does not end because the task has no time-out.
     """
     size = env.num_envs // groups
     quota = torch.full((size,), episodes // size)
@@ -108,7 +113,7 @@ def evaluate(
     means = _EpisodeMeans(env)
     with torch.no_grad(), env.observers.added(means):
         while bool((quota > 0).any()):
-            _require_end(env)
+            require_end(env, int(env.episode_length_buf.max()))
             step = env.step(act(obs))
             obs = step.obs["policy"]
             on_step(step)
@@ -121,23 +126,15 @@ def evaluate(
     return result
 
 
-def _require_end(env: VecEnv) -> None:
-    longest = int(env.episode_length_buf.max())
-    if longest > PATIENCE * env.max_episode_length:
-        message = f"an episode has lasted {longest} steps, {PATIENCE} times episode_length_s, and has not ended"
-        hint = "add a termination with time_out: true"
-        raise ConfigError([env.resolved.problem(("terminations",), message, hint)])
-
-
 def _mean_of_finite(values: list[float]) -> dict[str, float | None]:
-    """A mean with its interval; of values that are not all finite nothing is known."""
+    """Return the mean with its interval; all entries are None if a value is not finite."""
     if all(map(math.isfinite, values)):
         return mean(values)
     return {"mean": None, "std": None, "low": None, "high": None}
 
 
 class _EpisodeMeans(StepObserver):
-    """Adds up what a task logs, environment by environment, step by step, and gives the means of finished episodes."""
+    """Observer that sums a task's metrics in each environment, for their means over finished episodes."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
@@ -145,7 +142,7 @@ class _EpisodeMeans(StepObserver):
         self._steps: dict[str, Tensor] = {}
 
     def on_step(self, record: StepRecord) -> None:
-        """Add the values of one step."""
+        """Add the metrics of one step."""
         for name, values in self._env.step_metrics().items():
             sums = self._sums.setdefault(name, torch.zeros(self._env.num_envs, dtype=torch.float64))
             steps = self._steps.setdefault(name, torch.zeros(self._env.num_envs, dtype=torch.float64))
@@ -153,7 +150,7 @@ class _EpisodeMeans(StepObserver):
             steps += 1.0
 
     def finish(self, ids: Tensor) -> dict[str, list[float]]:
-        """Means over the episodes that have just ended in these environments."""
+        """Return the means over the episodes that have just ended in these environments, and reset their sums."""
         ids, found = ids.cpu(), {}
         for name, sums in self._sums.items():
             steps = self._steps[name]
@@ -181,7 +178,7 @@ def _add_episodes(result: Evaluation, step: StepResult, quota: Tensor, means: _E
         for name, column in values.items():
             column_values = result.values.setdefault(name, [math.nan] * (len(result.returns) - 1))
             column_values.append(column[row])
-        for name in ended.causes:  # `diverged` becomes one once something has
+        for name in ended.causes:  # `diverged` becomes a cause at the first divergence
             result.causes.setdefault(name, [False] * (len(result.returns) - 1))
         for name, fired in result.causes.items():
             fired.append(name in ended.causes and bool(ended.causes[name][row]))

@@ -21,7 +21,7 @@ _WORD = re.compile(r"[A-Za-z_][\w./-]*")
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """Smallest or largest accepted value of one number of an evaluation."""
+    """Smallest or largest accepted value of one metric of an evaluation."""
 
     key: str
     value: float
@@ -29,16 +29,16 @@ class Limit:
 
     @property
     def flag(self) -> str:
-        """The option that sets such a limit."""
+        """The option that sets the limit."""
         return "--fail-under" if self.is_minimum else "--fail-over"
 
     @property
     def end(self) -> str:
-        """The end of an interval that the option compares: KEY.low or KEY.high."""
+        """End of the confidence interval in KEY.low or KEY.high that the option accepts."""
         return "low" if self.is_minimum else "high"
 
     def value_in(self, summary: Mapping[str, Any]) -> float | None:
-        """Return the number that the key stands for; None where it is unknown.
+        """Return the value of the limit's key in an evaluation; None if it is unknown.
 
         Raises:
             UsageError: if the evaluation has no such term or value.
@@ -48,11 +48,11 @@ class Limit:
             entry, of_interval = summary[head], bool(rest)
         else:
             group, name = (head, rest) if head in _GROUPS else ("values", self.key)
-            whole, stem = _find_name(summary[group], name), name.removesuffix(f".{self.end}")
-            found = whole or _find_name(summary[group], stem)
+            full_name, stem = _find_name(summary[group], name), name.removesuffix(f".{self.end}")
+            found = full_name or _find_name(summary[group], stem)
             if found is None:
                 raise self._unknown(summary[group], group, stem)
-            entry, of_interval = summary[group][found], whole is None
+            entry, of_interval = summary[group][found], full_name is None
         value: float | None = entry[self.end] if of_interval else mean_or_rate(entry)
         return value
 
@@ -60,7 +60,7 @@ class Limit:
         """Return why an evaluation fails this limit; None if it holds."""
         value = self.value_in(summary)
         if value is None:
-            return f"{self.key} is not known from one episode, and {self.value:g} is asked for"
+            return f"{self.key} is unknown after one episode, the limit is {self.value:g}"
         if self.is_minimum and value < self.value:
             return f"{self.key} is {value:.6g}, below {self.value:g}"
         if not self.is_minimum and value > self.value:
@@ -70,20 +70,20 @@ class Limit:
     def _unknown(self, entries: Mapping[str, Any], group: str, name: str) -> UsageError:
         option = f"{self.flag} {self.key}={self.value:g}"
         if group != "values":
-            hint = did_you_mean(name, entries) or f"there are: {listing(entries)}"
+            hint = did_you_mean(name, entries) or f"allowed: {listing(entries)}"
             return UsageError(f"{option}: there is no {group}.{name}", hint=hint)
         if same := _ending_in(entries, name):
-            return UsageError(f"{option}: which of them?", hint=listing(same))
+            return UsageError(f"{option}: the name is ambiguous", hint=listing(same))
         names = [*_KEYS, *entries]
-        hint = did_you_mean(name, names) or f"there are: {listing(names)}"
+        hint = did_you_mean(name, names) or f"allowed: {listing(names)}"
         return UsageError(f"{option}: the task logs no value '{name}'", hint=hint)
 
 
 def read_limits(fail_under: Sequence[str] | None, fail_over: Sequence[str] | None = None) -> list[Limit]:
-    """Parse `KEY=X` of `--fail-under` and `--fail-over`; of two for one key the last one holds.
+    """Parse the `KEY=X` of `--fail-under` and `--fail-over`; the last one for a key wins.
 
     Raises:
-        UsageError: for anything else.
+        UsageError: for any other text.
     """
     limits = {}
     for texts, is_minimum in ((fail_under or (), True), (fail_over or (), False)):
@@ -94,7 +94,7 @@ def read_limits(fail_under: Sequence[str] | None, fail_over: Sequence[str] | Non
 
 
 def require_success(resolved: Resolved, keys: Iterable[str]) -> None:
-    """Check that the task defines success if one of the keys is about it.
+    """Check that the task defines success if a key needs it.
 
     Raises:
         UsageError: if it does not.
@@ -104,7 +104,7 @@ def require_success(resolved: Resolved, keys: Iterable[str]) -> None:
 
 
 def failures(summary: Mapping[str, Any], limits: Iterable[Limit]) -> list[str]:
-    """Return which limits an evaluation fails, one sentence each.
+    """Return a sentence for each limit that an evaluation fails.
 
     Raises:
         UsageError: if the evaluation has no such term or value.
@@ -113,7 +113,7 @@ def failures(summary: Mapping[str, Any], limits: Iterable[Limit]) -> list[str]:
 
 
 def mean_or_rate(entry: Mapping[str, Any]) -> Any:
-    """Return the number in the middle of an interval: a share's rate, else the mean."""
+    """Return the rate or the mean of an entry of an evaluation."""
     return entry["rate"] if "rate" in entry else entry["mean"]
 
 
@@ -128,13 +128,13 @@ def _parse(text: str, is_minimum: bool) -> Limit:
         raise UsageError(
             f"{limit.flag} '{text}' is not success=X, return=X, length=X or NAME=X",
             hint="NAME: a value of the task, reward_terms.NAME or terminations.NAME;"
-            f" KEY.{limit.end}=X is of the interval's {end} end",
+            f" KEY.{limit.end}=X is the {end} end of the 95 % interval",
         )
     return limit
 
 
 def _is_key(limit: Limit) -> bool:
-    """Whether a key may stand for a number; only an evaluation shows whether the task has a value of that name."""
+    """Return whether a key is well-formed; only an evaluation shows whether the task has a value of that name."""
     head, _, rest = limit.key.partition(".")
     if head in _KEYS:
         return rest in ("", limit.end)
@@ -144,7 +144,7 @@ def _is_key(limit: Limit) -> bool:
 
 
 def _find_name(entries: Mapping[str, Any], name: str) -> str | None:
-    """The entry of this name; of `command/metric` the last part is enough where it is unique."""
+    """Return the entry of this name; `metric` stands for `command/metric` if it is unique."""
     if name in entries:
         return name
     same = _ending_in(entries, name)

@@ -1,8 +1,8 @@
-"""A known answer beside a learned one: the linear-quadratic regulator of a task about its default state.
+"""Linear-quadratic regulator (LQR) of a task at its default state, a reference for trained policies.
 
-The task itself is asked how it moves: one step from many states near the default one, with small actions, gives its
-linear model, in the policy's own observations and actions. Where the default state is no equilibrium, where the
-observations do not say in which state the task is, or where no linear law holds it, there is no regulator.
+The linear model is identified from the environment: one step from each of many states near the default one, with small
+actions. The regulator uses the policy's observations and actions. A task has no regulator if its default state is not
+an equilibrium, if the observations do not determine the state, or if no linear feedback stabilises it.
 """
 
 from __future__ import annotations
@@ -23,32 +23,33 @@ from rlcli.errors import UsageError, listing
 
 Matrix = NDArray[Any]
 _SPREAD = 1e-2
-"""Of the states and actions that are tried, about the default ones."""
-_MISFIT = 1e-2
-"""How much of what is observed may be left unexplained, as a share of its size."""
-_STILL = 1e-5
-"""How far an equilibrium may move in a step [m or rad, m/s or rad/s]."""
+"""Largest deviation of the sampled states and actions from the default ones [m, rad, m/s, rad/s, unit of actions]."""
+_MAX_RESIDUAL = 1e-2
+"""Largest residual of a linear fit, as a share of the root mean square of the fitted values."""
+_MAX_DRIFT = 1e-5
+"""Largest movement of an equilibrium in one step [m or rad, m/s or rad/s]."""
 _SINGULAR = 1e-4
-"""Directions of the observations that are this much weaker than the strongest are rounding."""
-_ROUNDS = 100_000
-_MOST_COST = 1e12
-"""Of a state of 1, beyond which nothing holds it."""
+"""Singular values of the observations below this share of the largest are rounding errors."""
+_MAX_ITERATIONS = 100_000
+_MAX_COST = 1e12
+"""Cost of a unit state above which the system cannot be stabilised."""
 
 
 @dataclass(frozen=True, slots=True)
 class Regulator:
-    """action = -gain (observation - rest), within the bound."""
+    """Feedback law: action = -gain (observation - rest), clamped to the bound."""
 
     gain: Matrix
     """(actions, observations)"""
     rest: Matrix
     """The observation of the equilibrium. (observations,)"""
     bound: float | None
+    """Largest absolute action; None: no bound."""
     poles: tuple[float, ...]
-    """Absolute values of the closed loop's, per control step; below 1 it is stable."""
+    """Absolute values of the closed loop's poles, per control step, the largest first; stable below 1."""
 
     def acting(self, env: VecEnv) -> Callable[[Tensor], Tensor]:
-        """The regulator in an environment."""
+        """Return the action function of the regulator in an environment."""
         gain = torch.from_numpy(self.gain).to(env.device)
         rest = torch.from_numpy(self.rest).to(env.device)
 
@@ -60,59 +61,61 @@ class Regulator:
 
 
 def regulator(resolved: Resolved, bound: float | None) -> Regulator:
-    """The regulator of a task: unit weights on positions, velocities, and actions as shares of the bound.
+    """Compute the regulator of a task, with unit weights on positions, velocities, and actions divided by the bound.
 
     Args:
         resolved: the task.
-        bound: of its actions; None: they have none.
+        bound: largest absolute action; None: no bound.
 
     Raises:
-        UsageError: if the task has none, with the reason.
+        UsageError: if the task has no regulator, with the reason.
     """
     if resolved.task.success is None:
-        raise _refused(resolved, "the task defines no success, so that nothing says where it is to be held")
-    env = make_env(_still(resolved, 1))
+        raise _no_regulator(resolved, "the task defines no success, so its target state is unknown")
+    env = make_env(_without_randomness(resolved, 1))
     try:
         model = env.engine.model
         if model.nq != model.nv:
-            raise _refused(resolved, "something in it floats or turns freely, and this regulator has hinges and slides")
+            raise _no_regulator(
+                resolved, "it has a floating body or a ball joint; only hinges and slides are supported"
+            )
         if model.na:
-            raise _refused(resolved, "its actuators have states of their own")
+            raise _no_regulator(resolved, "its actuators have internal states")
         count = 2 * model.nv + env.layout.action_size
     finally:
         env.close()
-    env = make_env(_still(resolved, 2 + 16 * count))
+    env = make_env(_without_randomness(resolved, 2 + 16 * count))
     try:
-        states, after, observed, rest = _try(env, resolved)
+        states, after, observed, rest = _sample_steps(env, resolved)
     finally:
         env.close()
-    model_of, misfit = _fit(states, after)
-    if misfit.max() > _MISFIT:
-        raise _refused(resolved, "position, velocity and action do not say how it moves on")
+    dynamics, residual = _fit(states, after)
+    if residual.max() > _MAX_RESIDUAL:
+        raise _no_regulator(resolved, "position, velocity and action do not determine the next state linearly")
     nx = after.shape[1]
-    decoder, misfit = _fit(observed, after)
-    if misfit.max() > _MISFIT:
-        unseen = listing(_coordinates(env)[i] for i in (misfit > _MISFIT).nonzero()[0])
-        raise _refused(resolved, f"its observations do not determine the state: {unseen}")
-    a, b = model_of[:nx].T, model_of[nx:].T
+    decoder, residual = _fit(observed, after)
+    if residual.max() > _MAX_RESIDUAL:
+        unseen = listing(_coordinates(env)[i] for i in (residual > _MAX_RESIDUAL).nonzero()[0])
+        raise _no_regulator(resolved, f"its observations do not determine the state: {unseen}")
+    a, b = dynamics[:nx].T, dynamics[nx:].T  # x+ = a x + b u
     gain = riccati(a, b, np.eye(nx), np.eye(b.shape[1]) / (bound or 1.0) ** 2)
     poles = tuple(sorted(np.abs(np.linalg.eigvals(a - b @ gain)).tolist(), reverse=True)) if gain is not None else ()
     if gain is None or poles[0] >= 1.0:
-        raise _refused(resolved, "no linear law holds it at its default state")
+        raise _no_regulator(resolved, "no linear feedback stabilises its default state")
     return Regulator(gain @ decoder.T, rest, bound, poles)
 
 
 def riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix) -> Matrix | None:
-    """The gain k of u = -k x that minimises the sum of x'qx + u'ru along x+ = a x + b u; None if there is none.
+    """Return the gain k of u = -k x that minimises the sum of x'qx + u'ru for x+ = a x + b u; None if none exists.
 
-    The discrete algebraic Riccati equation, iterated from q on: the cost of ever longer horizons.
+    The discrete algebraic Riccati equation is iterated from q on; iteration n gives the cost of a horizon of n steps.
     """
     cost, gain = q, np.zeros((b.shape[1], a.shape[0]))
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ITERATIONS):
         gain = np.linalg.solve(r + b.T @ cost @ b, b.T @ cost @ a)
         longer = q + a.T @ cost @ (a - b @ gain)
-        longer = (longer + longer.T) / 2
-        if np.abs(longer).max() > _MOST_COST:
+        longer = (longer + longer.T) / 2  # keeps rounding errors symmetric
+        if np.abs(longer).max() > _MAX_COST:
             return None
         if np.abs(longer - cost).max() <= 1e-12 * np.abs(longer).max():
             return gain
@@ -120,57 +123,62 @@ def riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix) -> Matrix | None:
     return None
 
 
-def _try(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """States and actions, the states a step later, what is then observed, and what is observed at rest.
+def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """Return deviations of states and actions, of the states after one step, of its observations; and those at rest.
 
-    The first three are half the differences of pairs about the default state: what is even in them drops out.
+    The first three are half the differences of pairs on both sides of the default state, so that quadratic and other
+    even terms cancel.
+
+    Raises:
+        UsageError: if the default state is not an equilibrium in which the task succeeds.
     """
     env.reset(seed=0)
     engine, pairs, nv = env.engine, env.num_envs // 2 - 1, env.engine.model.nv
-    everyone = engine.select(torch.ones(env.num_envs, dtype=torch.bool, device=env.device), 0, env.episode_index)
-    assert everyone is not None
-    engine.reset(everyone)
+    all_envs = engine.select(torch.ones(env.num_envs, dtype=torch.bool, device=env.device), 0, env.episode_index)
+    assert all_envs is not None
+    engine.reset(all_envs)
     qpos, qvel = engine.field("qpos"), engine.field("qvel")
     middle = qpos[0].clone()
     drawn = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, (pairs, 2 * nv + env.layout.action_size))
+    # environments 0 and 1 stay at the default state, the others come in pairs
     both = torch.from_numpy(np.concatenate([np.zeros((2, drawn.shape[1])), drawn, -drawn])).to(env.device)
     qpos.copy_(middle + both[:, :nv])
     qvel.copy_(both[:, nv : 2 * nv])
-    env.sim.on_moved(everyone)
+    env.sim.on_moved(all_envs)
     for sensor in env.sensors.values():
-        sensor.on_moved(everyone)
+        sensor.on_moved(all_envs)
     env.sim.forward_moved()
     step = env.step(both[:, 2 * nv :].float())
     if bool((step.terminated | step.truncated).any()):
-        raise _refused(resolved, "its default state ends an episode")
+        raise _no_regulator(resolved, "its default state ends an episode")
     after = torch.cat([qpos - middle, qvel], dim=1).double().cpu().numpy()
     observed = step.obs["policy"].double().cpu().numpy()
-    if np.abs(after[0]).max() > _STILL:
+    if np.abs(after[0]).max() > _MAX_DRIFT:
         moved = _coordinates(env)[int(np.abs(after[0]).argmax())]
-        raise _refused(resolved, f"its default state is no equilibrium: {moved} moves")
-    succeeding = env.compute_success()
-    if succeeding is None or not bool(succeeding[0]):
-        raise _refused(resolved, "its default state is not where it succeeds")
+        raise _no_regulator(resolved, f"its default state is not an equilibrium: {moved} moves")
+    success = env.compute_success()
+    if success is None or not bool(success[0]):
+        raise _no_regulator(resolved, "it does not succeed at its default state")
     half = [(values[2 : 2 + pairs] - values[2 + pairs :]) / 2 for values in (after, observed)]
     return drawn, half[0], half[1], observed[0]
 
 
-def _fit(given: Matrix, wanted: Matrix) -> tuple[Matrix, Matrix]:
-    """The matrix that maps rows of the one to rows of the other, and how much of each column it leaves unexplained."""
-    found, *_ = np.linalg.lstsq(given, wanted, rcond=_SINGULAR)
-    left = np.sqrt(np.square(wanted - given @ found).mean(axis=0))
-    return found, left / np.maximum(np.sqrt(np.square(wanted).mean(axis=0)), 1e-9)
+def _fit(inputs: Matrix, targets: Matrix) -> tuple[Matrix, Matrix]:
+    """Return the least-squares matrix from rows of inputs to rows of targets, and the relative residual by column."""
+    found, *_ = np.linalg.lstsq(inputs, targets, rcond=_SINGULAR)
+    residual = np.sqrt(np.square(targets - inputs @ found).mean(axis=0))
+    return found, residual / np.maximum(np.sqrt(np.square(targets).mean(axis=0)), 1e-9)
 
 
-def _still(resolved: Resolved, count: int) -> Resolved:
-    """The task without chance: no events, no noise, so many environments."""
+def _without_randomness(resolved: Resolved, count: int) -> Resolved:
+    """Return the task with `count` environments and without events, curriculum and noise."""
     task = resolved.task
     observations = {
         name: group.model_copy(update={"enable_corruption": False}) for name, group in task.observations.items()
     }
     scene = task.scene.model_copy(update={"num_envs": count})
-    still: dict[str, Any] = {"scene": scene, "events": {}, "curriculum": {}, "observations": observations}
-    return replace(resolved, task=task.model_copy(update=still))
+    changes: dict[str, Any] = {"scene": scene, "events": {}, "curriculum": {}, "observations": observations}
+    return replace(resolved, task=task.model_copy(update=changes))
 
 
 def _coordinates(env: VecEnv) -> list[str]:
@@ -179,5 +187,5 @@ def _coordinates(env: VecEnv) -> list[str]:
     return [*names, *(f"the velocity of {name}" for name in names)]
 
 
-def _refused(resolved: Resolved, why: str) -> UsageError:
+def _no_regulator(resolved: Resolved, why: str) -> UsageError:
     return UsageError(f"there is no LQR of {resolved.source.name}: {why}", hint="other policies: trained, zero, random")

@@ -1,4 +1,4 @@
-"""Numbers of the model that a stress test changes, in each environment by a value of its own."""
+"""Model parameters that a stress test changes, with a value for each environment."""
 
 from __future__ import annotations
 
@@ -10,33 +10,24 @@ from torch import Tensor
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import listing
 from rlcli.evaluation.stress_params import PHYSICAL, Sweep, unknown_parameter
+from rlcli.scene.entity import KINDS
 from rlcli.scene.model_fields import DERIVED_FROM, FIELDS
 from rlcli.scene.names import NameProblem, match
 
-_OBJECTS = {
-    "Bodies": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
-    "Joints": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
-    "Geoms": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
-    "Sites": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
-    "Actuators": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
-    "Tendons": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
-    "Pairs": (mujoco.mjtObj.mjOBJ_PAIR, "npair"),
-}
-"""Kind of element -> its type, and the model's field with their number."""
 _FIXED, _AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
 _NO_BIAS, _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
 
 
-class Physical:
-    """A number of the model, or several.
+class ModelPerturbation:
+    """One parameter of the model, for one or more elements.
 
     Args:
         env: the environment.
-        sweep: what is changed.
-        values: in every environment, NaN where it stays as it is. (num_envs,) float64
+        sweep: the parameter.
+        values: its value in each environment; NaN: not changed. (num_envs,) float64
 
     Raises:
-        NameProblem: for what the model does not have, or where it would change nothing.
+        NameProblem: if the model lacks the parameter or an element, or if the values would change nothing.
     """
 
     def __init__(self, env: VecEnv, sweep: Sweep, values: Tensor) -> None:
@@ -57,19 +48,23 @@ class Physical:
         now = self._parts[0].now()
         if (not sweep.absolute or sweep.parameter == "gravity") and bool((now == 0).all()):
             hint = "abs:LOW:HIGH sets it" if field != "opt.gravity" else "sim.gravity=[0,0,-9.81] gives it a direction"
-            raise NameProblem(f"it is 0 of {listing(names)}, and a factor changes nothing", hint)
+            raise NameProblem(f"its value is 0 for {listing(names)}, so a factor changes nothing", hint)
         if field == "body_mass" and bool((now == 0).any()):
-            bare = [name for name, mass in zip(names, now[0].tolist(), strict=True) if mass == 0]
-            raise NameProblem(f"no mass to change on {listing(bare)}", "name other bodies")
+            massless = [name for name, mass in zip(names, now[0].tolist(), strict=True) if mass == 0]
+            raise NameProblem(f"no mass to change on {listing(massless)}", "name other bodies")
         if sweep.parameter == "effort_limit":
             limited = env.engine.model.actuator_forcelimited[rows].astype(bool).tolist()
-            if bare := [name for name, has in zip(names, limited, strict=True) if not has]:
-                raise NameProblem(f"{listing(bare)} has no effort limit", "give its joint an effort_limit")
-        self._touched = ~values.isnan() & ((values != 1.0) | sweep.absolute)
+            if unlimited := [name for name, has in zip(names, limited, strict=True) if not has]:
+                raise NameProblem(f"{listing(unlimited)} has no effort limit", "give its joint an effort_limit")
+        self._affected = ~values.isnan() & ((values != 1.0) | sweep.absolute)
 
-    def hold(self) -> Tensor | None:
-        """Change what has been written since `note`; where something was. (num_envs,) bool"""
-        written = [part.written() & self._touched[:, None] for part in self._parts]
+    def apply(self) -> Tensor | None:
+        """Change the values that the task has written since `note_values`.
+
+        Returns:
+            The changed environments, (num_envs,) bool; None if there are none.
+        """
+        written = [part.written() & self._affected[:, None] for part in self._parts]
         rows = torch.stack([mask.any(dim=1) for mask in written]).any(dim=0)
         if not bool(rows.any()):
             return None
@@ -77,13 +72,13 @@ class Physical:
             part.write(mask, values)
         return rows
 
-    def note(self) -> None:
-        """What stands there now is as it should be."""
+    def note_values(self) -> None:
+        """Store the current values, to detect later writes of the task."""
         for part in self._parts:
             part.held = part.now()
 
     def _targets(self, now: Tensor) -> list[Tensor]:
-        """What each part is to be. (num_envs, values) each"""
+        """Return the values that each part must have. (num_envs, values) each"""
         value = self._values[:, None]
         if not self._sweep.absolute:
             return [part.now() * value for part in self._parts]
@@ -91,7 +86,7 @@ class Physical:
             ends = torch.tensor([-1.0, 1.0], dtype=now.dtype, device=now.device)
             return [value * ends.repeat(now.shape[1] // 2)]
         if self._sweep.parameter == "gravity":
-            return [now * (value / now.square().sum(dim=1, keepdim=True).sqrt())]  # its direction stays
+            return [now * (value / now.square().sum(dim=1, keepdim=True).sqrt())]  # keeps its direction
         if self._sweep.parameter == "body_mass":
             return [part.now() * (value / now).repeat_interleave(part.width, dim=1) for part in self._parts]
         return [value.expand_as(now)]
@@ -108,38 +103,38 @@ class _Part:
         axes = list(range(width)) if axes is None else axes
         self.width = len(axes)
         self.held: Tensor | None = None
-        """The values when they were last changed; None before. (num_envs, elements x axes)"""
+        """The values after the last change; None before the first. (num_envs, elements x axes)"""
         self._columns = torch.tensor([row * width + axis for row in rows for axis in axes], device=env.device)
 
     def now(self) -> Tensor:
-        """A copy of the values. (num_envs, elements x axes)"""
+        """Return a copy of the values. (num_envs, elements x axes)"""
         return self._live[:, self._columns]
 
     def written(self) -> Tensor:
-        """Which values somebody else has written. (num_envs, elements x axes) bool"""
+        """Return which values the task has written since the last change. (num_envs, elements x axes) bool"""
         now = self.now()
         return torch.ones_like(now, dtype=torch.bool) if self.held is None else now != self.held
 
-    def write(self, where: Tensor, values: Tensor) -> None:
-        """Set the values where that holds. (num_envs, elements x axes) each"""
-        self._live[:, self._columns] = torch.where(where, values.to(self._live.dtype), self.now())
+    def write(self, mask: Tensor, values: Tensor) -> None:
+        """Set the values where a mask holds. (num_envs, elements x axes) each"""
+        self._live[:, self._columns] = torch.where(mask, values.to(self._live.dtype), self.now())
 
 
 def _rows(env: VecEnv, field: str, pattern: str | None) -> tuple[list[int], list[str]]:
-    """Rows of a model field, and the names of what they belong to.
+    """Return rows of a model field, and the names of the elements that they belong to.
 
     Raises:
-        NameProblem: for what the model does not have.
+        NameProblem: if the model has no such element.
     """
     model, kind = env.engine.model, FIELDS[field]
     if not kind:
         if pattern is not None:
-            raise NameProblem(f"it is of the whole world, and not of '{pattern}'", "leave the name out")
+            raise NameProblem(f"it belongs to the whole world, not to '{pattern}'", "leave the name out")
         return [0], ["the world"]
     entities = [f"{name}/" for name in env.entities]
     ids: list[int] = []
     names: list[str] = []
-    object_type, count_field = _OBJECTS[kind]
+    object_type, count_field = KINDS[kind]
     for number in range(1 if kind == "Bodies" else 0, getattr(model, count_field)):
         name = mujoco.mj_id2name(model, object_type, number) or ""
         short = next((name.removeprefix(prefix) for prefix in entities if name.startswith(prefix)), name)
@@ -157,7 +152,7 @@ def _rows(env: VecEnv, field: str, pattern: str | None) -> tuple[list[int], list
 
 
 def _elements(model: mujoco.MjModel, field: str, number: int) -> list[int]:
-    """Rows of an element in a field: of a joint one for each of its degrees of freedom."""
+    """Return the rows of an element in a field; a joint has one for each degree of freedom or coordinate."""
     if field.startswith("dof_"):
         return [dof for dof in range(model.nv) if model.dof_jntid[dof] == number]
     if field in ("qpos0", "qpos_spring"):
@@ -167,27 +162,30 @@ def _elements(model: mujoco.MjModel, field: str, number: int) -> list[int]:
 
 
 def _axes(env: VecEnv, field: str, sweep: Sweep) -> list[int] | None:
-    """Which of an element's values are meant; None: all.
+    """Return the columns of an element's row that are changed; None: all.
 
     Raises:
-        NameProblem: if one value were to be set on several.
+        NameProblem: if a row has several values and all would be set to one number.
     """
     if field == "geom_friction":
-        return [0]
+        return [0]  # sliding friction; the other two are torsional and rolling friction
     own = sweep.parameter in PHYSICAL
     value = np.asarray(getattr(env.engine.model, field)) if field != "opt.gravity" else np.zeros((1, 3))
     width = value[:1].size
     if sweep.absolute and not own and width > 1:
-        raise NameProblem(f"{field} has {width} values each, and they cannot all be one", "a factor: leave out abs:")
+        raise NameProblem(
+            f"{field} has {width} values each, which abs: would make equal", "use a factor: leave out abs:"
+        )
     return None
 
 
 def _require_affine(model: mujoco.MjModel, rows: list[int], names: list[str]) -> None:
     kinds = [(int(model.actuator_gaintype[row]), int(model.actuator_biastype[row])) for row in rows]
-    odd = [
+    unsupported = [
         name
         for name, (gain, bias) in zip(names, kinds, strict=True)
         if gain not in (_FIXED, _AFFINE) or bias not in (_NO_BIAS, _AFFINE_BIAS)
     ]
-    if odd:
-        raise NameProblem(f"{listing(odd)} cannot be scaled as a whole", "motors, position and velocity actuators can")
+    if unsupported:
+        hint = "motors, position and velocity actuators can"
+        raise NameProblem(f"{listing(unsupported)} cannot be scaled as a whole", hint)

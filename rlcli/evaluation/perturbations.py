@@ -1,7 +1,7 @@
-"""What a stress test changes in an environment: its model, and what lies between it and a policy.
+"""Perturbations of a stress test: of the model, of the signals between environment and policy, and pushes.
 
-Values are one an environment, so that one set of environments holds many variants of a task. Where a value is neutral
-nothing is changed: the environment gives the same episodes as without perturbations.
+Every environment has its own values, so that one set of environments holds many variants of a task. A neutral value
+changes nothing: the environment runs the same episodes as without perturbations.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rlcli.envs.layout import TermLayout
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import UsageError, listing
-from rlcli.evaluation.model_perturbations import Physical
+from rlcli.evaluation.model_perturbations import ModelPerturbation
 from rlcli.evaluation.stress_params import SIGNALS, Sweep
 from rlcli.scene.names import NameProblem, match
 
@@ -26,20 +26,20 @@ Act = Callable[[Tensor], Tensor]
 
 
 class Perturbations(StepObserver):
-    """Everything that is changed in an environment.
+    """Observer that applies all perturbations to an environment.
 
     Args:
         env: the environment; from now on its steps are perturbed.
         sweeps: the parameters.
-        values: of each in every environment, NaN where it stays as it is. (num_envs, sweeps) float64
+        values: value of each parameter in every environment; NaN: not changed. (num_envs, sweeps) float64
 
     Raises:
-        UsageError: for a parameter or an element that there is not, or where it would change nothing.
+        UsageError: for an unknown parameter or element, or if a parameter would change nothing.
     """
 
     def __init__(self, env: VecEnv, sweeps: Sequence[Sweep], values: Tensor) -> None:
         self._env = env
-        self._physical: list[Physical] = []
+        self._physical: list[ModelPerturbation] = []
         self._inputs: list[_Signal] = []
         self._outputs: list[_Signal] = []
         self._pushes: list[_Push] = []
@@ -50,14 +50,14 @@ class Perturbations(StepObserver):
                 self._add(sweep, values[:, number].nan_to_num(neutral))
             except NameProblem as problem:
                 raise UsageError(f"--sweep {sweep.name}: {problem}", hint=problem.hint) from None
-        # in the order in which a signal meets them: sensors are noisy before they are late, actions before they are
+        # a signal gets its noise before its delay
         for signals in (self._inputs, self._outputs):
             signals.sort(key=lambda signal: isinstance(signal, _Delay))
-        self._hold()
+        self._apply_to_model()
         env.observers.add(self)
 
     def around(self, act: Act) -> Act:
-        """A policy that sees and acts through what is perturbed."""
+        """Return the action function with perturbed observations and actions."""
         if not self._inputs and not self._outputs:
             return act
 
@@ -84,43 +84,43 @@ class Perturbations(StepObserver):
             signal = make(env, sweep, values, columns.to(env.device), of_action)
             (self._outputs if of_action else self._inputs).append(signal)
         else:
-            self._physical.append(Physical(env, sweep, values))
+            self._physical.append(ModelPerturbation(env, sweep, values))
 
     def before_step(self) -> None:
-        """Hold the model's fields and push bodies."""
-        self._hold()
+        """Change the model's fields where necessary, and push bodies."""
+        self._apply_to_model()
         for push in self._pushes:
             push()
 
-    def _hold(self) -> None:
-        """Change the model where that has not been done, or an event of the task has written since."""
+    def _apply_to_model(self) -> None:
+        """Change the model for the first time, or after an event of the task has written to it."""
         env, changed, derived = self._env, False, None
         for physical in self._physical:
-            rows = physical.hold()
+            rows = physical.apply()
             changed = changed or rows is not None
             if rows is not None and physical.derives:
                 derived = rows if derived is None else derived | rows
         if changed:
-            for physical in self._physical:  # what one has written is no event to another
-                physical.note()
+            for physical in self._physical:  # so that no one takes another's values for those of an event
+                physical.note_values()
         if derived is not None:
             env.engine.set_constants(env.engine.select(derived, env.seed, env.episode_index))
 
 
 class _Signal:
-    """Something that happens to some columns on their way to the policy or from it."""
+    """Perturbation of some columns of the observations or of the actions."""
 
     def __init__(self, env: VecEnv, sweep: Sweep, values: Tensor, columns: Tensor, of_action: bool) -> None:
         self.env, self.values, self.columns, self.of_action = env, values, columns, of_action
         self.stream = random.stream(f"stress.{sweep.name}")
 
     def __call__(self, signal: Tensor, is_first: Tensor) -> Tensor:
-        """(num_envs, k) -> (num_envs, k); `is_first`: environments in the first step of an episode"""
+        """Perturb a signal (num_envs, k); `is_first` (num_envs,) marks the first step of an episode."""
         raise NotImplementedError
 
 
 class _Noise(_Signal):
-    """Gaussian, drawn anew in every step."""
+    """Gaussian noise, drawn in every step."""
 
     def __call__(self, signal: Tensor, is_first: Tensor) -> Tensor:
         env, count = self.env, len(self.columns)
@@ -132,14 +132,14 @@ class _Noise(_Signal):
 
 
 class _Delay(_Signal):
-    """What was there some steps ago: before an episode's first observation that one, before its first action none."""
+    """Delay by some steps. Before enough steps, an episode's first observation is repeated, and the action is 0."""
 
     def __init__(self, env: VecEnv, sweep: Sweep, values: Tensor, columns: Tensor, of_action: bool) -> None:
         super().__init__(env, sweep, values, columns, of_action)
         self._steps = values.long()
         shape = (int(self._steps.max()) + 1, env.num_envs, len(columns))
         self._past = torch.zeros(shape, device=env.device)
-        self._everyone = torch.arange(env.num_envs, device=env.device)
+        self._all_envs = torch.arange(env.num_envs, device=env.device)
 
     def __call__(self, signal: Tensor, is_first: Tensor) -> Tensor:
         now = signal[:, self.columns]
@@ -147,12 +147,12 @@ class _Delay(_Signal):
         begin = torch.zeros_like(now) if self.of_action else now
         self._past[1:] = torch.where(is_first[:, None], begin, self._past[1:])
         late = signal.clone()
-        late[:, self.columns] = self._past[self._steps, self._everyone]
+        late[:, self.columns] = self._past[self._steps, self._all_envs]
         return late
 
 
 class _Push:
-    """A blow once in an episode, at a moment of its first half that its life draws: a jump of a velocity."""
+    """Push once in an episode, at a random step of its first half: a jump of a velocity in a random direction."""
 
     def __init__(self, env: VecEnv, sweep: Sweep, values: Tensor) -> None:
         self._env, self._values = env, values
@@ -165,39 +165,43 @@ class _Push:
         }
         if sweep.element is None:
             if len(floating) != 1:
-                what = "nothing floats" if not floating else "several things float"
-                raise NameProblem(f"{what}: say what is pushed", f"push.NAME, of {listing([*floating, *joints])}")
+                reason = "no entity floats" if not floating else "several entities float"
+                hint = f"push.NAME, with one of {listing([*floating, *joints])}"
+                raise NameProblem(f"{reason}: name the entity or joint to push", hint)
             self._root, self._joint = next(iter(floating.values()), None), None
             return
         names = [*floating, *joints]
         found = match(sweep.element, names, "entity or joint")
         if len(found) != 1:
-            raise NameProblem(f"it names {len(found)}: {listing(names[i] for i in found)}", "push one of them")
+            raise NameProblem(f"it matches {len(found)}: {listing(names[i] for i in found)}", "name one of them")
         name = names[found[0]]
         self._root, self._joint = floating.get(name), joints.get(name)
 
     def __call__(self) -> None:
-        """Push where the moment has come."""
+        """Push the environments that have reached their random step."""
         env = self._env
+        # columns: the step of the push, and its direction
         uniform = random.uniform(_keys(env, env.episode_index), self._stream, 0, 2)
-        moment = torch.from_numpy(1 + (uniform[:, 0] * (env.max_episode_length // 2)).astype(np.int64)).to(env.device)
-        now = (env.episode_length_buf == moment) & (self._values > 0)
+        push_step = torch.from_numpy(1 + (uniform[:, 0] * (env.max_episode_length // 2)).astype(np.int64)).to(
+            env.device
+        )
+        now = (env.episode_length_buf == push_step) & (self._values > 0)
         selection = env.engine.select(now, env.seed, env.episode_index) if bool(now.any()) else None
         if selection is None:
             return
-        way = torch.from_numpy(uniform[:, 1]).to(env.device)
+        direction = torch.from_numpy(uniform[:, 1]).to(env.device)
         size = selection.read_view(self._values.float())
-        way = selection.read_view(way)
+        direction = selection.read_view(direction)
         if self._joint is not None:
             entity, column = self._joint
-            velocity = selection.read(entity.data.joint_vel)[:, column] + size * torch.where(way < 0.5, -1.0, 1.0)
+            velocity = selection.read(entity.data.joint_vel)[:, column] + size * torch.where(direction < 0.5, -1.0, 1.0)
             entity.write_joint_velocities(selection, velocity[:, None], slice(column, column + 1))
         else:
             assert self._root is not None
             linear, angular = self._root.read_root_velocity(selection)
-            angle = 2.0 * torch.pi * way
-            blow = torch.stack([angle.cos() * size, angle.sin() * size, torch.zeros_like(size)], dim=1)
-            self._root.write_root_velocity(selection, linear + blow, angular)
+            angle = 2.0 * torch.pi * direction
+            push = torch.stack([angle.cos() * size, angle.sin() * size, torch.zeros_like(size)], dim=1)
+            self._root.write_root_velocity(selection, linear + push, angular)
         env.sim.on_moved(selection)
         for sensor in env.sensors.values():
             sensor.on_moved(selection)
@@ -205,17 +209,17 @@ class _Push:
 
 
 _STEPS = 1 << 32
-"""More than an episode has."""
+"""More steps than an episode has: step t of episode e has the counter e * _STEPS + t."""
 
 
 def _keys(env: VecEnv, counters: Tensor) -> random.Keys:
-    """Keys of draws by life and counter. (num_envs,)"""
+    """Return the keys of random draws by random stream and counter. (num_envs,)"""
     ids = np.arange(env.num_envs) % (env.engine.shared_streams or env.num_envs)
     return random.row_keys(env.seed, ids, counters.cpu().numpy())
 
 
 def _columns(terms: Sequence[TermLayout], pattern: str | None, what: str) -> Tensor:
-    """Columns of the terms, or of the elements `term.element`, that a pattern matches. (k,)"""
+    """Return the columns of the terms, or of the elements `term.element`, that match a pattern. (k,)"""
     total = sum(term.size for term in terms)
     if pattern is None:
         return torch.arange(total)

@@ -1,4 +1,4 @@
-"""A policy in a task, as play, eval, stress and report use it: find it, check it, and build its environment."""
+"""Sessions of play, eval, stress and report: find a policy and its task, check them, and build the environment."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.config.layers import flags
 from rlcli.errors import CheckpointError, MachineError, TaskError, UsageError, require_known
+from rlcli.runs.run import RECORD, Run
+from rlcli.runs.run_ref import default_runs_dir, find_run, list_runs
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -20,7 +22,6 @@ if TYPE_CHECKING:
     from rlcli.envs.vec_env import VecEnv
     from rlcli.registry import TaskSource
     from rlcli.rl.acting import Act
-    from rlcli.runs.run import Run
 
 _log = logging.getLogger(__name__)
 
@@ -29,7 +30,7 @@ POLICIES = ("trained", "zero", "random", "lqr")
 
 @dataclass(frozen=True, slots=True)
 class PolicyRequest:
-    """A policy and a task as a command line names them."""
+    """References to a policy and a task from a command line."""
 
     task: str | None
     overrides: Sequence[str] = ()
@@ -42,12 +43,12 @@ class PolicyRequest:
     config: Path | None = None
     runs_dir: Path | None = None
     min_envs: int = 1
-    """The task gets at least so many environments."""
+    """Smallest number of environments."""
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyInTask:
-    """A policy in a task, found and checked, and not yet built."""
+    """A policy and its task, found and checked; nothing is built yet."""
 
     resolved: Resolved
     run: Run | None
@@ -60,10 +61,10 @@ class PolicyInTask:
     stochastic: bool
     seed: int
     as_trained: bool
-    """Whether it is a checkpoint in its own run, in the task as the run has it."""
+    """Whether the policy is a checkpoint of a run and the task is configured as in that run."""
 
     def record(self) -> dict[str, Any]:
-        """Return which policy this is, as JSON."""
+        """Return the references of the policy as JSON."""
         checkpoint = str(self.checkpoint) if self.checkpoint else None
         return {"checkpoint": checkpoint, "chosen": self.reason, "policy": self.kind}
 
@@ -76,15 +77,15 @@ class Session:
     act: Act
     policy: PolicyInTask
     start: tuple[int, Tensor] | None = None
-    """An environment to watch, and the present observations of all; None: from a reset."""
+    """The environment to watch, and the current observations of all; None: the session starts with a reset."""
 
 
 def find_policy(request: PolicyRequest, check: Callable[[Resolved], None] = lambda resolved: None) -> PolicyInTask:
-    """Find the policy and its task, and check the task; nothing heavy is imported.
+    """Find the policy and its task, and check the task; torch and MuJoCo are not imported for a policy without files.
 
     Args:
         request: the policy and the task.
-        check: gets the configuration and may raise.
+        check: called with the configuration; it may raise an error.
 
     Raises:
         UsageError: if neither a task nor a checkpoint is named, or there is no such policy.
@@ -92,28 +93,25 @@ def find_policy(request: PolicyRequest, check: Callable[[Resolved], None] = lamb
     """
     from rlcli.config.load import resolve
     from rlcli.formats import log_notes
-    from rlcli.runs.run_ref import default_runs_dir
 
-    require_policy(request.policy)
+    require_known(request.policy, POLICIES, "policy", "policies")
     task, overrides = split_overrides(request.task, request.overrides)
     if task is None and request.checkpoint is None:
-        raise UsageError("play what?", hint="a TASK, or --checkpoint RUN|latest")
+        raise UsageError("no task or checkpoint given", hint="name a TASK, or --checkpoint RUN|latest")
     source = None if task is None else named_task_or_run(task, request.runs_dir)
-    run = folder = reason = None
+    run = folder = reason = agent = None
     as_trained = False
-    configure: Callable[..., Resolved]
     if request.policy == "trained" or request.checkpoint is not None:
         from rlcli.runs.policy_ref import choose
 
         choice = choose(request.checkpoint, request.runs_dir or default_runs_dir(), source)
         run, folder, reason = choice.run, choice.folder, choice.why
         _log.info(f"checkpoint {folder} ({reason})")
-        configure = partial(choice.configure, source, config_file=request.config, overrides=overrides)
+        source, agent = choice.source(source), choice.agent
         own = run is not None and folder.resolve().parent == run.checkpoints.resolve()
         as_trained = own and request.policy == "trained" and not overrides and request.config is None
-    else:
-        assert source is not None
-        configure = partial(resolve, source, play=True, config_file=request.config, overrides=overrides)
+    assert source is not None
+    configure = partial(resolve, source, agent=agent, play=True, config_file=request.config, overrides=overrides)
     values = flags(scene__num_envs=request.num_envs)
     resolved = configure(flags=values)
     if resolved.task.scene.num_envs < request.min_envs:
@@ -124,7 +122,7 @@ def find_policy(request: PolicyRequest, check: Callable[[Resolved], None] = lamb
 
 
 def split_overrides(task: str | None, overrides: Sequence[str]) -> tuple[str | None, list[str]]:
-    """Return the task and the overrides of a command line, on which the task may be left out."""
+    """Return the task and the overrides of a command line; a word with `=` in place of the task is an override."""
     if task is not None and "=" in task:
         return None, [task, *overrides]
     return task, list(overrides)
@@ -134,9 +132,8 @@ def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
     """Find a task by its name.
 
     Raises:
-        TaskError: if there is none; the hint says so if the name is that of a run.
+        TaskError: if there is no such task; the hint tells whether the name is that of a run.
     """
-    from rlcli.runs.run_ref import default_runs_dir, find_run
     from rlcli.runs.trusted_tasks import named_task
 
     try:
@@ -149,48 +146,44 @@ def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
 
 
 def open_session(request: PolicyRequest, check: Callable[[Resolved], None] = lambda resolved: None) -> Session:
-    """Find, check and build; heavy imports begin only when files and configuration are in order.
+    """Find and check a policy and its task, then build the environment; a divergence in it is dumped.
 
     Args:
         request: the policy and the task.
-        check: gets the configuration and may raise.
+        check: called with the configuration; it may raise an error.
     """
     policy = find_policy(request, check)
-    session = _build(policy)
+    from rlcli.envs.make import make_env
+    from rlcli.random import derive
     from rlcli.replay.crash_dump import CrashDumper
-    from rlcli.runs.run_ref import default_runs_dir
+    from rlcli.rl.rng import seed_generators
 
+    make = make_actor(policy)
+    seed_generators(derive(policy.seed, "task"))  # some tasks draw from torch's, numpy's or Python's generator
+    # a derived seed: evaluation uses other episodes than training
+    env = make_env(policy.resolved, seed=derive(policy.seed, "evaluation"))
+    session = Session(env, make(env), policy)
     home = request.runs_dir or default_runs_dir() if policy.run is None else policy.run.folder
-    CrashDumper(session.env, home / "dumps")
+    CrashDumper(env, home / "dumps")
     return session
 
 
-def require_policy(policy: str) -> None:
-    """Check that there is such a policy.
-
-    Raises:
-        UsageError: with the valid ones.
-    """
-    require_known(policy, POLICIES, "policy", "policies")
-
-
 def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:
-    """Return another policy in the same task, one that needs no checkpoint.
+    """Return a policy without a checkpoint (zero, random or lqr) in the task of another policy.
 
     Raises:
         UsageError: if there is no such policy.
     """
-    require_policy(kind)
+    require_known(kind, POLICIES, "policy", "policies")
     if kind == "trained":
-        raise UsageError("--against trained: it is compared with what needs no training", hint="lqr, zero or random")
+        raise UsageError(
+            "--against trained: only a policy without training can be the reference", hint="lqr, zero or random"
+        )
     return replace(policy, kind=kind, stochastic=False, as_trained=False)
 
 
 def is_run_name(word: str, runs_dir: Path | None) -> bool:
-    """Whether a word names a run or a checkpoint, and not a task."""
-    from rlcli.runs.run import RECORD
-    from rlcli.runs.run_ref import default_runs_dir, list_runs
-
+    """Return whether a word names a run or a checkpoint and not a task."""
     runs = runs_dir or default_runs_dir()
     name = word if Path(word).exists() else word.partition("@")[0]
     if name == "latest" or (Path(word) / "manifest.json").is_file():
@@ -201,13 +194,13 @@ def is_run_name(word: str, runs_dir: Path | None) -> bool:
 
 
 def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
-    """Return a function that makes the policy act in an environment; its files are read only once."""
+    """Return a function that opens the policy in an environment; the policy's files are read only once."""
     import torch
 
     from rlcli.random import derive
     from rlcli.rl.acting import random_policy, trained_policy, zero_policy
     from rlcli.runs.checkpoint import open_checkpoint
-    from rlcli.runs.restore import policy_of, require_fit
+    from rlcli.runs.restore import require_fit
 
     torch.set_num_threads(1)
     agent, seed = policy.resolved.agent, derive(policy.seed, "play")
@@ -222,7 +215,7 @@ def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
         return regulator(policy.resolved, bound).acting
     assert policy.checkpoint is not None
     checkpoint = open_checkpoint(policy.checkpoint)
-    trained = policy_of(checkpoint)
+    trained = checkpoint.policy()
 
     def make(env: VecEnv) -> Act:
         require_fit(checkpoint, env.layout)
@@ -232,24 +225,12 @@ def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
     return make
 
 
-def _build(policy: PolicyInTask) -> Session:
-    from rlcli.envs.make import make_env
-    from rlcli.random import derive
-    from rlcli.rl.rng import seed_generators
-
-    make = make_actor(policy)
-    # evaluation uses other episodes than training did
-    seed_generators(derive(policy.seed, "task"))  # some tasks draw from these generators
-    env = make_env(policy.resolved, seed=derive(policy.seed, "evaluation"))
-    return Session(env, make(env), policy)
-
-
 def check_record(record: Path | None, mode: str) -> None:
-    """Refuse, before anything is built, what cannot be recorded.
+    """Check the options of a recording, before anything is built.
 
     Raises:
-        UsageError: for a mode that there is not.
-        MachineError: if the folder is not there.
+        UsageError: for an unknown mode, or a folder in place of a file.
+        MachineError: if the folder of the file does not exist.
     """
     modes = ("all", "succeeded", "failed", "separate")
     require_known(mode, modes, "--record-mode", "modes")
@@ -264,7 +245,7 @@ def check_record(record: Path | None, mode: str) -> None:
 def run_episodes(
     session: Session, episodes: int, record: Path | None = None, mode: str = "all"
 ) -> tuple[dict[str, Any], list[str]]:
-    """Evaluate, and record if asked to: the summary, and the files that were written."""
+    """Evaluate, and record if a file is given; return the summary and the written files."""
     from rlcli.evaluation.evaluate import evaluate
 
     if record is None:
@@ -279,7 +260,7 @@ def run_episodes(
 
 
 def evaluation_record(session: Session, summary: dict[str, Any]) -> dict[str, Any]:
-    """Return what `rlcli eval` reports: the policy, how it was evaluated, and the summary."""
+    """Return the report of `rlcli eval`: the policy, the settings of the evaluation, and the summary."""
     policy = session.policy
     settings = {"stochastic": policy.stochastic, "seed": policy.seed, "num_envs": session.env.num_envs}
     return {**policy.record(), **settings, **summary}
@@ -288,9 +269,10 @@ def evaluation_record(session: Session, summary: dict[str, Any]) -> dict[str, An
 def save_evaluation(session: Session, record: dict[str, Any]) -> None:
     """Write the evaluation of a checkpoint into its run, for `report` and `runs`.
 
-    Only a deterministic policy in the task as it was trained is saved. A run that cannot be written to stays as it is.
+    It is written only for a deterministic policy in the task as it was trained. If the run cannot be written, a warning
+    is logged.
     """
-    from rlcli.runs.eval_store import keep_evaluation
+    from rlcli.runs.eval_store import write_evaluation
 
     policy = session.policy
     if policy.stochastic or not policy.as_trained:
@@ -298,8 +280,8 @@ def save_evaluation(session: Session, record: dict[str, Any]) -> None:
     assert policy.run is not None
     assert policy.checkpoint is not None
     try:
-        file = keep_evaluation(policy.run, policy.checkpoint.name, record)
+        file = write_evaluation(policy.run, policy.checkpoint.name, record)
     except (CheckpointError, MachineError) as error:
-        _log.warning(f"the evaluation is not kept in the run: {error.message}")
+        _log.warning(f"the evaluation is not saved in the run: {error.message}")
         return
-    _log.debug(f"kept in {file}")
+    _log.debug(f"evaluation saved in {file}")

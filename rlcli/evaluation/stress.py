@@ -1,4 +1,4 @@
-"""Stress test: a policy evaluated in many variants of its task at once, in the same episodes in each variant."""
+"""Stress test: evaluation of a policy in many variants of its task, with the same random numbers in each variant."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from rlcli.rl.rng import seed_generators
 
 _log = logging.getLogger(__name__)
 
-MOST_ENVS = 8192
-"""Environments that run at a time; more are run in several batches."""
+MAX_ENVS = 8192
+"""Largest number of environments that run at a time; more are run in batches."""
 _NEAR = 0.25
-"""Spread of a local search, as a share of the box's edges."""
+"""Standard deviation of a local search, as a share of the box's edges."""
 
 Actor = Callable[[VecEnv], Act]
-"""Makes a policy act in an environment."""
+"""Opens a policy in an environment, and returns its action function."""
 Summary = dict[str, Any]
 """Summary of an evaluation."""
 
@@ -43,40 +43,43 @@ class StressResult:
 
     sweeps: Sequence[Sweep]
     nominal: Summary
-    """Of the task as it is."""
+    """Summary of the unchanged task."""
     grid: dict[Point, Summary]
-    """Of every combination of the sweeps' values."""
+    """Summary of every combination of the sweeps' values."""
     searched: dict[Point, Summary]
-    """Of the points that the search for a worse case tried."""
+    """Summary of each point that the search for a worse case evaluated."""
     reference: dict[Point | None, Summary]
-    """Of the policy that it is compared with; None: the task as it is. Empty without such a policy."""
+    """Summaries of the reference policy; the key None is the unchanged task. Empty without a reference."""
     num_envs: int
 
     @property
     def metric(self) -> str:
-        """The number that is compared: success, or return for a task without success."""
+        """The metric that is compared: success, or return for a task without a success condition."""
         return "success" if "success" in self.nominal else "return"
 
     @property
+    def variants(self) -> dict[Point, Summary]:
+        """Summaries of the grid and of the search."""
+        return {**self.grid, **self.searched}
+
+    @property
     def worst(self) -> Point:
-        """The point of the worst variant."""
-        variants = {**self.grid, **self.searched}
-        return min(variants, key=lambda point: score(variants[point]))
+        """Point of the worst variant."""
+        return min(self.variants, key=lambda point: score(self.variants[point]))
 
     def failures(self, limits: Sequence[Limit]) -> list[str]:
-        """Return which limits fail, each in the variant that is worst in its number."""
-        variants = {**self.grid, **self.searched}
+        """Return a sentence for each limit that fails in the variant with the worst value of its metric."""
         found = []
         for limit in limits:
-            values = {point: limit.value_in(summary) for point, summary in variants.items()}
+            values = {point: limit.value_in(summary) for point, summary in self.variants.items()}
             worst = min(values, key=lambda point: -math.inf if (value := values[point]) is None else value)
-            failure = limit.failure(variants[worst])
+            failure = limit.failure(self.variants[worst])
             if failure is not None:
                 found.append(f"at {describe_point(self.sweeps, worst)}: {failure}")
         return found
 
     def record(self, against: str | None) -> dict[str, Any]:
-        """Return the result as JSON; `against` names the policy that it is compared with."""
+        """Return the result as JSON; `against` is the name of the reference policy."""
         worst = self.worst
         reference = {point: summary for point, summary in self.reference.items() if point is not None}
         return {
@@ -91,7 +94,7 @@ class StressResult:
             "worst": {
                 "at": by_name(self.sweeps, worst),
                 "found": "search" if worst in self.searched else "grid",
-                **{**self.grid, **self.searched}[worst],
+                **self.variants[worst],
             },
             "against": None
             if not self.reference
@@ -110,23 +113,23 @@ def stress(
     worst: int = 0,
     reference: PolicyInTask | None = None,
 ) -> StressResult:
-    """Evaluate a policy in its task as it is, in every variant of the grid, and in further ones near the worst.
+    """Evaluate a policy in its unchanged task, in every variant of the grid, and in further ones near the worst.
 
     Args:
         policy: the policy.
-        sweeps: what is varied.
-        episodes: of each variant.
-        worst: how many further points a search for a worse case tries.
+        sweeps: the parameters that are varied.
+        episodes: number of episodes in each variant.
+        worst: number of further points in a search for a worse case.
         reference: a policy that is evaluated in the same variants.
 
     Raises:
-        UsageError: for a parameter that the task does not have.
+        UsageError: if the task lacks a parameter.
     """
     task = one_each(policy.resolved, episodes)
     variants = grid(sweeps)
 
-    def run(which: PolicyInTask, points: Sequence[Point | None]) -> list[Summary]:
-        found = run_points(task, make_actor(which), sweeps, points, episodes, policy.seed)
+    def run(policy_to_run: PolicyInTask, points: Sequence[Point | None]) -> list[Summary]:
+        found = run_points(task, make_actor(policy_to_run), sweeps, points, episodes, policy.seed)
         return [evaluation.summary() for evaluation in found]
 
     _log.info(f"{len(variants) + 1} variants, {episodes} episodes in each, seed {policy.seed}")
@@ -148,34 +151,34 @@ def run_points(
     episodes: int,
     seed: int,
 ) -> list[Evaluation]:
-    """Evaluate in the variants of a task, each in as many environments as the task has.
+    """Evaluate a policy in variants of a task, each in as many environments as the task has.
 
-    Environment i draws the same random numbers in every variant, those of environment i in `rlcli eval` with the seed.
+    Environment i draws the same random numbers in every variant, and in `rlcli eval` with the same seed.
 
     Args:
         resolved: the task.
         actor: the policy.
-        sweeps: what is varied.
-        points: the values; None: the task as it is.
-        episodes: of each variant.
-        seed: of the evaluation.
+        sweeps: the parameters that are varied.
+        points: their values in each variant; None: the unchanged task.
+        episodes: number of episodes in each variant.
+        seed: seed of the evaluation.
 
     Raises:
-        UsageError: for a parameter that the task does not have.
+        UsageError: if the task lacks a parameter.
     """
     torch.set_num_threads(1)
     size = resolved.task.scene.num_envs
-    at_once = max(1, MOST_ENVS // size)
+    at_once = max(1, MAX_ENVS // size)
     results: list[Evaluation] = []
     for start in range(0, len(points), at_once):
         batch = points[start : start + at_once]
-        seed_generators(derive(seed, "task"))  # some tasks draw from them
+        seed_generators(derive(seed, "task"))  # some tasks draw from torch's, numpy's or Python's generator
         env = make_env(with_envs(resolved, size * len(batch)), seed=derive(seed, "evaluation"), shared_streams=size)
         try:
             act = actor(env)
             if sweeps:
-                as_it_is = (math.nan,) * len(sweeps)
-                values = torch.tensor([point or as_it_is for point in batch], dtype=torch.float64)
+                unchanged = (math.nan,) * len(sweeps)
+                values = torch.tensor([point or unchanged for point in batch], dtype=torch.float64)
                 act = Perturbations(env, sweeps, values.repeat_interleave(size, dim=0)).around(act)
             found = evaluate(env, act, episodes, groups=len(batch))
         finally:
@@ -186,23 +189,23 @@ def run_points(
     return results
 
 
-def search(sweeps: Sequence[Sweep], around: Point, count: int, seed: int) -> list[Point]:
-    """Return further points of the box that the sweeps span: half of them near a point, the others anywhere."""
+def search(sweeps: Sequence[Sweep], center: Point, count: int, seed: int) -> list[Point]:
+    """Return `count` random points of the box that the sweeps span: half of them near a point, the others uniform."""
     generator = np.random.default_rng(derive(seed, "stress"))
-    middle = np.array([sweep.share(value) for sweep, value in zip(sweeps, around, strict=True)])
+    middle = np.array([sweep.share(value) for sweep, value in zip(sweeps, center, strict=True)])
     near = middle + _NEAR * generator.standard_normal(((count + 1) // 2, len(sweeps)))
     shares = np.concatenate([near.clip(0.0, 1.0), generator.random((count // 2, len(sweeps)))])
     return list(dict.fromkeys(tuple(s.between(float(x)) for s, x in zip(sweeps, row, strict=True)) for row in shares))
 
 
 def score(summary: Summary) -> tuple[float, float]:
-    """Return what variants are ordered by: success first, then return."""
+    """Return the key that orders variants: success rate, then mean return."""
     return summary["success"]["rate"] if "success" in summary else 0.0, summary["return"]["mean"]
 
 
 def one_each(resolved: Resolved, episodes: int) -> Resolved:
     """Return the task with one environment for each episode, unless the user has set the number."""
-    return resolved if "scene.num_envs" in explicit_values(resolved) else with_envs(resolved, min(episodes, MOST_ENVS))
+    return resolved if "scene.num_envs" in explicit_values(resolved) else with_envs(resolved, min(episodes, MAX_ENVS))
 
 
 def with_envs(resolved: Resolved, count: int) -> Resolved:

@@ -1,4 +1,4 @@
-"""What a stress test varies, as the command line says it: `body_mass.pole=0.5:2`, `action_delay=0:3`."""
+"""Parameters of a stress test and their values on a command line: `body_mass.pole=0.5:2`, `action_delay=0:3`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PHYSICAL = {
     "effort_limit": "actuator_forcerange",
     "gravity": "opt.gravity",
 }
-"""Parameter -> the model field behind it. A model field's own name is one, too."""
+"""Parameter -> field of the model. The name of a model field is a parameter, too."""
 SIGNALS = {
     "action_delay": "control steps",
     "action_noise": "standard deviation, in the policy's own units",
@@ -31,13 +31,13 @@ SIGNALS = {
     "push": "m/s or rad/s",
 }
 """Parameter -> its unit."""
-_WHOLE = ("action_delay", "observation_delay")
-_MOST = 1000
-"""Values of a sweep, and steps of a delay."""
+_INTEGER = ("action_delay", "observation_delay")
+_MAX_POINTS = 1000
+"""Largest number of values of a sweep, and of steps of a delay."""
 _FORM = re.compile(r"(?P<name>\w+)(?:\.(?P<element>[^=]+))?=(?P<absolute>abs:)?(?P<values>[^=]+)")
 
 Point = tuple[float, ...]
-"""A value of each sweep."""
+"""One value for each sweep."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +46,9 @@ class Sweep:
 
     parameter: str
     element: str | None
-    """Name or regular expression of bodies, joints, geoms, ...; None: all."""
+    """Name or regular expression of bodies, joints, geoms and so on; None: all."""
     absolute: bool
-    """The value is the quantity itself; else the factor on what the task has."""
+    """Whether a value replaces the task's value; otherwise it is a factor."""
     values: tuple[float, ...]
 
     @property
@@ -58,34 +58,29 @@ class Sweep:
 
     @property
     def neutral(self) -> float | None:
-        """The value at which nothing is changed; None where that is not known."""
+        """The value that changes nothing; None if it is unknown."""
         return 0.0 if self.parameter in SIGNALS else None if self.absolute else 1.0
 
     @property
     def unit(self) -> str:
-        """What the values are."""
+        """Unit of the values."""
         return SIGNALS.get(self.parameter, "the model's unit" if self.absolute else "factor")
 
     @property
-    def is_whole(self) -> bool:
-        """Whether it takes whole numbers alone."""
-        return self.parameter in _WHOLE
-
-    @property
     def spacing(self) -> Literal["linear", "geometric"]:
-        """How values lie between two ends: factors at equal ratios."""
+        """Spacing of values in a range: factors have equal ratios, other values equal differences."""
         return "geometric" if self.neutral == 1.0 and min(self.values) > 0.0 else "linear"
 
     def between(self, share: float) -> float:
-        """The value at a share of the way from the lowest to the highest."""
+        """Return the value at a share (0 to 1) of the way from the lowest to the highest value."""
         low, high = min(self.values), max(self.values)
-        if self.is_whole:
+        if self.parameter in _INTEGER:
             return float(round(low + (high - low) * share))
         value = low * (high / low) ** share if self.spacing == "geometric" else low + (high - low) * share
-        return float(f"{value:.12g}")  # the middle of 0.8:1.25 is 1, and not nearly
+        return float(f"{value:.12g}")  # so that the middle of 0.8:1.25 is exactly 1
 
     def share(self, value: float) -> float:
-        """Where a value lies, the inverse of `between`."""
+        """Return the share at which `between` gives a value."""
         low, high = min(self.values), max(self.values)
         if high == low:
             return 0.0
@@ -95,10 +90,10 @@ class Sweep:
 
 
 def read_sweeps(texts: Sequence[str], points: int) -> list[Sweep]:
-    """`NAME[.ELEMENT]=[abs:]LOW:HIGH[:POINTS]` or `...=A,B,C`, each of another parameter.
+    """Parse `NAME[.ELEMENT]=[abs:]LOW:HIGH[:POINTS]` or `...=A,B,C`; no parameter may appear twice.
 
     Raises:
-        UsageError: for what is not of this form, or cannot be.
+        UsageError: for text of another form, or values that are not possible.
     """
     sweeps: list[Sweep] = []
     for text in texts:
@@ -110,7 +105,7 @@ def read_sweeps(texts: Sequence[str], points: int) -> list[Sweep]:
 
 
 def grid(sweeps: Sequence[Sweep]) -> list[Point]:
-    """Every combination of the sweeps' values, the last sweep's changing fastest."""
+    """Return every combination of the sweeps' values; the last sweep changes fastest."""
     return list(itertools.product(*(sweep.values for sweep in sweeps)))
 
 
@@ -130,7 +125,7 @@ def describe_point(sweeps: Sequence[Sweep], point: Point) -> str:
 
 
 def unknown_parameter(name: str, fields: Sequence[str]) -> UsageError:
-    """Return the error for a parameter that does not exist; `fields` are those of the model."""
+    """Return the error for an unknown parameter; `fields` are the names of model fields."""
     own = [*PHYSICAL, *SIGNALS]
     near = did_you_mean(name, [*own, *fields])
     return UsageError(
@@ -146,15 +141,15 @@ def _read(text: str, points: int) -> Sweep:
         )
     name, absolute = found["name"], found["absolute"] is not None
     if name in SIGNALS and absolute:
-        raise UsageError(f"--sweep {text}: {name} is absolute anyhow [{SIGNALS[name]}]", hint="leave out abs:")
+        raise UsageError(f"--sweep {text}: {name} is always absolute [{SIGNALS[name]}]", hint="leave out abs:")
     if name == "actuator_gain" and absolute:
-        raise UsageError(f"--sweep {text}: actuator_gain is a factor on all that an actuator does")
+        raise UsageError(f"--sweep {text}: actuator_gain is always a factor", hint="leave out abs:")
     values = _values(text, found["values"], name, points, absolute)
     lowest = min(values)
     if lowest < 0.0:
         raise UsageError(f"--sweep {text}: {name} cannot be {lowest:g}", hint="0 or more")
-    if name in _WHOLE and (any(v != round(v) for v in values) or max(values) > _MOST):
-        raise UsageError(f"--sweep {text}: {name} takes whole steps", hint=f"0 to {_MOST}")
+    if name in _INTEGER and (any(v != round(v) for v in values) or max(values) > _MAX_POINTS):
+        raise UsageError(f"--sweep {text}: {name} takes whole numbers of steps", hint=f"0 to {_MAX_POINTS}")
     if name == "body_mass" and lowest == 0.0:
         raise UsageError(f"--sweep {text}: a body cannot have no mass", hint="values above 0")
     return Sweep(name, found["element"], absolute, values)
@@ -164,7 +159,7 @@ def _values(text: str, written: str, name: str, points: int, absolute: bool) -> 
     if ":" not in written:
         values = tuple(_number(text, part) for part in written.split(","))
         if len(set(values)) != len(values):
-            raise UsageError(f"--sweep {text}: a value stands there twice")
+            raise UsageError(f"--sweep {text}: a value appears twice")
         return values
     ends = written.split(":")
     if len(ends) not in (2, 3):
@@ -172,12 +167,12 @@ def _values(text: str, written: str, name: str, points: int, absolute: bool) -> 
     low, high = (_number(text, part) for part in ends[:2])
     if len(ends) == 3:
         if not re.fullmatch("[0-9]{1,6}", ends[2].strip()):
-            raise UsageError(f"--sweep {text}: '{ends[2]}' is no number of points")
+            raise UsageError(f"--sweep {text}: '{ends[2]}' is not a number of points")
         points = int(ends[2])
     if not low < high:
         raise UsageError(f"--sweep {text}: {low:g} is not below {high:g}", hint="LOW:HIGH, or a single value")
-    if not 2 <= points <= _MOST:
-        raise UsageError(f"--sweep {text}: {points} points", hint=f"2 to {_MOST}, or a single value")
+    if not 2 <= points <= _MAX_POINTS:
+        raise UsageError(f"--sweep {text}: {points} points", hint=f"2 to {_MAX_POINTS}, or a single value")
     box = Sweep(name, None, absolute, (low, high))
     inner = [box.between(i / (points - 1)) for i in range(1, points - 1)]
     return tuple(dict.fromkeys((low, *inner, high)))

@@ -1,4 +1,4 @@
-"""Write the engine calls that led to a divergence into a trajectory file."""
+"""Crash dumps: trajectory files with the engine calls that led to a divergence."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class CrashDumper(StepObserver):
     """Observer that logs and dumps the first divergence of an environment.
 
     Args:
-        env: the environment; from now on its engine keeps the last calls.
-        folder: folder of the dump; created with the first one.
+        env: the environment; its engine is set to keep the last calls.
+        folder: folder of the dump; created with the dump.
     """
 
     def __init__(self, env: VecEnv, folder: Path) -> None:
@@ -51,7 +51,7 @@ class CrashDumper(StepObserver):
             f"the simulation diverged for the first time, in step {env.common_step + 1}: {found[0]}; its episode ends"
         )
         if env.engine.replayable is None:
-            message += "; there is no dump: what a GPU computes cannot be replayed"
+            message += "; there is no dump: steps on a GPU cannot be replayed"
         else:
             try:
                 file = write_dump(env, found, pending, self._folder)
@@ -63,7 +63,7 @@ class CrashDumper(StepObserver):
 
 
 def stop_observing_divergences(env: VecEnv, observer: StepObserver) -> None:
-    """Remove an observer; without another one of divergences the engine needs only its last call."""
+    """Remove an observer of divergences; without another one, the engine keeps only its last call."""
     env.observers.remove(observer)
     if not env.observers.on_divergence and env.engine.replayable is not None:
         env.engine.replayable.record_calls(1)
@@ -71,17 +71,17 @@ def stop_observing_divergences(env: VecEnv, observer: StepObserver) -> None:
 
 @dataclass(slots=True)
 class CallTrace:
-    """Copies of an environment's last engine calls; they are simulated again later, in another thread."""
+    """Copies of an environment's last engine calls; another thread simulates them again later."""
 
     divergence: Divergence
-    """Its cause; for an episode that did not diverge, why the episode is kept."""
+    """The divergence; for an episode that did not diverge, its cause is the reason why the episode is kept."""
     calls: list[Call]
     final: NDArray[np.float64]
-    """The state after the last call; if that call is pending, before it."""
+    """The state after the last call, or before it if that call is pending."""
     own_model: dict[str, Tensor]
-    """Model fields of the environment's own."""
+    """Model fields that differ between environments, with this environment's values."""
     last: int
-    """How many of the calls belong to the last environment step."""
+    """Number of calls in the last environment step."""
     pending: bool
     """Whether the engine has not made the last call yet."""
 
@@ -102,13 +102,13 @@ def trace_calls(env: VecEnv, divergence: Divergence, pending: bool = False) -> C
 def describe_traces(
     traces: Sequence[CallTrace], model: mujoco.MjModel, resolved: Resolved, follows_constants: bool, *, diverged: bool
 ) -> tuple[list[World], dict[str, Tensor]]:
-    """Simulate traces again, and return what a trajectory file holds of them.
+    """Simulate traces again, and return their records and tensors for a trajectory file.
 
     Args:
         traces: one for each environment.
         model: the model of all environments.
         resolved: the configuration.
-        follows_constants: whether MuJoCo's constants are derived from an environment's model fields again.
+        follows_constants: whether MuJoCo's constants are derived again from an environment's model fields.
         diverged: whether the traces end in a divergence.
     """
     worlds, tensors = [], {}
@@ -145,7 +145,7 @@ def write_dump(env: VecEnv, found: list[Divergence], pending: bool, folder: Path
         folder: folder of the file; created if it does not exist.
 
     Raises:
-        MachineError: if the disk refuses.
+        MachineError: if the disk reports an error.
     """
     engine = env.engine.replayable
     assert engine is not None

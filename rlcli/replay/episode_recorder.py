@@ -1,4 +1,4 @@
-"""Record whole episodes of an evaluation, with what a replay needs to simulate them again."""
+"""Recorder of whole episodes of an evaluation; a replay can simulate them again."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from rlcli.replay.trajectory import STATE_FIELDS, Episode, Header, write_traject
 
 
 class EpisodeRecorder(StepObserver):
-    """Observer that records from the first step inside its `with` block on.
+    """Observer that records episodes, from the first step inside its `with` block on.
 
     Args:
         env: the environment.
-        episodes: how many to keep; each environment contributes a fixed number, as in an evaluation.
-        only: the one environment that contributes all of them; None: all environments.
+        episodes: number of episodes; each environment contributes a fixed number, as in an evaluation.
+        env_id: the environment that contributes all episodes; None: all environments contribute.
     """
 
-    def __init__(self, env: VecEnv, episodes: int, *, only: int | None = None) -> None:
+    def __init__(self, env: VecEnv, episodes: int, *, env_id: int | None = None) -> None:
         self._env, count = env, env.num_envs
         self._quota = [episodes // count + (i < episodes % count) for i in range(count)]
-        if only is not None:
-            self._quota = [episodes * (i == only) for i in range(count)]
+        if env_id is not None:
+            self._quota = [episodes * (i == env_id) for i in range(count)]
         self._start: dict[str, Tensor] = {}
         self._new = list(range(count))
         self._begin = [0] * count
         self._first: dict[tuple[int, int], dict[str, Tensor]] = {}
-        """(environment, first step) -> the state and the own model fields that an episode begins with."""
+        """(environment, first step) -> state and model fields at the start of the episode."""
         self._after: list[dict[str, Tensor]] = []
         self._actions: list[Tensor] = []
         self._rewards: list[Tensor] = []
@@ -47,7 +47,7 @@ class EpisodeRecorder(StepObserver):
         self._env.observers.remove(self)
 
     def before_step(self) -> None:
-        """Copy the state that new episodes begin with."""
+        """Copy the initial state of new episodes."""
         if not self._start:
             self._start = self._env.state_dict()
         if not self._new:
@@ -84,7 +84,7 @@ class EpisodeRecorder(StepObserver):
             The files that were written.
 
         Raises:
-            MachineError: if the disk refuses.
+            MachineError: if the disk reports an error.
         """
         if mode == "all":
             self._write(file, self.episodes)

@@ -1,4 +1,4 @@
-"""The failure cases that a training kept, as `rlcli autopsy` reads them; nothing of a run is executed."""
+"""Failure cases of a training, as `rlcli autopsy` reads them; no code of a run is executed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _MAX_FILES = 10_000
 
 @dataclass(frozen=True, slots=True)
 class FailureCase:
-    """The last steps of an episode that a training kept."""
+    """The last steps of one episode of a training."""
 
     trajectory: Trajectory
 
@@ -41,19 +41,19 @@ class FailureCase:
 
     @property
     def failure(self) -> Failure:
-        """Why it was kept."""
+        """Why the episode was kept."""
         failure = self.trajectory.header.failure
         assert failure is not None
         return failure
 
     @property
     def world(self) -> World:
-        """Its engine calls."""
+        """Engine calls of the kept steps."""
         return self.trajectory.header.worlds[0]
 
     @property
     def ended_by(self) -> str:
-        """The terminations, or the cause of a divergence with its place."""
+        """The terminations, or the cause of a divergence with its joint, actuator or element."""
         return self.world.ended_by if self.failure.kind == "diverged" else ", ".join(self.episode.causes)
 
     @property
@@ -78,7 +78,7 @@ class FailureCase:
         return dict(zip(names, self.values(name).T, strict=True))
 
     def record(self) -> dict[str, Any]:
-        """Return its facts as plain JSON."""
+        """Return the metadata as plain JSON."""
         episode, failure = self.episode, self.failure
         facts = {
             "file": str(self.trajectory.file),
@@ -117,7 +117,7 @@ def list_failure_cases(run: Run) -> list[FailureCase]:
     """Return the failure cases of a run, the oldest first; a file that cannot be read is skipped with a warning.
 
     Raises:
-        CheckpointError: if their folder is not a folder of the run.
+        CheckpointError: if the folder of failure cases is outside the run.
     """
     folder = run.folder / FOLDER
     if not folder.is_dir():
@@ -132,10 +132,10 @@ def list_failure_cases(run: Run) -> list[FailureCase]:
         try:
             trajectory = read_trajectory(file)
         except CheckpointError as error:
-            _log.warning("passed over: %s", error.message)
+            _log.warning("skipped: %s", error.message)
             continue
         if trajectory.header.failure is None:
-            _log.warning("passed over: %s holds no kept episode of a training", file)
+            _log.warning("skipped: %s is not a failure case", file)
             continue
         cases.append(FailureCase(trajectory))
     return sorted(cases, key=lambda case: (case.failure.step, case.episode.env, case.episode.index))
@@ -146,10 +146,10 @@ def why_no_cases(run: Run) -> str:
     device = str(run.record.get("device", "cpu"))
     if device.startswith("cuda"):
         return (
-            f"it was trained on {device}, where a step cannot be stepped again; rlcli eval --checkpoint RUN --record"
+            f"it was trained on {device}, where steps cannot be replayed; rlcli eval --checkpoint RUN --record"
             " FILE --record-mode failed keeps episodes of its policy"
         )
-    return "training keeps some as they end (agent.autopsy), and writes them with each checkpoint"
+    return "training records some episodes (agent.autopsy), and writes them with each checkpoint"
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,16 +158,16 @@ class Contact:
 
     geoms: tuple[str, str]
     distance: float
-    """Negative where they penetrate [m]."""
+    """Negative if they penetrate [m]."""
     force: float
-    """Along the normal [N]."""
+    """Along the contact normal [N]."""
     position: tuple[float, float, float]
-    """[m]"""
+    """In the world frame [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class StagedCase:
-    """A failure case in a world of the installed task."""
+    """A failure case in a simulation of the installed task."""
 
     staged: Staged
     states: list[NDArray[np.float64]]
@@ -194,7 +194,7 @@ class StagedCase:
 
 
 def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase:
-    """Build the task of a case, for its contacts and pictures.
+    """Build the task of a case, for contacts and pictures.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `rlcli.replay.resimulate.stage`.
@@ -202,15 +202,17 @@ def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase
     torch.set_num_threads(1)
     staged = stage(case.trajectory, named)
     if not staged.same_model:
-        _log.warning("the installed task's model is not the one of the training: contacts and pictures are of today's")
+        _log.warning(
+            "the installed task's model differs from the one in training: contacts and pictures show the installed one"
+        )
     first, calls = case.world.first, staged.worlds[0].calls
     calls_per_step = max(1, first // max(1, case.episode.kept - 1))
     states = [call.state for call in calls[first % calls_per_step : first + 1 : calls_per_step]]
-    if case.failure.kind != "diverged":  # MuJoCo has reset a world that diverged to its default state
+    if case.failure.kind != "diverged":  # after a divergence MuJoCo resets the state to the default
         states.append(staged.worlds[0].final)
     finite = [state for state in states if np.isfinite(state).all()]
     if not finite:
-        raise CheckpointError(f"{case.trajectory.file} has no state that is finite")
+        raise CheckpointError(f"{case.trajectory.file} has no finite state")
     return StagedCase(staged, finite)
 
 

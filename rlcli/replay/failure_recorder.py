@@ -1,12 +1,12 @@
-"""Keep the last seconds of failed and unusual episodes of a training, for `rlcli autopsy`.
+"""Recorder of the last seconds of failed and unusual episodes of a training, for `rlcli autopsy`.
 
-While training steps, the last seconds of all environments lie in ring buffers: the states at the beginning of each
-engine call (`sim.divergence.StateHistory`), observations, actions and rewards. Of the episodes that end in an iteration
-one of every kind is copied: the terminated one of the lowest return, the one whose return is farthest from the
-others', the first that diverged. They become files with the next checkpoint, in the thread that writes it. Files that
-are newer than the checkpoint from which a training resumes are removed: their episodes come again.
+Ring buffers hold the last seconds of all environments: the states at the beginning of each engine call
+(`sim.divergence.StateHistory`), observations, actions and rewards. In each iteration one episode of every kind is
+copied: the terminated one with the lowest return, the ones with unusually low and high returns, and the first that
+diverged. The thread that writes the next checkpoint writes them to files. When a training resumes, files that are newer
+than the checkpoint are removed, because their episodes are run again.
 
-Recording draws no random numbers and writes nothing to the environment, so that the trained bits are the same.
+Recording draws no random numbers and writes nothing to the environment, so that the trained bits stay the same.
 """
 
 from __future__ import annotations
@@ -47,22 +47,22 @@ from rlcli.sim.divergence_report import Divergence
 
 _log = logging.getLogger(__name__)
 RECENT = 1024
-"""Returns of finished episodes that the next ones are compared with."""
+"""Number of recent returns with which the next ones are compared."""
 LEAST = 64
-"""Returns without which nothing is called unusual."""
+"""Number of returns below which no return is unusual."""
 FAR = 3.0
-"""How many interquartile ranges beyond the quartiles a return is unusual (Tukey's outer fences)."""
+"""Interquartile ranges beyond the quartiles from which on a return is unusual (Tukey's outer fences)."""
 _RETURNS_FILE = "recent.json"
 _MIN_SPREAD = 1e-3
-"""Least interquartile range, as a share of the quartiles: returns that agree in three digits are not unusual."""
+"""Smallest interquartile range, as a share of the quartiles: returns with three equal digits are not unusual."""
 
 
 @dataclass(frozen=True, slots=True)
 class KeptEpisode:
-    """The end of an episode in memory."""
+    """The last steps of an episode, in memory."""
 
     value: float
-    """Of several episodes of one kind the lowest value is kept."""
+    """Rank of the episode: the one with the lowest value of its kind is kept."""
     kind: FailureKind
     episode: Episode
     trace: CallTrace
@@ -72,7 +72,7 @@ class KeptEpisode:
 
 @dataclass(frozen=True, slots=True)
 class FailureBatch:
-    """The changes of the folder that belong to a checkpoint."""
+    """Changes of the folder of failure cases that are made with a checkpoint."""
 
     step: int
     write: dict[str, tuple[KeptEpisode, Failure]]
@@ -82,7 +82,7 @@ class FailureBatch:
 
 
 class _RecentReturns(BaseModel):
-    """The returns that the next episodes are compared with, at a checkpoint."""
+    """File of the recent returns at a checkpoint."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
     step: int
@@ -90,13 +90,13 @@ class _RecentReturns(BaseModel):
 
 
 class FailureRecorder(StepObserver):
-    """Observer that keeps the ends of episodes of a training on a CPU.
+    """Observer that records the last steps of episodes of a training on a CPU.
 
     Args:
-        env: the environment; from now on its engine keeps the last seconds.
-        config: how much is kept.
+        env: the environment; its engine is set to keep the last seconds.
+        config: limits of time, memory and number of files.
         folder: folder of the run; files go to `autopsy` in it.
-        step: environment steps of the checkpoint from which training resumes; None: it is new.
+        step: environment steps of the checkpoint from which training resumes; None: a new training.
     """
 
     def __init__(self, env: VecEnv, config: AutopsyConfig, folder: Path, step: int | None) -> None:
@@ -115,7 +115,7 @@ class FailureRecorder(StepObserver):
         self._step = 0
         self._diverging: dict[int, CallTrace] = {}
         self._pending: dict[tuple[str, ...], KeptEpisode] = {}
-        """Kind, and causes -> the episode of this iteration that is kept."""
+        """(kind, causes) -> the recorded episode of this iteration."""
         self._returns: list[NDArray[np.float32]] = []
         self._recent = np.zeros(0)
         self._quartiles: tuple[float, float] | None = None
@@ -132,7 +132,7 @@ class FailureRecorder(StepObserver):
 
     @property
     def seconds(self) -> float:
-        """How much of an episode's end is kept [s]."""
+        """Recorded time before the end of an episode [s]."""
         return min(self._slots, self._engine.history.calls // self._env.calls_per_step) * self._env.step_dt
 
     def close(self) -> None:
@@ -142,9 +142,9 @@ class FailureRecorder(StepObserver):
     # --- between iterations ---
 
     def commit(self, iteration: int, step: int) -> None:
-        """Keep the episodes of an iteration that has ended with so many environment steps."""
+        """Add the episodes of a finished iteration; `step` is the number of environment steps so far."""
         if self._failed:
-            _log.warning("ends of episodes are not kept any more: %s", self._failed)
+            _log.warning("failed episodes are not recorded any more: %s", self._failed)
             self._failed = ""
             self.close()
         for kept in self._pending.values():
@@ -159,14 +159,14 @@ class FailureRecorder(StepObserver):
         self._update_quartiles()
 
     def take(self, step: int) -> FailureBatch:
-        """Return what is written with the checkpoint of a step."""
+        """Return the changes that are written with the checkpoint of a step."""
         names = set(self._files)
         batch = FailureBatch(step, self._unwritten, sorted(self._written - names), self._recent.tolist())
         self._unwritten, self._written = {}, names
         return batch
 
     def write(self, batch: FailureBatch) -> None:
-        """Write files, in the thread of the checkpoints; a disk that refuses ends the recording, not the training."""
+        """Write the files, in the thread of the checkpoints; a disk error ends the recording, but not the training."""
         try:
             for name, (kept, failure) in batch.write.items():
                 worlds, tensors = describe_traces(
@@ -179,7 +179,7 @@ class FailureRecorder(StepObserver):
                 parts = {"kind": "failure", "episodes": [kept.episode], "worlds": worlds, "failure": failure}
                 header = self._header.model_copy(update={**parts, "follows_constants": kept.follows_constants})
                 write_trajectory(self._folder / name, header, tensors | kept.tensors)
-            if batch.returns:  # the next episodes are compared with them, also if no episode was kept yet
+            if batch.returns:  # needed after a resumption, even if no episode is recorded yet
                 self._folder.mkdir(parents=True, exist_ok=True)
                 recent = _RecentReturns(step=batch.step, returns=batch.returns)
                 write_atomic(self._folder / _RETURNS_FILE, recent.model_dump_json(indent=2) + "\n")
@@ -187,7 +187,7 @@ class FailureRecorder(StepObserver):
             self._failed = str(error)
 
     def drop(self, batch: FailureBatch) -> None:
-        """Remove the files that others have replaced."""
+        """Remove the files that newer ones replace."""
         for name in batch.remove:
             with contextlib.suppress(OSError):
                 (self._folder / name).unlink(missing_ok=True)
@@ -205,7 +205,7 @@ class FailureRecorder(StepObserver):
                 self._diverging[divergence.env] = trace_calls(self._env, divergence, pending)
 
     def on_step(self, record: StepRecord) -> None:
-        """Write the step into the ring buffers, and choose among the episodes that end."""
+        """Write the step into the ring buffers, and select from the episodes that end."""
         slot = self._step % self._slots
         for name, value in (
             ("observations", record.obs["policy"]),
@@ -220,7 +220,7 @@ class FailureRecorder(StepObserver):
         self._diverging.clear()
 
     def _choose(self, ended: Episodes) -> None:
-        """Keep the episodes that are the first or most remarkable of their kind in this iteration."""
+        """Record the episodes that are the first, or have the lowest value, of their kind in this iteration."""
         returns, rest = ended.returns.detach().numpy().copy(), ~ended.truncated.numpy()
         self._returns.append(returns)
         if DIVERGED in ended.causes:
@@ -242,7 +242,7 @@ class FailureRecorder(StepObserver):
         rest &= ~diverged
         if not rest.any():
             return
-        code = np.zeros(len(rest), np.int64)  # a bit for each termination
+        code = np.zeros(len(rest), np.int64)  # bit n: termination n has fired; 62 bits fit into int64
         for number, fired in enumerate(ended.causes.values()):
             code |= fired.numpy().astype(np.int64) << number % 62
         for causes in np.unique(code[rest]).tolist():
@@ -257,7 +257,7 @@ class FailureRecorder(StepObserver):
         mask: NDArray[np.bool_],
         ended: Episodes,
     ) -> None:
-        """Keep the episode with the lowest value where a mask holds, if it is lower than the kept one's."""
+        """Record the episode with the lowest value where a mask holds, if it is lower than the recorded one's."""
         if not mask.any():
             return
         row = int(np.where(mask, value, np.inf).argmin())
@@ -302,7 +302,7 @@ class FailureRecorder(StepObserver):
 
     def _evict(self) -> None:
         """While there are too many files, drop the oldest of the most frequent kind."""
-        self._files = dict(sorted(self._files.items()))  # the order of a resumed run, which reads the folder
+        self._files = dict(sorted(self._files.items()))  # a resumed run reads the folder in this order
         while len(self._files) > self._keep:
             counts = Counter(self._files.values())
             most = max(counts.values())
@@ -313,7 +313,7 @@ class FailureRecorder(StepObserver):
     # --- at the beginning ---
 
     def _steps_that_fit(self, seconds: float, memory: int) -> int:
-        """Return how many environment steps the ring buffers hold."""
+        """Return the number of environment steps that the ring buffers can hold."""
         env, engine = self._env, self._engine
         columns = env.layout.size() + env.layout.action_size + 1 + len(env.reward_names)
         bytes_per_step = env.num_envs * (8 * engine.history.width * env.calls_per_step + 4 * columns)
@@ -321,7 +321,7 @@ class FailureRecorder(StepObserver):
         return max(1, min(round(seconds / env.step_dt), most, memory // bytes_per_step))
 
     def _read_folder(self, step: int | None) -> None:
-        """Take over the files of earlier checkpoints, and remove those of later ones."""
+        """Read the files of earlier checkpoints, and remove those of later ones."""
         if not self._folder.is_dir():
             return
         for file in sorted(self._folder.iterdir()):
@@ -348,5 +348,5 @@ class FailureRecorder(StepObserver):
 def open_failure_recorder(
     env: VecEnv, config: AutopsyConfig | None, folder: Path, step: int | None
 ) -> FailureRecorder | None:
-    """Return a recorder, if one is configured and the engine is replayable: a GPU's steps are not."""
+    """Return a recorder; None if none is configured, or on a GPU, whose steps cannot be replayed."""
     return None if config is None or env.engine.replayable is None else FailureRecorder(env, config, folder, step)

@@ -1,9 +1,9 @@
 """Run one episode of an evaluation again from its seed: the episode K of environment E of `rlcli eval`.
 
 A random number depends on the seed, the term, the environment and the number of its episode. If nothing else connects
-the episodes of a task, episode K starts at once. If something does (commands and intervals that follow the clock of all
-episodes, noise, curricula, objects with memory), the episodes before it are run first, in all environments as in the
-evaluation, and the reasons are reported.
+the episodes of a task, episode K starts at once. Other tasks have commands and intervals that follow the clock of all
+episodes, noise, curricula, or terms with a state. Then the episodes before K are run first, in all environments as in
+the evaluation, and the reasons are reported.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class EpisodeStart:
     """States of the generators that all environments share, before any step."""
 
     def shared_draws(self) -> bool:
-        """Return whether the task has drawn from them: then the episode depends on the number of environments."""
+        """Return whether the task has used them: then the episode depends on the number of environments."""
         return _has_drawn(self.generators)
 
 
@@ -46,7 +46,7 @@ def start_episode(env: VecEnv, act: Act, env_id: int, episode: int, *, drawn_act
         act: the policy.
         env_id: the environment of the episode.
         episode: its number, from 0.
-        drawn_actions: whether the policy draws its actions.
+        drawn_actions: whether the policy is stochastic.
 
     Raises:
         ConfigError: if an episode does not end because the task has no time-out.
@@ -74,17 +74,26 @@ def run_episode(env: VecEnv, act: Act, obs: Tensor, env_id: int) -> StepResult:
     """
     with torch.no_grad():
         while True:
-            if int(env.episode_length_buf[env_id]) > PATIENCE * env.max_episode_length:
-                message = f"an episode has lasted {int(env.episode_length_buf[env_id])} steps and has not ended"
-                hint = "add a termination with time_out: true"
-                raise ConfigError([env.resolved.problem(("terminations",), message, hint)])
+            require_end(env, int(env.episode_length_buf[env_id]))
             step = env.step(act(obs))
             obs = step.obs["policy"]
             if bool(step.terminated[env_id] | step.truncated[env_id]):
                 return step
 
 
+def require_end(env: VecEnv, length: int) -> None:
+    """Check that a running episode of `length` steps is not much longer than the task's episodes.
+
+    Raises:
+        ConfigError: if it is, because the task has no time-out.
+    """
+    if length > PATIENCE * env.max_episode_length:
+        message = f"an episode has lasted {length} steps, {PATIENCE} times episode_length_s, and has not ended"
+        hint = "add a termination with time_out: true"
+        raise ConfigError([env.resolved.problem(("terminations",), message, hint)])
+
+
 def _has_drawn(before: dict[str, Tensor]) -> bool:
-    """Return whether random numbers were drawn from the shared generators since."""
+    """Return whether random numbers were drawn from the shared generators since their states `before`."""
     after = rng_state()
     return any(not torch.equal(before[name].nan_to_num(-1.0), after[name].nan_to_num(-1.0)) for name in before)

@@ -1,7 +1,8 @@
-"""Simulate the steps of a trajectory file again and compare every state bit by bit.
+"""Replays of trajectory files: simulate their steps again, and compare every state bit by bit.
 
 A recording is replayed in an environment: its actions are applied to all environments, so that events, rewards and
-resets are computed again. Engine calls are replayed in one world each, without the task's terms.
+resets are computed again. Engine calls of crash dumps and failure files are replayed in one world for each environment,
+without the task's terms.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from rlcli.sim.divergence_report import WARNING_FIELDS, Call, Divergence
 from rlcli.sim.engine import open_cpu_engine
 
 _PHYSICS_FIELDS = ("time", "qpos", "qvel", "act", "qacc_warmstart")
-"""Fields of a state that only physics writes between two engine calls, unless an event does."""
+"""Fields of a state that only physics and events write between two engine calls."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,7 @@ class Difference:
     episode: int | None
     """Number of the episode in a recording; None for engine calls."""
     step: int
-    """State of the episode, counted from 0, or engine call."""
+    """Number of the state in the episode, or of the engine call, from 0."""
     field: str
     recorded: list[float]
     replayed: list[float]
@@ -51,11 +52,11 @@ class Replay:
     """Environment steps, or engine calls, that were simulated again."""
     difference: Difference | None = None
     compared: int = 0
-    """States that were compared after engine calls."""
+    """Number of states that were compared after engine calls."""
     same_model: bool = True
     """Whether the installed task's model is the recorded one."""
     diverged_at: dict[int, DivergencePoint | None] = field(default_factory=dict)
-    """Environment -> where its simulation diverges now."""
+    """Environment -> the point at which its simulation diverges now."""
 
 
 # --- recordings ---
@@ -71,7 +72,7 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
     if trajectory.header.kind != "recording":
         if episode is not None or filmed:
             raise UsageError(
-                "a dump holds no whole episodes: --episode and --video are of recordings",
+                "a dump holds no whole episodes: --episode and --video need a recording",
                 hint="rlcli autopsy RUN N --video FILE.mp4 draws a case of a run",
             )
         return []
@@ -95,7 +96,7 @@ class StateReader(StepObserver):
 
 
 def read_state(env: VecEnv) -> dict[str, Tensor]:
-    """Return copies of the fields that a recording holds of each state. (num_envs, n) each"""
+    """Return copies of the state's fields in STATE_FIELDS. (num_envs, n) each"""
     return {name: env.engine.field(name).detach().cpu().clone() for name in STATE_FIELDS}
 
 
@@ -119,7 +120,7 @@ def replay_episodes(
     try:
         env.load_state_dict(recording.part("start."))
     except (KeyError, RuntimeError, ValueError) as error:
-        raise recording.misfit(error) from None
+        raise recording.mismatch_error(error) from None
     actions, after = recording.tensors["actions"], StateReader(env)
     with env.observers.added(after):
         for t in range(max((e.begin + e.length for _, e, _ in chosen), default=0)):
@@ -155,7 +156,7 @@ class ReplayWorld:
     Args:
         model: the model of all environments.
         resolved: the configuration.
-        own_model: the model fields of the environment's own.
+        own_model: model fields that differ between environments, with this environment's values.
         follows_constants: whether MuJoCo's constants are derived from them again.
 
     Raises:
@@ -185,14 +186,14 @@ class ReplayWorld:
         return self.engine.state_row(0)
 
     def differing_field(self, recorded: NDArray[np.float64], now: NDArray[np.float64], *, final: bool) -> str | None:
-        """Return the first field whose bits differ; of a state that is not final, only those that physics writes."""
+        """Return the first field whose bits differ; in other states than the final one, only a field of physics."""
         for name, columns in self.layout.fields():
             if (final or name in _PHYSICS_FIELDS) and not _same_bits(recorded[columns], now[columns]):
                 return name
         return None
 
     def find_divergence(self, calls: list[Call], first: int) -> DivergencePoint | None:
-        """Return the first physics step that diverges, from a call on."""
+        """Return the first physics step that diverges, starting at the call `first`."""
         for number, call in enumerate(calls[first:], start=first):
             self.engine.set_state_row(0, call.state)
             for substep in range(call.nstep):
@@ -255,7 +256,7 @@ def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
 
     Raises:
         TaskError: if the task is not installed any more.
-        ConfigError: if the installed task does not take the configuration.
+        ConfigError: if the installed task refuses the configuration.
         CheckpointError: if the states or model fields do not fit it.
     """
     header, resolved = trajectory.header, trajectory.resolved(named)
@@ -273,14 +274,14 @@ def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
             if states.shape[1] != width or len(final) != width:
                 raise ValueError(f"a state has {len(final)} numbers, the model's {width}")
         except (ValueError, RuntimeError) as error:
-            raise trajectory.misfit(error) from None
+            raise trajectory.mismatch_error(error) from None
         calls = [Call(state, nstep) for state, nstep in zip(states, described.nstep, strict=True)]
         worlds.append(StagedWorld(described, world, calls, final))
     return Staged(resolved, model, model_digest(model) == header.model, worlds)
 
 
 def replay_calls(trajectory: Trajectory, named: TaskSource | None = None) -> Replay:
-    """Simulate every engine call of a failure or crash file again, and compare every state that must follow.
+    """Simulate every engine call of a failure or crash file again, and compare the states that physics determines.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `stage`.

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import mujoco
 import safetensors.torch
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
@@ -35,9 +35,10 @@ from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
 from rlcli.errors import CheckpointError, ConfigError
 from rlcli.registry import TaskSource
-from rlcli.runs.atomic_io import disk_error, write_atomic
+from rlcli.runs.atomic_io import disk_errors, write_atomic
 from rlcli.runs.provenance import model_digest
 from rlcli.runs.restore import recorded_task
+from rlcli.runs.safe_io import check_json
 from rlcli.sim.divergence_report import MAX_DESCRIBED
 
 if TYPE_CHECKING:
@@ -74,27 +75,27 @@ class Episode(_Strict):
     """One recorded episode."""
 
     env: Count
-    """Environment."""
+    """Number of the environment."""
     index: Count
     """Number of the episode in its environment, counted from 0."""
     begin: Count
-    """Steps of the recording before the episode's first; 0 in a failure file."""
+    """Number of steps in the recording before the episode; 0 in a failure file."""
     length: int = Field(ge=1, le=2**53)
     """Environment steps."""
     kept: int = Field(ge=1, le=2**53)
-    """How many of them the file holds, the last ones; all of them in a recording."""
+    """Number of steps in the file: the last ones in a failure file, all in a recording."""
     total_reward: float
     """Undiscounted sum of rewards of the whole episode."""
     truncated: bool
-    """Ended by a time-out alone."""
+    """Whether it ended by a time-out and no other termination."""
     success: bool | None
-    """Met the task's success condition; None where the task has none."""
+    """Whether it met the task's success condition; None if the task has none."""
     causes: list[str]
     """Terminations that fired at its end."""
 
     @staticmethod
     def of(env: VecEnv, ended: Episodes, row: int, begin: int = 0, kept: int | None = None) -> Episode:
-        """Return the row of episodes that end in the current step of an environment, before its reset."""
+        """Return an episode that ends in the current step, before the reset; `row` is its row in `ended`."""
         number, length = int(ended.ids[row]), int(ended.lengths[row])
         return Episode(
             env=number,
@@ -110,7 +111,7 @@ class Episode(_Strict):
 
     @property
     def succeeded(self) -> bool:
-        """Whether it counts as a success; without a success condition: whether it ended by a time-out alone."""
+        """Whether it is a success; without a success condition, whether it ended by a time-out alone."""
         return self.truncated if self.success is None else self.success
 
 
@@ -131,7 +132,7 @@ class DivergencePoint(_Strict):
     """Its value as Python prints it: `nan`, `1e+30`."""
 
     def __str__(self) -> str:
-        """One line."""
+        """Return the cause, time and value on one line."""
         what = f"{self.place} = {self.value}" if self.value else self.place
         return f"{self.cause} in physics step {self.substep} of call {self.call}, t = {self.time:.6g} s: {what}"
 
@@ -144,20 +145,20 @@ class World(_Strict):
     cause: str
     """Cause of the divergence, or why the episode was kept."""
     detail: str
-    """Where it diverged, as far as the engine reported it."""
+    """The joint, actuator or element that diverged, if the engine reports it."""
     nstep: list[Annotated[int, Field(ge=1, le=1000)]] = Field(min_length=1, max_length=MAX_SUBSTEPS)
     """Physics steps of each engine call."""
     follows: list[bool]
-    """For each call but the first: whether it began in the state in which the one before ended, controls and forces
-    aside. False where an event wrote the state in between."""
+    """For each call but the first: whether it started from the final state of the previous call, apart from controls
+    and forces. False if an event changed the state in between."""
     first: Count
-    """The call that begins the last environment step."""
+    """Number of the first call of the last environment step."""
     diverged_at: DivergencePoint | None
-    """None if it did not diverge, or if a single world does not reproduce the divergence."""
+    """None if it did not diverge, or if one world alone does not reproduce the divergence."""
 
     @property
     def ended_by(self) -> str:
-        """The cause and where it was."""
+        """The cause and its detail."""
         return f"{self.cause}{f' ({self.detail})' if self.detail else ''}"
 
 
@@ -183,7 +184,7 @@ class Header(_Strict):
     task: dict[str, str | None]
     config: str
     model: str
-    """Digest of the compiled model."""
+    """SHA-256 of the compiled model's numbers."""
     device: str
     num_envs: Count
     step_dt: float = Field(gt=0, le=1e6)
@@ -238,18 +239,18 @@ class Header(_Strict):
             if len(world.follows) != len(world.nstep) - 1 or world.first >= len(world.nstep):
                 raise ValueError(f"the engine calls of environment {world.env} are malformed")
         if sum(count for world in self.worlds for count in world.nstep) > MAX_SUBSTEPS:
-            raise ValueError(f"more than {MAX_SUBSTEPS} physics steps are not simulated again")
+            raise ValueError(f"it has more than {MAX_SUBSTEPS} physics steps")
         for number, e in enumerate(self.episodes):
             if e.env >= self.num_envs or e.kept > e.length or (self.kind == "recording" and e.kept != e.length):
-                raise ValueError(f"episode {number} is not one of the recording")
+                raise ValueError(f"episode {number} is malformed")
         if self.kind == "failure":
             if len(self.worlds) != 1 or len(self.episodes) != 1 or self.failure is None:
                 raise ValueError("it does not hold the end of one episode")
             first, steps_before = self.worlds[0].first, self.episodes[0].kept - 1
             if first < steps_before or first % max(1, steps_before):
-                raise ValueError("the engine calls are not those of the episode's steps")
+                raise ValueError("the engine calls do not fit the episode's steps")
         elif self.failure is not None or bool(self.worlds) != (self.kind == "crash"):
-            raise ValueError(f"it is no {self.kind}")
+            raise ValueError(f"it is not a {self.kind}")
         return self
 
 
@@ -273,8 +274,8 @@ class Trajectory:
 
         Raises:
             TaskError: if the task is not installed any more.
-            CheckpointError: if the task is code that the user has never named.
-            ConfigError: if the installed task does not take the configuration.
+            CheckpointError: if the task is code that the user has never named on this machine.
+            ConfigError: if the installed task refuses the configuration.
         """
         source = recorded_task(self.header.task, f"the task of {self.file}", named=named)
         with tempfile.TemporaryDirectory() as folder:
@@ -288,10 +289,12 @@ class Trajectory:
                     replace(p, where=p.where.replace(str(config), str(self.file))) for p in error.problems
                 ) from None
         if not flags and resolved.task.scene.num_envs != self.header.num_envs:
-            raise CheckpointError(f"{self.file} is corrupt: it and its configuration name different environments")
+            raise CheckpointError(
+                f"{self.file} is corrupt: its number of environments differs from its configuration's"
+            )
         return resolved
 
-    def misfit(self, error: Exception) -> CheckpointError:
+    def mismatch_error(self, error: Exception) -> CheckpointError:
         """Return the error for a file whose states do not fit the installed task."""
         return CheckpointError(
             f"{self.file} does not fit the installed task: {' '.join(str(error).split())}",
@@ -303,17 +306,15 @@ def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor]) 
     """Write a file; its folder is created if it does not exist.
 
     Raises:
-        MachineError: if the disk refuses.
+        MachineError: if the disk reports an error.
     """
     document = header.model_dump(mode="json")
     copies = {
         name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
     }
     document["sha256"] = content_digest(copies, document)
-    try:
+    with disk_errors(file.parent):
         file.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise disk_error(file.parent, error) from error
     write_atomic(file, safetensors.torch.save(copies, metadata={"rlcli": json.dumps(document)}))
 
 
@@ -325,7 +326,7 @@ def read_trajectory(file: Path) -> Trajectory:
     """
     try:
         if file.exists() and not file.is_file():
-            raise ValueError("it is no plain file")  # a pipe would block
+            raise ValueError("it is not a plain file")  # reading a pipe would block
         with safe_open(file, "pt") as opened:
             data = json.loads((opened.metadata() or {}).get("rlcli", "{}"))
             if not isinstance(data, dict) or "format" not in data:
@@ -336,17 +337,13 @@ def read_trajectory(file: Path) -> Trajectory:
                 raise ValueError(f"it is larger than {_MAX_BYTES >> 20} MiB")
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 (not a mapping)
         if data.pop("sha256", None) != content_digest(tensors, data):
-            raise CheckpointError(f"{file} is corrupt: it is not what was written")
-        header = Header.model_validate_json(json.dumps(data))
+            raise CheckpointError(f"{file} is corrupt: its content does not match its hash")
+        header = check_json(Header, data, file)
         _check_tensors(header, tensors)
     except FileNotFoundError:
         raise CheckpointError(
             f"there is no recording or dump {file}", hint="rlcli eval TASK --record FILE makes a recording"
         ) from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise CheckpointError(f"{file} is corrupt: {f'{place}: ' if place else ''}{first['msg']}") from None
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{file} is corrupt, or no recording or dump: {' '.join(str(error).split())}") from None
     return Trajectory(file, header, tensors)
@@ -389,17 +386,17 @@ def _check_tensors(header: Header, tensors: Mapping[str, Tensor]) -> None:
             or len(shape) != tensor.dim()
             or any(size not in (None, found) for size, found in zip(shape, tensor.shape, strict=True))
         ):
-            raise ValueError(f"the tensor {name} is missing or of another shape than its header says")
+            raise ValueError(f"the tensor {name} is missing or does not have the shape in the header")
         expected = torch.float64 if name.startswith("world.") else torch.float32
-        if tensor.dtype != expected and not name.endswith(STATE_FIELDS):  # those have the engine's precision
+        if tensor.dtype != expected and not name.endswith(STATE_FIELDS):  # states have the engine's precision
             raise ValueError(f"the tensor {name} holds {tensor.dtype} instead of {expected}")
     for number, e in enumerate(header.episodes):
         if header.kind == "recording" and e.begin + e.length > len(tensors["actions"]):
-            raise ValueError(f"episode {number} does not lie in the recording")
+            raise ValueError(f"episode {number} is longer than the recording")
 
 
 def _column_names(terms: tuple[TermLayout, ...]) -> list[str]:
-    """Return `joint_pos.hip`, `last_action[2]`, or the term's own name if it has one column, for each column."""
+    """Return a name for each column: `joint_pos.hip`, `last_action[2]`, or the name of a term with one column."""
     names = []
     for term in terms:
         for index in range(term.size):

@@ -1,4 +1,4 @@
-"""Writing files so that a reader sees the old content or the new, whenever the writer dies."""
+"""Atomic writing of files: after a crash a reader finds either the old content or the new one."""
 
 from __future__ import annotations
 
@@ -6,22 +6,24 @@ import contextlib
 import json
 import math
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from rlcli.errors import MachineError
 
 
-def write_atomic(file: Path, content: bytes | str) -> None:
-    """Write to a temporary neighbour, fsync, rename.
+def write_atomic(file: Path, content: bytes | str) -> Path:
+    """Write a temporary file in the same folder, sync it to the disk, rename it, and return the file.
 
     Raises:
-        MachineError: if the disk refuses; the old file is untouched.
+        MachineError: if the disk reports an error; the old file is unchanged.
     """
     data = content.encode() if isinstance(content, str) else content
     temporary = file.with_name(f".{file.name}.tmp-{os.getpid()}")
     try:
-        temporary.unlink(missing_ok=True)  # a link in its place would be followed
+        temporary.unlink(missing_ok=True)  # open() would follow a link of this name
         write_synced(temporary, data)
         os.replace(temporary, file)
     except BaseException as error:
@@ -30,10 +32,11 @@ def write_atomic(file: Path, content: bytes | str) -> None:
         if isinstance(error, OSError):
             raise disk_error(file, error) from error
         raise
+    return file
 
 
 def write_synced(file: Path, data: bytes) -> None:
-    """Write a file and wait until it is on the disk."""
+    """Write a file and wait until its content is on the disk."""
     with file.open("wb") as handle:
         handle.write(data)
         handle.flush()
@@ -41,7 +44,7 @@ def write_synced(file: Path, data: bytes) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until a folder's entries are on the disk, where the system can."""
+    """Wait until the entries of a folder are on the disk; does nothing on Windows, which cannot sync folders."""
     if os.name != "posix":
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -52,7 +55,11 @@ def sync_folder(folder: Path) -> None:
 
 
 def to_json(value: object) -> str:
-    """JSON with a final newline; numbers that are not finite are refused."""
+    """Return indented JSON with a final newline.
+
+    Raises:
+        ValueError: if a number is not finite.
+    """
     return json.dumps(value, indent=2, allow_nan=False) + "\n"
 
 
@@ -66,13 +73,35 @@ def finite_json(value: Any) -> Any:
 
 
 def disk_error(path: Path, error: OSError) -> MachineError:
-    """What the machine said, for the user."""
+    """Return the error for a path that cannot be written, with a hint that fits the cause."""
     return MachineError(f"cannot write {path}: {error.strerror or error}", hint=_HINTS.get(error.errno or 0))
 
 
+@contextlib.contextmanager
+def disk_errors(path: Path, *, remove: bool = False) -> Iterator[None]:
+    """Turn an OSError inside the block into a MachineError that names the path.
+
+    Args:
+        path: the file or folder that the block writes.
+        remove: after an error, delete the folder at this path.
+
+    Raises:
+        MachineError: if the disk reports an error.
+    """
+    try:
+        yield
+    except (OSError, MachineError) as error:
+        if remove:
+            shutil.rmtree(path, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise disk_error(path, error) from error
+        raise
+
+
 _HINTS = {
-    28: "free some space, then go on with --resume",
+    28: "free some space, then continue with --resume",
     13: "choose another folder with --runs-dir",
     30: "choose another folder with --runs-dir",
     122: "the disk quota is used up",
 }
+"""errno -> hint: ENOSPC, EACCES, EROFS, EDQUOT."""

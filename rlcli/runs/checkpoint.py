@@ -1,4 +1,4 @@
-"""Reading checkpoints: folders of safetensors and JSON, verified before use, never unpickled."""
+"""Checkpoints: folders of safetensors and JSON files, which are verified before use and never unpickled."""
 
 from __future__ import annotations
 
@@ -17,31 +17,37 @@ from rlcli.errors import CheckpointError
 from rlcli.machine import available_memory
 from rlcli.rl.policy import Policy, blank_policy, filled, size_of
 from rlcli.rl.trainer import Rows, TrainerState
-from rlcli.runs.safe_io import JSON_LIMIT, Count, FileModel, check_json, parse_json, read_file
+from rlcli.runs.safe_io import JSON_LIMIT, Count, FileModel, check_json, manifest_error, parse_json, read_file
 
 FORMAT = 1
 PARTS = ("policy", "trainer", "env", "rng")
-"""Tensor files of every checkpoint: the policy alone, critics and optimisers, environment, generators. A trainer may
-add parts of its own."""
+"""Tensor files of every checkpoint: the policy; critics and optimisers; environment; random generators. A trainer may
+add parts."""
 LOG_FOLDER = "logs"
-"""Beside the checkpoints: rows that several of them share, such as a replay buffer's, in files that never change."""
-
+"""Folder beside the checkpoints with rows that several checkpoints share, such as those of a replay buffer. Its files
+never change."""
+_ROWS_AT_ONCE = 1000
+_MAX_SHARD_BYTES = 2**30
+_HEADER_LIMIT = 4 * 2**20
+_LIMITS = {"policy": 2 * 2**30, "trainer": 16 * 2**30, "env": 16 * 2**30, "rng": 2**20}
+"""Part -> largest size of its file [bytes]."""
+_UNLIMITED = 2**62
 
 _NAME = r"^[a-z][a-z0-9_]{0,63}"
 FileName = Annotated[str, Field(pattern=_NAME + r"(\.[0-9]{1,6})?\.(json|safetensors)$")]
 LogName = Annotated[str, Field(pattern=_NAME + "$")]
-_MOST_FILES = 4096
+_MAX_FILES = 4096
 
 
 class FileEntry(FileModel):
-    """Size and hash of a file, as the manifest has them."""
+    """Size and hash of a file in the manifest."""
 
     size: Count
     sha256: Annotated[str, Field(max_length=64)]
 
 
 class Shard(FileModel):
-    """A file with some rows of a log."""
+    """A file with the rows `start` to `stop` - 1 of a log."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -51,36 +57,36 @@ class Shard(FileModel):
     sha256: Annotated[str, Field(min_length=64, max_length=64)]
 
     @model_validator(mode="after")
-    def _some_rows(self) -> Self:
+    def _check_not_empty(self) -> Self:
         if self.start >= self.stop:
             raise ValueError("start must be below stop")
         return self
 
     @property
     def file(self) -> str:
-        """Its name."""
+        """Name of the file."""
         return f"{self.start:012d}-{self.stop:012d}.safetensors"
 
 
 class _Log(FileModel):
-    """Rows `first` to `stop` of a log, and the files that hold them."""
+    """Rows `first` to `stop` - 1 of a log, and their files."""
 
     first: Count
     stop: Count
-    shards: Annotated[list[Shard], Field(max_length=_MOST_FILES)]
+    shards: Annotated[list[Shard], Field(max_length=_MAX_FILES)]
 
     @model_validator(mode="after")
-    def _in_order(self) -> Self:
+    def _check_order(self) -> Self:
         if self.first > self.stop:
             raise ValueError("first must not be above stop")
         return self
 
 
 class _Manifest(FileModel):
-    """The part of a manifest that every reader needs."""
+    """The entries of a manifest that every reader needs."""
 
     step: Count
-    files: Annotated[dict[FileName, FileEntry], Field(max_length=_MOST_FILES)]
+    files: Annotated[dict[FileName, FileEntry], Field(max_length=_MAX_FILES)]
 
 
 class _Iteration(FileModel):
@@ -92,7 +98,7 @@ class _Logs(FileModel):
 
 
 class _TensorEntry(FileModel):
-    """Shape of a tensor in the header of a safetensors file; safetensors checks the rest."""
+    """Shape of a tensor in the header of a safetensors file; the safetensors library checks the rest."""
 
     shape: list[Count] = Field(default_factory=list, max_length=16)
 
@@ -102,7 +108,7 @@ class _Header(RootModel[Annotated[dict[str, _TensorEntry], Field(max_length=20_0
 
 
 class _State(FileModel):
-    """What every trainer keeps besides tensors. A trainer checks what only it keeps."""
+    """Values besides tensors that every trainer saves. A trainer checks the values that only it saves."""
 
     iteration: Count = 0
     env_steps: Count = 0
@@ -114,7 +120,7 @@ class _State(FileModel):
 
 
 class _Statistics(FileModel):
-    """Lengths and returns of the newest episodes."""
+    """Sums over the episodes of recent iterations, as (episodes, return, length, success)."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -131,27 +137,27 @@ class Checkpoint:
 
     @property
     def step(self) -> int:
-        """Environment steps at which it was written."""
+        """Environment steps before it was written."""
         return int(self.manifest["step"])
 
     @property
     def iteration(self) -> int:
-        """Iteration after which it was written."""
+        """Number of the last iteration before it was written."""
         return check_json(_Iteration, self.manifest, self.folder / "manifest.json").iteration
 
     def json(self, name: str) -> dict[str, Any]:
-        """A JSON file of the checkpoint."""
+        """Read a JSON file of the checkpoint."""
         return parse_json(self._data(name, JSON_LIMIT), self.folder / name)
 
     def tensors(self, part: str, limit: int | None = None) -> dict[str, Tensor]:
-        """The tensors of a part.
+        """Read the tensors of a part.
 
         Args:
-            part: its name.
-            limit: largest size of its file [bytes]; None: what such a part and this machine's memory allow.
+            part: the name of the part.
+            limit: largest size of its file [bytes]; None: the limit for such a part, at most a third of the memory.
 
         Raises:
-            CheckpointError: if the file is larger, or not what safetensors reads.
+            CheckpointError: if the file is larger, or not a valid safetensors file.
         """
         name = f"{part}.safetensors"
         if limit is None:
@@ -159,14 +165,14 @@ class Checkpoint:
         return _tensors(self._data(name, limit), self.folder / name)
 
     def policy(self) -> Policy:
-        """The policy, ready to act; nothing of the task or the simulator is needed.
+        """Load the policy; neither the task nor the simulator is needed.
 
         Raises:
-            CheckpointError: if it is corrupt.
+            CheckpointError: if the policy is corrupt.
         """
         try:
             blank = blank_policy(self.json("policy.json"))
-            # as many bytes as its description asks for, and a header; a longer file is not even read
+            # the file holds the tensors of policy.json and a header; a longer one is refused before it is read
             return filled(blank, self.tensors("policy", size_of(blank) + _HEADER_LIMIT))
         except CheckpointError as error:
             if str(self.folder) in error.message:
@@ -174,10 +180,10 @@ class Checkpoint:
             raise CheckpointError(f"{self.folder}: {error.message}", hint=error.hint) from None
 
     def state(self) -> TrainerState:
-        """Everything a trainer goes on from.
+        """Load everything that a trainer needs to resume.
 
         Raises:
-            CheckpointError: if something is missing, corrupt, not finite or of a kind that no trainer saves.
+            CheckpointError: if an entry is missing, corrupt, not finite, or of a type that no trainer saves.
         """
         missing = [part for part in PARTS if f"{part}.safetensors" not in self.manifest["files"]]
         if missing:
@@ -185,30 +191,29 @@ class Checkpoint:
                 f"{self.folder} has no {missing[0]}.safetensors", hint="--init-from takes its policy into a new run"
             )
         values = self.json("state.json")
-        _require_values(values, self.step, self.folder / "state.json")
+        _check_state(values, self.step, self.folder / "state.json")
         if values["policy"] != self.json("policy.json"):
             raise CheckpointError(f"{self.folder}/state.json is corrupt: its policy is not that of policy.json")
         self.policy()
         parts = [name.removesuffix(".safetensors") for name in self.manifest["files"] if name.endswith(".safetensors")]
         tensors = {part: self.tensors(part) for part in parts}
-        seen = tensors["trainer"].get("observations")
-        if seen is not None and (seen.dim() != 2 or seen.shape[1] != values["policy"]["observation_size"]):
-            raise CheckpointError(f"{self.folder}/trainer.safetensors: 'observations' is {tuple(seen.shape)}")
+        obs = tensors["trainer"].get("observations")
+        if obs is not None and (obs.dim() != 2 or obs.shape[1] != values["policy"]["observation_size"]):
+            raise CheckpointError(f"{self.folder}/trainer.safetensors: 'observations' has shape {tuple(obs.shape)}")
         for part in ("policy", "trainer"):
+            file = f"{self.folder / part}.safetensors"
             for name, value in tensors[part].items():
                 if value.is_floating_point() and not bool(value.isfinite().all()):
-                    raise CheckpointError(
-                        f"{self.folder / part}.safetensors: '{name}' holds values that are not finite"
-                    )
+                    raise CheckpointError(f"{file}: '{name}' holds values that are not finite")
                 if name.endswith(("normalizer.var", "normalizer.count")) and bool((value < 0).any()):
-                    raise CheckpointError(f"{self.folder / part}.safetensors: '{name}' is negative")
+                    raise CheckpointError(f"{file}: '{name}' is negative")
         return TrainerState(tensors, values, {name: self._rows(name) for name in self.shards()})
 
     def verify(self, *, whole: bool) -> None:
-        """Read and check the policy, or everything.
+        """Read and check the policy alone, or with `whole` all files.
 
         Raises:
-            CheckpointError: at the first thing that is wrong.
+            CheckpointError: at the first error.
         """
         if not whole:
             self.policy()
@@ -218,10 +223,10 @@ class Checkpoint:
                 rows.read(start, min(start + _ROWS_AT_ONCE, rows.stop))
 
     def shards(self) -> dict[str, list[Shard]]:
-        """The files with the rows of each log, oldest first.
+        """Return the files of each log, those with the oldest rows first.
 
         Raises:
-            CheckpointError: if the manifest does not say so properly.
+            CheckpointError: if the manifest's entry `logs` is malformed.
         """
         return {name: log.shards for name, log in self._logs().items()}
 
@@ -231,12 +236,12 @@ class Checkpoint:
     def _rows(self, name: str) -> Rows:
         log = self._logs()[name]
         first, stop, shards = log.first, log.stop, log.shards
-        begins = [shard.start for shard in shards] + [stop]
-        if [shard.stop for shard in shards] != begins[1:] or begins[0] > first:
+        starts = [shard.start for shard in shards] + [stop]
+        if [shard.stop for shard in shards] != starts[1:] or starts[0] > first:
             raise CheckpointError(f"{self.folder}/manifest.json is corrupt: rows of '{name}' are missing")
-        held, most = sum(shard.size for shard in shards), available_memory() // 3
-        if held > most:
-            raise CheckpointError(f"{self.folder}: '{name}' has {held:,} bytes; this machine has memory for {most:,}")
+        size, limit = sum(shard.size for shard in shards), available_memory() // 3
+        if size > limit:
+            raise CheckpointError(f"{self.folder}: '{name}' has {size:,} bytes; this machine has memory for {limit:,}")
 
         def read(start: int, end: int) -> dict[str, Tensor]:
             parts = []
@@ -246,18 +251,17 @@ class Checkpoint:
                     rows = slice(max(start, shard.start) - shard.start, min(end, shard.stop) - shard.start)
                     parts.append({column: values[rows] for column, values in columns.items()})
             if any(set(part) != set(parts[0]) for part in parts):
-                raise CheckpointError(f"{self.folder}/manifest.json: the files of '{name}' do not belong together")
+                raise CheckpointError(f"{self.folder}/manifest.json: the files of '{name}' have different columns")
             return {column: torch.cat([part[column] for part in parts]) for column in parts[0]} if parts else {}
 
         return Rows(first, stop, read)
 
     def _shard(self, name: str, shard: Shard) -> dict[str, Tensor]:
         file = self.folder.parent / LOG_FOLDER / name / shard.file
-        most = min(_MOST_OF_A_SHARD, available_memory() // 3)
-        columns = _tensors(_verified(file, shard.size, shard.sha256, most), file)
+        columns = _tensors(_verified(file, shard.size, shard.sha256, min(_MAX_SHARD_BYTES, available_memory() // 3)), file)
         for column, values in columns.items():
             if values.shape[:1] != (shard.stop - shard.start,):
-                raise CheckpointError(f"{file} is corrupt: '{column}' has not the rows of its name")
+                raise CheckpointError(f"{file} is corrupt: '{column}' does not have the rows that the file name states")
         return columns
 
     def _data(self, name: str, limit: int) -> bytes:
@@ -268,7 +272,7 @@ class Checkpoint:
 
 
 def open_checkpoint(folder: Path) -> Checkpoint:
-    """Open a checkpoint and check its manifest; the files are checked as they are read.
+    """Open a checkpoint and check its manifest; each file is checked when it is read.
 
     Raises:
         CheckpointError: if it is missing, incomplete, corrupt or of another format.
@@ -286,12 +290,12 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     step = check_json(_Manifest, manifest, file).step
     name = folder.name
     if name.isdecimal() and name.isascii() and len(name) >= 12 and int(name) != step:
-        raise CheckpointError(f"{file} is corrupt: it is of step {step}, and its folder of step {int(name)}")
+        raise CheckpointError(f"{file} is corrupt: it is for step {step}, but its folder for step {int(name)}")
     return Checkpoint(folder, manifest)
 
 
 def steps(checkpoints: Path) -> list[int]:
-    """Steps of the complete checkpoints of a run, ascending."""
+    """Return the steps of a run's complete checkpoints, ascending; links and other folders are ignored."""
     if checkpoints.is_symlink() or not checkpoints.is_dir():
         return []
     names = [file.parent.name for file in checkpoints.glob("*/manifest.json") if not file.parent.is_symlink()]
@@ -299,54 +303,39 @@ def steps(checkpoints: Path) -> list[int]:
 
 
 def sha256(data: bytes) -> str:
-    """The hash that a manifest keeps of a file."""
+    """Return the hash of a file's content that a manifest stores."""
     return hashlib.sha256(data).hexdigest()
 
 
 def _verified(file: Path, size: int, digest: str, limit: int) -> bytes:
-    """The content of a file, if it is what the manifest says."""
+    """Return the content of a file after a check of its size and hash."""
     try:
         data = read_file(file, limit, size=size)
     except FileNotFoundError:
         raise CheckpointError(f"{file} is missing") from None
     if len(data) != size or sha256(data) != digest:
-        raise CheckpointError(
-            f"{file} is corrupt: it is not what the manifest says ({len(data)} bytes of {size})",
-            hint="choose an older checkpoint with RUN@step:N",
-        )
+        raise manifest_error(file, len(data), size)
     return data
 
 
 def _tensors(data: bytes, file: Path) -> dict[str, Tensor]:
-    _require_header(data, file)
+    """Return the tensors of a safetensors file after a check of its header."""
+    length = int.from_bytes(data[:8], "little")
+    if length > min(_HEADER_LIMIT, len(data) - 8):
+        raise CheckpointError(f"{file} is corrupt: it is not a safetensors file, or its header is too long")
+    check_json(_Header, parse_json(data[8 : 8 + length], file), file)  # shapes that torch accepts
     try:
         return safetensors.torch.load(data)
     except (SafetensorError, RuntimeError, ValueError, KeyError, MemoryError) as error:
         raise CheckpointError(f"{file} is corrupt: {' '.join(str(error).split())}") from None
 
 
-_ROWS_AT_ONCE = 1000
-_MOST_OF_A_SHARD = 2**30
-_HEADER_LIMIT = 4 * 2**20
-_LIMITS = {"policy": 2 * 2**30, "trainer": 16 * 2**30, "env": 16 * 2**30, "rng": 2**20}
-"""Part -> largest size of its file [bytes]."""
-_UNLIMITED = 2**62
-
-
-def _require_header(data: bytes, file: Path) -> None:
-    """What the file says of its tensors must be of a size that torch takes; whether it is true, safetensors checks."""
-    length = int.from_bytes(data[:8], "little")
-    if length > min(_HEADER_LIMIT, len(data) - 8):
-        raise CheckpointError(f"{file} is corrupt: it is no safetensors file, or its header is too long")
-    header = parse_json(data[8 : 8 + length], file)
-    check_json(_Header, header, file)
-
-
-def _require_values(values: dict[str, Any], step: int, file: Path) -> None:
-    """Check what every trainer keeps besides tensors."""
+def _check_state(values: dict[str, Any], step: int, file: Path) -> None:
+    """Check the values of state.json that every trainer saves."""
     check_json(_State, values, file)
     if values.get("env_steps", step) != step:
-        raise CheckpointError(f"{file} is corrupt: it is of step {values['env_steps']}, and the manifest of {step}")
+        found = values["env_steps"]
+        raise CheckpointError(f"{file} is corrupt: it is for step {found}, but the manifest for step {step}")
     for key, entry in values.items():
         if key.partition(".")[0] == "statistics":
             check_json(_Statistics, entry, file, key)

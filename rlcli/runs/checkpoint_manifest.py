@@ -1,4 +1,4 @@
-"""What a checkpoint's manifest says of the environment that its policy was trained in, read as a stranger's."""
+"""Layout and deployment records of a checkpoint's manifest, checked as content of an untrusted file."""
 
 from __future__ import annotations
 
@@ -18,45 +18,43 @@ Name = Annotated[str, Field(max_length=1000)]
 Columns = Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(max_length=100_000)]
 Numbers = Annotated[list[float], Field(max_length=100_000)]
 
-
 OPS = {
     "add": 2, "sub": 2, "mul": 2, "div": 2, "clip": 3, "take": 2, "cat": None, "dot": 2, "cross": 2, "sqrt": 1,
     "rotate": 2, "unrotate": 2, "product": 2, "inverse": 1, "unique": 1, "asin": 1, "angle": 1, "wrap": 1, "below": 4,
     "filter": 1,
 }  # fmt: skip
-"""Operations of formulas -> how many values they take."""
+"""Operation of formulas -> number of its operands; None: any number."""
 FIELDS = {
     "qpos", "qvel", "xpos", "xquat", "site_xpos", "cvel", "subtree_com", "sensordata", "qfrc_actuator", "mocap_pos",
     "mocap_quat",
 }  # fmt: skip
-"""Fields of MjData that formulas read."""
-_NO_LAYOUT = "checkpoints of this rlcli say what the policy's columns are: train again"
-_GIVEN = re.compile(r"last_action|steps|action|command|(command|observation)/.{1,1000}", re.DOTALL)
+"""Fields of MjData that formulas may read."""
+_NO_LAYOUT = "this rlcli reads checkpoints that describe the policy's columns: train again"
+_INPUT_NAME = re.compile(r"last_action|steps|action|command|(command|observation)/.{1,1000}", re.DOTALL)
 
 
 def check_formula(value: Any) -> None:
-    """What a file says is a formula, and nothing else.
+    """Check that a JSON value is a formula: a list of constants, a field of MjData, an input, or an operation.
 
     Raises:
-        ValueError: where it is not.
+        ValueError: if it is anything else.
     """
     if isinstance(value, list):
         if not all(type(item) in (int, float) for item in value):
             raise ValueError("a constant is a list of numbers")
         return
-    keys = set(value) if isinstance(value, dict) else set()
-    at = value.get("at", []) if isinstance(value, dict) else []
+    if not isinstance(value, dict):
+        raise ValueError(f"not a formula: {str(value)[:60]}")
+    keys, at, name = set(value), value.get("at", []), value.get("given")
     if not isinstance(at, list) or not all(type(i) is int and 0 <= i < 2**31 for i in at):
-        raise ValueError("at is a list of positions")
+        raise ValueError("at is a list of indices")
     if keys == {"field", "at"} and value["field"] in FIELDS:
         return
-    if keys in ({"given"}, {"given", "at"}) and isinstance(value["given"], str) and _GIVEN.fullmatch(value["given"]):
+    if keys in ({"given"}, {"given", "at"}) and isinstance(name, str) and _INPUT_NAME.fullmatch(name):
         return
-    if not isinstance(value, dict):
-        raise ValueError(f"no formula: {str(value)[:60]}")
     own = {"b", "a", "key"} if value.get("op") == "filter" else set()
     if keys != {"op", "of"} | own or not isinstance(value["op"], str) or value["op"] not in OPS:
-        raise ValueError(f"no formula: {str(value)[:60]}")
+        raise ValueError(f"not a formula: {str(value)[:60]}")
     count, of = OPS[value["op"]], value["of"]
     if not isinstance(of, list) or (count is not None and len(of) != count) or not of:
         raise ValueError(f"'{value['op']}' takes {count or 'some'} values")
@@ -79,7 +77,7 @@ class _Record(FileModel):
 
 
 class _Columns(_Record):
-    """Columns of a term, as the checkpoint's layout has them."""
+    """Columns of one observation or action term."""
 
     name: str
     size: int = Field(ge=1)
@@ -88,7 +86,7 @@ class _Columns(_Record):
     scale: list[float] | None
 
     @model_validator(mode="after")
-    def _widths(self) -> Self:
+    def _check_widths(self) -> Self:
         own = ("offset", "clip", "limits") if isinstance(self, ActionColumns) else ()
         for key in ("scale", *own):
             values = getattr(self, key)
@@ -98,17 +96,17 @@ class _Columns(_Record):
 
 
 class ObservationColumns(_Columns):
-    """Columns of an observation term; with a history those of the oldest step first."""
+    """Columns of an observation term; with a history, those of the oldest step come first."""
 
     clip: tuple[float, float] | None
     history: int = Field(ge=1)
     shape: list[int] = Field(default_factory=list)
-    """Of one step's columns, where they are a picture: (channels, rows, columns)."""
+    """(channels, rows, columns) of an image; empty for other terms."""
     modifiers: list[dict[str, Any]]
 
 
 class ActionColumns(_Columns):
-    """Columns of `action` and of `command`. Without a scale the command is the action, within `clip`."""
+    """Columns of `action` and of `command`. Without a scale the command is the action, limited to `clip`."""
 
     offset: list[float] | None
     clip: list[tuple[float | None, float | None]] | None
@@ -127,19 +125,19 @@ class LayoutRecord(_Record):
 
 class _Formula(_Record):
     @model_validator(mode="after")
-    def _good(self) -> Self:
+    def _check_value(self) -> Self:
         value, closed = getattr(self, "value", None), getattr(self, "closed", False)
         if value is not None:
             check_formula(value)
         if closed and value is None:
-            raise ValueError("closed, and without a formula")
+            raise ValueError("closed, but without a formula")
         if not closed and isinstance(self, ObservationFormula) and not _is_external_input(value):
-            raise ValueError("not closed, and yet with a formula")
+            raise ValueError("not closed, but with a formula")
         return self
 
 
 class ObservationFormula(_Formula):
-    """How plain code computes some columns of the observation. `value` is that of one step."""
+    """Formula of an observation term's columns. `value` computes the columns of one step."""
 
     name: Name
     func: Name
@@ -151,7 +149,7 @@ class ObservationFormula(_Formula):
 
 
 class ControlFormula(_Formula):
-    """How plain code computes some controls of the model from `action` and `command`."""
+    """Formula that computes some controls of the model from `action` and `command`."""
 
     name: Name
     func: Name
@@ -162,7 +160,7 @@ class ControlFormula(_Formula):
 
 
 class CommandRecord(_Record):
-    """What is asked of the policy from outside."""
+    """A command that the policy receives from outside, such as a velocity."""
 
     name: Name
     func: Name
@@ -170,7 +168,7 @@ class CommandRecord(_Record):
 
 
 class JointRecord(_Record):
-    """A hinge or slide, and what drives it. Without an actuator of its kind stiffness and damping are 0."""
+    """A hinge or slide joint, and the gains of its actuator; both are 0 without an actuator."""
 
     name: Name
     entity: Name
@@ -182,14 +180,14 @@ class JointRecord(_Record):
 
 
 class ActuatorRecord(_Record):
-    """An actuator of the model, in the order of its controls."""
+    """An actuator of the model; a list of them has the order of `MjData.ctrl`."""
 
     name: Name
     range: tuple[float, float] | None
 
 
 class DeploymentRecord(_Record):
-    """Everything that plain code needs to be the environment of the policy."""
+    """Description of the environment for programs that run the policy without rlcli."""
 
     joints: list[JointRecord]
     actuators: list[ActuatorRecord]
@@ -202,10 +200,10 @@ class DeploymentRecord(_Record):
 
 
 def layout_of(checkpoint: Checkpoint, policy: Policy) -> LayoutRecord:
-    """The layout of a checkpoint, which fits its policy.
+    """Return the layout of a checkpoint after a check that it fits the policy.
 
     Raises:
-        CheckpointError: if it says none, or another.
+        CheckpointError: if there is no layout, or one with other numbers of columns.
     """
     file, spec = checkpoint.folder / "manifest.json", policy.spec
     layout = check_json(LayoutRecord, checkpoint.manifest.get("layout"), file, "layout", hint=_NO_LAYOUT)
@@ -213,22 +211,22 @@ def layout_of(checkpoint: Checkpoint, policy: Policy) -> LayoutRecord:
         ("observations", sum(t.size for t in layout.observations.get(spec.group, [])), spec.observation_size),
         ("actions", sum(t.size for t in layout.actions), spec.action_size),
     )
-    for what, found, expected in sizes:
+    for kind, found, expected in sizes:
         if found != expected:
-            raise CheckpointError(f"{file} does not fit policy.json: {found} columns of {what}, expected {expected}")
+            raise CheckpointError(f"{file} does not fit policy.json: {found} columns of {kind}, expected {expected}")
     return layout
 
 
 def deployment_of(checkpoint: Checkpoint, policy: Policy, found: object = None) -> DeploymentRecord | None:
-    """How plain code computes what goes in and comes out; None for a checkpoint that does not know.
+    """Return the deployment record of a checkpoint; None if there is no record.
 
     Args:
         checkpoint: the checkpoint.
         policy: its policy.
-        found: what is known from elsewhere, if the checkpoint says nothing.
+        found: a record from another source, used if the checkpoint has none.
 
     Raises:
-        CheckpointError: if it makes no sense.
+        CheckpointError: if the record is malformed, or does not fit the policy.
     """
     recorded = checkpoint.manifest.get("deployment", found)
     if recorded is None:
@@ -236,35 +234,35 @@ def deployment_of(checkpoint: Checkpoint, policy: Policy, found: object = None) 
     file = checkpoint.folder / "manifest.json"
     record = check_json(DeploymentRecord, recorded, file, "deployment", hint=_NO_LAYOUT)
     terms = record.observations.get(policy.spec.group, [])
-    end = 0
-    for begin, stop, history in ((*term.columns, term.history) for term in terms):
-        if begin != end or stop <= begin or (stop - begin) % history:
-            raise CheckpointError(f"{file}: deployment: its columns are not the policy's")
-        end = stop
-    if end != policy.spec.observation_size:
+    begins = [term.columns[0] for term in terms] + [policy.spec.observation_size]
+    ends = [0] + [term.columns[1] for term in terms]
+    widths = [term.columns[1] - term.columns[0] for term in terms]
+    if begins != ends or any(width <= 0 or width % t.history for width, t in zip(widths, terms, strict=True)):
         raise CheckpointError(f"{file}: deployment: its columns are not the policy's")
     return record
 
 
 def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: object, randomized: bool) -> list[str]:
-    """Return the places where a checkpoint and an environment of its task describe different robots; formulas aside.
+    """Return the keys in which the records of a checkpoint and of an environment of its task differ.
+
+    Formulas are not compared.
 
     Args:
         checkpoint: the checkpoint.
         layout: the environment's layout, as plain JSON.
         deployment: the environment's description, as `rlcli.deploy.env_description.describe` returns it.
-        randomized: leave out gains and the start state, which the task draws at random.
+        randomized: do not compare gains and the start state, because the task draws them at random.
     """
     saved_layout, saved = checkpoint.manifest.get("layout"), checkpoint.manifest.get("deployment")
-    found = list(_differing_places(saved_layout, layout, "layout"))
+    found = list(_differing_keys(saved_layout, layout, "layout"))
     if saved is not None:
         before, now = (_comparable_parts(description, randomized) for description in (saved, deployment))
-        found += _differing_places(before, now, "deployment")
+        found += _differing_keys(before, now, "deployment")
     return found
 
 
 def _comparable_parts(deployment: Any, randomized: bool) -> dict[str, Any]:
-    """Return the part of a description that depends neither on the engine nor on formulas."""
+    """Return the entries of a description that depend neither on the engine nor on formulas."""
     terms = {group: [_without_values(t) for t in found] for group, found in deployment["observations"].items()}
     rest = {key: deployment[key] for key in ("actuators", "commands", *(() if randomized else ("start",)))}
     gains = ("default", "stiffness", "damping") if randomized else ()
@@ -277,18 +275,18 @@ def _without_values(entry: Mapping[str, Any], *randomized: str) -> dict[str, Any
     return {key: value for key, value in entry.items() if key != "value" and key not in randomized}
 
 
-def _differing_places(one: Any, other: Any, place: str) -> Iterator[str]:
+def _differing_keys(one: Any, other: Any, path: str) -> Iterator[str]:
     if isinstance(one, dict) and isinstance(other, dict):
         for key in {**one, **other}:
-            yield from _differing_places(one.get(key, _ABSENT), other.get(key, _ABSENT), f"{place}.{key}")
+            yield from _differing_keys(one.get(key, _ABSENT), other.get(key, _ABSENT), f"{path}.{key}")
     elif isinstance(one, list | tuple) and isinstance(other, list | tuple) and len(one) == len(other):
         for number, pair in enumerate(zip(one, other, strict=True)):
-            yield from _differing_places(*pair, f"{place}.{number}")
+            yield from _differing_keys(*pair, f"{path}.{number}")
     elif type(one) in (int, float) and type(other) in (int, float):
-        if not math.isclose(one, other, rel_tol=1e-5, abs_tol=1e-6):  # engines keep other digits
-            yield place
+        if not math.isclose(one, other, rel_tol=1e-5, abs_tol=1e-6):  # engines round differently
+            yield path
     elif one != other:
-        yield place
+        yield path
 
 
 _ABSENT = object()

@@ -1,4 +1,4 @@
-"""Where two configurations differ, and what of: the physics, the decision process, the learner, or nothing computed."""
+"""Comparison of two configurations, with a category for each difference: physics, MDP, agent or cosmetic."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from rlcli.config.strict_yaml import Path
 
 CATEGORIES = ("physics", "MDP", "agent", "cosmetic")
-"""What a key is of. physics: what one world does between two actions. MDP: what is observed, rewarded, drawn at
-random, and when an episode ends. agent: who learns, and how. cosmetic: pictures, names, threads, what is kept on disk:
-nothing that is computed depends on it."""
+"""Categories of keys. physics: the simulation between two actions. MDP: observations, rewards, random draws, and the
+ends of episodes. agent: the policy and its training. cosmetic: rendering, names, threads and files kept on disk; no
+result depends on them."""
 
 _PHYSICS = frozenset(("sim", "scene"))
 _AGENT = frozenset(("agent", "seed"))
@@ -33,28 +33,28 @@ _COSMETIC_KEYS = frozenset(
     ]
 )
 _NOT_PHYSICS = frozenset(("init", "soft_joint_pos_limit_factor"))
-"""Of an entity: where episodes start, and what terms judge by."""
-_NOTHING: tuple[Any, ...] = (None, {})
-"""A key that is not there, one that is null, and one that holds none."""
+"""Keys of an entity that set the start of episodes, or a limit that only terms read."""
+_EMPTY: tuple[Any, ...] = (None, {})
+"""Values that equal a missing key."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One place where two sides differ; None stands for what one of them does not have."""
+    """One difference between two sides; None stands for a value that one side does not have."""
 
     where: str
     left: Any
     right: Any
     left_from: str | None = None
-    """Where the value was written."""
+    """Where the left value was written, such as `config.yaml:12:3`."""
     right_from: str | None = None
     category: str | None = None
-    """Of a configuration: one of `CATEGORIES`."""
+    """One of `CATEGORIES` for a difference of configurations."""
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """What comparing one part of two sides gave; `compared` says in words how much there was."""
+    """The differences of one part of two sides; `compared` describes how much was compared, such as `120 keys`."""
 
     name: str
     compared: str
@@ -63,47 +63,49 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Values:
-    """A configuration as values by path, and where each was written."""
+    """The values of a configuration by path, each with the place where it was written."""
 
     values: Mapping[Path, tuple[Any, str | None]]
 
     @classmethod
     def of_run(cls, run: Run) -> Values:
-        """What a run was trained with, the seed included.
+        """Return the configuration and the seed with which a run was trained.
 
         Raises:
-            CheckpointError: if its file cannot be read.
+            CheckpointError: if the run's configuration cannot be read.
         """
         document = run.read_config()
         given = run.record.get("given", {})
 
-        def place(path: Path) -> str:
+        def written_at(path: Path) -> str:
             line, column = document.marks.get(path, (0, 0))
             return str(given.get(dotted(path)) or f"{run.config.name}:{line}:{column}")
 
         found: dict[Path, tuple[Any, str | None]] = {("seed",): (run.record["seed"], "run.json")}
-        return cls(found | {_chosen(path, document.data): (v, place(path)) for path, v in leaves(document.data)})
+        for path, value in leaves(document.data):
+            found[_override_path(path, document.data)] = value, written_at(path)
+        return cls(found)
 
     @classmethod
     def of_task(cls, resolved: Resolved) -> Values:
-        """A task with its chosen agent, all defaults filled in."""
+        """Return the configuration of a task with its chosen agent and all defaults."""
         from rlcli.config.dump import origins, to_data
 
         data, places = to_data(resolved), origins(resolved)
-        return cls({_chosen(path, data): (value, places.get(dotted(path))) for path, value in leaves(data)})
+        return cls({_override_path(path, data): (value, places.get(dotted(path))) for path, value in leaves(data)})
 
     def without_seed(self) -> Values:
-        """The same, to be compared with what has none."""
+        """Return the values without the seed, to compare them with a task, which has none."""
         return Values({path: value for path, value in self.values.items() if path != ("seed",)})
 
     @property
     def observes_images(self) -> bool:
-        """Whether images are observed: colours and lights are then a part of the task."""
+        """Whether the policy observes images: then colours and lights are a part of the task."""
         return any(path[-1] == "kind" and value == "camera" for path, (value, _) in self.values.items())
 
 
 def compare_values(left: Values, right: Values) -> Section:
-    """Every key in which two configurations differ, physics first."""
+    """Return every key in which two configurations differ, physics first."""
     one, other = left.values, right.values
     images = left.observes_images or right.observes_images
     absent = (None, None)
@@ -111,14 +113,14 @@ def compare_values(left: Values, right: Values) -> Section:
     found = []
     for path in keys:
         (value, place), (twin, there) = one.get(path, absent), other.get(path, absent)
-        if as_text(value) != as_text(twin) and not (value in _NOTHING and twin in _NOTHING):
+        if as_text(value) != as_text(twin) and not (value in _EMPTY and twin in _EMPTY):
             kind = category(path, observes_images=images)
             found.append(Difference(dotted(path), value, twin, place, there, kind))
     return Section("configuration", f"{len(keys)} keys", sorted(found, key=lambda d: CATEGORIES.index(str(d.category))))
 
 
 def compare_files(left: Mapping[str, str], right: Mapping[str, str]) -> Section:
-    """The models and the code of two tasks, each a file's name and its sha256."""
+    """Compare the files of two tasks, given as file name -> sha256. Models are physics, Python files are MDP."""
     keys = list(dict.fromkeys([*left, *right]))
     found = [
         Difference(name, left.get(name), right.get(name), category="MDP" if name.endswith(".py") else "physics")
@@ -129,11 +131,11 @@ def compare_files(left: Mapping[str, str], right: Mapping[str, str]) -> Section:
 
 
 def category(path: Path, *, observes_images: bool = False) -> str:
-    """What a key of a configuration is of, one of `CATEGORIES`.
+    """Return the category of a key of a configuration, one of `CATEGORIES`.
 
     Args:
-        path: its path; `agent` stands for the chosen agent.
-        observes_images: whether the policy gets images.
+        path: the path of the key; `agent` stands for the chosen agent.
+        observes_images: whether the policy observes images.
     """
     if path[0] == "play" and len(path) > 1:
         return category(path[1:], observes_images=observes_images)
@@ -142,23 +144,23 @@ def category(path: Path, *, observes_images: bool = False) -> str:
     if path[:2] == ("scene", "lights") or (path[:2] == ("scene", "entities") and path[3:4] == ("color",)):
         return "MDP" if observes_images else "cosmetic"
     if path[0] in _AGENT or path[:2] == ("scene", "num_envs"):
-        return "agent"  # how many worlds there are changes what is learned from, not what happens in one
+        return "agent"  # num_envs changes the amount of training data, but not the episodes of one environment
     if path[:2] == ("scene", "sensors"):
         return "MDP"
     if path[:2] == ("scene", "entities") and (path[3:4] and path[3] in _NOT_PHYSICS):
         return "MDP"
     if path[:2] == ("scene", "entities") and path[3:4] == ("joints",) and path[-1] == "velocity_limit":
-        return "MDP"  # terms judge by it, the physics does not
+        return "MDP"  # terms read it, the physics does not
     return "physics" if path[0] in _PHYSICS else "MDP"
 
 
 def as_text(value: object) -> str:
-    """One text a value: equal numbers of other types differ, NaN equals itself."""
+    """Return a value as JSON text to compare: 1 and 1.0 differ, NaN equals NaN."""
     return json.dumps(value, sort_keys=True, default=str)
 
 
-def _chosen(path: Path, data: Mapping[str, Any]) -> Path:
-    """The path as an override has it: the settings of the chosen agent, whatever it is called."""
+def _override_path(path: Path, data: Mapping[str, Any]) -> Path:
+    """Return the path that an override uses: `agents.NAME` of the chosen agent becomes `agent`."""
     agents = data.get("agents")
     if path[0] != "agents" or len(path) < 2 or not isinstance(agents, dict):
         return path

@@ -1,4 +1,4 @@
-"""The evaluations that a run keeps: of each of its checkpoints the document that `rlcli eval` wrote last."""
+"""Evaluations stored in a run: the last result of `rlcli eval` for each checkpoint."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from rlcli.errors import CheckpointError
-from rlcli.runs.atomic_io import disk_error, to_json, write_atomic
+from rlcli.runs.atomic_io import disk_errors, to_json, write_atomic
 from rlcli.runs.run import Run, require_own
 from rlcli.runs.safe_io import FileModel, check_json, read_json
 
 FOLDER = "evaluations"
-"""Of a run; `STEP.json` in it is of the checkpoint whose folder has that name."""
+"""Folder in a run; its file `STEP.json` belongs to the checkpoint folder of the same name."""
 _LIMIT = 1024 * 1024
 _STEP = re.compile("[0-9]{1,30}")
 
@@ -36,8 +36,8 @@ class _Share(FileModel):
 Name = Annotated[str, Field(max_length=500)]
 
 
-class _Document(FileModel):
-    """What is relied on; the document may hold more."""
+class _EvaluationRecord(FileModel):
+    """The entries that rlcli reads; the document may have more."""
 
     command: Literal["eval"]
     episodes: Annotated[int, Field(ge=1)]
@@ -51,44 +51,41 @@ class _Document(FileModel):
     diverged_by: Annotated[dict[Name, int], Field(max_length=10_000)]
 
 
-def keep_evaluation(run: Run, step_name: str, document: Mapping[str, Any]) -> Path:
-    """Write the document of an evaluation of a run's checkpoint; an older one of that checkpoint is replaced.
+def write_evaluation(run: Run, step_name: str, document: Mapping[str, Any]) -> Path:
+    """Write the result of an evaluation of a run's checkpoint; it replaces an older result for that checkpoint.
 
     Args:
         run: the run.
-        step_name: the name of the checkpoint's folder.
-        document: what `rlcli eval --json` prints.
+        step_name: name of the checkpoint's folder.
+        document: the JSON document that `rlcli eval --json` prints.
 
     Raises:
-        CheckpointError: if the run's folder is not as rlcli makes one: it may lead elsewhere.
-        MachineError: if the disk refuses.
+        CheckpointError: if the run's folder holds links or special files: a write could leave the run.
+        MachineError: if the disk reports an error.
     """
     require_own(run, FOLDER)
     file = _file(run, step_name)
-    try:
+    with disk_errors(file.parent):
         file.parent.mkdir(exist_ok=True)
-    except OSError as error:
-        raise disk_error(file.parent, error) from error
-    write_atomic(file, to_json(dict(document)))
-    return file
+    return write_atomic(file, to_json(dict(document)))
 
 
 def read_evaluation(run: Run, step_name: str) -> dict[str, Any] | None:
-    """The newest evaluation of a run's checkpoint; None where there is none.
+    """Return the newest evaluation of a run's checkpoint; None if there is none.
 
-    Of the document these are certain to be there, and of their kind: `episodes`, `seed`, `return` and `length` (mean,
-    std, low, high; of a single episode the ends are None), `reward_terms` (the same by name), `terminations` (rate,
-    low, high by name), `diverged`, `diverged_by`, and `success` (rate, low, high) or nothing of that name.
+    These entries are checked: `episodes`, `seed`, `return` and `length` (mean, std, low, high; for a single episode low
+    and high are None), `reward_terms` (the same by name), `terminations` (rate, low, high by name), `diverged`,
+    `diverged_by`. `success` (rate, low, high) is missing for a task without a success condition.
 
     Raises:
-        CheckpointError: if it is not such a document.
+        CheckpointError: if the file is malformed.
     """
     file = _file(run, step_name)
     try:
         document = read_json(run.folder, f"{FOLDER}/{file.name}", _LIMIT)
     except FileNotFoundError:
         return None
-    check_json(_Document, document, file, hint="rlcli eval writes it anew")
+    check_json(_EvaluationRecord, document, file, hint="run rlcli eval again to replace the file")
     if document.get("success", 0) is None:
         del document["success"]
     return document

@@ -1,86 +1,88 @@
-"""States and scores of the runs in a folder, from their files alone: fast for thousands, safe for untrusted ones."""
+"""States and scores of the runs in a folder, read from their files alone: fast for thousands of untrusted runs."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import stat
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from rlcli.errors import CheckpointError
 from rlcli.runs.metric_rows import is_number, parse_row
-from rlcli.runs.run import CONFIG, RECORD, STUDY, WAITING, Run, is_locked, open_run
+from rlcli.runs.run import CONFIG, RECORD, WAITING, Run, is_locked, open_run, run_folders
 from rlcli.runs.safe_io import read_tail
 
 ENDED = {"finished", "stopped", "diverged", "failed"}
-"""States that a run says of itself when it ends; one that says `running` and is not locked was interrupted."""
-_TAIL = 32 * 1024
-_ROWS = 20
-"""Of the newest rows, how many are looked at."""
-_LONGEST_ROW = 1024**2
-_MOST_ROWS = 64 * 1024**2
+"""Recorded states of runs that have ended. A run whose state is `running` and that is not locked was interrupted."""
+_TAIL_BYTES = 32 * 1024
+_MAX_ROWS = 20
+"""Number of newest rows that are read."""
+_MAX_ROW_BYTES = 1024**2
+_MAX_SEARCH_BYTES = 64 * 1024**2
 """Bytes of the metrics that are searched for one row."""
-_MOST_FILES = 20_000
-_BEGINNING_S = 5.0
-"""A run that is so young may not have its lock yet."""
+_MAX_FILES = 20_000
+_STARTING_S = 5.0
+"""A younger run may not have its lock yet [s]."""
 
 
 @dataclass(slots=True)
 class Overview:
-    """One run, or a folder in a run's place."""
+    """Summary of one run, or of a broken folder where a run should be."""
 
     folder: Path
     task: str
     state: str
     """running, waiting, finished, stopped, interrupted, diverged, failed, or broken."""
     reason: str | None = None
-    """Why it is not in order, where that is known."""
+    """Why the run failed, diverged or is broken, if known."""
     resumable: bool = False
     iteration: int | None = None
     iterations: int | None = None
-    """Iterations in all."""
+    """Number of iterations of the whole training."""
     step: int | None = None
     last: dict[str, float] = field(default_factory=dict)
     """`return` and `success` of the newest iteration in which episodes ended."""
     best: dict[str, float] = field(default_factory=dict)
-    """`step`, `return` and `success` of the best evaluation between iterations."""
+    """`step`, `return` and `success` of the best evaluation during training."""
     evaluation: dict[str, Any] = field(default_factory=dict)
-    """`step`, `episodes`, `return` and `success` of the newest checkpoint that `rlcli eval` has looked at."""
+    """`step`, `episodes`, `return` and `success` of the newest checkpoint that `rlcli eval` has evaluated."""
     started: str | None = None
     age_s: float | None = None
-    """Since it was started."""
+    """Time since the start [s]."""
     duration_s: float | None = None
-    """For how long it has trained, over all its resumptions."""
+    """Training time, summed over all resumptions [s]."""
     size_bytes: int = 0
     agent: str | None = None
     seed: int | None = None
     tags: dict[str, Any] = field(default_factory=dict)
-    """What else sets it apart: device, processes, what its weights are from, its loggers."""
+    """Further settings: device, processes, source of the initial weights, loggers, videos."""
 
     def document(self) -> dict[str, Any]:
-        """As plain JSON."""
-        names = [name for name in self.__slots__ if name not in ("folder",)]
-        return {"run": str(self.folder), **{name: getattr(self, name) for name in names}}
+        """Return the summary as plain JSON."""
+        values = asdict(self)
+        return {"run": str(values.pop("folder")), **values}
 
 
 def overviews(runs_dir: Path, task: str | None = None) -> list[Overview]:
-    """All runs under a folder, newest first, those that are broken last.
+    """Return all runs under a folder, the newest first and broken ones last.
 
     Args:
         runs_dir: the folder of runs.
-        task: only those of this task.
+        task: return only runs of this task.
     """
-    found = [overview(folder) for folder in _folders(runs_dir)]
+    found = [overview(folder) for folder in run_folders(runs_dir)]
     chosen = [run for run in found if task is None or run.task == task]
     return sorted(chosen, key=lambda run: (run.started or "", run.folder.name), reverse=True)
 
 
 def overview(folder: Path) -> Overview:
-    """Return the overview of a folder; what is wrong with it is its reason."""
+    """Return the overview of a folder; for a broken one, its `reason` is the error message."""
     try:
         run = open_run(folder)
     except (CheckpointError, OSError) as error:
@@ -109,10 +111,10 @@ def overview_of(run: Run) -> Overview:
         tags=_tags(record),
     )
     newest: dict[str, Any] = {}
-    for row in _backwards(run):
+    for row in _rows_backwards(run):
         newest = newest or row
         overview.last = _score(row, "Train/")
-        if overview.last:  # not in every iteration do episodes end
+        if overview.last:  # in some iterations no episode ends
             break
     overview.iteration, overview.step = (count(newest.get(key, record.get(key))) or 0 for key in ("iteration", "step"))
     if state == "finished" and overview.iterations is None:
@@ -132,58 +134,40 @@ def state_of(run: Run) -> tuple[str, str | None]:
     recorded = run.record.get("state", "")
     why = run.record.get("reason")
     reason = why if isinstance(why, str) and recorded in ("diverged", "failed") else None
-    if is_locked(run.folder) or (recorded == "running" and _age(run.record.get("started")) < _BEGINNING_S):
+    if is_locked(run.folder) or (recorded == "running" and _age(run.record.get("started")) < _STARTING_S):
         return "running", None
     if recorded in ENDED or recorded == WAITING:
         return recorded, reason
     if recorded == "running":
-        return "interrupted", "its process ended without a word: a kill, or the machine"
-    return "broken", f"{RECORD} says state '{recorded[:40]}'"
+        return "interrupted", "its process was killed, or the machine stopped"
+    return "broken", f"{RECORD} has the unknown state '{recorded[:40]}'"
 
 
 def newest_rows(run: Run) -> list[dict[str, Any]]:
-    """The newest rows of `metrics.jsonl`, oldest first."""
-    return [*_backwards(run)][::-1]
+    """Return the newest rows of `metrics.jsonl`, the oldest of them first."""
+    return [*_rows_backwards(run)][::-1]
 
 
-def _backwards(run: Run) -> Iterator[dict[str, Any]]:
-    """The newest rows, newest first, read one by one; a line that is no row is passed over."""
-    for size in (_TAIL, 2 * _LONGEST_ROW):
+def _rows_backwards(run: Run) -> Iterator[dict[str, Any]]:
+    """Yield the newest rows, the newest first; corrupt lines are skipped."""
+    for size in (_TAIL_BYTES, 2 * _MAX_ROW_BYTES):
         try:
             data, whole = read_tail(run.metrics, size)
         except (OSError, CheckpointError):
             return
-        lines = data.split(b"\n")[0 if whole else 1 : -1]  # what is after the last newline is being written
+        lines = data.split(b"\n")[0 if whole else 1 : -1]  # the text after the last newline is still being written
         if lines:
             break
-    yield from (row for line in lines[: -_ROWS - 1 : -1] if (row := _row(line)) is not None)
+    yield from (row for line in lines[: -_MAX_ROWS - 1 : -1] if (row := _row(line)) is not None)
 
 
 def _is_new(folder: Path) -> bool:
-    """Whether a folder may be that of a run which is just being created: its run.json comes last."""
+    """Return whether a folder may belong to a run that is being created: run.json is written last."""
     try:
-        young = time.time() - folder.stat().st_mtime < _BEGINNING_S
+        young = time.time() - folder.stat().st_mtime < _STARTING_S
         return young and not {RECORD, "metrics.jsonl"} & set(os.listdir(folder))
     except OSError:
         return False
-
-
-def _folders(runs_dir: Path) -> Iterator[Path]:
-    """What stands in a run's place: the folders of the folders, those with a dot left out."""
-    for task in _subfolders(runs_dir):
-        for folder in _subfolders(task):
-            if (folder / STUDY).is_file():
-                yield from _subfolders(folder)
-            else:
-                yield folder
-
-
-def _subfolders(folder: Path) -> list[Path]:
-    try:
-        with os.scandir(folder) as entries:
-            return [Path(entry.path) for entry in entries if not entry.name.startswith(".") and entry.is_dir()]
-    except OSError:
-        return []
 
 
 def _row(line: bytes) -> dict[str, Any] | None:
@@ -194,9 +178,9 @@ def _row(line: bytes) -> dict[str, Any] | None:
 
 
 def _row_at(run: Run, step: int) -> dict[str, Any]:
-    """The row of one step; nothing if it is not there."""
+    """Return the row of one step; an empty one if there is none."""
     try:
-        data, _ = read_tail(run.metrics, _MOST_ROWS)
+        data, _ = read_tail(run.metrics, _MAX_SEARCH_BYTES)
     except (OSError, CheckpointError):
         return {}
     at = data.find(f'"step": {step},'.encode())
@@ -205,8 +189,8 @@ def _row_at(run: Run, step: int) -> dict[str, Any]:
 
 
 def _score(row: Mapping[str, Any], prefix: str) -> dict[str, float]:
-    names = {"return": f"{prefix}mean_reward", "success": f"{prefix}success_rate"}
-    return {word: float(row[name]) for word, name in names.items() if name in row}
+    metrics = {"return": f"{prefix}mean_reward", "success": f"{prefix}success_rate"}
+    return {key: float(row[metric]) for key, metric in metrics.items() if metric in row}
 
 
 def _evaluation(run: Run) -> dict[str, Any]:
@@ -214,9 +198,9 @@ def _evaluation(run: Run) -> dict[str, Any]:
         names = sorted(name for name in os.listdir(run.folder / "evaluations") if name.endswith(".json"))
     except OSError:
         return {}
-    from rlcli.runs.eval_store import read_evaluation  # only where there is one: it takes longer than all the rest
+    from rlcli.runs.eval_store import read_evaluation  # its import takes longer than the rest of this module
 
-    for name in names[: -_ROWS - 1 : -1]:
+    for name in names[: -_MAX_ROWS - 1 : -1]:
         try:
             found = read_evaluation(run, name.removesuffix(".json"))
         except CheckpointError:
@@ -229,12 +213,12 @@ def _evaluation(run: Run) -> dict[str, Any]:
 
 
 def count(value: object) -> int | None:
-    """Return a value of untrusted JSON if it is a count; else None."""
+    """Return a value of untrusted JSON if it is an integer from 0 to 2**63 - 1; else None."""
     return value if type(value) is int and 0 <= value < 2**63 else None
 
 
 def times(run: Run) -> tuple[float | None, float | None]:
-    """Return the age of a run, and how long it has trained [s]."""
+    """Return the time since the start of a run and its training time [s]; None if unknown."""
     age = _age(run.record.get("started"))
     if not math.isfinite(age):
         return None, None
@@ -251,7 +235,7 @@ def times(run: Run) -> tuple[float | None, float | None]:
 
 
 def _age(stamp: Any) -> float:
-    """Seconds since a time stamp; without end for what is none."""
+    """Return the seconds since an ISO time stamp; infinity if it is malformed."""
     try:
         return max(0.0, time.time() - datetime.fromisoformat(stamp).timestamp())
     except (TypeError, ValueError, OverflowError, OSError):
@@ -259,13 +243,13 @@ def _age(stamp: Any) -> float:
 
 
 def _resumable(run: Run) -> bool:
-    """Whether there is a checkpoint to go on from, or the run never came to its first."""
+    """Return whether a run has a checkpoint to resume from, or was stopped before its first one."""
     try:
         names = os.listdir(run.checkpoints)
     except OSError:
         return False
-    have = any(name.isdigit() and os.path.isfile(run.checkpoints / name / "manifest.json") for name in names)
-    return have or "step" not in run.record
+    has_checkpoint = any(name.isdigit() and os.path.isfile(run.checkpoints / name / "manifest.json") for name in names)
+    return has_checkpoint or "step" not in run.record
 
 
 def _tags(record: Mapping[str, Any]) -> dict[str, Any]:
@@ -274,17 +258,14 @@ def _tags(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _size(folder: Path) -> int:
-    """Bytes of the files in a folder, links not followed."""
-    total, visited, pending = 0, 0, [str(folder)]
-    while pending and visited < _MOST_FILES:
-        try:
-            with os.scandir(pending.pop()) as entries:
-                for entry in entries:
-                    visited += 1
-                    if entry.is_dir(follow_symlinks=False):
-                        pending.append(entry.path)
-                    elif entry.is_file(follow_symlinks=False):
-                        total += entry.stat(follow_symlinks=False).st_size
-        except OSError:
-            continue
+    """Return the total size of the files in a folder [bytes]; links are not followed."""
+    total = visited = 0
+    for parent, folders, files in os.walk(folder):
+        for name in files:
+            with contextlib.suppress(OSError):
+                status = os.lstat(os.path.join(parent, name))
+                total += status.st_size if stat.S_ISREG(status.st_mode) else 0
+        visited += len(folders) + len(files)
+        if visited >= _MAX_FILES:
+            break
     return total

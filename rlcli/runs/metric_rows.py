@@ -1,4 +1,4 @@
-"""Rows of a run's `metrics.jsonl`, one for each iteration."""
+"""Reader of a run's `metrics.jsonl`, which has one row for each iteration."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from rlcli.runs.run import Run
 _LONGEST_LINE = 2**20
 _MOST_BYTES = 2**30
 _LARGEST = 1e300
-"""A larger number does not count: an integer of many digits has no float."""
+"""Larger numbers are ignored: an integer with many digits cannot become a float."""
 
 
 def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
-    """Yield the rows, the oldest first; a last line that a kill has cut short is left out.
+    """Yield the rows, the oldest first; an incomplete last line, left by a killed process, is skipped.
 
     Args:
         run: the run.
-        strict: raise at a corrupt line; else stop before it.
+        strict: raise an error at a corrupt line; otherwise stop before it.
 
     Raises:
         CheckpointError: if the file cannot be read or is too large, or at a corrupt line.
@@ -38,7 +38,7 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
                 if row is not None:
                     yield row
                 elif strict:
-                    raise CheckpointError(f"{run.metrics}:{number} is corrupt: not an iteration's metrics")
+                    raise CheckpointError(f"{run.metrics}:{number} is corrupt: it is not a row of metrics")
                 else:
                     return
     except FileNotFoundError:
@@ -48,7 +48,7 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
 
 
 def parse_row(line: bytes) -> dict[str, Any] | None:
-    """Return one line as a row; None if it is not an iteration's metrics."""
+    """Return one line as a row; None if it is not JSON with integers `iteration` and `step`."""
     try:
         row = json.loads(line)
     except (ValueError, RecursionError):
@@ -59,5 +59,5 @@ def parse_row(line: bytes) -> dict[str, Any] | None:
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value of untrusted JSON is a finite number, and no bool."""
+    """Return whether a value of untrusted JSON is a finite number; a bool is not a number."""
     return type(value) in (int, float) and -_LARGEST < value < _LARGEST

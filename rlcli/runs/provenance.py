@@ -1,4 +1,4 @@
-"""What the bits of a run depend on besides its configuration: versions, sources, processor, threads, settings."""
+"""Record of what the bits of a run depend on besides its configuration: versions, source code, hardware, threads."""
 
 from __future__ import annotations
 
@@ -31,28 +31,28 @@ VARIABLES = (
     "OMP_SCHEDULE", "OMP_THREAD_LIMIT", "ONEDNN_DEFAULT_FPMATH_MODE", "ONEDNN_MAX_CPU_ISA", "OPENBLAS_CORETYPE",
     "TORCH_ALLOW_TF32_CUBLAS_OVERRIDE",
 )  # fmt: skip
-"""Environment variables that choose kernels or the order of sums. No other variable is recorded."""
+"""Environment variables that select kernels or the order of sums. Other variables are not recorded."""
 ENTRIES = (
     "rlcli", "python", "machine", "libc", "versions", "sources", "cpu", "variables", "engine_threads", "torch_threads",
     "device", "processes", "torch", "model",
 )  # fmt: skip
-"""The entries of run.json that are compared. Its others (command, pid, platform, times) change no bit."""
+"""Entries of run.json that are compared. The others (command, pid, platform, times) do not affect the results."""
 
 _ASSETS = re.compile(rb"""\bfile\s*=\s*["']([^"']{1,500})["']""")
 _FOLDERS = re.compile(rb"""\b(?:meshdir|texturedir|assetdir)\s*=\s*["']([^"']{0,500})["']""")
 _MAX_FILES = 256
 _MAX_BYTES = 64 * 1024**2
-"""Of one task: larger models are known by the hash of what they compile to."""
+"""Size of the files that are hashed for one task [bytes]. The hash of the compiled model covers larger ones."""
 
 
 def environment_record(resolved: Resolved, engine_threads: int, torch_threads: int) -> dict[str, Any]:
-    """What is known before anything heavy is imported; `built_record` is the rest."""
+    """Return the part of the record that needs no heavy imports; `built_record` returns the rest."""
     return {
         "rlcli": rlcli.__version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
         "machine": platform.machine(),
-        "libc": _libc(),
+        "libc": " ".join(platform.libc_ver()).strip(),  # torch and MuJoCo call its mathematics
         "versions": versions(resolved),
         "sources": sources(resolved),
         "cpu": processor(),
@@ -65,17 +65,17 @@ def environment_record(resolved: Resolved, engine_threads: int, torch_threads: i
 
 
 def built_record(model: mujoco.MjModel, device: str) -> dict[str, Any]:
-    """What is known once the environment is built: how torch computes, and the compiled model."""
+    """Return the part of the record that needs the built environment: torch's settings and the compiled model."""
     import torch
 
-    cpu = torch.backends.cpu.get_cpu_capability()
+    denormal = torch.tensor([1e-310], dtype=torch.float64)
     settings: dict[str, Any] = {
-        "cpu_capability": cpu,
+        "cpu_capability": torch.backends.cpu.get_cpu_capability(),
         "mkl": torch.backends.mkl.is_available(),  # type: ignore[no-untyped-call]  # torch has no type here
         "onednn": has_onednn() and bool(torch.backends.mkldnn.enabled),
         "matmul_precision": torch.get_float32_matmul_precision(),
         "deterministic": torch.are_deterministic_algorithms_enabled(),
-        "flush_denormal": _flushes_denormals(),
+        "flush_denormal": float(denormal * 1.0) == 0.0,
     }
     if device != "cpu":
         settings["gpu"] = torch.cuda.get_device_name(device)
@@ -85,7 +85,7 @@ def built_record(model: mujoco.MjModel, device: str) -> dict[str, Any]:
 
 
 def versions(resolved: Resolved) -> dict[str, str]:
-    """Return versions of what computes: packages, the distributions of task, trainer and format, their requirements."""
+    """Return the versions of PACKAGES, and of the distributions of task, trainer and format with their requirements."""
     found = {name: _version(name) for name in PACKAGES}
     owners = []
     if resolved.source.distribution:
@@ -106,7 +106,7 @@ def versions(resolved: Resolved) -> dict[str, str]:
 
 
 def sources(resolved: Resolved) -> dict[str, str]:
-    """Return the sha256 of each of the task's own files, one of all of rlcli's, and one of its format's."""
+    """Return the sha256 of each file of the task, one of rlcli's source code, and one of the format's source code."""
     root = resolved.source.root.resolve()
     digests = {}
     for file in _task_files(resolved):
@@ -120,7 +120,7 @@ def sources(resolved: Resolved) -> dict[str, str]:
 
 
 def file_digest(file: Path) -> str | None:
-    """sha256 of a file; None where it cannot be read."""
+    """Return the sha256 of a file; None if it cannot be read."""
     try:
         with file.open("rb") as handle:
             return hashlib.file_digest(handle, "sha256").hexdigest()
@@ -129,7 +129,7 @@ def file_digest(file: Path) -> str | None:
 
 
 def model_digest(model: mujoco.MjModel) -> str:
-    """sha256 of the numbers of a compiled model; what is only looked at, and where its files lie, is left out."""
+    """Return the sha256 of the numbers of a compiled model, without textures, materials, skins and file paths."""
     import numpy as np
 
     digest = hashlib.sha256()
@@ -148,7 +148,7 @@ def model_digest(model: mujoco.MjModel) -> str:
 
 
 def differences(was: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Entries that both records know and that differ, as (name, was, now), flat."""
+    """Return (name, was, now) for each entry that both records have and that differs; nested entries are flattened."""
     rows = []
     for entry in ENTRIES:
         if entry not in was or entry not in now:
@@ -166,18 +166,18 @@ def _flat(name: str, value: object) -> dict[str, Any]:
 
 
 def _task_files(resolved: Resolved) -> Iterator[Path]:
-    """The task's Python files, its models and what these name, each once. Its YAML is in the run, resolved."""
+    """Yield the task's Python files, its models and their assets. The YAML is in the run, resolved."""
     source = resolved.source
-    wanted = [*source.term_files, *([source.task_file] if source.task_file else []), *sorted(source.root.glob("*.py"))]
+    pending = [*source.term_files, *([source.task_file] if source.task_file else []), *sorted(source.root.glob("*.py"))]
     for entity in resolved.task.scene.entities.values():
         model = getattr(entity, "model", None)
         if isinstance(model, str):
             with contextlib.suppress(TaskError):
-                wanted.append(model_file(source.root, model))
+                pending.append(model_file(source.root, model))
     seen: set[Path] = set()
     left = _MAX_BYTES
-    while wanted and len(seen) < _MAX_FILES:
-        file = wanted.pop(0)
+    while pending and len(seen) < _MAX_FILES:
+        file = pending.pop(0)
         with contextlib.suppress(OSError, ValueError):
             file = file.resolve()
             size = file.stat().st_size
@@ -187,11 +187,11 @@ def _task_files(resolved: Resolved) -> Iterator[Path]:
             left -= size
             yield file
             if file.suffix == ".xml":
-                wanted += _named_by(file)
+                pending += _assets_of(file)
 
 
-def _named_by(model: Path) -> Iterable[Path]:
-    """The files that an MJCF names, wherever its folders may have them."""
+def _assets_of(model: Path) -> Iterable[Path]:
+    """Return the files that an MJCF may refer to: each asset in the model's folder and in each of its asset folders."""
     text = model.read_bytes()
     folders = ["", *(os.fsdecode(name) for name in _FOLDERS.findall(text))]
     names = dict.fromkeys(os.fsdecode(name) for name in _ASSETS.findall(text))
@@ -230,17 +230,3 @@ def _requirements(distribution: str) -> list[str]:
         found = [re.match(r"[A-Za-z0-9][\w.-]*", line) for line in lines if "extra ==" not in line]
         return [match[0] for match in found if match]
     return []
-
-
-def _libc() -> str:
-    try:
-        return os.confstr("CS_GNU_LIBC_VERSION") or ""  # mathematics that neither torch nor MuJoCo brings along
-    except (AttributeError, ValueError, OSError):
-        return ""
-
-
-def _flushes_denormals() -> bool:
-    import torch
-
-    tiny = torch.tensor([1e-310], dtype=torch.float64)
-    return float(tiny * 1.0) == 0.0

@@ -1,4 +1,4 @@
-"""From a run to an environment and a policy that fit each other: what play, eval and resume have in common."""
+"""Task, configuration and compatibility checks of a saved run, used by play, eval and resume."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
 
 
 def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
-    """The task of a run: its code and models as installed, its configuration as the run recorded it.
+    """Return the task of a run: code and models as installed now, configuration as recorded in the run.
 
     Args:
         run: the run.
-        named: the task that the command line names, if it does: of a task that is not installed its code is taken.
+        named: the task on the command line, if there is one. If it is not installed, its code is used.
 
     Raises:
         TaskError: if the task is not installed any more.
-        CheckpointError: if the run names code that the user never has.
+        CheckpointError: if the run names code that the user has never named on this machine.
     """
     source = recorded_task(run.record["task"], f"the task of {run.folder}", str(run.folder), named)
     try:
@@ -44,17 +44,17 @@ def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
 def recorded_task(
     record: Mapping[str, Any], what: str, run: str | None = None, named: TaskSource | None = None
 ) -> TaskSource:
-    """The task that a `TaskSource.record` stands for, as it is installed now.
+    """Return the task of a record made by `TaskSource.record`, as it is installed now.
 
     Args:
         record: the record.
-        what: how messages name the task.
-        run: the run that holds the record, if one does.
+        what: name of the task in messages, such as `the task of RUN`.
+        run: the run that holds the record, if there is one.
         named: see `source_of`.
 
     Raises:
         TaskError: if the task is not installed any more.
-        CheckpointError: if the record names code that the user never has.
+        CheckpointError: if the record names code that the user has never named on this machine.
     """
     owner = record.get("distribution")
     try:
@@ -63,52 +63,41 @@ def recorded_task(
         if named is not None and named.distribution is None:
             return named
         if not trusted_tasks.is_known(record):
-            raise _unknown(record, what, run)
+            raise _untrusted_code_error(record, what, run)
         if record.get("python"):
             return python_task(str(record["python"]), str(record["name"]))
         file = Path(str(record.get("file") or "task.yaml")).name
         return folder_task(Path(str(record["folder"])), file)
     except TaskError as error:
         hint = f"install {owner} {record.get('version')}" if owner else error.hint
-        raise TaskError(f"{what} is not there: {error.message}", hint=hint) from None
+        raise TaskError(f"{what} is not installed: {error.message}", hint=hint) from None
 
 
-def _unknown(record: Mapping[str, Any], what: str, run: str | None) -> CheckpointError:
-    place = trusted_tasks.place(record)
-    name = shlex.quote(place if os.sep in place or "/" in place else f"./{place}")
+def _untrusted_code_error(record: Mapping[str, Any], what: str, run: str | None) -> CheckpointError:
+    code = trusted_tasks.named_code(record)
+    name = shlex.quote(code if os.sep in code or "/" in code else f"./{code}")
     allow = f"--task {name}" if run is None else f"rlcli play {name} --checkpoint {shlex.quote(run)}"
     return CheckpointError(
-        f"{what} is not loaded: it names code that you have not used on this machine, {place}",
+        f"{what} is not loaded: it names code that you have not used on this machine, {code}",
         hint=f"if you trust that code, or have it elsewhere, name it once: {allow}",
     )
 
 
 def resolve_run(
-    run: Run,
-    *,
-    play: bool,
-    config_file: Path | None = None,
-    overrides: Sequence[str] = (),
-    flags: Mapping[str, Any] | None = None,
-    named: TaskSource | None = None,
+    run: Run, *, play: bool, flags: Mapping[str, Any] | None = None, named: TaskSource | None = None
 ) -> Resolved:
-    """The configuration of a run, with what the command line changes for playing; `named`: see `source_of`."""
-    return resolve(source_of(run, named), play=play, config_file=config_file, overrides=overrides, flags=flags)
-
-
-def policy_of(checkpoint: Checkpoint) -> Policy:
-    """The policy of a checkpoint; nothing of the task or the simulator is needed."""
-    return checkpoint.policy()
+    """Return the configuration of a run, changed by flags of the command line; `named`: see `source_of`."""
+    return resolve(source_of(run, named), play=play, flags=flags)
 
 
 def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
-    """The environment must be what the policy was trained in.
+    """Check that an environment has the observations, actions and control period that a policy was trained with.
 
     Raises:
-        CheckpointError: with a table of what differs, then and now.
+        CheckpointError: with a table of the differences.
     """
     try:
-        differing = _differing(checkpoint.manifest["layout"], layout.record())
+        differing = _differing_rows(checkpoint.manifest["layout"], layout.record())
     except (AttributeError, KeyError, TypeError, ValueError):
         raise CheckpointError(f"{checkpoint.folder}/manifest.json is corrupt: its layout is malformed") from None
     if not differing:
@@ -122,36 +111,37 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
 
 
 def require_trainer(checkpoint: Checkpoint, trainer: str) -> None:
-    """A run goes on with the trainer that saved it; checkpoints of older versions do not say which.
+    """Check that a run is resumed by the trainer that saved it; checkpoints of older versions do not record it.
 
     Raises:
-        CheckpointError: naming both.
+        CheckpointError: with both trainers.
     """
     saved = checkpoint.manifest.get("trainer")
     if saved is not None and saved != trainer:
         raise CheckpointError(
-            f"{checkpoint.folder} is a checkpoint of trainer '{saved}', and the run's agent is one of '{trainer}'",
+            f"{checkpoint.folder} is a checkpoint of trainer '{saved}', but the run's agent uses '{trainer}'",
             hint="--init-from takes only the weights of its policy, in a new run",
         )
 
 
 def require_same_policy(checkpoint: Checkpoint, policy: Policy, trainer: str) -> None:
-    """Weights go into a policy that computes the same with them; how far actions reach is the new agent's own.
+    """Check that the weights of a checkpoint fit a policy. The two may differ in the bounds of actions.
 
     Raises:
-        CheckpointError: with a table of what differs.
+        CheckpointError: with a table of the differences.
     """
-    saved, wanted = policy_of(checkpoint).spec.model_dump(), policy.spec.model_dump()
+    saved, wanted = checkpoint.policy().spec.model_dump(), policy.spec.model_dump()
     rows = [(key, str(saved[key]), str(wanted[key])) for key in wanted if saved[key] != wanted[key]]
-    alike = {"action_bound"} if saved["normalize"] and wanted["normalize"] else {"action_bound", "normalize_clip"}
-    rows = [row for row in rows if row[0] not in alike]
+    # without normalisation the clip of normalised observations has no effect
+    free = {"action_bound"} if saved["normalize"] and wanted["normalize"] else {"action_bound", "normalize_clip"}
+    rows = [row for row in rows if row[0] not in free]
     if rows:
         table = _table([("policy", "in the checkpoint", "the agent's"), *rows])
         owner = checkpoint.manifest.get("trainer") or "?"
         raise CheckpointError(
-            f"{checkpoint.folder}: the weights do not fit the agent; it is a checkpoint of trainer '{owner}', and the"
-            f" agent is one of '{trainer}':\n{table}",
-            hint="give the agent the network of the checkpoint, or begin without --init-from",
+            f"{checkpoint.folder}: the weights do not fit the agent; the checkpoint is from trainer '{owner}', and the"
+            f" agent uses '{trainer}':\n{table}",
+            hint="give the agent the network of the checkpoint, or start without --init-from",
         )
 
 
@@ -160,15 +150,15 @@ def _table(rows: Sequence[tuple[str, str, str]]) -> str:
     return "\n".join(f"  {a.ljust(widths[0])}  {b.ljust(widths[1])}  {c}" for a, b, c in rows)
 
 
-def _differing(record: Mapping[str, Any], current: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """The rows of the table."""
+def _differing_rows(record: Mapping[str, Any], current: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Return a row (name, in the checkpoint, now) for each field that differs."""
     was, now = _fields(record), _fields(current)
     names = [name for name in {**was, **now} if _differ(was.get(name), now.get(name))]
     return [(name, _text(was.get(name)), _text(now.get(name))) for name in names]
 
 
 def _fields(record: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """What must be equal, by the name it has in the table."""
+    """Return the terms and the control period by their names in the table."""
     fields: dict[str, Mapping[str, Any]] = {}
     for group, terms in record.get("observations", {}).items():
         for position, term in enumerate(terms):
@@ -181,15 +171,15 @@ def _fields(record: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 
 
 _CONTRACT = ("name", "size", "elements", "scale", "offset", "clip", "history", "modifiers")
-"""Of a term: what a policy was trained with. Units are words, and limits belong to the machine that is driven."""
+"""Keys of a term that must be equal. Units are only text, and limits belong to the robot, not to the policy."""
 
 
 def _differ(was: Mapping[str, Any] | None, now: Mapping[str, Any] | None) -> bool:
-    """Whether something differs that both sides know; older checkpoints do not know everything."""
+    """Return whether a key that both sides have differs; older checkpoints lack some keys."""
     if was is None or now is None:
         return True
-    known = [key for key in _CONTRACT if key in was and key in now]
-    return any(_rounded(was[key]) != _rounded(now[key]) for key in known if key != "elements" or was[key])
+    common = [key for key in _CONTRACT if key in was and key in now]
+    return any(_rounded(was[key]) != _rounded(now[key]) for key in common if key != "elements" or was[key])
 
 
 def _text(term: Mapping[str, Any] | None) -> str:
@@ -205,7 +195,7 @@ def _text(term: Mapping[str, Any] | None) -> str:
 
 
 def _rounded(value: object) -> Any:
-    """Numbers as six digits: the last bits of a model's values depend on the machine that compiled it."""
+    """Return numbers with six digits: the last bits of a model's values depend on the machine that compiled it."""
     if isinstance(value, list):
         return "[" + ", ".join(str(_rounded(item)) for item in value) + "]"
     return f"{value:.6g}" if isinstance(value, float) else value

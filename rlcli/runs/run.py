@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,27 +19,27 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from rlcli.config import strict_yaml
 from rlcli.errors import CheckpointError, MachineError, UsageError
-from rlcli.runs.atomic_io import disk_error, to_json, write_atomic
+from rlcli.runs.atomic_io import disk_errors, to_json, write_atomic
 from rlcli.runs.safe_io import FileModel, Word, check_json, read_file, read_json, refuse_links, require_inside
 
 CONFIG = "config.yaml"
 RECORD = "run.json"
 STUDY = "study.json"
-"""What a folder holds whose folders are runs of one study: the seeds of a training, or the trials of a sweep."""
+"""File that marks a study: a folder of runs with several seeds, or of the trials of a sweep."""
 WAITING = "waiting"
-"""State of a run of a study whose turn has not come."""
+"""State of a run of a study that has not started yet."""
 LOCK = ".lock"
 MAX_SEED = 2**62
 _TASK = re.compile(r"(?!\.{1,2}$)[^/\\:]{1,255}")
-_MANY = 100_000
-_PEEK_S = 0.3
-"""For longer than somebody looks whether a run is locked."""
+_MAX_FILES = 100_000
+_LOCK_TIMEOUT_S = 0.3
+"""Longer than `is_locked` holds the lock [s]."""
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
 
 
 @dataclass(slots=True)
 class Run:
-    """One training run's folder. `record` is the content of run.json."""
+    """Folder of one training run. `record` is the content of run.json."""
 
     folder: Path
     record: dict[str, Any] = field(default_factory=dict)
@@ -47,24 +47,24 @@ class Run:
 
     @property
     def config(self) -> Path:
-        """The resolved configuration."""
+        """File of the resolved configuration."""
         return self.folder / CONFIG
 
     @property
     def checkpoints(self) -> Path:
-        """The folder of checkpoints."""
+        """Folder of the checkpoints."""
         return self.folder / "checkpoints"
 
     @property
     def metrics(self) -> Path:
-        """One JSON line an iteration."""
+        """File with one JSON line for each iteration."""
         return self.folder / "metrics.jsonl"
 
     def read_config(self) -> strict_yaml.Document:
         """Read the resolved configuration.
 
         Raises:
-            CheckpointError: if it is missing, corrupt, or no plain file.
+            CheckpointError: if it is missing, corrupt, or not a plain file.
         """
         try:
             return strict_yaml.load(read_file(self.config, strict_yaml.MAX_BYTES))
@@ -74,17 +74,17 @@ class Run:
             raise CheckpointError(f"{self.config}:{error.line}:{error.column} is corrupt: {error.message}") from None
 
     def update(self, **entries: Any) -> None:
-        """Change entries of run.json."""
+        """Change entries of `record`, and write run.json."""
         self.record.update(entries)
         write_atomic(self.folder / RECORD, to_json(self.record))
 
     def lock(self) -> None:
-        """Keep a second writer out.
+        """Lock the run for this process, the only one that may write to it.
 
         Raises:
             MachineError: if another process is writing to this run.
         """
-        self._lock = FileLock(self.folder / LOCK, timeout=_PEEK_S)
+        self._lock = FileLock(self.folder / LOCK, timeout=_LOCK_TIMEOUT_S)
         try:
             self._lock.acquire()
         except Timeout:
@@ -92,46 +92,44 @@ class Run:
             raise MachineError(f"{self.folder} is being written to by another process") from None
 
     def unlock(self) -> None:
-        """Let others write again."""
+        """Release the lock."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None
 
     def discard(self) -> None:
-        """Remove a run that never began."""
+        """Delete a run that has not started."""
         self.unlock()
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def create_run(runs_dir: Path, task: str, name: str | None, config: str, record: Mapping[str, Any]) -> Run:
-    """Make a new run folder with its configuration in it; two that start in the same second get two folders.
+    """Create and lock a new run with its configuration; runs that start in the same second get different folders.
 
     Raises:
-        UsageError: for a name that cannot be part of a folder's.
-        MachineError: if the folder cannot be made or written.
+        UsageError: if the name cannot be part of a folder's name.
+        MachineError: if the folder cannot be created or written.
     """
-    return begin_run(new_folder(runs_dir, task, name), config, record)
+    return initialize_run(new_folder(runs_dir, task, name), config, record)
 
 
 def new_folder(runs_dir: Path, task: str, name: str | None) -> Path:
-    """A folder for a run or a study of runs, with the time in its name.
+    """Create a folder for a run or a study, with the UTC time in its name.
 
     Raises:
-        UsageError: for a name that cannot be part of a folder's.
-        MachineError: if the folder cannot be made.
+        UsageError: if the name cannot be part of a folder's name.
+        MachineError: if the folder cannot be created.
     """
     require_name(name)
     parent = runs_dir / task
     stem = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S") + (f"-{name}" if name else "")
-    try:
+    with disk_errors(parent):
         parent.mkdir(parents=True, exist_ok=True)
-        return _fresh_folder(parent, stem)
-    except OSError as error:
-        raise disk_error(parent, error) from error
+        return _create_numbered_folder(parent, stem)
 
 
 def require_name(name: str | None) -> None:
-    """A name can be part of a folder's.
+    """Check that a name can be part of a folder's name.
 
     Raises:
         UsageError: if it cannot.
@@ -140,29 +138,26 @@ def require_name(name: str | None) -> None:
         raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint="letters, digits, - and _")
 
 
-def begin_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
-    """Write what a run is to do into its empty folder, and lock it.
+def initialize_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
+    """Write the configuration and the record of a new run into its empty folder, and lock it.
 
     Raises:
-        MachineError: if it cannot be written; the folder is gone then.
+        MachineError: if the folder cannot be written; it is deleted.
     """
     run = Run(folder)
-    try:
+    with disk_errors(folder, remove=True):
         run.checkpoints.mkdir()
         write_atomic(run.config, config)
         run.update(**{"started": datetime.now(UTC).isoformat(timespec="microseconds"), "state": "running", **record})
         run.lock()
-    except (OSError, MachineError) as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise disk_error(folder, error) if isinstance(error, OSError) else error from error
     return run
 
 
 def open_run(folder: Path) -> Run:
-    """Open an existing run.
+    """Open an existing run, and check its record and its files' types.
 
     Raises:
-        CheckpointError: if it is not a run.
+        CheckpointError: if the folder is not a valid run.
     """
     try:
         record = read_json(folder, RECORD)
@@ -174,25 +169,43 @@ def open_run(folder: Path) -> Run:
             refuse_links(folder / inner)
     for part in (folder / CONFIG, folder / "metrics.jsonl"):
         if part.exists() and not part.is_file():
-            raise CheckpointError(f"{part} is no plain file")  # a pipe would be waited for
+            raise CheckpointError(f"{part} is not a plain file")  # reading a pipe would block
     check_json(RunRecord, record, folder / RECORD)
     return Run(folder, record)
 
 
+def run_folders(runs_dir: Path) -> Iterator[Path]:
+    """Yield the folders in which runs are expected: RUNS/TASK/RUN and RUNS/TASK/STUDY/RUN, without hidden ones."""
+    for task in _subfolders(runs_dir):
+        for folder in _subfolders(task):
+            if (folder / STUDY).is_file():
+                yield from _subfolders(folder)
+            else:
+                yield folder
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    try:
+        with os.scandir(folder) as entries:
+            return [Path(entry.path) for entry in entries if not entry.name.startswith(".") and entry.is_dir()]
+    except OSError:
+        return []
+
+
 def is_locked(folder: Path) -> bool:
-    """Whether a process is writing to the run: asked of the system, without a trace in the folder."""
+    """Return whether a process has locked the run; no file is created or changed."""
     try:
         handle = os.open(folder / LOCK, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
     except OSError:
         return False
     try:
-        return stat.S_ISREG(os.fstat(handle).st_mode) and not _shared(handle)
+        return stat.S_ISREG(os.fstat(handle).st_mode) and not _can_share(handle)
     finally:
         os.close(handle)
 
 
-def _shared(handle: int) -> bool:
-    """Whether a lock file can be locked together with others; the lock is let go with the handle."""
+def _can_share(handle: int) -> bool:
+    """Return whether a lock file can get a shared lock, which ends when the handle is closed."""
     try:
         import fcntl
     except ImportError:  # Windows
@@ -214,20 +227,20 @@ def _shared(handle: int) -> bool:
 
 
 def require_own(run: Run, *parts: str) -> None:
-    """What is about to be written lies in the run: no link leads out of it, no pipe or device stands in a file's place.
+    """Check that paths to be written stay in the run: no link leads out of it, and no pipe or device is among them.
 
     Args:
         run: the run.
-        parts: files and folders in it; of a folder all that it holds.
+        parts: files and folders in the run; a folder stands for everything in it.
 
     Raises:
-        CheckpointError: naming what does not belong in a run.
+        CheckpointError: with the path that does not belong in a run.
     """
-    seen = 0
+    count = 0
     pending = [run.folder / part for part in parts]
     while pending:
         path = pending.pop()
-        seen += 1
+        count += 1
         try:
             require_inside(run.folder, path)
             mode = path.stat().st_mode
@@ -235,23 +248,23 @@ def require_own(run: Run, *parts: str) -> None:
                 pending += path.iterdir()
             elif not stat.S_ISREG(mode):
                 raise OSError(errno.EINVAL, "it is not a plain file")
-            if seen > _MANY:
-                raise OSError(errno.EFBIG, f"the run holds more than {_MANY} files")
+            if count > _MAX_FILES:
+                raise OSError(errno.EFBIG, f"the run holds more than {_MAX_FILES} files")
         except FileNotFoundError:
             continue
         except (OSError, RuntimeError) as error:
-            said = getattr(error, "strerror", None) or error
-            raise CheckpointError(f"{path} cannot be written to: {said}", hint="it was not made by rlcli") from None
+            reason = getattr(error, "strerror", None) or error
+            raise CheckpointError(f"{path} cannot be written to: {reason}", hint="rlcli did not create it") from None
 
 
 def _require_task_name(name: str) -> str:
     if not _TASK.fullmatch(name):
-        raise ValueError("a name of a task is part of a path: it has no '/', '\\' or ':'")
+        raise ValueError("the name of a task is part of a path: '/', '\\' and ':' are not allowed")
     return name
 
 
 class TaskRecord(FileModel):
-    """The task that a file names. Every entry is a name or a path."""
+    """Record of a task in an untrusted file. Every entry is a name or a path."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Word | None] = Field(init=False)
@@ -262,17 +275,17 @@ class TaskRecord(FileModel):
 
 
 class _InstalledTask(TaskRecord):
-    """The task of a run, which says where the task is from."""
+    """Record of a run's task, which must name the origin of the task."""
 
     @model_validator(mode="after")
-    def _from_somewhere(self) -> Self:
+    def _check_origin(self) -> Self:
         if not (self.folder or self.distribution):
             raise ValueError("names neither a folder nor a distribution")
         return self
 
 
 class RunRecord(FileModel):
-    """The entries of run.json that are read again."""
+    """The entries of run.json that rlcli reads."""
 
     task: _InstalledTask
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
@@ -297,10 +310,11 @@ class RunRecord(FileModel):
     video_every: Annotated[int, Field(ge=0, lt=2**31)] = 0
 
 
-def _fresh_folder(parent: Path, stem: str) -> Path:
+def _create_numbered_folder(parent: Path, stem: str) -> Path:
+    """Create the folder `stem`, or `stem-2`, `stem-3`, ... if it exists."""
     for attempt in range(1, 10_000):
         folder = parent / (stem if attempt == 1 else f"{stem}-{attempt}")
         with contextlib.suppress(FileExistsError):
             folder.mkdir()
             return folder
-    raise OSError(17, "too many runs of this name", str(parent / stem))
+    raise OSError(errno.EEXIST, "too many runs of this name", str(parent / stem))

@@ -1,8 +1,8 @@
-"""Where two runs first part: configuration, environment, metrics, weights. Their files are read, nothing else."""
+"""Comparison of two runs from their files: configuration, environment, metrics, weights and policy."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import takewhile, zip_longest
 from typing import TYPE_CHECKING, Any
 
@@ -19,25 +19,25 @@ if TYPE_CHECKING:
     from rlcli.runs.checkpoint import Checkpoint
 
 SECTIONS = ("configuration", "environment", "metrics", "weights", "policy")
-"""In the order of cause and effect: what stands first explains what follows."""
+"""Parts of the comparison, causes before their effects: a difference may explain those of later parts."""
 _CLOCK = "Perf/"
-"""Metrics of the clock, which are never equal."""
+"""Prefix of metrics that measure time, which are never equal."""
 _ROWS = 4096
-"""Of a replay buffer that are compared at a time."""
+"""Rows of a replay buffer that are read and compared at a time."""
 
 
 def compare(left: Run, right: Run, *, sections: Iterable[str] = SECTIONS, until: int | None = None) -> list[Section]:
-    """Compare two runs. Of metrics and weights the first difference is told, of the others each.
+    """Compare two runs: return the first difference of metrics, weights and policy, and all others.
 
     Args:
         left: a run.
-        right: another.
-        sections: which parts to compare.
-        until: the environment step up to which metrics and checkpoints count; None: to the end of both, and a run
-            that has more iterations differs.
+        right: another run.
+        sections: the parts to compare.
+        until: last environment step of the metrics and checkpoints that are compared; None: compare all, so that a
+            longer run differs.
 
     Raises:
-        CheckpointError: if a file that is needed cannot be read.
+        CheckpointError: if a required file cannot be read.
     """
     parts: dict[str, Callable[[], Section]] = {
         "configuration": lambda: compare_values(Values.of_run(left), Values.of_run(right)),
@@ -51,24 +51,24 @@ def compare(left: Run, right: Run, *, sections: Iterable[str] = SECTIONS, until:
 
 
 def first_difference(sections: Iterable[Section]) -> tuple[str, Difference] | None:
-    """The first difference that is not cosmetic, and its section."""
+    """Return the first difference that is not cosmetic, with the name of its section; None if there is none."""
     found = ((section.name, each) for section in sections for each in section.differences)
     return next(((name, each) for name, each in found if each.category != "cosmetic"), None)
 
 
-def reached(run: Run) -> int:
-    """Return the last iteration that a run has metrics of."""
+def last_iteration(run: Run) -> int:
+    """Return the number of the last iteration in a run's metrics; 0 if there is none."""
     return max((row["iteration"] for row in read_rows(run, strict=True)), default=0)
 
 
 def _environments(left: Run, right: Run) -> Section:
     rows = differences(left.record, right.record)
-    resumed, again = left.record.get("resumed"), right.record.get("resumed")
-    if as_text(resumed) != as_text(again):
-        rows.append(("resumed", resumed, again))
-    whole = all("sources" in run.record and "cpu" in run.record for run in (left, right))
-    words = "versions, sources, processor, threads" if whole else "what both have recorded"
-    return Section("environment", words, [Difference(*row) for row in rows])
+    resumed = [run.record.get("resumed") for run in (left, right)]
+    if as_text(resumed[0]) != as_text(resumed[1]):
+        rows.append(("resumed", resumed[0], resumed[1]))
+    complete = all("sources" in run.record and "cpu" in run.record for run in (left, right))
+    compared = "versions, sources, processor, threads" if complete else "the entries that both have recorded"
+    return Section("environment", compared, [Difference(*row) for row in rows])
 
 
 def _metrics(left: Run, right: Run, until: int | None) -> Section:
@@ -77,22 +77,22 @@ def _metrics(left: Run, right: Run, until: int | None) -> Section:
         if row is None or twin is None:
             if until is not None:
                 break
-            ends = [None if side is None else "recorded" for side in (row, twin)]
-            longer = row if row is not None else twin
+            longer = row or twin
             assert longer is not None
-            difference = Difference(f"iteration {longer['iteration']}", *ends)
+            sides = _presence("recorded", row is not None, twin is not None)
+            difference = Difference(f"iteration {longer['iteration']}", *sides)
             return Section("metrics", f"{count} iterations", [difference])
-        for name in ("iteration", *sorted((row.keys() | twin.keys()) - {"iteration"})):
-            if not name.startswith(_CLOCK) and as_text(row.get(name)) != as_text(twin.get(name)):
-                where = f"iteration {row['iteration']}: {name}"
-                difference = Difference(where, row.get(name), twin.get(name))
-                return Section("metrics", f"{count} iterations", [difference])
+        names = ("iteration", *sorted((row.keys() | twin.keys()) - {"iteration"}))
+        found = _first_unequal(row, twin, [name for name in names if not name.startswith(_CLOCK)])
+        if found is not None:
+            difference = Difference(f"iteration {row['iteration']}: {found}", row.get(found), twin.get(found))
+            return Section("metrics", f"{count} iterations", [difference])
         count += 1
     return Section("metrics", f"{count} iterations")
 
 
 def _rows(run: Run, until: int | None) -> Iterator[dict[str, Any]]:
-    """The rows of a run's metrics up to an environment step."""
+    """Return the rows of a run's metrics up to an environment step."""
     rows = read_rows(run, strict=True)
     return rows if until is None else takewhile(lambda row: row["step"] <= until, rows)
 
@@ -101,48 +101,50 @@ def _weights(left: Run, right: Run, until: int | None) -> Section:
     steps = _common_steps(left, right, until)
     if not steps:
         return Section("weights", "no checkpoint at a step that both have")
-    words = f"checkpoints at {len(steps)} steps, to step {steps[-1]}"
+    compared = f"checkpoints at {len(steps)} steps, to step {steps[-1]}"
     for step in steps:
-        one, other = (_open(run, step) for run in (left, right))
+        one, other = (_open_checkpoint(run, step) for run in (left, right))
         for part in _parts(one, other):
             equal = _digest(one, f"{part}.safetensors") == _digest(other, f"{part}.safetensors")
             if equal and step != steps[-1]:
-                continue  # the last pair is read whatever its manifests say: that checks the files
-            found = _tensors(one, other, part)
+                continue  # the last pair is read even if its hashes are equal: this checks the files
+            found = _compare_part(one, other, part)
             if found is not None:
-                return Section("weights", words, [found])
-        found = _values(one, other) or (_logs(one, other) if step == steps[-1] else None)
+                return Section("weights", compared, [found])
+        found = _compare_values(one, other) or (_compare_logs(one, other) if step == steps[-1] else None)
         if found is not None:
-            return Section("weights", words, [found])
-    return Section("weights", words)
+            return Section("weights", compared, [found])
+    return Section("weights", compared)
 
 
 def _parts(one: Checkpoint, other: Checkpoint) -> list[str]:
-    """Tensor files of either: the policy first, then what trains it."""
+    """Return the parts of both checkpoints: policy and trainer first, the others by name."""
     names = {name for saved in (one, other) for name in saved.manifest["files"] if name.endswith(".safetensors")}
     order = ("policy.safetensors", "trainer.safetensors")
     ordered = sorted(names, key=lambda name: (order.index(name) if name in order else len(order), name))
     return [name.removesuffix(".safetensors") for name in ordered]
 
 
-def _tensors(one: Checkpoint, other: Checkpoint, part: str) -> Difference | None:
+def _compare_part(one: Checkpoint, other: Checkpoint, part: str) -> Difference | None:
     file = f"{part}.safetensors"
-    held = [file in saved.manifest["files"] for saved in (one, other)]
-    if not all(held):
-        return Difference(f"step {one.step}: {file}", *("there" if has else None for has in held))
-    left, right = one.tensors(part), other.tensors(part)
+    present = [file in saved.manifest["files"] for saved in (one, other)]
+    if not all(present):
+        return Difference(f"step {one.step}: {file}", *_presence("there", *present))
+    return _compare_tensors(one.tensors(part), other.tensors(part), f"step {one.step}: {part} ")
+
+
+def _compare_tensors(left: Mapping[str, Tensor], right: Mapping[str, Tensor], prefix: str) -> Difference | None:
     for name in sorted(left.keys() | right.keys()):
-        where = f"step {one.step}: {part} {name}"
         if name not in left or name not in right:
-            return Difference(where, *("there" if name in side else None for side in (left, right)))
-        found = _elements(left[name], right[name], where)
+            return Difference(f"{prefix}{name}", *_presence("there", name in left, name in right))
+        found = _compare_elements(left[name], right[name], f"{prefix}{name}")
         if found is not None:
             return found
     return None
 
 
-def _elements(left: Tensor, right: Tensor, where: str) -> Difference | None:
-    """The first element whose bits differ."""
+def _compare_elements(left: Tensor, right: Tensor, where: str) -> Difference | None:
+    """Return the first element whose bits differ, or the difference of types and shapes."""
     import torch
 
     kinds = [f"{str(value.dtype).removeprefix('torch.')} {list(value.shape)}" for value in (left, right)]
@@ -150,53 +152,63 @@ def _elements(left: Tensor, right: Tensor, where: str) -> Difference | None:
         return Difference(where, *kinds)
     if not left.numel():
         return None
+    # one row of bytes for each element: NaN equals itself, 0.0 differs from -0.0
     bits = [value.contiguous().reshape(-1, 1).view(torch.uint8).reshape(left.numel(), -1) for value in (left, right)]
     differ = (bits[0] != bits[1]).any(dim=1)
     if not bool(differ.any()):
         return None
-    place = int(differ.int().argmax())
-    index = [int(i) for i in torch.unravel_index(torch.tensor(place), left.shape)]
-    one, other = (value.reshape(-1)[place].item() for value in (left, right))
+    first = int(differ.int().argmax())
+    index = [int(i) for i in torch.unravel_index(torch.tensor(first), left.shape)]
+    one, other = (value.reshape(-1)[first].item() for value in (left, right))
     return Difference(f"{where}{index if index else ''}", one, other)
 
 
-def _logs(one: Checkpoint, other: Checkpoint) -> Difference | None:
-    """The first element of a replay buffer that differs, wherever its rows are cut into files."""
+def _compare_logs(one: Checkpoint, other: Checkpoint) -> Difference | None:
+    """Return the first differing element of a replay buffer; its rows may be split into files in other ways."""
     if not one.shards() and not other.shards():
         return None
     left, right = one.state().logs, other.state().logs
     for name in sorted(left.keys() | right.keys()):
         where = f"step {one.step}: {name}"
-        held = [None if name not in side else f"rows {side[name].first} to {side[name].stop}" for side in (left, right)]
-        if held[0] != held[1]:
-            return Difference(where, *held)
+        rows = [None if name not in side else f"rows {side[name].first} to {side[name].stop}" for side in (left, right)]
+        if rows[0] != rows[1]:
+            return Difference(where, *rows)
         for start in range(left[name].first, left[name].stop, _ROWS):
             stop = min(start + _ROWS, left[name].stop)
-            columns, twins = left[name].read(start, stop), right[name].read(start, stop)
-            for column in sorted(columns.keys() | twins.keys()):
-                found = _elements(columns[column], twins[column], f"{where} from row {start}: {column}")
-                if found is not None:
-                    return found
+            columns, other_columns = left[name].read(start, stop), right[name].read(start, stop)
+            found = _compare_tensors(columns, other_columns, f"{where} from row {start}: ")
+            if found is not None:
+                return found
     return None
 
 
-def _values(one: Checkpoint, other: Checkpoint) -> Difference | None:
+def _compare_values(one: Checkpoint, other: Checkpoint) -> Difference | None:
     left, right = (dict(leaves(saved.json("state.json"))) for saved in (one, other))
-    for path in dict.fromkeys([*left, *right]):
-        if as_text(left.get(path)) != as_text(right.get(path)):
-            return Difference(f"step {one.step}: state.json {dotted(path)}", left.get(path), right.get(path))
-    return None
+    path = _first_unequal(left, right, [*left, *right])
+    if path is None:
+        return None
+    return Difference(f"step {one.step}: state.json {dotted(path)}", left.get(path), right.get(path))
+
+
+def _first_unequal(left: Mapping[Any, Any], right: Mapping[Any, Any], keys: Iterable[Any]) -> Any:
+    """Return the first key whose values differ; None if all are equal."""
+    return next((key for key in keys if as_text(left.get(key)) != as_text(right.get(key))), None)
+
+
+def _presence(word: str, left: bool, right: bool) -> tuple[str | None, str | None]:
+    """Return the sides of a difference between an entry and a missing one."""
+    return word if left else None, word if right else None
 
 
 def _policies(left: Run, right: Run, until: int | None) -> Section:
     steps = _common_steps(left, right, until)
     if not steps:
         return Section("policy", "no checkpoint at a step that both have")
-    one, other = (_digest(_open(run, steps[-1]), "policy.safetensors") for run in (left, right))
-    words = f"sha256 of step {steps[-1]}"
+    one, other = (_digest(_open_checkpoint(run, steps[-1]), "policy.safetensors") for run in (left, right))
+    compared = f"sha256 of step {steps[-1]}"
     if one != other:
-        return Section("policy", words, [Difference(f"step {steps[-1]}: policy.safetensors sha256", one, other)])
-    return Section("policy", f"{words}: {str(one)[:12]}...")
+        return Section("policy", compared, [Difference(f"step {steps[-1]}: policy.safetensors sha256", one, other)])
+    return Section("policy", f"{compared}: {str(one)[:12]}...")
 
 
 def _common_steps(left: Run, right: Run, until: int | None) -> list[int]:
@@ -206,7 +218,7 @@ def _common_steps(left: Run, right: Run, until: int | None) -> list[int]:
     return sorted(step for step in common if until is None or step <= until)
 
 
-def _open(run: Run, step: int) -> Checkpoint:
+def _open_checkpoint(run: Run, step: int) -> Checkpoint:
     from rlcli.runs.checkpoint import open_checkpoint
 
     return open_checkpoint(run.checkpoints / f"{step:012d}")

@@ -1,25 +1,26 @@
-"""How a command line names a run or a checkpoint: by folder, by name, `latest`, `RUN@best` or `RUN@step:N`."""
+"""References to runs and checkpoints on a command line: folder, name, `latest`, `RUN@best` or `RUN@step:N`."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import re
 from pathlib import Path
 
 from rlcli.errors import CheckpointError, UsageError, did_you_mean, listing
-from rlcli.runs.run import RECORD, STUDY, Run, open_run
+from rlcli.runs.run import RECORD, STUDY, Run, open_run, run_folders
 from rlcli.settings import setting
 
 _log = logging.getLogger(__name__)
 
 
 def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[Run, str]:
-    """A run by its folder, its name, or `latest`; and why it was chosen.
+    """Find a run by its folder, its name, or `latest`; return it and the reason for the choice.
 
     Raises:
-        CheckpointError: if there is none.
-        UsageError: if it is a run of another task than the one given.
+        CheckpointError: if there is no such run.
+        UsageError: if it is a run of another task than `task`.
     """
     run, why = _find_run(reference, runs_dir, task)
     if task is not None and run.record["task"]["name"] != task:
@@ -28,15 +29,15 @@ def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[R
 
 
 def is_checkpoint_ref(reference: str) -> bool:
-    """Whether a word names one checkpoint (its folder, or RUN@...), and not a run."""
+    """Return whether a reference names one checkpoint (its folder, or RUN@...) and not a run."""
     return (Path(reference) / "manifest.json").is_file() or ("@" in reference and not Path(reference).exists())
 
 
 def find_runs(references: list[str], runs_dir: Path) -> list[Run]:
-    """Return the runs that words name: a folder, a name, `latest`, a task, or a folder of runs.
+    """Find the runs of several references: a folder, a name, `latest`, a task, or a folder of runs.
 
     Raises:
-        CheckpointError: if one names nothing.
+        CheckpointError: if a reference names no run.
     """
     found: list[Run] = []
     for reference in references:
@@ -52,7 +53,7 @@ def find_runs(references: list[str], runs_dir: Path) -> list[Run]:
 
 
 def _runs_of_task(reference: str, runs_dir: Path) -> list[Run]:
-    """The runs of a task, or in a folder of runs; none where the word names one run."""
+    """Return the runs of a task or of a folder of runs; an empty list if the reference names one run."""
     folder = Path(reference)
     if (folder / RECORD).is_file() or reference == "latest":
         return []
@@ -64,39 +65,39 @@ def _runs_of_task(reference: str, runs_dir: Path) -> list[Run]:
 
 
 def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
-    """Runs under a folder, oldest first; what is not a run is passed over."""
+    """Return the runs under a folder, the oldest first; other folders and broken runs are skipped."""
     runs = []
-    studies = (file.parent for file in runs_dir.glob(f"*/*/{STUDY}") if file.is_file())
-    for file in (*runs_dir.glob(f"*/*/{RECORD}"), *(file for study in studies for file in study.glob(f"*/{RECORD}"))):
-        try:
-            run = open_run(file.parent)
-        except CheckpointError:
-            continue
-        if task is None or run.record["task"].get("name") == task:
-            runs.append(run)
+    for folder in run_folders(runs_dir):
+        with contextlib.suppress(CheckpointError):
+            runs.append(open_run(folder))
+    if task is not None:
+        runs = [run for run in runs if run.record["task"]["name"] == task]
     return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name))
 
 
 def find_checkpoint(
     reference: str, runs_dir: Path, task: str | None = None, *, whole: bool = False
 ) -> tuple[Run, Path, str]:
-    """A checkpoint by `RUN`, `RUN@best`, `RUN@step:N`, `latest` or its folder; and why it was chosen.
+    """Find a checkpoint by `RUN`, `RUN@best`, `RUN@step:N`, `latest` or its folder.
 
-    Of a run that is named without a checkpoint it is the newest good one.
+    `RUN` and `latest` stand for the newest valid checkpoint of the run.
 
     Args:
-        reference: what was named.
+        reference: the reference.
         runs_dir: the folder of runs.
-        task: of which it must be.
-        whole: good is what can be resumed, not only what can be played.
+        task: the task that the run must be of; None: any.
+        whole: a valid checkpoint can be resumed; otherwise only its policy is checked.
+
+    Returns:
+        The run, the checkpoint's folder, and the reason for the choice.
 
     Raises:
-        CheckpointError: if there is none.
+        CheckpointError: if there is no such checkpoint.
     """
     from rlcli.runs.checkpoint import steps
 
     folder = Path(reference)
-    if os.path.isfile(folder / "manifest.json"):  # of a name too long for the system: no
+    if os.path.isfile(folder / "manifest.json"):  # Path.is_file raises an error for a name that is too long
         return open_run(folder.resolve().parent.parent), folder, "as named"
     name, _, which = (reference, "", "") if os.path.exists(folder) else reference.partition("@")
     run, why = find_run(name, runs_dir, task)
@@ -104,7 +105,7 @@ def find_checkpoint(
     if not have:
         raise CheckpointError(f"{run.folder} has no complete checkpoint")
     if not which:
-        return run, *_newest_good(run, have, why, whole)
+        return run, *_newest_valid(run, have, why, whole)
     if which == "best":
         best = run.record.get("best")
         if best not in have:
@@ -124,25 +125,25 @@ def find_checkpoint(
     )
 
 
-def _newest_good(run: Run, have: list[int], why: str, whole: bool) -> tuple[Path, str]:
-    """Return the newest checkpoint that is in order, with a warning for each newer one."""
+def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Path, str]:
+    """Return the newest valid checkpoint and the reason for the choice; warn of each newer, corrupt one."""
     from rlcli.runs.checkpoint import open_checkpoint
 
-    for passed, step in enumerate(reversed(have)):
+    for skipped, step in enumerate(reversed(have)):
         folder = run.checkpoints / f"{step:012d}"
         try:
             open_checkpoint(folder).verify(whole=whole)
         except CheckpointError as error:
-            if passed == len(have) - 1:
+            if skipped == len(have) - 1:
                 raise
-            _log.warning(f"checkpoint {folder.name} is passed over: {error.message}")
+            _log.warning(f"checkpoint {folder.name} is skipped: {error.message}")
             continue
-        return folder, f"{why}, its newest {'good ' if passed else ''}checkpoint"
-    raise AssertionError("a run without checkpoints is refused before")
+        return folder, f"{why}, its newest {'good ' if skipped else ''}checkpoint"
+    raise AssertionError("find_checkpoint refuses a run without checkpoints")
 
 
 def default_runs_dir() -> Path:
-    """RLCLI_RUNS_DIR, or what the user's settings say, or `runs` in the current folder."""
+    """Return the folder of runs: RLCLI_RUNS_DIR, else the user's setting, else `runs` in the current folder."""
     return Path(os.environ.get("RLCLI_RUNS_DIR") or Path(setting("runs_dir") or "runs").expanduser())
 
 
@@ -150,8 +151,9 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
     if reference == "latest":
         runs = list_runs(runs_dir, task)
         if not runs:
-            of = f" of {task}" if task else ""
-            raise CheckpointError(f"there is no run{of} in {runs_dir}", hint=f"rlcli train {task or 'TASK'} makes one")
+            of_task = f" of {task}" if task else ""
+            hint = f"rlcli train {task or 'TASK'} starts one"
+            raise CheckpointError(f"there is no run{of_task} in {runs_dir}", hint=hint)
         return runs[-1], f"newest run of {task}" if task else f"newest run in {runs_dir}"
     for candidate in (Path(reference), runs_dir / reference, *([runs_dir / task / reference] if task else [])):
         if os.path.isfile(candidate / RECORD):

@@ -1,4 +1,4 @@
-"""Read untrusted files: plain files of a limited size, strict JSON, and pydantic models of what the JSON may hold."""
+"""Reading of untrusted files: plain files of limited size, strict JSON, and pydantic models of the JSON's content."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from rlcli.errors import CheckpointError
 
 JSON_LIMIT = 4 * 2**20
 """Largest JSON file [bytes]."""
-_DEPTH = 32
-_DIGITS = 20
+_MAX_DEPTH = 32
+_MAX_DIGITS = 20
+_NOT_A_FILE = (errno.ELOOP, errno.ENXIO, errno.EISDIR)
+"""Errors of open() for links, pipes, sockets and folders."""
 _NO_LINKS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-
 
 Model = TypeVar("Model", bound=BaseModel)
 
 
 class FileModel(BaseModel):
-    """Base of the models of JSON files: wrong types and numbers that are not finite are refused; extra keys are not."""
+    """Base of models of JSON files: wrong types and numbers that are not finite are refused, extra keys are ignored."""
 
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
 
@@ -42,57 +43,62 @@ Word = Annotated[str, Field(max_length=4096), AfterValidator(_require_printable)
 """A name or a path."""
 
 
-def check_json(kind: type[Model], value: object, file: Path, *place: str, hint: str | None = None) -> Model:
+def check_json(kind: type[Model], value: object, file: Path, *keys: str, hint: str | None = None) -> Model:
     """Return a value of a JSON file as a model.
 
     Args:
-        kind: the model.
-        value: what was read; it must consist of what JSON has.
+        kind: the model's class.
+        value: the parsed JSON.
         file: the file, for the message.
-        place: the keys that lead to the value in the file.
+        keys: the keys that lead to the value in the file.
         hint: the hint of the error.
 
     Raises:
-        CheckpointError: with the place of the first problem, what was found there, and what is allowed.
+        CheckpointError: with the key of the first problem, the value found, and what is allowed.
     """
     try:
-        return kind.model_validate_json(json.dumps(value))  # of JSON strict models take lists for tuples
+        return kind.model_validate_json(json.dumps(value))  # strict models accept a list for a tuple only in JSON
     except ValidationError as error:
         problem = messages.problems(error, kind, value, messages.dotted)[0]
-        at = ".".join(filter(None, (*place, problem.path)))[:200]
+        at = ".".join(filter(None, (*keys, problem.path)))[:200]
         raise CheckpointError(f"{file} is corrupt: {at + ': ' if at else ''}{problem.message}", hint=hint) from None
 
 
 def read_file(file: Path, limit: int, *, size: int | None = None) -> bytes:
-    """The content of a plain file, read once; whatever is checked afterwards is checked on these bytes.
+    """Read the content of a plain file, only once: later checks must use these bytes, since the file may change.
 
     Args:
-        file: what to read.
+        file: the file.
         limit: largest size [bytes]; a larger file is not read at all.
-        size: the size that it must have; None: any.
+        size: the size that the file must have [bytes]; None: any.
 
     Raises:
-        CheckpointError: if it is a link, no plain file, too large or of another size, or cannot be read.
-        FileNotFoundError: if it is not there.
+        CheckpointError: if it is a link, not a plain file, too large or of another size, or cannot be read.
+        FileNotFoundError: if it does not exist.
     """
     handle, status = _open(file)
     with os.fdopen(handle, "rb") as opened:
         if size is not None and status.st_size != size:
-            raise CheckpointError(
-                f"{file} is corrupt: it is not what the manifest says ({status.st_size} bytes of {size})",
-                hint="choose an older checkpoint with RUN@step:N",
-            )
+            raise manifest_error(file, status.st_size, size)
         if status.st_size > limit:
             raise CheckpointError(f"{file} is too large: {status.st_size:,} bytes, at most {limit:,} are read")
         return _read(opened, file, 0, status.st_size)
 
 
+def manifest_error(file: Path, found: int, size: int) -> CheckpointError:
+    """Return the error for a file of `found` bytes whose size or hash differs from the manifest."""
+    return CheckpointError(
+        f"{file} is corrupt: it does not match the manifest ({found} of {size} bytes)",
+        hint="choose an older checkpoint with RUN@step:N",
+    )
+
+
 def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
-    """The last bytes of a plain file that may be growing, and whether they are all of it.
+    """Read the last bytes of a plain file that may be growing; return them and whether they are the whole file.
 
     Raises:
-        CheckpointError: if it is a link or no plain file, or cannot be read.
-        FileNotFoundError: if it is not there.
+        CheckpointError: if it is a link, not a plain file, or cannot be read.
+        FileNotFoundError: if it does not exist.
     """
     handle, status = _open(file)
     begin = max(0, status.st_size - limit)
@@ -106,45 +112,47 @@ def _read(opened: BinaryIO, file: Path, begin: int, count: int) -> bytes:
             opened.seek(begin)
         return opened.read(count)
     except (OSError, MemoryError) as error:
-        why = getattr(error, "strerror", None) or "there is not enough memory"
-        raise CheckpointError(f"{file} cannot be read: {why}") from None
+        reason = getattr(error, "strerror", None) or "there is not enough memory"
+        raise CheckpointError(f"{file} cannot be read: {reason}") from None
 
 
 def _open(file: Path) -> tuple[int, os.stat_result]:
-    """A plain file, opened."""
+    """Open a plain file; return its handle and status."""
     try:
         if file.is_symlink():
             raise CheckpointError(f"{file} is a link; links in runs are not followed")
-        handle = os.open(file, os.O_RDONLY | _NO_LINKS)  # a pipe must not make this wait
+        handle = os.open(file, os.O_RDONLY | _NO_LINKS)  # O_NONBLOCK: opening a pipe must not block
     except (FileNotFoundError, NotADirectoryError) as error:
         raise FileNotFoundError(*error.args) from None
     except (OSError, ValueError) as error:
-        why = (
-            "it is no plain file"
-            if getattr(error, "errno", None) in _ODD
-            else getattr(error, "strerror", None) or error
-        )
-        raise CheckpointError(f"{file} cannot be read: {why}") from None
+        reason = getattr(error, "strerror", None) or error
+        if getattr(error, "errno", None) in _NOT_A_FILE:
+            reason = "it is not a plain file"
+        raise CheckpointError(f"{file} cannot be read: {reason}") from None
     status = os.fstat(handle)
     if not stat.S_ISREG(status.st_mode):
         os.close(handle)
-        raise CheckpointError(f"{file} is no plain file")
+        raise CheckpointError(f"{file} is not a plain file")
     return handle, status
 
 
 def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:
-    """A JSON object, read strictly: no key twice, finite numbers of few digits, nested a few levels deep.
+    """Parse a JSON object strictly: unique keys, finite numbers with at most 20 digits, at most 32 levels of nesting.
 
     Raises:
-        CheckpointError: for anything else.
+        CheckpointError: for any other text.
     """
     try:
         text = data if isinstance(data, str) else data.decode()
         value = json.loads(
-            text, object_pairs_hook=_unique, parse_constant=_refuse, parse_float=_finite, parse_int=_short
+            text,
+            object_pairs_hook=_unique_keys,
+            parse_constant=_refuse_constant,
+            parse_float=_finite_float,
+            parse_int=_short_int,
         )
-        _require_flat(value)
-    except _Strict as error:
+        _check_depth(value)
+    except _StrictError as error:
         raise CheckpointError(f"{file} is corrupt: {error}") from None
     except (ValueError, RecursionError):
         raise CheckpointError(f"{file} is corrupt: not JSON") from None
@@ -154,11 +162,11 @@ def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:
 
 
 def read_json(folder: Path, name: str, limit: int = JSON_LIMIT) -> dict[str, Any]:
-    """Read a JSON object from a file that lies in a folder, links followed.
+    """Read a JSON object from a file in a folder; a link to a file outside the folder is refused.
 
     Raises:
-        CheckpointError: if the file cannot be read, or holds anything else.
-        FileNotFoundError: if it is not there.
+        CheckpointError: if the file cannot be read, or is not a JSON object.
+        FileNotFoundError: if it does not exist.
     """
     file = folder / name
     try:
@@ -171,21 +179,21 @@ def read_json(folder: Path, name: str, limit: int = JSON_LIMIT) -> dict[str, Any
 
 
 def require_inside(folder: Path, file: Path) -> None:
-    """Check that a file lies in a folder, links followed.
+    """Check that the real path of a file is inside a folder.
 
     Raises:
         OSError: if a link leads elsewhere.
     """
-    real = Path(os.path.realpath(file))  # where resolve() would raise something else for a link to itself
+    real = Path(os.path.realpath(file))  # resolve() raises RuntimeError for a link to itself
     if not real.is_relative_to(os.path.realpath(folder)):
         raise OSError(errno.ELOOP, "it is a link that leads elsewhere", str(file))
 
 
 def refuse_links(folder: Path) -> None:
-    """A run holds no links: what is written to it must not go elsewhere.
+    """Check that a folder of a run has no links: a write through one would change files outside the run.
 
     Raises:
-        CheckpointError: naming the first.
+        CheckpointError: with the first link.
     """
     try:
         links = sorted(entry.name for entry in os.scandir(folder) if entry.is_symlink())
@@ -195,39 +203,39 @@ def refuse_links(folder: Path) -> None:
         raise CheckpointError(f"{folder / links[0]} is a link; links in runs are not followed")
 
 
-class _Strict(ValueError):
-    """Valid JSON that is refused all the same."""
+class _StrictError(ValueError):
+    """Valid JSON that strict parsing refuses."""
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     value = dict(pairs)
     if len(value) != len(pairs):
         seen: set[str] = set()
         twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
-        raise _Strict(f"key '{twice[:40]}' stands there twice")
+        raise _StrictError(f"key '{twice[:40]}' appears twice")
     return value
 
 
-def _refuse(name: str) -> NoReturn:
-    raise _Strict(f"{name} is no number of JSON")
+def _refuse_constant(name: str) -> NoReturn:
+    raise _StrictError(f"{name} is not a JSON number")
 
 
-def _finite(text: str) -> float:
+def _finite_float(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise _Strict(f"number {text[:20]} is out of range")
+        raise _StrictError(f"number {text[:20]} is out of range")
     return value
 
 
-def _short(text: str) -> int:
-    if len(text) > _DIGITS:
-        raise _Strict(f"a number has {len(text)} digits")
+def _short_int(text: str) -> int:
+    if len(text) > _MAX_DIGITS:
+        raise _StrictError(f"a number has {len(text)} digits")
     return int(text)
 
 
-def _require_flat(value: object) -> None:
+def _check_depth(value: object) -> None:
     level = [value]
-    for _ in range(_DEPTH):
+    for _ in range(_MAX_DEPTH):
         level = [
             inner
             for outer in level
@@ -236,7 +244,4 @@ def _require_flat(value: object) -> None:
         ]
         if not level:
             return
-    raise _Strict(f"it is nested more than {_DEPTH} levels deep")
-
-
-_ODD = (errno.ELOOP, errno.ENXIO, errno.EISDIR)
+    raise _StrictError(f"it is nested more than {_MAX_DEPTH} levels deep")

@@ -1,4 +1,4 @@
-"""Archives of torch and Stable-Baselines3, read without unpickling anything that is not a tensor."""
+"""Reading of files saved by torch and Stable-Baselines3; nothing but tensors is unpickled."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ _ALLOWED = {
         for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Short", "Byte", "Bool")
     ),
 }
-"""Names that the pickle in a .pt file may contain; no other name is ever looked up."""
+"""Global names that the pickle in a .pt file may contain; a file with another name is refused."""
 _REFUSED_OPCODES = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "PERSID"}
 VEC_NORMALIZE_HINT = (
-    "a pickle runs the code of whoever wrote it, so none is opened; in a Python that trusts it:"
+    "a pickle can run code, so rlcli opens none; if you trust the file, convert it in Python:"
     " v = pickle.load(open('vecnormalize.pkl', 'rb')).obs_rms; safetensors.numpy.save_file("
     "{'mean': v.mean, 'var': v.var}, 'normalizer.safetensors'), then --normalizer normalizer.safetensors"
 )
 
 
 def read_archive_file(file: Path) -> bytes:
-    """Read a whole file, up to a share of the memory."""
+    """Read a whole file of at most 4 GiB and a quarter of the memory."""
     try:
         return read_file(file.resolve(), min(_MAX_BYTES, available_memory() // 4))
     except FileNotFoundError:
@@ -49,45 +49,46 @@ def read_archive_file(file: Path) -> bytes:
 
 
 def read_member(file: Path, name: str) -> bytes:
-    """Read a member of a zip, after a check of all members."""
+    """Read a member of a zip file after a check of all members."""
     data = read_archive_file(file)
     if data[:1] == b"\x80":
         raise CheckpointError(f"{file} is a pickle; it is not opened", hint=VEC_NORMALIZE_HINT)
     archive = _archive(data, str(file))
     if name not in archive.namelist():
-        raise CheckpointError(f"{file} has no {name}: it is not what Stable-Baselines3 saves")
+        raise CheckpointError(f"{file} has no {name}: Stable-Baselines3 did not save it")
     return _content(archive, name, str(file))
 
 
 def _archive(data: bytes, where: str) -> zipfile.ZipFile:
-    """Open a zip; check that all members are plain files of plausible sizes."""
+    """Open a zip file; check that all members are plain files of plausible sizes with safe names."""
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
         members = archive.infolist()
-    except Exception as error:  # untrusted numbers make zipfile raise many kinds of errors
-        raise CheckpointError(f"{where} is corrupt, or no zip: {one_line(error)}") from None
+    except Exception as error:  # zipfile raises many types of errors for malformed numbers
+        raise CheckpointError(f"{where} is corrupt or not a zip file: {one_line(error)}") from None
     if len(members) > _MAX_MEMBERS:
         raise CheckpointError(f"{where} has {len(members)} members")
     seen: set[str] = set()
     for member in members:
-        name, shown = member.filename, repr(member.filename[:60])
+        name = member.filename
         parts = re.split(r"[/\\]", name)
-        if name != member.orig_filename or ".." in parts or name[:1] in ("/", "\\", "") or ":" in name:
-            raise CheckpointError(f"{where} has a member {shown}, which leads out of it")
-        if name.casefold() in seen:
-            raise CheckpointError(f"{where} has two members {shown}")
+        outside = name != member.orig_filename or ".." in parts or name[:1] in ("/", "\\", "") or ":" in name
+        refused = {
+            "its path leads out of the file": outside,
+            "it appears twice": name.casefold() in seen,
+            "it is a link": stat.S_ISLNK(member.external_attr >> 16),
+            "it is encrypted": member.flag_bits & 1,
+            "its compression is not supported": member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED),
+            f"it grows more than {_MAX_RATIO} times unpacked": member.file_size
+            > _MAX_RATIO * max(member.compress_size, 1),
+        }
+        for reason, applies in refused.items():
+            if applies:
+                raise CheckpointError(f"{where} has a member {name[:60]!r} that is refused: {reason}")
         seen.add(name.casefold())
-        if stat.S_ISLNK(member.external_attr >> 16):
-            raise CheckpointError(f"{where} has a member {shown}, which is a link")
-        if member.flag_bits & 1:
-            raise CheckpointError(f"{where} has a member {shown}, which is encrypted")
-        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise CheckpointError(f"{where} has a member {shown}, which is packed in an uncommon way")
-        if member.file_size > _MAX_RATIO * max(member.compress_size, 1):
-            raise CheckpointError(f"{where} has a member {shown}, which grows more than {_MAX_RATIO} times unpacked")
-    total, most = sum(member.file_size for member in members), min(_MAX_BYTES, available_memory() // 4)
-    if total > most:
-        raise CheckpointError(f"{where} holds {total:,} bytes, at most {most:,} are read")
+    total, limit = sum(member.file_size for member in members), min(_MAX_BYTES, available_memory() // 4)
+    if total > limit:
+        raise CheckpointError(f"{where} holds {total:,} bytes, at most {limit:,} are read")
     return archive
 
 
@@ -104,31 +105,31 @@ def _content(archive: zipfile.ZipFile, name: str, where: str) -> bytes:
 
 
 def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
-    """Load nested dictionaries of tensors and numbers; the pickle inside may name nothing else."""
+    """Load nested dictionaries of tensors and numbers from a .pt file; a pickle with other types is refused."""
     if data[:4] != b"PK\x03\x04":
-        kind = "in the form of torch before 1.6, or a plain pickle" if data[:1] == b"\x80" else "no file of torch"
+        kind = "a plain pickle or a file of torch before 1.6" if data[:1] == b"\x80" else "not a torch file"
         raise CheckpointError(f"{where} is {kind}; it is not opened", hint="save it again with torch.save")
     archive = _archive(data, where)
     described = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
     if len(described) != 1 or archive.getinfo(described[0]).file_size > _PICKLE_LIMIT:
-        raise CheckpointError(f"{where} is no file of torch: it does not describe its tensors, or at great length")
+        raise CheckpointError(f"{where} is not a torch file: its data.pkl is missing, not unique or too large")
     _require_tensors_only(_content(archive, described[0], where), where)
     try:
         saved = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:
-        raise CheckpointError(f"{where} is corrupt, or holds more than tensors: {one_line(error, 300)}") from None
+        raise CheckpointError(f"{where} is corrupt or holds more than tensors: {one_line(error, 300)}") from None
     if not isinstance(saved, Mapping):
         raise CheckpointError(f"{where} holds no named tensors")
     return saved
 
 
 def _require_tensors_only(description: bytes, where: str) -> None:
-    """Check the instructions of a pickle without executing any."""
+    """Check the opcodes of a pickle without executing them."""
     try:
         for opcode, argument, _ in pickletools.genops(description):
             if opcode.name in _REFUSED_OPCODES or (opcode.name == "GLOBAL" and argument not in _ALLOWED):
-                what = f"names '{str(argument)[:80]}'" if argument is not None else "makes objects"
-                raise CheckpointError(f"{where} {what}, which is no tensor; nothing of it is loaded")
+                found = f"names '{str(argument)[:80]}'" if argument is not None else "creates objects"
+                raise CheckpointError(f"{where} {found}, which is not a tensor; nothing is loaded")
     except CheckpointError:
         raise
     except Exception as error:

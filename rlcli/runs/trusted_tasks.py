@@ -1,8 +1,8 @@
-"""Whose code may run: a run or a recording is data, and names code that is loaded only if the user has used it before.
+"""Trust in task code that a run or a recording names: it is loaded only if the user has used it before.
 
-Installed tasks are looked up among the installed ones. A task folder or a configuration in Python that a run names is
-another matter: whoever wrote the run chose it. It is loaded if this user has named it on a command line of this machine
-before; that is noted in a folder of the user's own, one file a task.
+Installed tasks are always trusted. A run may also name a task folder or a configuration in Python; its author chose
+them, so they are untrusted. They are loaded only after the user has named them on a command line of this machine. The
+user's state folder has one file for each task named so.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from rlcli.machine import read_plain
 from rlcli.registry import TaskSource, find_task, python_place
 from rlcli.runs.atomic_io import write_atomic
 
-_LONGEST = 16 * 1024
+_MAX_BYTES = 16 * 1024
 
 
 def named_task(name: str) -> TaskSource:
-    """A task that the user names to have its code run; from now on runs may name it too.
+    """Find a task that the user names on a command line, and trust its code in runs from now on.
 
     Raises:
         TaskError: if there is no such task.
@@ -35,30 +35,30 @@ def named_task(name: str) -> TaskSource:
 
 
 def is_known(record: Mapping[str, Any]) -> bool:
-    """Whether the user has named the folder or the Python configuration of a run's record before."""
+    """Return whether the user has named the folder or the Python configuration of a task's record before."""
     try:
         key = _key(record)
-        return read_plain(_file(key), _LONGEST) == key.encode()
-    except (OSError, RuntimeError, ValueError):  # none such; a loop of links; a name that cannot be one
+        return read_plain(_file(key), _MAX_BYTES) == key.encode()
+    except (OSError, RuntimeError, ValueError):  # no such file; a loop of links; an invalid name
         return False
 
 
-def place(record: Mapping[str, Any]) -> str:
-    """The code that a run's record names, as a command line would name it."""
+def named_code(record: Mapping[str, Any]) -> str:
+    """Return the task code that a record names, as it is written on a command line."""
     return str(record.get("python") or record["folder"])
 
 
 def _key(record: Mapping[str, Any]) -> str:
-    """The folder, or the file or package and the name in it, links resolved."""
+    """Return the real path of the folder or of the Python file, the latter with the attribute in it."""
     if not record.get("python"):
         return str(Path(str(record["folder"])).resolve())
-    path, attribute = python_place(str(record["python"]))  # as it will be loaded
+    path, attribute = python_place(str(record["python"]))  # resolved as the loader does it
     return f"{path}:{attribute}" if attribute else str(path)
 
 
 def _record_use(key: str) -> None:
     file = _file(key)
-    with contextlib.suppress(OSError, MachineError):  # a note that cannot be kept means naming the task again
+    with contextlib.suppress(OSError, MachineError):  # without the file the user has to name the task again
         if not file.exists():
             file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             write_atomic(file, key)
@@ -66,7 +66,7 @@ def _record_use(key: str) -> None:
 
 
 def _file(key: str) -> Path:
-    """Where the use of a task is noted."""
+    """Return the file that records the use of a task."""
     import platformdirs
 
     folder = os.environ.get("RLCLI_STATE_DIR") or platformdirs.user_state_dir("rlcli")

@@ -26,7 +26,7 @@ from rlcli.sim.state_cache import SimData
 if TYPE_CHECKING:
     from rlcli.scene.actuators import ActuatorModel
 
-_KINDS = {
+KINDS = {
     "Joints": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
     "Bodies": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
     "Sites": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
@@ -49,13 +49,13 @@ class Entity:
         self.engine = engine
         self.sim = sim
         model = engine.model
-        self.ids = {alias: _ids(model, name, kind, getattr(model, count)) for alias, (kind, count) in _KINDS.items()}
-        """Ids in the model by kind: Joints, Bodies, ..."""
+        self.ids = {alias: _ids(model, name, kind, getattr(model, count)) for alias, (kind, count) in KINDS.items()}
+        """Ids in the model, by kind: Joints, Bodies, ..."""
         self.ids["Joints"] = self.ids["Joints"][np.isin(model.jnt_type[self.ids["Joints"]], _SCALAR)]
         self.joint_ids, self.body_ids, self.site_ids = self.ids["Joints"], self.ids["Bodies"], self.ids["Sites"]
         self.actuator_ids, self.geom_ids = self.ids["Actuators"], self.ids["Geoms"]
-        self.names = {alias: _names(model, name, kind, self.ids[alias]) for alias, (kind, _) in _KINDS.items()}
-        """Names by kind, without the entity's prefix."""
+        self.names = {alias: _names(model, name, kind, self.ids[alias]) for alias, (kind, _) in KINDS.items()}
+        """Names without the entity's prefix, by kind."""
         self.joint_names = self.names["Joints"]
         self.qpos_columns = id_tensor(model.jnt_qposadr[self.joint_ids], engine.device)
         self.dof_columns = id_tensor(model.jnt_dofadr[self.joint_ids], engine.device)

@@ -24,7 +24,6 @@ from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DeviceError, RlcliError
 from rlcli.runs.bundle import open_bundle
-from rlcli.runs.checkpoint import open_checkpoint
 from rlcli.runs.restore import require_fit
 from rlcli.testing.episode_checks import first_difference
 from rlcli.testing.host_sync import HostSyncError, HostSyncGuard
@@ -146,18 +145,19 @@ def policy(subject: TaskUnderTest) -> Iterator[Finding]:
     if folder is None:
         raise NotRunError("the task ships none; rlcli export --format bundle writes one")
     try:
-        checkpoint, bundle = open_checkpoint(folder), open_bundle(folder)
-        checkpoint.policy()
-        one = resolve(subject.source, agent=bundle.agent, play=True, flags={"scene.num_envs": 1})
+        bundle = open_bundle(folder)
+        bundle.policy()
+        one = resolve(subject.source, agent=bundle.manifest.get("agent"), play=True, flags={"scene.num_envs": 1})
         env = make_env(one)
-        require_fit(checkpoint, env.layout)
+        require_fit(bundle, env.layout)
         env.close()
     except RlcliError as error:
         hint = "train again, and export the new policy as a bundle to the same folder"
         yield error_at(str(folder), error.message, hint)
         return
-    if bundle.task["name"] != subject.source.name:
-        message = f"is a policy for '{bundle.task['name']}'"
+    name = bundle.manifest["task"]["name"]
+    if name != subject.source.name:
+        message = f"is a policy for '{name}'"
         yield error_at(str(folder), message, f"export one of {subject.source.name}")
 
 

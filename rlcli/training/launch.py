@@ -15,7 +15,7 @@ from rlcli.errors import CheckpointError, DeviceError, UsageError
 from rlcli.machine import choose_device
 from rlcli.rl import distributed
 from rlcli.runs.provenance import environment_record, file_digest
-from rlcli.runs.run import RECORD, WAITING, Run, begin_run, create_run, open_run, require_own
+from rlcli.runs.run import RECORD, WAITING, Run, create_run, initialize_run, open_run, require_own
 from rlcli.settings import setting
 from rlcli.training.job import Job, TrainingResult, threads
 from rlcli.training.loggers import check_loggers
@@ -144,7 +144,7 @@ def prepare_run(folder: Path, request: TrainingRequest, changes: Sequence[str] =
         path = folder / file
         shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
     record = run_record(request, resolved, device)
-    begin_run(folder, to_yaml(to_data(resolved)), {**record, "state": WAITING}).unlock()
+    initialize_run(folder, to_yaml(to_data(resolved)), {**record, "state": WAITING}).unlock()
     return device
 
 

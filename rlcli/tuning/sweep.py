@@ -18,7 +18,7 @@ from rlcli.random import derive
 from rlcli.reporting.figures import check_drawing, scatter
 from rlcli.runs.atomic_io import disk_error, to_json, write_atomic
 from rlcli.runs.run import STUDY
-from rlcli.runs.study import read_study, write_summary
+from rlcli.runs.study import read_study
 from rlcli.tuning.optuna_storage import open_study, without_password
 from rlcli.tuning.search_space import Parameter, read_parameters
 
@@ -307,7 +307,7 @@ def draw_sweep(sweep: Sweep) -> Path:
     panels += [(p.key, [sweep.values(trial)[p.key] for trial in done], p.log) for p in sweep.parameters]
     values = [trial.value for trial in done if trial.value is not None]  # a finished trial has a value
     picture = scatter(panels, values, sweep.settings["objective"], title=sweep.folder.name)
-    return write_summary(sweep.folder, PICTURE, picture)
+    return write_atomic(sweep.folder / PICTURE, picture)
 
 
 def _require_same(place: object, known: Mapping[str, Any], settings: Mapping[str, Any]) -> None:

@@ -13,9 +13,10 @@ from rlcli.errors import CheckpointError, DependencyError
 from rlcli.reporting.curves import AXES, Curve, Line, gather
 from rlcli.reporting.figures import check_drawing, picture
 from rlcli.reporting.panels import choose
+from rlcli.runs.atomic_io import write_atomic
 from rlcli.runs.index import overview
 from rlcli.runs.run import open_run
-from rlcli.runs.study import create_study, read_study, runs_of, write_summary
+from rlcli.runs.study import create_study, read_study, runs_of
 from rlcli.training.launch import TrainingRequest, run_record
 from rlcli.training.subprocesses import train_all
 
@@ -134,7 +135,7 @@ def _summary(folder: Path, task: str, runs: Sequence[Path]) -> StudyResult:
         low, high = (None if end is None else float(end[-1]) for end in (line.low, line.high))
         result.together[name] = {"iqm": float(line.middle[-1]), "low": low, "high": high, "step": int(line.x[-1])}
     if found:
-        result.curves = write_summary(folder, CURVES, _csv(found))
+        result.curves = write_atomic(folder / CURVES, _csv(found))
         result.picture = _picture(folder, curves)
     return result
 
@@ -168,4 +169,4 @@ def _picture(folder: Path, curves: list[Curve]) -> Path | None:
     if not panels:
         return None
     drawn = picture(panels, AXES["steps"], ".svg", title=curves[0].label, note="")
-    return write_summary(folder, PICTURE, drawn)
+    return write_atomic(folder / PICTURE, drawn)

@@ -10,7 +10,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError
 from rlcli.rl.acting import Act, trained_policy
 from rlcli.runs.checkpoint import open_checkpoint, steps
-from rlcli.runs.restore import policy_of, require_fit
+from rlcli.runs.restore import require_fit
 from rlcli.runs.run import Run
 
 
@@ -48,7 +48,7 @@ class RunCheckpoints:
             raise CheckpointError(f"{folder} is not there any more")
         try:
             checkpoint = open_checkpoint(folder)
-            policy = policy_of(checkpoint)
+            policy = checkpoint.policy()
             require_fit(checkpoint, self.env.layout)
         except OSError as error:  # removed while it is read
             raise CheckpointError(f"{folder} cannot be read: {error.strerror or error}") from None

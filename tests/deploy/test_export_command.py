@@ -121,7 +121,6 @@ def test_an_exported_file_runs_without_rlcli(newest, tmp_path, suffix):
 
     from rlcli.deploy.export import export
     from rlcli.runs.checkpoint import open_checkpoint
-    from rlcli.runs.restore import policy_of
 
     checkpoint, file = open_checkpoint(newest("cartpole sac")), tmp_path / f"policy{suffix}"
     export(checkpoint, file, {".onnx": "onnx", ".pt2": "torch"}[suffix])
@@ -130,7 +129,7 @@ def test_an_exported_file_runs_without_rlcli(newest, tmp_path, suffix):
     result = python(RUN, file, tmp_path / "obs.npy", cwd=tmp_path, blocked={"rlcli", *MODULES})
     assert result.returncode == 0, result.stderr
     action = torch.from_numpy(np.load(tmp_path / "action.npy"))
-    torch.testing.assert_close(action, policy_of(checkpoint)(obs), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(action, checkpoint.policy()(obs), atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(torch.from_numpy(np.load(tmp_path / "command.npy")), 100.0 * action)
 
 

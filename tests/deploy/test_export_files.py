@@ -23,7 +23,7 @@ from rlcli.envs.make import make_env
 from rlcli.errors import VerdictError
 from rlcli.registry import find_task
 from rlcli.runs.checkpoint import open_checkpoint
-from rlcli.runs.restore import policy_of, resolve_run
+from rlcli.runs.restore import resolve_run
 from rlcli.runs.run import open_run
 from rlcli.runs.run_ref import find_run
 
@@ -39,7 +39,7 @@ def exported(newest, tmp_path):
         checkpoint = open_checkpoint(newest(task))
         file = tmp_path / f"policy{module.FORMATS[format_]}"
         done = export(checkpoint, file, format_)
-        policy = policy_of(checkpoint)
+        policy = checkpoint.policy()
         if format_ == "numpy":
             space = runpy.run_path(str(file))
             numpy_run = lambda obs: {k: torch.from_numpy(v) for k, v in space["run"]({"obs": obs.numpy()}).items()}  # noqa: E731
@@ -108,7 +108,7 @@ def test_outputs_stay_inside_the_bound_where_a_runtimes_tanh_does_not(newest, tm
 
 
 def test_the_deployed_policy_does_not_depend_on_the_batch(newest):
-    policy = policy_of(open_checkpoint(newest("cartpole")))
+    policy = open_checkpoint(newest("cartpole")).policy()
     observations = thousand(newest, "cartpole")
     whole = policy(observations)
     single = torch.cat([policy(row) for row in observations.split(1)])

@@ -19,7 +19,7 @@ TRAINED = {
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """trained(name) -> the folder of a run, trained once."""
+    """trained(name) -> the folder of a run, which is trained only once."""
     from rlcli.cli.app import main
 
     folder, runs = tmp_path_factory.mktemp("compared"), {}
@@ -34,7 +34,7 @@ def trained(tmp_path_factory):
     return find
 
 
-def test_a_policy_against_itself_is_no_better_and_no_different(cli, trained):
+def test_compare_a_policy_with_itself_finds_no_difference(cli, trained):
     run = trained("cartpole")
     done = cli("eval", "--compare", run, run, "--episodes", 20, "--json").json
     one, same = done["policies"]
@@ -45,7 +45,7 @@ def test_a_policy_against_itself_is_no_better_and_no_different(cli, trained):
         assert compared[metric]["improvement"] == {"probability": 0.5, "low": 0.5, "high": 0.5}
 
 
-def test_each_policy_has_the_numbers_of_its_own_evaluation(cli, trained):
+def test_compare_has_the_numbers_of_eval(cli, trained):
     run = trained("cartpole")
     done = cli("eval", "--compare", run, f"{run}@step:0", "lqr", "--episodes", 10, "--json").json
     assert [policy["policy"] for policy in done["policies"]] == ["trained", "trained", "lqr"]
@@ -55,8 +55,8 @@ def test_each_policy_has_the_numbers_of_its_own_evaluation(cli, trained):
         cli("eval", "--checkpoint", f"{run}@step:0", "--episodes", 10, "--num-envs", 10, "--json").json,
         cli("eval", "cartpole", "--policy", "lqr", "--episodes", 10, "--num-envs", 10, "--json").json,
     ]
-    for policy, said in zip(done["policies"], alone, strict=True):
-        assert {key: policy[key] for key in keys} == {key: said[key] for key in keys}
+    for policy, message in zip(done["policies"], alone, strict=True):
+        assert {key: policy[key] for key in keys} == {key: message[key] for key in keys}
     versus_lqr = done["comparisons"][1]
     assert (versus_lqr["left"], versus_lqr["right"]) == (str(run), "lqr")
     assert versus_lqr["return"]["improvement"]["probability"] < 0.2
@@ -66,7 +66,7 @@ def test_each_policy_has_the_numbers_of_its_own_evaluation(cli, trained):
     assert gap["mean"] == pytest.approx(means[0] - means[2])
 
 
-def test_where_chance_alone_decides_two_policies_share_it(cli, coin, only_run):
+def test_compare_uses_the_same_random_numbers(cli, coin, only_run):
     cli("train", coin, *SMALL, "--max-iterations", 1)
     run = only_run()
     done = cli("eval", "--compare", run, "zero", "--episodes", 100, "--json").json
@@ -75,7 +75,7 @@ def test_where_chance_alone_decides_two_policies_share_it(cli, coin, only_run):
     assert done["comparisons"][0]["success"]["improvement"]["probability"] == 0.5
 
 
-def test_what_is_shown(cli, trained):
+def test_compare_prints_a_table(cli, trained):
     run = trained("cartpole")
     done = cli("eval", "--compare", run, "zero", "--episodes", 4, "episode_length_s=0.5")
     assert done.code == 0, done.err
@@ -88,11 +88,11 @@ def test_what_is_shown(cli, trained):
     assert f"return: {run.name} - zero" in done.out
 
 
-def test_runs_whose_tasks_differ_are_refused_with_what_differs(cli, trained):
+def test_compare_refuses_tasks_with_different_settings(cli, trained):
     one, other = trained("cartpole"), trained("changed")
     done = cli("eval", "--compare", one, other)
     assert done.code == 3
-    assert "episode_length_s: 2.0, and in" in done.err
+    assert "episode_length_s: 2.0, but 5.0 in" in done.err
     assert "rewards.alive.weight: 3.0" in done.err
     assert done.err.count("error: ") == 2
     problems = json.loads(cli("eval", "--compare", one, other, "--json").out)["error"]["problems"]
@@ -101,20 +101,20 @@ def test_runs_whose_tasks_differ_are_refused_with_what_differs(cli, trained):
     assert cli("eval", "--compare", one, other, *alike, "--episodes", 2).code == 0
 
 
-def test_how_many_environments_a_run_was_trained_in_makes_no_difference(cli, trained):
+def test_compare_ignores_num_envs_of_the_training(cli, trained):
     one, other = trained("cartpole"), trained("other")
     assert cli("eval", "--compare", one, other, "--episodes", 2).code == 0
 
 
-def test_runs_of_other_tasks_are_refused(cli, trained):
+def test_compare_refuses_different_tasks(cli, trained):
     one, other = trained("cartpole"), trained("direct")
     done = cli("eval", "--compare", one, other)
     assert done.code == 2
-    assert "of the task cartpole, and" in done.err
-    assert "of cartpole-direct" in done.err
+    assert "is for the task cartpole, but" in done.err
+    assert "for cartpole-direct" in done.err
 
 
-def test_the_first_policy_is_the_one_that_must_not_fall_short(cli, trained):
+def test_limits_apply_to_the_first_policy(cli, trained):
     run = trained("cartpole")
     words = ("eval", "--compare", run, "lqr", "--episodes", 6, "--json")
     done = cli(*words, "--fail-under", "success=0.9")
@@ -124,18 +124,18 @@ def test_the_first_policy_is_the_one_that_must_not_fall_short(cli, trained):
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "message"),
     [
-        ((), 2, "--compare: with what?"),
-        (("nowhere",), 2, "--compare nowhere: with what?"),
-        (("lqr", "zero"), 2, "none of these is a run"),
+        ((), 2, "--compare needs at least two policies, found: (none)"),
+        (("nowhere",), 2, "--compare needs at least two policies, found: nowhere"),
+        (("lqr", "zero"), 2, "--compare needs at least one run"),
         (("nowhere", "zero"), 5, "no run 'nowhere'"),
         (("a", "b", "--checkpoint", "c"), 2, "as words"),
         (("a", "b", "--policy", "zero"), 2, "as words"),
         (("a", "b", "--record", "x.safetensors"), 2, "as words"),
     ],
 )
-def test_mistakes_are_one_message_and_a_code(cli, words, code, said):
+def test_compare_usage_errors(cli, words, code, message):
     done = cli("eval", "--compare", *words)
     assert done.code == code, done.err
-    assert said in done.err
+    assert message in done.err

@@ -1,4 +1,4 @@
-"""Evaluation against episodes whose mix is known, and intervals against published values."""
+"""Evaluation of episodes with known lengths and causes, and intervals against published values."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from rlcli.rl.statistics import EpisodeStatistics
 
 
 @pytest.mark.parametrize("episodes", [1, 3, 4, 10])
-def test_exactly_as_many_episodes_as_asked_the_first_of_each_environment(make, scheduled, episodes):
+def test_evaluate_runs_the_first_episodes_of_each_environment(make, scheduled, episodes):
     env, _ = make(scheduled)
     result = evaluate(env, zero_policy(env), episodes)
     assert len(result.returns) == episodes
@@ -24,7 +24,7 @@ def test_exactly_as_many_episodes_as_asked_the_first_of_each_environment(make, s
     assert sum(result.truncated) == share[1]
 
 
-def test_causes_are_shares_of_the_episodes(make, scheduled):
+def test_summary_has_rates_of_terminations(make, scheduled):
     env, _ = make(scheduled)
     summary = evaluate(env, zero_policy(env), 8).summary()
     shares = {name: share["rate"] for name, share in summary["terminations"].items()}
@@ -33,7 +33,7 @@ def test_causes_are_shares_of_the_episodes(make, scheduled):
     assert "success" not in summary
 
 
-def test_how_well_commands_are_followed_is_a_mean_over_episodes(make):
+def test_summary_has_means_of_command_metrics(make):
     env, _ = make("quadruped-flat", "scene.num_envs=4", "episode_length_s=0.2")
     seen = []
 
@@ -55,7 +55,7 @@ def test_how_well_commands_are_followed_is_a_mean_over_episodes(make):
     )
 
 
-def test_groups_of_environments_run_as_many_episodes_each_and_are_told_apart(make, scheduled):
+def test_groups_run_equal_numbers_of_episodes(make, scheduled):
     env, _ = make(scheduled, "scene.num_envs=8")
     result = evaluate(env, zero_policy(env), 6, groups=2)
     alone = evaluate(make(scheduled)[0], zero_policy(make(scheduled)[0]), 6)
@@ -66,7 +66,7 @@ def test_groups_of_environments_run_as_many_episodes_each_and_are_told_apart(mak
     assert result.part(4, 8).summary()["episodes"] == 6
 
 
-def test_episodes_that_never_end_are_a_configuration_error(make):
+def test_episode_without_end_raises_config_error(make):
     env, _ = make("cartpole", "scene.num_envs=2", "episode_length_s=0.1", "terminations.time_out=null",
                   "terminations.cart_out_of_bounds=null")  # fmt: skip
     with pytest.raises(ConfigError, match="has not ended") as caught:
@@ -74,7 +74,7 @@ def test_episodes_that_never_end_are_a_configuration_error(make):
     assert "time_out: true" in str(caught.value)
 
 
-def test_random_actions_fill_the_bound_and_repeat_with_the_seed(make, scheduled):
+def test_random_policy_fills_the_bound_and_repeats_with_its_seed(make, scheduled):
     env, _ = make(scheduled, "scene.num_envs=500")
     actions = [random_policy(env, 0.5, 7)(torch.zeros(500, 2)) for _ in range(2)]
     assert torch.equal(*actions)
@@ -82,7 +82,7 @@ def test_random_actions_fill_the_bound_and_repeat_with_the_seed(make, scheduled)
     assert float(random_policy(env, None, 7)(torch.zeros(500, 2)).std()) == pytest.approx(1.0, abs=0.15)
 
 
-def test_statistics_name_what_rsl_rl_names(make):
+def test_statistics_have_the_names_of_rsl_rl(make):
     env, _ = make("cartpole", "scene.num_envs=3", "episode_length_s=0.1")
     statistics = EpisodeStatistics(env.config.episode_length_s)
     env.reset(seed=1)

@@ -1,4 +1,4 @@
-"""The linear-quadratic regulator against equations solved by hand, on the cartpoles, and where there is none."""
+"""The linear-quadratic regulator: equations solved by hand, the cartpoles, and tasks without a regulator."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ success: {func: joints_near, joints: [slide], tolerance: 0.1, hold_s: 0.1}
 
 @pytest.fixture
 def task(tmp_path):
-    """task(*overrides) -> a block that slides, resolved."""
+    """task(*overrides) -> configuration of a sliding block."""
 
     def make(*overrides, more="", text=TASK):
         (tmp_path / "task.yaml").write_text(text)
@@ -41,20 +41,20 @@ def task(tmp_path):
     return make
 
 
-def test_a_scalar_riccati_equation():
+def test_riccati_of_a_scalar_system():
     # p = q + a^2 p r / (r + b^2 p) with a = b = q = r = 1: p^2 = p + 1, the golden ratio; k = p / (1 + p)
     one = np.ones((1, 1))
     golden = (1 + 5**0.5) / 2
     assert riccati(one, one, one, one)[0, 0] == pytest.approx(golden / (1 + golden))
 
 
-def test_what_cannot_be_held_has_no_gain():
+def test_riccati_returns_none_if_not_stabilisable():
     unstable = np.diag([1.1, 0.9])
     assert riccati(unstable, np.array([[0.0], [1.0]]), np.eye(2), np.eye(1)) is None
 
 
 @pytest.mark.parametrize("bound", [1.0, 4.0, None])
-def test_the_gain_of_a_block_is_that_of_its_equations(task, bound):
+def test_regulator_gain_of_a_sliding_block(task, bound):
     # 2 kg at 20 N: v+ = v + 0.1 u, x+ = x + 0.01 v+ (semi-implicit Euler)
     a, b = np.array([[1.0, 0.01], [0.0, 1.0]]), np.array([[0.001], [0.1]])
     wanted = riccati(a, b, np.eye(2), np.eye(1) / (bound or 1.0) ** 2)
@@ -67,7 +67,7 @@ def test_the_gain_of_a_block_is_that_of_its_equations(task, bound):
     assert found.poles[0] < 1.0
 
 
-def test_actions_stay_within_the_bound(task):
+def test_regulator_clamps_actions_to_the_bound(task):
     resolved = task()
 
     class Env:
@@ -79,7 +79,7 @@ def test_actions_stay_within_the_bound(task):
 
 
 @pytest.mark.parametrize("name", ["cartpole", "cartpole-direct"])
-def test_it_balances_the_cartpoles(name):
+def test_regulator_balances_the_cartpoles(name):
     resolved = resolve(find_task(name), play=True, overrides=["scene.num_envs=60", "sim.engine_threads=1"])
     bound = resolved.agent.action_bound
     (found,) = run_points(resolved, regulator(resolved, bound).acting, [], [None], 60, 42)
@@ -87,29 +87,29 @@ def test_it_balances_the_cartpoles(name):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "more", "said"),
+    ("overrides", "more", "output"),
     [
         (["success=null"], "", "defines no success"),
-        (["success.target=1.0"], "", "not where it succeeds"),
+        (["success.target=1.0"], "", "does not succeed at its default state"),
         (["observations.policy.pos=null"], "", "do not determine the state: slide"),
         (["observations.policy.vel=null", "observations.policy.pos.history=1"], "", "the velocity of slide"),
-        ([], '<body name="ball" pos="0 0 1"><joint type="ball"/><geom size="0.1"/></body>', "turns freely"),
+        ([], '<body name="ball" pos="0 0 1"><joint type="ball"/><geom size="0.1"/></body>', "a ball joint"),
         (
             [],
             '<body name="arm" pos="0 0 1"><joint name="swing" axis="0 1 0"/><geom size="0.1" pos="0.3 0 0"/></body>',
-            "no equilibrium: the velocity of swing moves",
+            "not an equilibrium: the velocity of swing moves",
         ),
     ],
 )
-def test_where_there_is_none_the_reason_is_said(task, overrides, more, said):
+def test_regulator_refuses_a_task_with_the_reason(task, overrides, more, output):
     with pytest.raises(UsageError) as caught:
         regulator(task(*overrides, more=more), 1.0)
-    assert said in caught.value.message
+    assert output in caught.value.message
     assert "there is no LQR of" in caught.value.message
 
 
 @pytest.mark.slow
-def test_on_the_other_engine_it_is_the_same_regulator_and_variants_have_the_same_numbers():
+def test_regulator_is_equal_on_the_warp_engine():
     found = {}
     for engine in ("batch", "warp"):
         settings = ["scene.num_envs=3", f"sim.engine={engine}", "sim.engine_threads=1", "episode_length_s=0.7"]

@@ -1,4 +1,4 @@
-"""What a stress test changes, against numbers worked out by hand, in real environments."""
+"""Perturbations of a stress test in real environments, against values computed by hand."""
 
 import pytest
 import torch
@@ -48,7 +48,7 @@ BALL = """
 
 @pytest.fixture
 def world(tmp_path):
-    """world(*overrides, shared_streams=...) -> an environment, reset."""
+    """world(*overrides, shared_streams=...) -> an environment after a reset."""
 
     def make(*overrides, shared_streams=0, model=MODEL, task=TASK):
         (tmp_path / "task.yaml").write_text(task)
@@ -61,19 +61,19 @@ def world(tmp_path):
 
 
 def perturb(env, text, *values):
-    """Sweeps `NAME=...` whose values are given for each environment."""
+    """Apply a sweep `NAME=...` with a value for each environment."""
     sweeps = read_sweeps([text], 5)
     return Perturbations(env, sweeps, torch.tensor(values, dtype=torch.float64)[:, None])
 
 
 def speeds(env, steps=1, action=0.0, joint=0):
-    """Velocity of a joint after some steps. (num_envs,)"""
+    """Return the velocity of a joint after some steps. (num_envs,)"""
     for _ in range(steps):
         env.step(torch.full((env.num_envs, env.layout.action_size), action))
     return env.engine.field("qvel")[:, joint].clone()
 
 
-def test_gravity_by_a_factor_and_as_it_is_said(world):
+def test_gravity_as_a_factor_and_as_a_value(world):
     env = world("scene.entities.robot.joints.slide.damping=0")
     perturb(env, "gravity=0:3", 1.0, 0.0, 2.0, 3.0)
     assert speeds(env).tolist() == pytest.approx([-0.1, 0.0, -0.2, -0.3])
@@ -82,7 +82,7 @@ def test_gravity_by_a_factor_and_as_it_is_said(world):
     assert speeds(env).tolist() == pytest.approx([-0.01, -0.02, -0.0981, -0.1])
 
 
-def test_a_mass_takes_its_inertia_with_it(world):
+def test_mass_scales_its_inertia(world):
     env = world()
     alike = speeds(env, 1, 1.0, joint=1)
     env = world()
@@ -95,7 +95,7 @@ def test_a_mass_takes_its_inertia_with_it(world):
     assert speeds(env, 1, 1.0, joint=1).tolist() == pytest.approx((alike / torch.tensor([1.0, 2.0, 8.0, 1.0])).tolist())
 
 
-def test_constants_that_derive_from_a_mass_follow_it(world):
+def test_mass_updates_derived_constants(world):
     env = world()
     perturb(env, "body_mass=0.5:2", 1.0, 0.5, 2.0, 1.0)
     alone = float(env.engine.model.body_subtreemass[1])
@@ -104,7 +104,7 @@ def test_constants_that_derive_from_a_mass_follow_it(world):
     )
 
 
-def test_damping_friction_gains_and_limits(world):
+def test_damping_friction_gains_and_effort_limits(world):
     env = world()
     perturb(env, "joint_damping.slide=1:4", 1.0, 2.0, 4.0, 0.0)
     assert env.engine.expanded("dof_damping")[:, 0].tolist() == [0.5, 1.0, 2.0, 0.0]
@@ -130,7 +130,7 @@ def test_damping_friction_gains_and_limits(world):
     assert (speeds(env, 1, -100.0, joint=1) / plain).tolist() == pytest.approx([-1.0, -0.5, -2.0, -3.0])
 
 
-def test_any_field_of_the_model_by_its_name(world):
+def test_model_field_by_its_name(world):
     env = world()
     perturb(env, "dof_armature.hinge=abs:0:2", 0.0, 0.5, 1.0, 2.0)
     assert env.engine.expanded("dof_armature")[:, 1].tolist() == [0.0, 0.5, 1.0, 2.0]
@@ -139,7 +139,7 @@ def test_any_field_of_the_model_by_its_name(world):
     assert env.engine.expanded("geom_size")[:, 2, 1].tolist() == pytest.approx([0.1, 0.15, 0.2, 0.1])
 
 
-def test_what_an_event_of_the_task_draws_is_scaled_once_whenever_it_is_drawn(world):
+def test_values_drawn_by_events_are_scaled_once(world):
     drawn = (
         "events.mass={func: randomize_body_mass, mode: reset, bodies: [arm], operation: set, range: [2.0, 6.0]}",
         "events.damp={func: randomize_joint_damping, mode: interval, interval_range_s: [0.03, 0.03],"
@@ -163,7 +163,7 @@ def test_what_an_event_of_the_task_draws_is_scaled_once_whenever_it_is_drawn(wor
     assert len(masses) == 4  # drawn anew in each of the four episodes
 
 
-def test_sweeps_of_the_same_values_multiply_once_in_any_order(world):
+def test_sweeps_of_one_field_multiply_in_any_order(world):
     event = (
         "events.mass={func: randomize_body_mass, mode: reset, bodies: [arm], operation: set, range: [2.0, 6.0],"
         " with_inertia: false}"
@@ -189,7 +189,7 @@ def test_sweeps_of_the_same_values_multiply_once_in_any_order(world):
 
 
 class Counting:
-    """A policy that counts its steps, and notes what it sees."""
+    """Policy whose action is the step number, and that stores its observations."""
 
     def __init__(self, env):
         self.env, self.seen = env, []
@@ -199,8 +199,8 @@ class Counting:
         return torch.full((self.env.num_envs, 1), float(len(self.seen)))
 
 
-def played(env, perturbed, steps):
-    """What was done, and what would have been seen. (steps, num_envs, k) each"""
+def run_policy(env, perturbed, steps):
+    """Return the perturbed actions and the unperturbed observations. (steps, num_envs, k) each"""
     obs, done, shown = env.reset(seed=3)["policy"], [], []
     for _ in range(steps):
         shown.append(obs.clone())
@@ -210,19 +210,19 @@ def played(env, perturbed, steps):
     return torch.stack(done), torch.stack(shown)
 
 
-def test_actions_come_some_steps_late_and_none_before_an_episodes_first(world):
+def test_action_delay_starts_with_zero(world):
     env = world()
-    done, _ = played(env, perturb(env, "action_delay=0:3", 0, 1, 2, 3).around(Counting(env)), 23)
+    done, _ = run_policy(env, perturb(env, "action_delay=0:3", 0, 1, 2, 3).around(Counting(env)), 23)
     for row in range(4):
         # episodes of ten steps: at the begin of each nothing has come through yet
         wanted = [float(t + 1 - row) if t % 10 >= row else 0.0 for t in range(23)]
         assert done[:, row, 0].tolist() == wanted
 
 
-def test_observations_come_some_steps_late_and_an_episode_begins_with_its_first(world):
+def test_observation_delay_repeats_the_first_observation(world):
     env = world("events.start={func: reset_joints_by_offset, mode: reset, position: [-1.0, 1.0]}")
     policy = Counting(env)
-    _, shown = played(env, perturb(env, "observation_delay=0:3", 0, 1, 2, 3).around(policy), 23)
+    _, shown = run_policy(env, perturb(env, "observation_delay=0:3", 0, 1, 2, 3).around(policy), 23)
     seen = torch.stack(policy.seen)
     for row in range(4):
         for t in range(23):
@@ -230,11 +230,11 @@ def test_observations_come_some_steps_late_and_an_episode_begins_with_its_first(
             assert torch.equal(seen[t, row], shown[late, row]), (row, t)
 
 
-def test_noise_has_the_size_that_is_said_and_none_where_it_is_0(world):
+def test_noise_has_its_standard_deviation(world):
     env = world("scene.num_envs=400")
     policy = Counting(env)
     values = [0.0] * 200 + [0.3] * 200
-    done, shown = played(env, perturb(env, "observation_noise=0:1", *values).around(policy), 10)
+    done, shown = run_policy(env, perturb(env, "observation_noise=0:1", *values).around(policy), 10)
     noise = torch.stack(policy.seen) - shown
     assert torch.equal(noise[:, :200], torch.zeros_like(noise[:, :200]))
     assert float(noise[:, 200:].std()) == pytest.approx(0.3, rel=0.05)
@@ -243,22 +243,22 @@ def test_noise_has_the_size_that_is_said_and_none_where_it_is_0(world):
     assert done[:, 0, 0].tolist() == [float(t + 1) for t in range(10)]
 
 
-def test_a_term_alone_may_be_noisy_or_late(world):
+def test_noise_and_delay_of_a_single_term(world):
     env = world()
     policy = Counting(env)
-    _, shown = played(env, perturb(env, "observation_noise.vel=0:1", 1.0, 1.0, 1.0, 1.0).around(policy), 5)
+    _, shown = run_policy(env, perturb(env, "observation_noise.vel=0:1", 1.0, 1.0, 1.0, 1.0).around(policy), 5)
     changed = (torch.stack(policy.seen) != shown).any(dim=0).any(dim=0).tolist()
     assert changed == [False, False, True, True]
     env = world()
     policy = Counting(env)
-    _, shown = played(env, perturb(env, "observation_noise.pos.hinge=0:1", 1.0, 1.0, 1.0, 1.0).around(policy), 5)
+    _, shown = run_policy(env, perturb(env, "observation_noise.pos.hinge=0:1", 1.0, 1.0, 1.0, 1.0).around(policy), 5)
     assert (torch.stack(policy.seen) != shown).any(dim=0).any(dim=0).tolist() == [False, True, False, False]
 
 
-def test_equal_lives_meet_equal_noise_and_equal_pushes(world):
+def test_shared_streams_get_equal_noise_and_pushes(world):
     env = world(shared_streams=2)
     policy = Counting(env)
-    played(env, perturb(env, "observation_noise=0:1", 0.5, 0.5, 0.5, 0.5).around(policy), 5)
+    run_policy(env, perturb(env, "observation_noise=0:1", 0.5, 0.5, 0.5, 0.5).around(policy), 5)
     seen = torch.stack(policy.seen)
     assert torch.equal(seen[:, :2], seen[:, 2:])
     assert not torch.equal(seen[:, 0], seen[:, 1])
@@ -269,7 +269,7 @@ def test_equal_lives_meet_equal_noise_and_equal_pushes(world):
         assert torch.equal(turning[:2], turning[2:])
 
 
-def test_a_joint_is_pushed_once_in_the_first_half_of_an_episode(world):
+def test_joint_is_pushed_once_in_the_first_half_of_an_episode(world):
     env = world("scene.num_envs=40")
     perturb(env, "push.hinge=0:5", *([0.0] * 20 + [3.0] * 20))
     speed = torch.stack([speeds(env, joint=1) for _ in range(9)])
@@ -281,7 +281,7 @@ def test_a_joint_is_pushed_once_in_the_first_half_of_an_episode(world):
     assert int((jumps.abs() > 1.0).nonzero()[:, 0].max()) <= 5
 
 
-def test_what_floats_is_pushed_sideways(world):
+def test_floating_entity_is_pushed_horizontally(world):
     env = world("scene.num_envs=30", "sim.gravity=[0, 0, 0]", model=BALL)
     perturb(env, "push=0:5", *([2.0] * 30))
     for _ in range(9):
@@ -293,33 +293,33 @@ def test_what_floats_is_pushed_sideways(world):
 
 
 @pytest.mark.parametrize(
-    ("text", "said", "hint"),
+    ("text", "output", "hint"),
     [
         ("body_mas.arm=1:2", "there is no parameter 'body_mas'", "did you mean 'body_mass'"),
         ("body_mass.amr=1:2", "no body matches 'amr'", "did you mean 'arm'"),
         ("joint_damping.hing=1:2", "no joint matches 'hing'", "did you mean 'hinge'"),
-        ("joint_damping.hinge=1:2", "it is 0 of hinge", "abs:"),
-        ("body_mass.weightless=1:2", "0 of weightless", "abs:"),
+        ("joint_damping.hinge=1:2", "its value is 0 for hinge", "abs:"),
+        ("body_mass.weightless=1:2", "0 for weightless", "abs:"),
         ("effort_limit.slide=1:2", "no actuator matches 'slide'", "hinge"),
-        ("gravity.arm=1:2", "of the whole world", "leave the name out"),
+        ("gravity.arm=1:2", "to the whole world", "leave the name out"),
         ("tendon_stiffness=1:2", "the model has no tendons", None),
         ("geom_size.rod=abs:1:2", "3 values each", "leave out abs:"),
         ("observation_noise.poss=0:1", "no observation matches 'poss'", "did you mean 'pos'"),
         ("action_delay.trun=0:1", "no action matches 'trun'", "did you mean 'turn'"),
-        ("push=0:1", "nothing floats", "push.NAME"),
+        ("push=0:1", "no entity floats", "push.NAME"),
         ("push.hing=0:1", "matches 'hing'", "hinge"),
-        ("push..*=0:1", "names 2", "push one of them"),
+        ("push..*=0:1", "matches 2", "name one of them"),
     ],
 )
-def test_what_cannot_be_perturbed_is_named_with_what_can(world, text, said, hint):
+def test_invalid_perturbation_is_refused_with_a_hint(world, text, output, hint):
     env = world()
     with pytest.raises(UsageError) as caught:
         perturb(env, text, 1.0, 1.0, 1.0, 1.0)
-    assert said in caught.value.message
+    assert output in caught.value.message
     assert hint is None or hint in (caught.value.hint or "")
 
 
-def test_without_gravity_there_is_none_to_scale(world):
+def test_gravity_factor_without_gravity_is_refused(world):
     env = world("sim.gravity=[0, 0, 0]")
-    with pytest.raises(UsageError, match="0 of the world"):
+    with pytest.raises(UsageError, match="0 for the world"):
         perturb(env, "gravity=1:2", 1.0, 1.0, 1.0, 1.0)

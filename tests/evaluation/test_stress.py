@@ -1,4 +1,4 @@
-"""`rlcli stress`: variants of a task, one after the other in numbers, all at once in one engine."""
+"""`rlcli stress`: variants of a task that are simulated together and equal separate evaluations."""
 
 import json
 import sys
@@ -18,18 +18,18 @@ SMALL = ("scene.num_envs=8", "sim.engine_threads=1", "agent.torch_threads=1", "-
 
 
 def of(document, **at):
-    """The numbers of one variant."""
+    """Return the summary of one variant."""
     (found,) = [
         point for point in document["points"] if point["at"] == {k.replace("__", "."): v for k, v in at.items()}
     ]
     return found
 
 
-def test_as_it_is_and_at_factor_1_it_is_exactly_what_eval_says(cli):
+def test_nominal_and_factor_1_equal_eval(cli):
     done = cli("stress", *LQR, "--sweep", "body_mass.pole=1,3", "--sweep", "action_delay=0,2", "--episodes", 12)
-    said = cli("eval", *LQR, "--episodes", 12, "--num-envs", 12).json
+    message = cli("eval", *LQR, "--episodes", 12, "--num-envs", 12).json
     keys = ("episodes", "return", "length", "success", "reward_terms", "terminations", "diverged")
-    numbers = {key: said[key] for key in keys}
+    numbers = {key: message[key] for key in keys}
     assert {key: done.json["nominal"][key] for key in keys} == numbers
     point = of(done.json, body_mass__pole=1.0, action_delay=0.0)
     assert {key: point[key] for key in keys} == numbers
@@ -37,26 +37,26 @@ def test_as_it_is_and_at_factor_1_it_is_exactly_what_eval_says(cli):
     assert len({json.dumps(value) for value in others}) == 4  # and every other variant is another one
 
 
-def test_chance_in_the_actions_is_the_same_in_every_variant(cli, only_run):
+def test_stochastic_actions_are_equal_in_every_variant(cli, only_run):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     for words in (("cartpole", "--policy", "random"), ("--checkpoint", only_run(), "--stochastic")):
         done = cli("stress", *words, *SHORT, "--sweep", "body_mass.pole=1,8", "--episodes", 6, "--json").json
-        said = cli("eval", *words, *SHORT, "--episodes", 6, "--num-envs", 6, "--json").json["return"]
-        assert done["nominal"]["return"] == of(done, body_mass__pole=1.0)["return"] == said
-        assert of(done, body_mass__pole=8.0)["return"] != said
+        message = cli("eval", *words, *SHORT, "--episodes", 6, "--num-envs", 6, "--json").json["return"]
+        assert done["nominal"]["return"] == of(done, body_mass__pole=1.0)["return"] == message
+        assert of(done, body_mass__pole=8.0)["return"] != message
 
 
-def test_fewer_environments_than_episodes_are_eval_with_as_many(cli):
+def test_fewer_envs_than_episodes_equals_eval(cli):
     done = cli("stress", *LQR, *SHORT, "--sweep", "gravity=1,2", "--episodes", 7, "--num-envs", 3).json
-    said = cli("eval", *LQR, *SHORT, "--episodes", 7, "--num-envs", 3).json
+    message = cli("eval", *LQR, *SHORT, "--episodes", 7, "--num-envs", 3).json
     assert done["num_envs"] == 3
     words = ("scene.num_envs=3", "--sweep", "gravity=1,2", "--episodes", 7)
     assert cli("stress", *LQR, *SHORT, *words).json["points"] == done["points"]
-    assert done["nominal"]["return"] == said["return"]
-    assert of(done, gravity=1.0)["return"] == said["return"]
+    assert done["nominal"]["return"] == message["return"]
+    assert of(done, gravity=1.0)["return"] == message["return"]
 
 
-def test_a_task_of_chance_has_the_same_luck_in_every_variant(cli, coin):
+def test_random_task_draws_equal_numbers_in_every_variant(cli, coin):
     arguments = ("stress", coin, "--policy", "zero", "--json", "--episodes", 200)
     done = cli(*arguments, "--sweep", "body_mass=0.5:2", "--sweep", "action_delay=0:2").json
     rates = [done["nominal"]["success"], *(point["success"] for point in done["points"])]
@@ -67,7 +67,7 @@ def test_a_task_of_chance_has_the_same_luck_in_every_variant(cli, coin):
 
 
 @pytest.mark.slow
-def test_success_falls_with_pole_mass_and_with_delay(cli):
+def test_success_decreases_with_pole_mass_and_delay(cli):
     sweeps = ("--sweep", "body_mass.pole=1:16:3", "--sweep", "action_delay=0:2")
     done = cli("stress", *LQR, *sweeps, "--episodes", 100).json
     rate = {tuple(point["at"].values()): point["success"] for point in done["points"]}
@@ -79,7 +79,7 @@ def test_success_falls_with_pole_mass_and_with_delay(cli):
                 assert rate[heavier, later]["low"] <= here["high"]
 
 
-def test_the_known_answer_stands_beside_it(cli):
+def test_against_lqr_adds_its_results(cli):
     words = ("stress", "cartpole", "--policy", "zero", "--against", "lqr", "--sweep", "gravity=1,1.5", "--episodes", 8)
     done = cli(*words, "sim.engine_threads=1", "--json").json
     assert done["nominal"]["success"]["rate"] == 0.0
@@ -94,7 +94,7 @@ def test_the_known_answer_stands_beside_it(cli):
     assert "worst of the grid: gravity" in text
 
 
-def test_the_worst_case_decides_and_a_search_may_find_a_worse_one(cli):
+def test_limits_apply_to_the_worst_variant_and_search(cli):
     words = (
         "stress",
         *LQR,
@@ -126,7 +126,7 @@ def test_the_worst_case_decides_and_a_search_may_find_a_worse_one(cli):
     )
 
 
-def test_it_repeats_with_its_seed(cli):
+def test_stress_repeats_with_its_seed(cli):
     words = (
         "stress",
         "cartpole",
@@ -143,7 +143,7 @@ def test_it_repeats_with_its_seed(cli):
     assert one == same != other
 
 
-def test_a_task_without_success_is_judged_by_its_return(cli, coin):
+def test_task_without_success_uses_the_return(cli, coin):
     words = ("stress", coin, "success=null", "--policy", "zero", "--sweep", "gravity=abs:0:1:2", "--episodes", 4)
     done = cli(*words)
     assert done.code == 2  # the task has no gravity, so that it has no direction
@@ -156,20 +156,20 @@ def test_a_task_without_success_is_judged_by_its_return(cli, coin):
     assert "defines no success" in done.err
 
 
-def test_a_run_a_checkpoint_or_a_task_is_stressed(cli, only_run):
+def test_stress_accepts_run_checkpoint_and_task(cli, only_run):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     run = only_run()
     tail = (*SHORT, "--sweep", "body_mass.pole=1:2:2", "--episodes", 2, "--json")
     words = ((run,), (run.name,), ("latest",), (f"{run}@step:128",), ("cartpole",), ("--checkpoint", run))
-    said = [cli("stress", *word, *tail).json for word in words]
-    assert {document["checkpoint"] for document in said} == {f"{run}/checkpoints/000000000128"}
-    assert all(document["points"] == said[0]["points"] for document in said)
-    assert cli("stress", f"{run}@step:0", *tail).json["points"] != said[0]["points"]
+    message = [cli("stress", *word, *tail).json for word in words]
+    assert {document["checkpoint"] for document in message} == {f"{run}/checkpoints/000000000128"}
+    assert all(document["points"] == message[0]["points"] for document in message)
+    assert cli("stress", f"{run}@step:0", *tail).json["points"] != message[0]["points"]
     assert not (run / "evaluations").exists()
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "message"),
     [
         ((), 2, "stress what?"),
         (("cartpole",), 2, "sweep what?"),
@@ -188,15 +188,15 @@ def test_a_run_a_checkpoint_or_a_task_is_stressed(cli, only_run):
         (("ant-direct", "--policy", "lqr", "--sweep", "gravity=1:2"), 2, "no LQR of ant-direct"),
     ],
 )
-def test_mistakes_are_one_message_and_a_code(cli, words, code, said):
+def test_stress_usage_errors(cli, words, code, message):
     done = cli("stress", *words)
     assert done.code == code, done.err
-    assert said in done.err
+    assert message in done.err
     assert json.loads(cli("stress", *words, "--json").out)["error"]["exit_code"] == code
     assert not list(Path().iterdir())
 
 
-def test_without_matplotlib_the_pip_line_is_said(cli, monkeypatch):
+def test_missing_matplotlib_error_has_the_pip_line(cli, monkeypatch):
     import importlib.util
 
     real = importlib.util.find_spec
@@ -207,7 +207,7 @@ def test_without_matplotlib_the_pip_line_is_said(cli, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["map.png", "map.svg"])
-def test_the_map_is_drawn(cli, name):
+def test_heat_map_is_written(cli, name):
     words = ("stress", *LQR[:-1], "--sweep", "body_mass.pole=1:2:2", "--sweep", "push.slider_to_cart=0:1:3", *SHORT)
     words += ("--against", "zero", "--episodes", 2)
     done = cli(*words, "-o", name)
@@ -228,7 +228,7 @@ def test_the_map_is_drawn(cli, name):
 # --- maps ---
 
 
-def test_a_map_of_three_sweeps_shows_the_worst_over_the_third():
+def test_heat_map_of_three_sweeps_shows_the_worst_of_the_third():
     sweeps = read_sweeps(["gravity=1,2", "action_delay=0:2", "push=0,1"], 5)
     values = {at: at[0] + 10 * at[1] - 100 * at[2] for at in grid(sweeps)}
     found = heat_map("success", sweeps, values)
@@ -239,13 +239,13 @@ def test_a_map_of_three_sweeps_shows_the_worst_over_the_third():
     assert (found.share(found.low), found.share(found.high)) == (0.0, 1.0)
 
 
-def test_a_map_of_one_sweep_is_a_row():
+def test_heat_map_of_one_sweep_is_a_row():
     sweeps = read_sweeps(["gravity=1,2,3"], 5)
     found = heat_map("success", sweeps, {(1.0,): 0.5, (2.0,): 0.2, (3.0,): 0.9})
     assert (found.rows, found.columns, found.cells) == (("",), ("1", "2", "3"), ((0.5, 0.2, 0.9),))
 
 
-def test_on_a_terminal_the_map_has_colours(capfd, monkeypatch):
+def test_heat_map_on_a_terminal_has_colours(capfd, monkeypatch):
     sweeps = read_sweeps(["gravity=1,2"], 5)
     found = heat_map("success", sweeps, {(1.0,): 1.0, (2.0,): 0.0})
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)

@@ -1,4 +1,4 @@
-"""What `--sweep` takes, and the values that it stands for."""
+"""Parsing of `--sweep`, and its values."""
 
 import pytest
 
@@ -27,16 +27,16 @@ def read(text, points=5):
         ("geom_size.ball=1:4", 3, (1.0, 2.0, 4.0)),  # a field of the model
     ],
 )
-def test_the_values_of_a_sweep(text, points, values):
+def test_read_sweeps_values(text, points, values):
     assert read(text, points).values == pytest.approx(values, rel=1e-11)
 
 
-def test_a_factor_of_1_between_ends_is_exactly_1():
+def test_geometric_middle_is_exactly_1():
     assert 1.0 in read("body_mass=0.8:1.25", 3).values
     assert 1.0 in read("body_mass=0.1:10", 5).values
 
 
-def test_name_element_and_neutral_value():
+def test_sweep_name_element_and_neutral_value():
     sweep = read("body_mass.left_(foot|toe)=0.5:2")
     assert (sweep.parameter, sweep.element, sweep.name) == ("body_mass", "left_(foot|toe)", "body_mass.left_(foot|toe)")
     assert sweep.neutral == 1.0
@@ -44,19 +44,19 @@ def test_name_element_and_neutral_value():
     assert read("action_delay=0:1").neutral == 0.0
 
 
-def test_the_grid_is_every_combination():
+def test_grid_is_every_combination():
     sweeps = read_sweeps(["gravity=1,2", "action_delay=0:2"], 5)
     assert grid(sweeps) == [(1, 0), (1, 1), (1, 2), (2, 0), (2, 1), (2, 2)]
 
 
 @pytest.mark.parametrize("text", ["body_mass=0.5:2", "gravity=0:3", "action_delay=0:7", "joint_damping=abs:2:9"])
-def test_shares_of_the_way_are_undone(text):
+def test_share_inverts_between(text):
     sweep = read(text)
     assert [sweep.between(sweep.share(value)) for value in sweep.values] == pytest.approx(sweep.values)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "output"),
     [
         ("body_mass", "is not NAME=LOW:HIGH"),
         ("=1:2", "is not NAME=LOW:HIGH"),
@@ -67,24 +67,24 @@ def test_shares_of_the_way_are_undone(text):
         ("body_mass=1:inf", "'inf' is not a number"),
         ("body_mass=nan", "'nan' is not a number"),
         ("body_mass=1:2:3:4", "a range is"),
-        ("body_mass=1:2:x", "no number of points"),
+        ("body_mass=1:2:x", "is not a number of points"),
         ("body_mass=1:2:1", "1 points"),
         ("body_mass=1:2:99999", "99999 points"),
         ("body_mass=0:2", "cannot have no mass"),
         ("gravity=-1:1", "cannot be -1"),
-        ("body_mass=1,1", "stands there twice"),
-        ("action_delay=0.5:2", "whole steps"),
-        ("action_delay=0:5000", "whole steps"),
-        ("action_noise=abs:0:1", "absolute anyhow"),
-        ("actuator_gain=abs:0:1", "is a factor"),
+        ("body_mass=1,1", "appears twice"),
+        ("action_delay=0.5:2", "whole numbers of steps"),
+        ("action_delay=0:5000", "whole numbers of steps"),
+        ("action_noise=abs:0:1", "is always absolute"),
+        ("actuator_gain=abs:0:1", "is always a factor"),
     ],
 )
-def test_what_is_no_sweep_is_a_usage_error(text, said):
+def test_invalid_sweep_raises_usage_error(text, output):
     with pytest.raises(UsageError) as caught:
         read(text)
-    assert said in caught.value.message
+    assert output in caught.value.message
 
 
-def test_a_parameter_is_swept_once():
+def test_repeated_parameter_raises_usage_error():
     with pytest.raises(UsageError, match="swept twice"):
         read_sweeps(["gravity=1:2", "gravity=1:3"], 5)

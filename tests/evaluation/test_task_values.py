@@ -1,4 +1,4 @@
-"""What a task measures of itself, in evaluations: means over each episode, intervals, and limits on both sides."""
+"""Metrics of a task in evaluations: means over each episode, intervals, and limits on both sides."""
 
 import pytest
 import torch
@@ -69,7 +69,7 @@ def meter(tmp_path):
     return "./meter"
 
 
-def test_values_are_means_over_each_episode_then_over_episodes(cli, meter):
+def test_values_are_means_over_steps_then_over_episodes(cli, meter):
     values = cli("eval", meter, *ZERO, "--episodes", 8, "--json").json["values"]
     assert sorted(values) == ["clock", "everywhere", "pair"]
     # episodes of n steps have a mean of (n + 1) / 2, and each environment lives two of equal length
@@ -79,15 +79,15 @@ def test_values_are_means_over_each_episode_then_over_episodes(cli, meter):
     assert values["everywhere"] == {"mean": 7.0, "std": 0.0, "low": 7.0, "high": 7.0}
 
 
-def test_what_commands_measure_is_among_them(cli, tmp_path):
+def test_values_include_command_metrics(cli, tmp_path):
     command = {"func": "uniform_velocity", "resampling_time_s": [10.0, 10.0],
                "lin_vel_x": [1.0, 1.0], "lin_vel_y": [0.0, 0.0], "ang_vel_z": [0.0, 0.0]}  # fmt: skip
     write(tmp_path / "critter", edited(CRITTER_TASK, commands={"walk": command}), critter_xml=CRITTER)
-    said = cli("eval", "./critter", *ZERO, "--episodes", 4, "--json", "--fail-over", "error_vel_xy=0.1")
-    assert said.code == 9, said.err
-    assert said.json["values"]["walk/error_vel_xy"]["mean"] > 0.1
-    assert said.json["failures"][0].startswith("error_vel_xy is ")
-    assert said.json["failures"][0].endswith(", above 0.1")
+    message = cli("eval", "./critter", *ZERO, "--episodes", 4, "--json", "--fail-over", "error_vel_xy=0.1")
+    assert message.code == 9, message.err
+    assert message.json["values"]["walk/error_vel_xy"]["mean"] > 0.1
+    assert message.json["failures"][0].startswith("error_vel_xy is ")
+    assert message.json["failures"][0].endswith(", above 0.1")
 
 
 @pytest.mark.parametrize(
@@ -103,15 +103,15 @@ def test_what_commands_measure_is_among_them(cli, tmp_path):
         (("--fail-over", "terminations.task=0.9"), ["terminations.task is 1, above 0.9"]),
     ],
 )  # fmt: skip
-def test_a_value_beyond_its_limit_is_a_negative_verdict(cli, meter, limits, failed):
+def test_value_beyond_its_limit_exits_9(cli, meter, limits, failed):
     done = cli("eval", meter, *ZERO, "--episodes", 8, "--json", *limits)
     assert done.code == (9 if failed else 0), done.err
     assert len(done.json["failures"]) == len(failed)
-    assert all(said.startswith(begin) for said, begin in zip(done.json["failures"], failed, strict=True))
+    assert all(message.startswith(begin) for message, begin in zip(done.json["failures"], failed, strict=True))
 
 
 @pytest.mark.parametrize(
-    ("limit", "said"),
+    ("limit", "message"),
     [
         (("--fail-under", "clok=1"), "the task logs no value 'clok'"),
         (("--fail-under", "clok=1"), "did you mean 'clock'?"),
@@ -120,12 +120,12 @@ def test_a_value_beyond_its_limit_is_a_negative_verdict(cli, meter, limits, fail
         (("--fail-over", "lenght=1"), "--fail-over 'lenght=1' is not"),
     ],
 )
-def test_a_limit_of_a_value_that_there_is_not_is_a_usage_error(cli, meter, limit, said):
+def test_limit_of_an_unknown_value_is_a_usage_error(cli, meter, limit, message):
     done = cli("eval", meter, *ZERO, "--episodes", 4, *limit)
-    assert (done.code, said in done.err) == (2, True), done.err
+    assert (done.code, message in done.err) == (2, True), done.err
 
 
-def test_a_value_that_is_not_finite_is_not_known(cli, meter, tmp_path):
+def test_value_that_is_not_finite_is_null(cli, meter, tmp_path):
     file = tmp_path / "meter" / "task.py"
     file.write_text(
         file.read_text().replace('self.extras["everywhere"] = 7', 'self.extras["everywhere"] = float("nan")')
@@ -136,8 +136,8 @@ def test_a_value_that_is_not_finite_is_not_known(cli, meter, tmp_path):
     assert "not finite" in cli("eval", meter, *ZERO, "--episodes", 4).out
 
 
-def test_the_ants_speed_is_the_distance_over_the_time(cli):
-    said = cli("eval", "ant-direct", *ZERO, "--episodes", 4, "--json", "episode_length_s=0.5").json
+def test_ant_speed_is_distance_over_time(cli):
+    message = cli("eval", "ant-direct", *ZERO, "--episodes", 4, "--json", "episode_length_s=0.5").json
     resolved = resolve(find_task("ant-direct"), play=True, flags={"scene.num_envs": 4, "episode_length_s": 0.5})
     env = make_env(resolved, seed=derive(42, "evaluation"))
     env.reset()
@@ -151,11 +151,11 @@ def test_the_ants_speed_is_the_distance_over_the_time(cli):
     env.observers.add(Speed())
     for _ in range(30):
         env.step(torch.zeros(4, 8))
-    assert said["length"]["mean"] == 30.0
-    assert said["values"]["speed"]["mean"] == pytest.approx(float(gained[-1].mean()), abs=1e-3)
+    assert message["length"]["mean"] == 30.0
+    assert message["values"]["speed"]["mean"] == pytest.approx(float(gained[-1].mean()), abs=1e-3)
 
 
-def test_an_evaluation_leaves_the_observers_of_the_environment_as_they_were():
+def test_evaluate_restores_the_observers():
     env = make_env(resolve(find_task("cartpole"), flags={"scene.num_envs": 2}))
     records = []
 

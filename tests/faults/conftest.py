@@ -1,4 +1,4 @@
-"""What the suites of faults share."""
+"""Fixtures of the fault tests."""
 
 import pytest
 from support.child_processes import warm_parent
@@ -6,6 +6,6 @@ from support.child_processes import warm_parent
 
 @pytest.fixture(scope="session")
 def child():
-    """Starts commands as forked children of one warm parent."""
+    """Return a launcher of commands in processes that are forked from one initialised parent."""
     with warm_parent() as start:
         yield start

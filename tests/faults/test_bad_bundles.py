@@ -1,4 +1,4 @@
-"""Bundles from strangers: refused as checkpoints are, in one sentence; nothing is executed, changed or used up."""
+"""Untrusted bundles: refused with one message; no code is executed, no file is changed, memory is limited."""
 
 import json
 import pickle
@@ -10,7 +10,7 @@ import torch
 from support.bad_checkpoints import PLAYED, Bomb, Case, forged, named, setting
 from support.fault_sizes import amount, chosen
 from support.saved_states import rehash
-from test_bad_checkpoints import command, limited, look
+from test_bad_checkpoints import command, run_with_limits, snapshot
 
 from rlcli.cli.app import main
 from rlcli.errors import CheckpointError
@@ -21,8 +21,8 @@ HELD = ("manifest.json", "policy.json", "policy.safetensors")
 
 
 @pytest.fixture
-def gift(tmp_path, monkeypatch):
-    """A good bundle, whose policy normalises."""
+def bundle_folder(tmp_path, monkeypatch):
+    """A valid bundle whose policy has a normaliser."""
     monkeypatch.chdir(tmp_path)
     folder = shutil.copytree(find_task("cartpole").policy, tmp_path / "a" / "b" / "gift")
     spec = json.loads((folder / "policy.json").read_text())
@@ -36,14 +36,14 @@ def gift(tmp_path, monkeypatch):
     return folder
 
 
-def test_the_bundle_that_is_damaged_below_is_a_good_one(gift, capfd):
+def test_undamaged_bundle_is_accepted(bundle_folder, capfd):
     for reader in ("play", "eval", "export"):
-        assert main(command(reader, gift)) == 0
+        assert main(command(reader, bundle_folder)) == 0
     capfd.readouterr()
 
 
-def own():
-    """Damages of what only a bundle says."""
+def bundle_damages():
+    """Return damages of the entries that only a bundle has."""
     for name, *change in (
         ("bundle 2", "bundle", 2), ("bundle true", "bundle", True), ("bundle text", "bundle", "1"),
         ("no task", "task", None), ("task text", "task", "cartpole"), ("task ..", "task", "name", ".."),
@@ -65,23 +65,23 @@ def own():
 
 
 def applies(case):
-    """Whether a damage is one of what a bundle has: its folder is not named after a step."""
+    """Return whether a damage can occur in a bundle: its folder is not named after a step."""
     return case.run == "ppo" and "play" in case.readers and case.name != "step 7"
 
 
 CASES = [case for case in named() if applies(case)]
 
 
-@pytest.mark.parametrize("case", [*chosen(CASES, 40), *own()], ids=lambda case: case.name)
-def test_it_is_refused_in_one_sentence_and_stays_as_it_was(case, gift, capfd):
-    case.damage(gift)
-    before = look(gift)
+@pytest.mark.parametrize("case", [*chosen(CASES, 40), *bundle_damages()], ids=lambda case: case.name)
+def test_damaged_bundle_is_refused_and_unchanged(case, bundle_folder, capfd):
+    case.damage(bundle_folder)
+    before = snapshot(bundle_folder)
     readers = {"play", "export"} & set(case.readers)
     if case.name == "layout step_dt 5.0":  # a plausible number: only the task knows that it is not its own
         readers = {"play"}
     for reader in sorted(readers):
-        arguments = command(reader, gift)
-        code = limited(arguments) if case.bomb else main(arguments)
+        arguments = command(reader, bundle_folder)
+        code = run_with_limits(arguments) if case.bomb else main(arguments)
         out, err = capfd.readouterr()
         assert code == 5, f"{case.name}, {reader}: exit {code}\n{err}"
         assert "Traceback" not in err
@@ -90,27 +90,27 @@ def test_it_is_refused_in_one_sentence_and_stays_as_it_was(case, gift, capfd):
         assert len(errors) == 1, err
         assert "gift" in errors[0]
         assert len(errors[0]) < 1000, "a message is no copy of the file"
-        assert (out, look(gift)) == ("", before)
-        assert not (gift.parents[2] / "executed").exists()
+        assert (out, snapshot(bundle_folder)) == ("", before)
+        assert not (bundle_folder.parents[2] / "executed").exists()
 
 
 @pytest.mark.parametrize("case", list(forged(amount(10, 200))), ids=lambda case: case.name)
-def test_with_hashes_that_agree_it_is_refused_or_a_policy_like_any_other(case, gift):
-    if not (gift / case.name.split()[1]).is_file():
+def test_rehashed_bundle_is_refused_or_gives_a_valid_policy(case, bundle_folder):
+    if not (bundle_folder / case.name.split()[1]).is_file():
         assert case.name.split()[1] not in HELD  # it is of a file that a bundle does not have
         return
-    case.damage(gift)
+    case.damage(bundle_folder)
     try:
-        policy = open_checkpoint(gift).policy()
+        policy = open_checkpoint(bundle_folder).policy()
     except CheckpointError:
         return
     assert all(bool(value.isfinite().all()) for value in policy.state_dict().values())
 
 
-def test_pickles_beside_the_policy_are_not_read(gift, capfd):
+def test_pickles_beside_the_policy_are_not_read(bundle_folder, capfd):
     for name in ("policy.pkl", "policy.pt", "trainer.safetensors"):
-        (gift / name).write_bytes(pickle.dumps(Bomb()))
-    assert main(command("play", gift)) == 0
-    assert main(command("export", gift)) == 0
+        (bundle_folder / name).write_bytes(pickle.dumps(Bomb()))
+    assert main(command("play", bundle_folder)) == 0
+    assert main(command("export", bundle_folder)) == 0
     capfd.readouterr()
-    assert not (gift.parents[2] / "executed").exists()
+    assert not (bundle_folder.parents[2] / "executed").exists()

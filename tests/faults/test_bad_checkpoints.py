@@ -1,4 +1,4 @@
-"""Checkpoints and runs from strangers: refused in one sentence; nothing is executed, changed or used up."""
+"""Untrusted checkpoints and runs: refused with one message; no code runs, no file changes, memory is limited."""
 
 import hashlib
 import json
@@ -44,7 +44,7 @@ def runs(tmp_path_factory) -> dict[str, Path]:
 
 @pytest.fixture
 def stage(runs, tmp_path, monkeypatch):
-    """A case -> a copy of its run's folder with the damage done to the newest checkpoint, and that checkpoint."""
+    """stage(case) -> a copy of its run with the damage in the newest checkpoint, and that checkpoint."""
     monkeypatch.chdir(tmp_path)
     threads = torch.get_num_threads()
 
@@ -60,7 +60,7 @@ def stage(runs, tmp_path, monkeypatch):
 
 
 def command(reader: str, folder: Path | str, run: str = "ppo") -> list[str]:
-    """The command line of a reader."""
+    """Return the command line of a reader."""
     task = "cartpole" if run == "ppo" else "cartpole-direct"
     other = Path.cwd() / "other"
     return {
@@ -75,8 +75,8 @@ def command(reader: str, folder: Path | str, run: str = "ppo") -> list[str]:
     }[reader]  # fmt: skip
 
 
-def look(folder: Path) -> dict[str, str]:
-    """Everything below a folder; what is no plain file by its kind."""
+def snapshot(folder: Path) -> dict[str, str]:
+    """Return the content of all files below a folder; for special files, their type."""
     found = {}
     for path in sorted(folder.rglob("*")):
         kind = path.lstat().st_mode & 0o170000
@@ -88,10 +88,10 @@ def look(folder: Path) -> dict[str, str]:
 
 
 def refuse(case: Case, reader: str, run: Path, folder: Path, capfd) -> None:
-    """The reader says in one sentence what is wrong with which file, and leaves everything as it is."""
-    before = look(run)
+    """Check that the reader reports one error with the file, and changes nothing."""
+    before = snapshot(run)
     capfd.readouterr()
-    code = limited(command(reader, folder, case.run)) if case.bomb else main(command(reader, folder, case.run))
+    code = run_with_limits(command(reader, folder, case.run)) if case.bomb else main(command(reader, folder, case.run))
     out, err = capfd.readouterr()
     assert code == 5, f"{case.name}, {reader}: exit {code}\n{err}"
     assert "Traceback" not in err
@@ -100,7 +100,7 @@ def refuse(case: Case, reader: str, run: Path, folder: Path, capfd) -> None:
     assert run.name in errors[0] or "checkpoints" in errors[0], errors
     assert len(errors[0]) < 1000, "a message is no copy of the file"
     assert out == ""
-    assert look(run) == before
+    assert snapshot(run) == before
     assert not Path("executed").exists()
     assert not list(Path("other").rglob("*.pt2"))
     assert not list(Path("other").rglob("run.json")), "a run that did not begin was left"
@@ -121,14 +121,14 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def limited(arguments: list[str]) -> int:
-    """Run a command in a process that gets one GiB more than it has once torch is there, and 60 s."""
+def run_with_limits(arguments: list[str]) -> int:
+    """Run a command in a process with a limit of 60 s and of one GiB above its memory after the import of torch."""
     done = subprocess.run([sys.executable, "-c", LIMITED, *arguments], timeout=200)  # a fork of this one could hang
     return done.returncode
 
 
 def with_reader(cases):
-    """Each case with one of those who must refuse it, all of them in turn."""
+    """Return each case with one of the readers that must refuse it, in turn."""
     turn = cycle(range(60))
     return [(case, case.readers[next(turn) % len(case.readers)]) for case in cases]
 
@@ -138,13 +138,13 @@ DAMAGED = with_reader(cut_and_flipped(amount(4, 36, 700)))
 
 
 @pytest.mark.parametrize(("case", "reader"), [pytest.param(c, r, id=f"{c.name}-{r}"[:80]) for c, r in NAMED + DAMAGED])
-def test_it_is_refused_in_one_sentence_and_the_run_is_as_it_was(case, reader, stage, capfd):
+def test_damaged_checkpoint_is_refused_and_the_run_unchanged(case, reader, stage, capfd):
     run, folder = stage(case)
     refuse(case, reader, run, folder, capfd)
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, id=c.name) for c in forged(amount(7, 60, 700))])
-def test_with_hashes_that_agree_it_is_refused_or_a_policy_like_any_other(case, stage):
+def test_rehashed_checkpoint_is_refused_or_gives_a_valid_policy(case, stage):
     _, folder = stage(case)
     try:
         checkpoint = open_checkpoint(folder)
@@ -157,7 +157,7 @@ def test_with_hashes_that_agree_it_is_refused_or_a_policy_like_any_other(case, s
     assert state.values["env_steps"] == checkpoint.step
 
 
-def test_a_file_that_the_manifest_does_not_list_is_not_read(stage):
+def test_file_missing_in_the_manifest_is_not_read(stage):
     def damage(folder):
         torch.save(Bomb(), folder / "policy.pt")
         (folder / "optimizer.pkl").write_bytes(b"\x80\x04garbage")
@@ -169,7 +169,7 @@ def test_a_file_that_the_manifest_does_not_list_is_not_read(stage):
 
 
 @pytest.mark.parametrize("reader", ["eval", "init", "resume"])
-def test_a_run_is_read_from_its_newest_good_checkpoint_and_that_is_said(reader, stage, capfd):
+def test_newest_valid_checkpoint_is_used_with_a_warning(reader, stage, capfd):
     def damage(folder):
         (folder / "policy.safetensors").write_bytes(b"gone")
 
@@ -177,20 +177,20 @@ def test_a_run_is_read_from_its_newest_good_checkpoint_and_that_is_said(reader, 
     older = run / "checkpoints" / "000000000000"
     assert main([*command(reader, run), "-q"] if reader != "init" else command(reader, run)) == 0
     err = capfd.readouterr().err
-    assert f"warning: checkpoint {folder.name} is passed over: {folder}/policy.safetensors is corrupt" in err
+    assert f"warning: checkpoint {folder.name} is skipped: {folder}/policy.safetensors is corrupt" in err
     if reader == "resume":
         assert older.is_dir()
         open_checkpoint(run / "checkpoints" / "000000000256").state()
         assert not folder.exists()
 
 
-def test_what_only_resuming_needs_does_not_keep_a_policy_from_playing(stage, capfd):
+def test_play_ignores_damage_of_the_training_state(stage, capfd):
     run, folder = stage(Case("", lambda folder: (folder / "rng.safetensors").unlink(), ()))
     assert main(command("eval", run)) == 0
     assert f"{folder.name} (as named, its newest checkpoint)" in capfd.readouterr().err
 
 
-def test_a_run_without_a_good_checkpoint_is_refused(stage, capfd):
+def test_run_without_a_valid_checkpoint_is_refused(stage, capfd):
     def damage(folder):
         for file in folder.parent.glob("*/policy.json"):
             file.write_text("{")
@@ -203,7 +203,7 @@ def test_a_run_without_a_good_checkpoint_is_refused(stage, capfd):
 
 
 @pytest.mark.parametrize(("name", "reader"), chosen([(n, r) for n in LINKS for r in ("eval", "resume")], 4))
-def test_a_run_with_links_is_refused_and_what_they_lead_to_is_untouched(name, reader, stage, tmp_path, capfd):
+def test_run_with_links_is_refused_and_targets_unchanged(name, reader, stage, tmp_path, capfd):
     run, _ = stage(Case("", lambda folder: None, ()))
     own, precious = run / name, tmp_path / "precious"
     if own.exists():
@@ -211,15 +211,15 @@ def test_a_run_with_links_is_refused_and_what_they_lead_to_is_untouched(name, re
     else:
         precious.mkdir()
     own.symlink_to(precious)
-    before = look(precious) if precious.is_dir() else precious.read_bytes()
+    before = snapshot(precious) if precious.is_dir() else precious.read_bytes()
     assert main(command(reader, run)) == 5
     err = capfd.readouterr().err
     assert name in err
     assert "a link" in err
-    assert (look(precious) if precious.is_dir() else precious.read_bytes()) == before
+    assert (snapshot(precious) if precious.is_dir() else precious.read_bytes()) == before
 
 
-def test_what_a_file_says_commands_no_terminal(stage, capfd):
+def test_control_characters_of_a_file_are_not_printed(stage, capfd):
     def damage(folder):
         document = json.loads((folder / "manifest.json").read_text())
         document["layout"]["observations"]["policy"][0]["name"] = "\x1b[2J\x1b]0;title\x07\x9b31m"
@@ -238,7 +238,7 @@ def test_what_a_file_says_commands_no_terminal(stage, capfd):
      b'{"task": {"name": "cartpole"}, "seed": 1}', b'{"task": {"name": "cartpole", "folder": "."}, "seed": "x"}',
      b'{"task": {}, "task": {}}', b'{"seed": ' + b"1" * 30 + b"}"], 4),
 )  # fmt: skip
-def test_a_record_that_makes_no_sense_is_refused(record, stage, capfd):
+def test_malformed_run_record_is_refused(record, stage, capfd):
     run, folder = stage(Case("", lambda folder: None, ()))
     (run / "run.json").write_bytes(record)
     assert main(command("resume", folder)) == 5

@@ -1,4 +1,4 @@
-"""Bad YAML: each mistake is said with its file, line and column and exit code 3, and no bytes get past the reader."""
+"""Invalid YAML: each mistake is reported with file, line, column and exit code 3, for any bytes."""
 
 import copy
 import json
@@ -23,7 +23,7 @@ BUILT_IN = [
     find_task(entry.qualified).config.read_bytes() for entry in catalog(TASKS)[0] if entry.distribution == "rlcli"
 ]
 
-# --- named: what follows the good task, and where the mistake is in it (line 0: the file as a whole) ---
+# --- named mistakes: text after a valid task, and the position of the mistake (line 0: the whole file) ---
 
 NAMED = {
     "a key twice": ("x: {}\nx: {}\n", 2, 1),
@@ -61,7 +61,7 @@ NAMED = {
 
 
 @pytest.mark.parametrize("name", chosen(list(NAMED), 12))
-def test_a_file_that_is_not_strict_yaml_is_refused_where_the_mistake_is(name, tmp_path, capsys, monkeypatch):
+def test_invalid_yaml_is_refused_with_line_and_column(name, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text, line, column = NAMED[name]
     file = tmp_path / "task.yaml"
@@ -79,14 +79,14 @@ def test_a_file_that_is_not_strict_yaml_is_refused_where_the_mistake_is(name, tm
     assert not (tmp_path / "canary").exists()
 
 
-# --- three a field of the schema: wrong type, out of range, an unknown sibling ---
+# --- three mistakes for each field of the schema: wrong type, out of range, unknown sibling ---
 
 WRONG = [{"zz": 1}, [[]], "no such thing", True, 3]
 OUT_OF_RANGE = [-1, 0, -1.5, 10**12, 1e12, -1e12]
 
 
 def models(annotation):
-    """The one model that an annotation stands for, if it does."""
+    """Return the model that an annotation stands for, if it stands for one."""
     found = [
         kind for kind in (annotation, *get_args(annotation)) if isinstance(kind, type) and issubclass(kind, BaseModel)
     ]
@@ -123,7 +123,7 @@ def changed(data, path, value):
 
 
 def mistakes(model, at=()):
-    """(path, value): of every field a value of another type, one out of its range, and a key beside it."""
+    """Yield (path, value) for every field: another type, a value out of range, and an unknown key beside it."""
     for path, info in fields(model):
         wrong = next((value for value in WRONG if refuses(info, value)), None)
         if wrong is not None:
@@ -148,7 +148,7 @@ assert len(MISTAKES) + len(NAMED) >= 277, len(MISTAKES)
 
 
 @pytest.mark.parametrize("number", chosen(range(len(MISTAKES)), 40))
-def test_a_mistake_in_any_field_is_said_at_its_place(number, tmp_path, monkeypatch):
+def test_invalid_value_of_any_field_is_reported_at_its_position(number, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path, value = MISTAKES[number]
     data = strict_yaml.load(GOOD).data
@@ -173,7 +173,7 @@ def test_a_mistake_in_any_field_is_said_at_its_place(number, tmp_path, monkeypat
     assert any(place in wanted for place in places), (path, value, caught.value.message)
 
 
-# --- bytes ---
+# --- random bytes ---
 
 PIECES = [
     b"&a ", b"*a", b"!!python/name:os.system ", b"{", b"[", b"]", b"}", b"---\n", b": ", b"\t", b"\xc3", b"? ",
@@ -206,7 +206,7 @@ BATCH = 2000
 
 
 @pytest.mark.parametrize("seed", range(amount(1, 10, 500)))
-def test_any_bytes_give_a_mapping_or_a_syntax_error(seed):
+def test_random_bytes_give_a_mapping_or_a_syntax_error(seed):
     draw, read = random.Random(seed), 0
     for _ in range(BATCH):
         data = mutant(draw)
@@ -222,7 +222,7 @@ def test_any_bytes_give_a_mapping_or_a_syntax_error(seed):
 
 
 @pytest.mark.parametrize("seed", range(amount(1, 5, 50)))
-def test_any_bytes_of_a_task_give_a_configuration_or_problems_at_their_places(seed, tmp_path, monkeypatch):
+def test_mutated_task_gives_a_configuration_or_problems(seed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "task"
     folder.mkdir()

@@ -1,4 +1,4 @@
-"""Every way in which a simulation, a term or a learner goes wrong is found at once, named, and kept to itself."""
+"""Injected divergences of simulation, terms and learner: detected at once, named and isolated."""
 
 import math
 
@@ -17,7 +17,7 @@ CASES = [(name, who) for name in FAULTS for who in WHO]
 
 
 @pytest.mark.parametrize(("name", "who"), chosen(CASES, 14))
-def test_a_simulation_that_goes_wrong_is_found_named_dumped_and_kept_from_the_others(tmp_path, caplog, name, who):
+def test_diverged_environment_is_detected_dumped_and_isolated(tmp_path, caplog, name, who):
     fault = FAULTS[name]
     sound, sick = pair(tmp_path, fault)
     CrashDumper(sick, tmp_path / "dumps")
@@ -62,7 +62,7 @@ def test_a_simulation_that_goes_wrong_is_found_named_dumped_and_kept_from_the_ot
 
 
 @pytest.mark.parametrize("name", ["nan qpos", "nan ctrl", "engine error", "reset writes nan", "nan timestep"])
-def test_all_environments_that_go_wrong_at_once_end_and_begin_anew(tmp_path, caplog, name):
+def test_divergence_of_all_environments_resets_them(tmp_path, caplog, name):
     fault = FAULTS[name]
     _, env = pair(tmp_path, fault)
     CrashDumper(env, tmp_path / "dumps")
@@ -92,9 +92,7 @@ TERMS = {
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 @pytest.mark.parametrize(("what", "who"), chosen([(what, who) for what in TERMS for who in WHO], 4))
-def test_a_term_or_an_action_that_is_not_finite_stops_with_its_name_before_it_is_accumulated(
-    tmp_path, what, who, value
-):
+def test_term_or_action_that_is_not_finite_raises_with_its_name(tmp_path, what, who, value):
     _, env = pair(tmp_path, FAULTS["nan qpos"])
     env.step(torch.zeros(N, 2))
     before = {name: values.clone() for name, values in env.reward_manager.state_dict().items()}
@@ -111,7 +109,7 @@ def test_a_term_or_an_action_that_is_not_finite_stops_with_its_name_before_it_is
         assert all(torch.equal(after[name], values) for name, values in before.items())
 
 
-def test_a_direct_tasks_last_observation_and_state_are_looked_at_too(tmp_path):
+def test_final_obs_and_state_of_a_direct_task_are_checked(tmp_path):
     env = build("cartpole-direct", 3)
     env.reset()
     env.episode_length_buf[1] = env.max_episode_length
@@ -126,7 +124,7 @@ def test_a_direct_tasks_last_observation_and_state_are_looked_at_too(tmp_path):
         env.step(torch.zeros(3, 1))
 
 
-def test_a_task_that_diverges_everywhere_in_every_step_goes_on_until_the_run_stops_it(tmp_path):
+def test_divergence_in_every_step_continues_until_the_run_stops(tmp_path):
     _, env = pair(tmp_path, FAULTS["nan gravity"])
     FAULTS["nan gravity"].strike(env, range(N))
     for step in range(1, 4):
@@ -134,7 +132,7 @@ def test_a_task_that_diverges_everywhere_in_every_step_goes_on_until_the_run_sto
         assert env.causes == {"BADQACC": step * N}
 
 
-def test_what_is_set_aside_survives_a_checkpoint(tmp_path):
+def test_quarantined_states_survive_a_checkpoint(tmp_path):
     fault = FAULTS["event writes nan"]
     env, other = pair(tmp_path, fault)
     for _ in range(4):  # the event is of the fifth step
@@ -149,7 +147,7 @@ def test_what_is_set_aside_survives_a_checkpoint(tmp_path):
 
 
 @pytest.mark.slow  # compiles kernels
-def test_the_guard_of_warp_names_environment_and_cause(tmp_path, caplog):
+def test_warp_divergence_names_environment_and_cause(tmp_path, caplog):
     pytest.importorskip("mujoco_warp")
     task = machine(tmp_path, PLAIN_TASK)
     for who, field, column, value, cause in (

@@ -1,4 +1,4 @@
-"""Policies of Stable-Baselines3 and RSL-RL as runs: they act as they did, and a file that is more is not opened."""
+"""Import of policies of Stable-Baselines3 and RSL-RL: equal actions, and refusal of files with other content."""
 
 import base64
 import collections
@@ -39,7 +39,7 @@ ROWS = 1000
 
 
 class Still(gym.Env):
-    """What a policy is made for: cartpole's columns, and nothing happens."""
+    """Environment with cartpole's spaces and without dynamics."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (OBSERVATIONS,))
     action_space = gym.spaces.Box(-1.0, 1.0, (1,))
@@ -67,8 +67,8 @@ def _place(tmp_path, monkeypatch):
     assert not Path("executed").exists(), "something was executed"
 
 
-def stirred(module):
-    """Weights as training leaves them: no bias at 0."""
+def randomized(module):
+    """Randomise all weights, as after a training: no bias is 0."""
     with torch.no_grad():
         for value in module.parameters():
             value.add_(0.2 * torch.randn_like(value))
@@ -77,16 +77,16 @@ def stirred(module):
 
 def sb3_file(name="ppo", **policy):
     model = ALGORITHMS[name]("MlpPolicy", Still(), device="cpu", policy_kwargs=policy, seed=0)
-    stirred(model.policy)
+    randomized(model.policy)
     model.save("model.zip")
     return model, Path("model.zip")
 
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
-    """A model of SB3 and its file."""
+    """An SB3 model and its file."""
     model = PPO("MlpPolicy", Still(), device="cpu", policy_kwargs={"net_arch": [8]}, seed=0)
-    stirred(model.policy)
+    randomized(model.policy)
     file = tmp_path_factory.mktemp("good") / "model.zip"
     model.save(file)
     return model, file
@@ -97,20 +97,20 @@ def observations():
 
 
 def imported(form, file, *words):
-    """Import through the command line; the new run's policy."""
+    """Import through the command line, and return the new run's policy."""
     assert main(["import", form, str(file), "--task", "cartpole", "--runs-dir", "runs", *words]) == 0
     (run,) = Path("runs/cartpole").iterdir()
     return open_checkpoint(run / "checkpoints" / "000000000000").policy()
 
 
 def read(form, file, **settings):
-    """The policy of a file."""
+    """Return the policy of a file."""
     foreign = (read_sb3 if form == "sb3" else read_rsl_rl)(Path(file), **settings)
     return load_policy(foreign.spec, foreign.weights)
 
 
 def refused_by_command(capfd, *words, code=5):
-    """What the one error says; no run is left."""
+    """Return the text of the only error, after a check that no run is left."""
     capfd.readouterr()
     assert main(["import", *map(str, words), "--task", "cartpole", "--runs-dir", "runs"]) == code
     out, err = capfd.readouterr()
@@ -123,7 +123,7 @@ def refused_by_command(capfd, *words, code=5):
 
 
 def refused(form, file):
-    """What is said of a file."""
+    """Return the error for a file."""
     with pytest.raises(CheckpointError) as caught:
         (read_sb3 if form == "sb3" else read_rsl_rl)(Path(file))
     assert Path(file).name in caught.value.message
@@ -137,11 +137,11 @@ def close(policy, expected, obs=None):
     assert float((found - expected).abs().max()) <= 1e-6
 
 
-# --- what is taken over ---
+# --- accepted files ---
 
 
 @pytest.mark.parametrize(("name", "hidden"), chosen([(n, h) for h in ([32, 16, 8], [8], []) for n in ALGORITHMS], 4))
-def test_a_policy_of_sb3_acts_as_it_did(name, hidden):
+def test_sb3_policy_gives_the_same_actions(name, hidden):
     if not hidden and name == "sac":
         hidden = [1]
     model, file = sb3_file(name, net_arch=hidden)
@@ -151,27 +151,27 @@ def test_a_policy_of_sb3_acts_as_it_did(name, hidden):
 
 
 @pytest.mark.parametrize(("activation", "module"), [("elu", torch.nn.ELU), ("silu", torch.nn.SiLU)])
-def test_an_activation_is_as_it_is_said(activation, module):
+def test_sb3_activation_option(activation, module):
     model, file = sb3_file(net_arch=[16], activation_fn=module)
     expected, _ = model.predict(observations().numpy(), deterministic=True)
     close(read("sb3", file, activation=activation), torch.from_numpy(expected))
     assert float((read("sb3", file)(observations()) - torch.from_numpy(expected)).abs().max()) > 1e-3
 
 
-def test_a_deviation_is_taken_over():
+def test_sb3_standard_deviation_is_imported():
     model, file = sb3_file()
     assert torch.equal(read("sb3", file).log_std, model.policy.log_std.detach())
 
 
-def test_a_vec_normalize_comes_as_numbers(capfd):
+def test_vec_normalize_is_imported_from_safetensors(capfd):
     model, file = sb3_file(net_arch=[16])
     venv = VecNormalize(DummyVecEnv([Still]))
     for _ in range(5):
         venv.obs_rms.update(np.random.default_rng(0).normal(3.0, 2.0, (100, OBSERVATIONS)))
     venv.save("vecnormalize.pkl")
-    said = refused_by_command(capfd, "sb3", file, "--normalizer", "vecnormalize.pkl")
-    assert "is a pickle" in said
-    assert "safetensors.numpy.save_file" in said
+    output = refused_by_command(capfd, "sb3", file, "--normalizer", "vecnormalize.pkl")
+    assert "is a pickle" in output
+    assert "safetensors.numpy.save_file" in output
     assert "is a pickle" in refused_by_command(capfd, "sb3", "vecnormalize.pkl")
     safetensors.numpy.save_file({"mean": venv.obs_rms.mean, "var": venv.obs_rms.var}, "normalizer.safetensors")
     policy = imported("sb3", file, "--normalizer", "normalizer.safetensors")
@@ -202,7 +202,7 @@ def runner_of(**actor):
 @pytest.mark.parametrize(
     ("normalized", "std"), chosen([(True, "scalar"), (False, "log"), (True, "log"), (False, "scalar")], 2)
 )
-def test_a_policy_of_rsl_rls_runner_acts_as_it_did(normalized, std, capfd):
+def test_rsl_rl_policy_gives_the_same_actions(normalized, std, capfd):
     distribution = {"class_name": "GaussianDistribution", "init_std": 0.7, "std_type": std}
     runner = runner_of(obs_normalization=normalized, distribution_cfg=distribution)
     runner.learn(2)
@@ -217,7 +217,7 @@ def test_a_policy_of_rsl_rls_runner_acts_as_it_did(normalized, std, capfd):
         )
 
 
-def test_a_memory_of_rsl_rl_remembers_as_it_did(capfd):
+def test_rsl_rl_recurrent_policy_gives_the_same_actions(capfd):
     runner = runner_of(class_name="RNNModel", rnn_type="lstm", rnn_hidden_dim=6, rnn_num_layers=2)
     runner.save("model_0.pt")
     policy = read("rsl-rl", "model_0.pt")
@@ -231,9 +231,9 @@ def test_a_memory_of_rsl_rl_remembers_as_it_did(capfd):
             assert float((found - expected).abs().max()) <= 1e-6
 
 
-def older(normalizer, **more):
-    """A checkpoint in the form of RSL-RL 2 and 3, and the network behind it."""
-    network = stirred(
+def old_rsl_rl_checkpoint(normalizer, **more):
+    """Return a checkpoint in the format of RSL-RL 2 and 3, and its network."""
+    network = randomized(
         torch.nn.Sequential(
             torch.nn.Linear(OBSERVATIONS, 16),
             torch.nn.ELU(),
@@ -267,8 +267,8 @@ def older(normalizer, **more):
 
 
 @pytest.mark.parametrize("normalizer", [None, "2", "3"])
-def test_older_forms_of_rsl_rl_are_read(normalizer):
-    act = older(normalizer)
+def test_older_rsl_rl_checkpoints_are_read(normalizer):
+    act = old_rsl_rl_checkpoint(normalizer)
     policy = read("rsl-rl", "model_7.pt")
     with torch.no_grad():
         close(policy, act(observations()))
@@ -276,7 +276,7 @@ def test_older_forms_of_rsl_rl_are_read(normalizer):
 
 
 @pytest.mark.slow
-def test_an_imported_policy_is_evaluated_exported_and_trained_on(capfd):
+def test_imported_policy_can_be_evaluated_exported_and_resumed(capfd):
     _, file = sb3_file(net_arch=[32, 32], activation_fn=torch.nn.ELU)
     policy = imported("sb3", file, "--activation", "elu", "--agent", "sb3-ppo")
     (run,) = Path("runs/cartpole").iterdir()
@@ -294,7 +294,7 @@ def test_an_imported_policy_is_evaluated_exported_and_trained_on(capfd):
 
 
 @pytest.mark.parametrize(("form", "size"), [("sb3", "action_size"), ("rsl-rl", "observation_size")])
-def test_a_policy_of_another_shape_is_a_table(form, size, capfd):
+def test_policy_of_another_shape_is_refused_with_a_table(form, size, capfd):
     if form == "sb3":
         Still.action_space = gym.spaces.Box(-1.0, 1.0, (3,))
         try:
@@ -305,9 +305,9 @@ def test_a_policy_of_another_shape_is_a_table(form, size, capfd):
         weights = {"actor.0.weight": torch.randn(1, 9), "actor.0.bias": torch.zeros(1), "std": torch.ones(1)}
         torch.save({"model_state_dict": weights}, "model_7.pt")
         file = "model_7.pt"
-    said = refused_by_command(capfd, form, file)
-    assert f"error:   {size}" in said
-    assert "of cartpole" in said
+    output = refused_by_command(capfd, form, file)
+    assert f"error:   {size}" in output
+    assert "of cartpole" in output
 
 
 @pytest.mark.parametrize(
@@ -318,15 +318,15 @@ def test_a_policy_of_another_shape_is_a_table(form, size, capfd):
         (["--action-bound", "nan"], "--action-bound"),
     ],
 )
-def test_an_option_that_makes_no_sense_is_a_usage_error(words, named, capfd):
+def test_invalid_import_option_is_a_usage_error(words, named, capfd):
     assert named in refused_by_command(capfd, "sb3", "model.zip", *words, code=2)
 
 
-# --- what is not ---
+# --- refused files ---
 
 
 def zipped(members, name="model.zip", like=None):
-    """A zip with these members, after those of another without them."""
+    """Write a zip file with these members, after the other members of `like`."""
     with zipfile.ZipFile(name, "w") as archive:
         if like is not None:
             with zipfile.ZipFile(like) as other:
@@ -345,7 +345,7 @@ def saved_by_torch(value, **settings):
 
 
 def described(description, name="archive/data.pkl"):
-    """A file of torch with this description of its tensors."""
+    """Write a torch file with this description of its tensors."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr(name, description)
@@ -359,7 +359,7 @@ FIELDS = ("policy_class", "observation_space", "action_space", "lr_schedule", "c
 
 
 @pytest.mark.parametrize("field", chosen(FIELDS, 2))
-def test_a_pickle_in_a_field_of_sb3_is_not_looked_at(field, good):
+def test_pickle_in_an_sb3_field_is_not_opened(field, good):
     model, file = good
     data = json.loads(zipfile.ZipFile(file).read("data"))
     bomb = base64.b64encode(pickle.dumps(Bomb())).decode()
@@ -372,7 +372,7 @@ def test_a_pickle_in_a_field_of_sb3_is_not_looked_at(field, good):
     "member", chosen(["data", "policy.optimizer.pth", "pytorch_variables.pth", "system_info.txt", "more"], 2)
 )
 @pytest.mark.parametrize("kind", ["pickle", "torch"])
-def test_a_pickle_in_another_member_of_sb3_is_not_looked_at(member, kind, good):
+def test_pickle_in_another_sb3_member_is_not_opened(member, kind, good):
     _, file = good
     bomb = pickle.dumps(Bomb()) if kind == "pickle" else saved_by_torch({"a": Bomb()})
     foreign = read_sb3(zipped({member: bomb}, "bad.zip", like=file))
@@ -413,7 +413,7 @@ BOMBS = dict(bombs())
 
 
 @pytest.mark.parametrize("form", ["sb3", "rsl-rl"])
-def test_the_command_says_it_in_one_sentence(form, good, capfd):
+def test_import_command_refuses_with_one_error(form, good, capfd):
     Path("model.pt").write_bytes(BOMBS["torch's, in infos"])
     _, file = good
     bad = "model.pt" if form == "rsl-rl" else zipped({"policy.pth": BOMBS["names os system"]}, "bad.zip", like=file)
@@ -423,22 +423,22 @@ def test_the_command_says_it_in_one_sentence(form, good, capfd):
 
 @pytest.mark.parametrize("form", ["sb3", "rsl-rl"])
 @pytest.mark.parametrize("name", chosen(BOMBS, 9))
-def test_a_pickle_in_place_of_tensors_is_not_loaded(name, form, good):
+def test_pickle_in_place_of_tensors_is_not_loaded(name, form, good):
     if form == "rsl-rl":
         Path("model.pt").write_bytes(BOMBS[name])
-        said = refused(form, "model.pt")
-        assert "model.pt" in said
+        output = refused(form, "model.pt")
+        assert "model.pt" in output
     else:
         _, file = good
-        said = refused(form, zipped({"policy.pth": BOMBS[name]}, "bad.zip", like=file))
-        assert "policy.pth" in said
+        output = refused(form, zipped({"policy.pth": BOMBS[name]}, "bad.zip", like=file))
+        assert "policy.pth" in output
 
 
 class LooksLikeAState(collections.OrderedDict):
-    """A class of its own in a checkpoint."""
+    """Custom class in a checkpoint."""
 
 
-def test_a_class_of_ones_own_is_named():
+def test_custom_class_in_a_checkpoint_is_named():
     torch.save(LooksLikeAState(a=torch.zeros(1)), "model.pt")
     assert "LooksLikeAState" in refused("rsl-rl", "model.pt")
 
@@ -446,19 +446,19 @@ def test_a_class_of_ones_own_is_named():
 @pytest.mark.parametrize(
     "member", ["../policy.pth", "/etc/x", "a/../../x", "..", "C:/x", "\\\\host\\x", "a\\..\\..\\x", "//x"]
 )
-def test_a_member_that_leads_out_is_refused(member, good):
+def test_zip_member_outside_the_archive_is_refused(member, good):
     _, file = good
     assert "leads out" in refused("sb3", zipped({member: b"x"}, "bad.zip", like=file))
     assert not Path("../policy.pth").exists()
 
 
-def test_odd_members_are_refused(good):
+def test_unusual_zip_members_are_refused(good):
     _, file = good
-    for kind, said in (
+    for kind, output in (
         ("link", "is a link"),
-        ("twice", "two members"),
+        ("twice", "it appears twice"),
         ("encrypted", "encrypted"),
-        ("lzma", "uncommon"),
+        ("lzma", "its compression is not supported"),
     ):
         bad = zipped({}, "bad.zip", like=file)
         with zipfile.ZipFile(bad, "a") as archive:
@@ -475,10 +475,10 @@ def test_odd_members_are_refused(good):
             data = bytearray(bad.read_bytes())
             data[data.rfind(b"PK\x01\x02") + 8] |= 1
             bad.write_bytes(data)
-        assert said in refused("sb3", bad), kind
+        assert output in refused("sb3", bad), kind
 
 
-def test_a_zip_bomb_is_not_unpacked(good):
+def test_zip_bomb_is_not_unpacked(good):
     _, file = good
     for member in ("policy.pth", "more"):
         bad = zipped({}, "bad.zip", like=file)
@@ -490,7 +490,7 @@ def test_a_zip_bomb_is_not_unpacked(good):
         assert "grows more than 100 times" in refused("sb3", bad)
 
 
-def test_members_that_claim_gigabytes_are_not_unpacked(good):
+def test_zip_members_of_gigabytes_are_not_unpacked(good):
     _, file = good
     data = bytearray(file.read_bytes())
     at = data.rfind(b"PK\x01\x02")
@@ -499,8 +499,8 @@ def test_members_that_claim_gigabytes_are_not_unpacked(good):
     assert "bad.zip" in refused("sb3", "bad.zip")
 
 
-def spread(name):
-    """Tensors that claim more numbers than the file holds."""
+def tensor_larger_than_its_data(name):
+    """Return tensors whose shapes have more numbers than the file holds."""
     one = torch.zeros(1)
     return {
         "a stride of 0": lambda: one.expand(2**40),
@@ -546,18 +546,22 @@ def spread(name):
     ),
 )
 @pytest.mark.filterwarnings("ignore")  # of torch, about the oddest of them
-def test_what_is_no_plain_matrix_of_numbers_is_refused(name, form):
+def test_tensor_that_is_not_a_plain_matrix_is_refused(name, form):
     if form == "rsl-rl":
-        weights = {"actor.0.weight": spread(name), "actor.0.bias": torch.zeros(1), "std": torch.ones(1)}
+        weights = {
+            "actor.0.weight": tensor_larger_than_its_data(name),
+            "actor.0.bias": torch.zeros(1),
+            "std": torch.ones(1),
+        }
         torch.save({"model_state_dict": weights}, "model.pt")
         refused(form, "model.pt")
     else:
         model, file = sb3_file(net_arch=[])
-        weights = {**model.policy.state_dict(), "action_net.weight": spread(name)}
+        weights = {**model.policy.state_dict(), "action_net.weight": tensor_larger_than_its_data(name)}
         refused(form, zipped({"policy.pth": saved_by_torch(weights)}, "bad.zip", like=file))
 
 
-def test_many_names_for_one_tensor_do_not_fill_the_memory(monkeypatch):
+def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
     monkeypatch.setattr("rlcli.training.import_checkpoint.memory", lambda: 2**26)
     one = torch.zeros(1000, 1000)
     torch.save({"model_state_dict": {f"actor.{i}.weight": one for i in range(50)}}, "model.pt")
@@ -565,7 +569,7 @@ def test_many_names_for_one_tensor_do_not_fill_the_memory(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("weights", "said"),
+    ("weights", "output"),
     [
         ({}, "no actor"),
         ({"actor.0.weight": torch.zeros(1, 4)}, "is not a linear layer"),
@@ -592,42 +596,42 @@ def test_many_names_for_one_tensor_do_not_fill_the_memory(monkeypatch):
         ),
     ],
 )  # fmt: skip
-def test_weights_that_make_no_policy_are_refused(weights, said):
+def test_weights_without_a_policy_are_refused(weights, output):
     torch.save({"model_state_dict": weights}, "model.pt")
-    assert said in refused("rsl-rl", "model.pt")
+    assert output in refused("rsl-rl", "model.pt")
 
 
 @pytest.mark.parametrize(
     "content", [b"", b"PK", b"PK\x03\x04", b"text", b"\x80\x04.", bytes(1000), b"PK\x05\x06" + bytes(18)]
 )
 @pytest.mark.parametrize("form", ["sb3", "rsl-rl"])
-def test_what_is_no_file_of_theirs_is_refused(content, form):
+def test_file_of_another_format_is_refused(content, form):
     Path("model.zip").write_bytes(content)
     assert "model.zip" in refused(form, "model.zip")
 
 
 @pytest.mark.parametrize("form", ["sb3", "rsl-rl"])
-def test_what_is_no_file_at_all_is_refused(form):
+def test_missing_file_or_folder_is_refused(form):
     Path("folder").mkdir()
     os.mkfifo("pipe")
     for name in ("nowhere.zip", "folder", "pipe", "/dev/zero"):
         assert Path(name).name in refused(form, name)
 
 
-def test_a_policy_of_another_algorithm_is_refused(good):
+def test_policy_of_another_algorithm_is_refused(good):
     _, file = good
     for names in ({"q_net.q_net.0.weight": torch.zeros(2, 4)}, {"action_net.weight": torch.zeros(2, 4)}, {}):
         assert "no policy of PPO" in refused("sb3", zipped({"policy.pth": saved_by_torch(names)}, "bad.zip", like=file))
 
 
 @pytest.mark.parametrize("form", ["sb3", "rsl-rl"])
-def test_a_damaged_file_is_refused_or_read_as_it_was(form):
-    """Cut and flipped anywhere: the checksums of a zip find it, or it was of no importance."""
+def test_damaged_file_is_refused_or_read_unchanged(form):
+    """Truncate and flip bytes: either the checksums of the zip detect it, or the policy is unchanged."""
     if form == "sb3":
         model, file = sb3_file(net_arch=[4])
         reader, want = read_sb3, model.policy.state_dict()["action_net.weight"]
     else:
-        older(None)
+        old_rsl_rl_checkpoint(None)
         file, reader = Path("model_7.pt"), read_rsl_rl
         want = reader(file).weights["actor.4.weight"]
     data, count = file.read_bytes(), amount(6, 60, 1000)

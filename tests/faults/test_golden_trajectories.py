@@ -1,4 +1,4 @@
-"""The built-in tasks live as they did when their trajectories were recorded."""
+"""Built-in tasks give the recorded trajectories."""
 
 from itertools import product
 
@@ -16,8 +16,8 @@ def _torch_threads():
 
 
 @pytest.mark.parametrize(("task", "seed"), chosen(list(product(golden.TASKS, golden.SEEDS)), 3))
-def test_a_built_in_task_lives_as_recorded(task, seed):
-    """Bit for bit on a machine like that of the record, nearly so on another."""
+def test_built_in_task_equals_its_golden_trajectory(task, seed):
+    """Compare bit by bit on a machine like the recorded one, within a tolerance on another."""
     record = golden.recorded()
     then, now = record["tasks"][task][str(seed)], golden.trajectory(task, seed)
     assert golden.furthest(then["states"], now["states"]) <= golden.TOLERANCE
@@ -25,7 +25,7 @@ def test_a_built_in_task_lives_as_recorded(task, seed):
         assert now["sha256"] == then["sha256"]
 
 
-def test_the_record_is_of_the_installed_tasks_and_of_moving_robots():
+def test_golden_trajectories_cover_all_tasks_and_move():
     record = golden.recorded()["tasks"]
     assert sorted(record) == sorted(golden.TASKS)
     for seeds in record.values():

@@ -1,4 +1,4 @@
-"""What training keeps of episodes: it notices nothing of that, what is kept is what was lived, and nothing is twice."""
+"""Recorder of failure cases: the training is unchanged, cases equal their episodes, and none is written twice."""
 
 import random
 
@@ -25,20 +25,20 @@ from rlcli.training import loop
 
 KEPT = AutopsyConfig(seconds=0.1, keep=7)
 LONGER = {"sac": "train_freq: 6", "td3": "train_freq: 6"}
-"""Their own three steps an iteration end too few episodes."""
+"""Steps of an iteration; the default of three ends too few episodes."""
 GRID = [(Case(task, agent, True, LONGER.get(agent, "")), cut) for agent in AGENTS
         for task in ("everything", "cartpole-direct") for cut in (1, 4, "within")]  # fmt: skip
 
 
 @pytest.fixture
-def picky(monkeypatch):
-    """Nearly every return is unusual: few episodes of a small training end otherwise than by time."""
+def low_fences(monkeypatch):
+    """Make nearly every return unusual: in a small training most episodes end by time-out."""
     monkeypatch.setattr(failure_recorder, "LEAST", 4)
     monkeypatch.setattr(failure_recorder, "FAR", 0.0)
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
+def base_folder(tmp_path_factory):
     return tmp_path_factory.mktemp("tasks")
 
 
@@ -54,11 +54,9 @@ def cases(run):
 
 
 @pytest.mark.parametrize(("case", "cut"), chosen(GRID, 2), ids=str)
-def test_a_training_that_keeps_episodes_is_the_one_that_does_not_also_when_cut_and_resumed(
-    case, cut, place, tmp_path, monkeypatch, picky
-):
-    plain = train(tmp_path / "plain", case, place).folder
-    kept = train(tmp_path / "kept", case, place, autopsy=KEPT).folder
+def test_recording_failures_does_not_change_the_training(case, cut, base_folder, tmp_path, monkeypatch, low_fences):
+    plain = train(tmp_path / "plain", case, base_folder).folder
+    kept = train(tmp_path / "kept", case, base_folder, autopsy=KEPT).folder
     assert rows_of(kept) == rows_of(plain)
     assert content(newest(kept)) == content(newest(plain))
     assert 4 <= len(names(kept)) <= KEPT.keep
@@ -66,10 +64,10 @@ def test_a_training_that_keeps_episodes_is_the_one_that_does_not_also_when_cut_a
     if cut == "within":
         monkeypatch.setattr(loop, "LONG_S", -1.0)
         at = random.Random(str(case)).randrange(2, 9), 1
-        train(tmp_path / "cut", case, place, within=at, save_interval=None, autopsy=KEPT)
+        train(tmp_path / "cut", case, base_folder, within=at, save_interval=None, autopsy=KEPT)
     else:
-        train(tmp_path / "cut", case, place, after=cut, autopsy=KEPT)
-    resumed = train(tmp_path / "cut", case, place, resume=-1, autopsy=KEPT).folder
+        train(tmp_path / "cut", case, base_folder, after=cut, autopsy=KEPT)
+    resumed = train(tmp_path / "cut", case, base_folder, resume=-1, autopsy=KEPT).folder
     assert content(newest(resumed)) == content(newest(plain))
     assert leftovers(resumed) == []
     assert names(resumed) == names(kept), "the same episodes, none twice"
@@ -81,19 +79,19 @@ def test_a_training_that_keeps_episodes_is_the_one_that_does_not_also_when_cut_a
         assert of_left == of_right
         for name in ("episode.0.rewards", "episode.0.observations", "episode.0.actions", "world.0.states"):
             assert torch.equal(left.tensors[name][-last:], right.tensors[name][-last:])
-        assert replay_calls(right, resolved_of(case, place).source).difference is None
+        assert replay_calls(right, resolved_of(case, base_folder).source).difference is None
 
 
-def test_an_older_checkpoint_takes_back_what_was_kept_after_it(place, tmp_path, picky):
+def test_resume_from_an_older_checkpoint_removes_newer_cases(base_folder, tmp_path, low_fences):
     case = Case("everything", "ppo", normalize=False)
-    run = train(tmp_path / "r", case, place, autopsy=KEPT).folder
+    run = train(tmp_path / "r", case, base_folder, autopsy=KEPT).folder
     step = 4 * 16
     assert max(found.failure.step for found in cases(run)) > step
-    train(run, case, place, resume=step, after=5, autopsy=KEPT)
+    train(run, case, base_folder, resume=step, after=5, autopsy=KEPT)
     assert {found.failure.step for found in cases(run)} <= {*range(step + 1), 5 * 16}
 
 
-# --- what is kept is what was lived ---
+# --- a case equals its episode ---
 
 LYING = edited(CRITTER_TASK, terminations={"low": {"func": "root_height_below_minimum", "minimum_height": 0.28}})
 NERVOUS = edited(CRITTER_TASK, terminations={"tilt": {"func": "bad_orientation", "limit_angle": 0.2}})
@@ -103,8 +101,8 @@ def recorder_of(env, folder, **config):
     return FailureRecorder(env, AutopsyConfig(**{"seconds": 0.2, "keep": 20, **config}), folder, None)
 
 
-def lived(env, steps, seed=0, act=None):
-    """Random actions, and everything that happened."""
+def random_rollout(env, steps, seed=0, act=None):
+    """Step with random actions, and return all recorded values."""
     generator = torch.Generator().manual_seed(seed)
     act = act or (lambda obs: torch.rand(env.num_envs, 4, generator=generator) * 2 - 1)
     with EpisodeRecorder(env, 10**6) as recorder:
@@ -116,10 +114,10 @@ def lived(env, steps, seed=0, act=None):
     return recorder, seen
 
 
-def test_a_case_holds_the_end_of_the_episode_as_it_was_lived(tmp_path):
+def test_case_holds_the_last_steps_of_its_episode(tmp_path):
     env = build(critter(tmp_path, NERVOUS), 6)
     kept = recorder_of(env, tmp_path / "run")
-    recorder, seen = lived(env, 80)
+    recorder, seen = random_rollout(env, 80)
     kept.commit(1, 480)
     kept.write(kept.take(480))
     found = cases(tmp_path / "run")
@@ -145,10 +143,10 @@ def test_a_case_holds_the_end_of_the_episode_as_it_was_lived(tmp_path):
         assert replay_calls(case.trajectory, env.resolved.source).difference is None
 
 
-def test_contacts_at_the_end_are_those_of_the_last_state(tmp_path):
+def test_contacts_are_those_of_the_last_state(tmp_path):
     env = build(critter(tmp_path, LYING), 6)
     kept = recorder_of(env, tmp_path / "run")
-    lived(env, 80, act=lambda obs: torch.zeros(6, 4))
+    random_rollout(env, 80, act=lambda obs: torch.zeros(6, 4))
     kept.commit(1, 480)
     kept.write(kept.take(480))
     standing = [stage_case(case, env.resolved.source).contacts() for case in cases(tmp_path / "run")]
@@ -160,7 +158,7 @@ def test_contacts_at_the_end_are_those_of_the_last_state(tmp_path):
 
 
 def returns(kept, values, *, truncated=True, cause="time_out"):
-    """Let episodes with such returns end, without stepping them."""
+    """End episodes with these returns, without steps."""
     kept._env.episode_index += 1
     for start in range(0, len(values), kept._env.num_envs):
         some = torch.tensor(values[start : start + kept._env.num_envs])
@@ -169,7 +167,7 @@ def returns(kept, values, *, truncated=True, cause="time_out"):
         kept._choose(Episodes(torch.arange(len(some)), some, lengths, {}, {cause: every}, every & truncated, None))
 
 
-def test_a_return_beyond_the_fences_of_the_recent_ones_is_unusual_and_only_with_enough_of_them(tmp_path):
+def test_unusual_return_needs_enough_recent_returns(tmp_path):
     env = build("cartpole", 4)
     kept = recorder_of(env, tmp_path)
     env.reset()
@@ -194,7 +192,7 @@ def test_a_return_beyond_the_fences_of_the_recent_ones_is_unusual_and_only_with_
     assert len(kept._files) == before, "returns alike to three digits are all the same"
 
 
-def test_of_what_does_not_fit_the_oldest_of_the_commonest_kind_goes(tmp_path):
+def test_oldest_case_of_the_most_frequent_kind_is_dropped(tmp_path):
     env = build("cartpole", 4)
     kept = recorder_of(env, tmp_path, keep=4)
     env.reset()
@@ -222,10 +220,10 @@ def test_of_what_does_not_fit_the_oldest_of_the_commonest_kind_goes(tmp_path):
     assert [case.failure.step for case in cases(tmp_path)] == [2, 7, 8, 9]
 
 
-def test_where_memory_is_short_fewer_seconds_are_kept_and_still_exactly(tmp_path):
+def test_memory_limit_shortens_cases(tmp_path):
     env = build(critter(tmp_path), 400)
     kept = recorder_of(env, tmp_path / "run", seconds=20.0, memory_mib=6)
-    lived(env, 40)
+    random_rollout(env, 40)
     rings = sum(ring.nbytes for ring in kept._rings.values()) + env.engine.history._ring.nbytes
     assert rings <= 6 << 20
     assert 0.1 < kept.seconds < 0.5
@@ -238,7 +236,7 @@ def test_where_memory_is_short_fewer_seconds_are_kept_and_still_exactly(tmp_path
         assert replay_calls(case.trajectory, env.resolved.source).difference is None
 
 
-def test_a_disk_that_refuses_ends_the_keeping_and_not_the_training(tmp_path, monkeypatch, caplog):
+def test_disk_error_ends_the_recording_but_not_the_training(tmp_path, monkeypatch, caplog):
     env = build("cartpole", 4, "episode_length_s=0.1")
     kept = recorder_of(env, tmp_path)
 
@@ -264,7 +262,7 @@ def test_a_disk_that_refuses_ends_the_keeping_and_not_the_training(tmp_path, mon
 
 
 @pytest.mark.parametrize("name", ["nan qpos", "nan ctrl", "event writes nan", "reset writes nan"])
-def test_an_episode_that_diverged_is_kept_with_where_it_went_wrong(tmp_path, name):
+def test_diverged_episode_is_recorded_with_its_cause(tmp_path, name):
     fault = FAULTS[name]
     sound, sick = pair(tmp_path, fault)
     kept = recorder_of(sick, tmp_path / "run", seconds=1.0)
@@ -289,7 +287,7 @@ def test_an_episode_that_diverged_is_kept_with_where_it_went_wrong(tmp_path, nam
     assert replayed.difference is None
     assert replayed.diverged_at[2] == case.world.diverged_at
     if name == "reset writes nan":
-        with pytest.raises(CheckpointError, match="no state that is finite"):
+        with pytest.raises(CheckpointError, match="has no finite state"):
             stage_case(case, sick.resolved.source)
     else:
         assert np.isfinite(stage_case(case, sick.resolved.source).states).all()

@@ -1,4 +1,4 @@
-"""SIGKILL at every moment: what was saved is whole, and the resumed run is the one that was never killed."""
+"""SIGKILL at every moment: saved files are complete, and the resumed run equals an uninterrupted one."""
 
 import json
 import os
@@ -79,8 +79,8 @@ def prepared(folder):
 
 
 @pytest.fixture(scope="module")
-def whole(child, tmp_path_factory):
-    """Runs that nobody killed, and how long they took."""
+def uninterrupted(child, tmp_path_factory):
+    """Uninterrupted runs and their durations."""
     done = {}
 
     def of(name):
@@ -110,7 +110,7 @@ def assert_killed(ended):
 
 
 @pytest.mark.parametrize(("point", "nth", "name"), chosen(NAMED, 1), ids=lambda value: str(value).replace(" ", "-"))
-def test_a_run_killed_at_this_moment_goes_on_as_if_it_had_not_been(child, whole, tmp_path, point, nth, name):
+def test_run_killed_at_a_fault_point_resumes_bit_identical(child, uninterrupted, tmp_path, point, nth, name):
     folder = prepared(tmp_path)
     if point in RESUMING:  # twice: it had come some way before
         assert_killed(train(child, folder, name, faults=killed_at("after the rename", 4)).ended())
@@ -122,11 +122,11 @@ def test_a_run_killed_at_this_moment_goes_on_as_if_it_had_not_been(child, whole,
     assert_loads(run)
     resumed = child(folder, "train", "--resume", "latest", "-q").ended()
     assert resumed.code == 0, resumed.err
-    assert_same_run(run, whole(name)[0])
+    assert_same_run(run, uninterrupted(name)[0])
 
 
 def terminated(run):
-    """The episodes of a run that a termination ended, as they were kept."""
+    """Return the recorded episodes of a run that ended by a termination."""
     headers = [read_trajectory(file).header for file in (run / "autopsy").glob("*.safetensors")]
     return sorted(
         (header.failure.step, e.env, e.index, e.length, e.total_reward)
@@ -138,28 +138,28 @@ def terminated(run):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("point", KEPT)
-def test_a_run_killed_while_it_writes_kept_episodes_has_each_once_and_whole(child, tmp_path, point):
+def test_kill_while_writing_cases_leaves_each_once_and_complete(child, tmp_path, point):
     runs = []
     for name, faults in (("whole", []), ("killed", killed_at(point, 3))):
         (tmp_path / name).mkdir()
         ended = child(tmp_path / name, "train", *FALLING, *SMALL, *SHORT, "--seed", 5, faults=faults).ended()
         assert ended.code == (-signal.SIGKILL if faults else 0), ended.err
         runs.append(run_in(tmp_path / name))
-    whole, killed = runs
+    uninterrupted, killed = runs
     for file in (killed / "autopsy").glob("*.safetensors"):
         read_trajectory(file)  # also before anything is cleaned away
     resumed = child(tmp_path / "killed", "train", "--resume", "latest", "-q").ended()
     assert resumed.code == 0, resumed.err
-    assert_same_run(killed, whole)
-    assert len(terminated(whole)) > 3
-    assert terminated(killed) == terminated(whole)
+    assert_same_run(killed, uninterrupted)
+    assert len(terminated(uninterrupted)) > 3
+    assert terminated(killed) == terminated(uninterrupted)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(amount(1, 20, 240)))
-def test_a_run_killed_at_any_time_goes_on_as_if_it_had_not_been(child, whole, tmp_path, number):
+def test_run_killed_at_a_random_time_resumes_bit_identical(child, uninterrupted, tmp_path, number):
     draw, name = random.Random(number), list(RUNS)[number % len(RUNS)]
-    reference, took = whole(name)
+    reference, took = uninterrupted(name)
     folder, begun = prepared(tmp_path), None
     for _ in range(draw.choice([1, 1, 2, 3])):
         now = train(child, folder, name) if begun is None else child(folder, "train", "--resume", begun, "-q")
@@ -177,20 +177,20 @@ def test_a_run_killed_at_any_time_goes_on_as_if_it_had_not_been(child, whole, tm
 
 
 @pytest.mark.slow
-def test_a_run_killed_before_its_first_checkpoint_begins_again(child, whole, tmp_path):
+def test_run_killed_before_its_first_checkpoint_restarts(child, uninterrupted, tmp_path):
     folder = prepared(tmp_path)
     assert_killed(train(child, folder, "sac", faults=killed_at("before the rename")).ended())
     assert steps(run_in(folder) / "checkpoints") == []
     resumed = child(folder, "train", "--resume", "latest").ended()
     assert resumed.code == 0, resumed.err
     assert "starts again" in resumed.err
-    assert_same_run(run_in(folder), whole("sac")[0])
+    assert_same_run(run_in(folder), uninterrupted("sac")[0])
 
 
 @pytest.mark.slow
-def test_a_run_that_has_lost_its_checkpoints_does_not_begin_again(child, tmp_path, whole):
+def test_run_without_its_checkpoints_does_not_restart(child, tmp_path, uninterrupted):
     run = tmp_path / "runs/cartpole/r"
-    shutil.copytree(whole("sac")[0], run)
+    shutil.copytree(uninterrupted("sac")[0], run)
     for folder in run.glob("checkpoints/0*"):
         shutil.rmtree(folder)
     ended = child(tmp_path, "train", "--resume", run, "--max-iterations", 9).ended()
@@ -201,7 +201,7 @@ def test_a_run_that_has_lost_its_checkpoints_does_not_begin_again(child, tmp_pat
 @pytest.mark.slow
 @pytest.mark.skipif(SIZE == "sample", reason="minutes long: make test-faults runs it")
 @pytest.mark.timeout(1800)
-def test_a_training_of_cartpole_killed_five_times_has_the_weights_of_one_that_was_not(tmp_path):
+def test_cartpole_training_killed_five_times_has_equal_weights(tmp_path):
     def start(folder, *arguments):
         command = [sys.executable, "-m", "rlcli", "train", *map(str, arguments), "--quiet"]
         return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -225,6 +225,6 @@ def test_a_training_of_cartpole_killed_five_times_has_the_weights_of_one_that_wa
         if list(Path(tmp_path).glob("killed/runs/*/*/run.json")):
             arguments = ("--resume", "latest")
     process = start(tmp_path / "killed", *arguments)
-    said = process.communicate()[0]
-    assert process.returncode == 0, said
+    message = process.communicate()[0]
+    assert process.returncode == 0, message
     assert weights(tmp_path / "killed") == weights(tmp_path / "whole")

@@ -1,4 +1,4 @@
-"""A learner that turns non-finite stops in that iteration, and the first tensor in causal order is named."""
+"""A learner with non-finite values stops in that iteration, and names the first tensor in causal order."""
 
 import math
 
@@ -37,7 +37,7 @@ def module_of(trainer):
 
 
 def parameters(trainer, part):
-    """The parameters of the actor or the critic that an update moves, from the inputs to the outputs."""
+    """Return the trained parameters of the actor or the critic, from the inputs to the outputs."""
     named = [(name, p) for name, p in module_of(trainer).named_parameters() if p.requires_grad]
     words = {"actor": ("actor.", "mlp_extractor.policy_net", "action_net"),
              "critic": ("critic.", "mlp_extractor.value_net", "value_net")}[part]  # fmt: skip
@@ -45,13 +45,13 @@ def parameters(trainer, part):
 
 
 def at(items, where):
-    """The first, the middle or the last."""
+    """Return the first, the middle or the last item."""
     items = list(items)
     return items[{"first": 0, "middle": len(items) // 2, "last": -1}[where]]
 
 
 def poison(trainer, what, where):
-    """Bring one value about that is not finite; gives what the message must name."""
+    """Make one value non-finite, and return the name that the message must contain."""
     with torch.no_grad():
         if what == "normaliser":
             getattr(trainer, "collector", trainer).normalizer.var[at(range(4), where)] = math.nan
@@ -116,7 +116,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "what", "where"), chosen(CASES, 9))
-def test_the_first_tensor_that_is_not_finite_is_named_in_its_iteration(tmp_path, name, what, where):
+def test_first_tensor_that_is_not_finite_is_named(tmp_path, name, what, where):
     trainer = trainer_of(tmp_path, name, *(["agent.reward_scale=30"] if what == "advantage" else []))
     named = poison(trainer, what, where)
     with pytest.raises(DivergedError) as raised:
@@ -132,7 +132,7 @@ def test_the_first_tensor_that_is_not_finite_is_named_in_its_iteration(tmp_path,
 
 
 @pytest.mark.parametrize("name", ["ppo", "sb3-ppo"])
-def test_a_weight_that_a_step_makes_non_finite_is_named_where_the_gradients_are_finite(tmp_path, name):
+def test_weight_made_non_finite_by_the_optimiser_is_named(tmp_path, name):
     trainer = trainer_of(tmp_path, name)
     if name == "ppo":
         trainer.learner.learning_rate.fill_(math.inf)
@@ -143,7 +143,7 @@ def test_a_weight_that_a_step_makes_non_finite_is_named_where_the_gradients_are_
 
 
 @pytest.mark.parametrize("who", WHO)
-def test_one_nonfinite_sample_does_not_reach_the_normaliser(tmp_path, who):
+def test_nonfinite_sample_does_not_reach_the_normaliser(tmp_path, who):
     trainer = trainer_of(tmp_path, "sb3-ppo")
     faults(trainer.env).update(observation=[who], value=math.inf)
     before = {name: value.clone() for name, value in trainer.normalizer.state_dict().items()}

@@ -1,4 +1,4 @@
-"""A machine that refuses: the last good checkpoint stays, the message says what and where, training goes on later."""
+"""Disk and system errors: the last checkpoint stays, the message names cause and path, and training can resume."""
 
 import errno
 import json
@@ -51,7 +51,7 @@ def folder(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def whole(child, tmp_path_factory):
+def uninterrupted(child, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     (folder / "agent.yaml").write_text(AGENT)
     ended = child(folder, *TRAIN).ended()
@@ -70,8 +70,8 @@ def fault(aim, call, code, nth):
              "code": code, "nth": nth}]  # fmt: skip
 
 
-def assert_told(ended, code, *words):
-    """One message that says what the machine said, and where."""
+def assert_one_error(ended, code, *words):
+    """Check that there is one message with the system's error and the path."""
     assert ended.code == 10, (ended.code, ended.err)
     assert os.strerror(getattr(errno, code)) in ended.err
     for word in words:
@@ -80,8 +80,8 @@ def assert_told(ended, code, *words):
     assert "Exception" not in ended.err
 
 
-def assert_kept(run, state="failed"):
-    """What is there is whole, nothing else is, and nobody holds the lock."""
+def assert_files_complete(run, state="failed"):
+    """Check that files are complete, that no other files exist, and that the lock is free."""
     assert_loads(run)
     record = json.loads((run / "run.json").read_text())
     assert record["state"] == state
@@ -92,33 +92,33 @@ def assert_kept(run, state="failed"):
 
 
 @pytest.mark.parametrize(("aim", "call", "code"), chosen(CASES, 1))
-def test_a_refusal_costs_nothing_that_was_saved(child, whole, folder, aim, call, code):
+def test_disk_error_keeps_everything_saved_before(child, uninterrupted, folder, aim, call, code):
     # from the third checkpoint on, which has about twenty files before it
     nth = {"checkpoint": {"mkdir": 4, "rename": 4}.get(call, 25), "retention": 1, "metrics": 4}[aim]
     ended = child(folder, *TRAIN, faults=fault(aim, call, code, nth)).ended()
     run = run_in(folder)
     if aim == "retention":  # what cannot be removed stays
         assert ended.code == 0, ended.err
-        assert_kept(run, "finished")
-        assert len(steps(run / "checkpoints")) >= len(steps(whole / "checkpoints"))
+        assert_files_complete(run, "finished")
+        assert len(steps(run / "checkpoints")) >= len(steps(uninterrupted / "checkpoints"))
         more = child(folder, "train", "--resume", "latest", "--max-iterations", 9, "-q").ended()
         assert more.code == 0, more.err
         assert len(steps(run / "checkpoints")) == 3
         return
     where = r"checkpoints/\d{12}" if aim == "checkpoint" else r"metrics\.jsonl"
-    assert_told(ended, code, where)
-    assert_kept(run)
+    assert_one_error(ended, code, where)
+    assert_files_complete(run)
     assert newest(run).iteration >= 2
     assert not [file for file in run.rglob("*") if ".tmp" in file.name]
     resumed = child(folder, "train", "--resume", "latest", "-q").ended()
     assert resumed.code == 0, resumed.err
-    assert_same_run(run, whole)
+    assert_same_run(run, uninterrupted)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("aim", ["checkpoint", "metrics"])
-def test_a_limit_on_the_size_of_files_is_met_as_a_full_disk_is(child, whole, folder, aim):
-    """A real one: RLIMIT_FSIZE, under which writes come back short and then fail."""
+def test_file_size_limit_is_handled_like_a_full_disk(child, uninterrupted, folder, aim):
+    """Set RLIMIT_FSIZE, under which writes first are incomplete and then fail."""
     size = 6000 if aim == "checkpoint" else 1500
     calls = {
         "checkpoint": "rlcli.training.checkpoint_writer:write_checkpoint",
@@ -126,17 +126,19 @@ def test_a_limit_on_the_size_of_files_is_met_as_a_full_disk_is(child, whole, fol
     }
     faults = [{"kind": "limit", "call": calls[aim], "pattern": "", "nth": 3, "code": str(size)}]
     ended = child(folder, *TRAIN, faults=faults).ended()
-    assert_told(ended, "EFBIG", r"checkpoints/\d{12}" if aim == "checkpoint" else r"checkpoints/\d{12}|metrics\.jsonl")
+    assert_one_error(
+        ended, "EFBIG", r"checkpoints/\d{12}" if aim == "checkpoint" else r"checkpoints/\d{12}|metrics\.jsonl"
+    )
     assert_loads(run_in(folder))
     assert newest(run_in(folder)).iteration >= 1
     resumed = child(folder, "train", "--resume", "latest", "-q").ended()
     assert resumed.code == 0, resumed.err
-    assert_same_run(run_in(folder), whole)
+    assert_same_run(run_in(folder), uninterrupted)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gone", ["checkpoints", "run", "file in its place"])
-def test_a_folder_that_vanishes_is_not_made_again(child, folder, gone):
+def test_deleted_folder_is_not_recreated(child, folder, gone):
     wait = [{"kind": "slow", "call": "rlcli.envs.vec_env:VecEnv.step", "pattern": "", "nth": 8, "seconds": 0.2}]
     process = child(folder, *TRAIN, faults=wait)
     process.until(lambda: (folder / "slow").exists())
@@ -148,13 +150,13 @@ def test_a_folder_that_vanishes_is_not_made_again(child, folder, gone):
     ended = process.ended()
     # a checkpoint may come in the moment between
     code = "ENOTDIR" if os.strerror(errno.ENOTDIR) in ended.err and gone == "file in its place" else "ENOENT"
-    assert_told(ended, code, str(run.relative_to(folder)))
+    assert_one_error(ended, code, str(run.relative_to(folder)))
     assert not target.is_dir()
     elsewhere = folder / "elsewhere"
     assert steps(elsewhere if gone != "run" else elsewhere / "checkpoints")
 
 
-def test_a_file_where_the_runs_folder_should_be(child, folder):
+def test_file_in_place_of_the_runs_folder_is_a_machine_error(child, folder):
     (folder / "runs").touch()
     ended = child(folder, *TRAIN).ended()
     assert ended.code == 10
@@ -163,34 +165,34 @@ def test_a_file_where_the_runs_folder_should_be(child, folder):
 
 
 @pytest.mark.slow
-def test_full_metrics_end_the_run_with_what_was_saved(child, whole, folder):
-    """A real full device under the file."""
+def test_full_disk_for_metrics_ends_the_run(child, uninterrupted, folder):
+    """Use a file on a device that is full."""
     faults = [{"kind": "full", "call": "open", "pattern": AIMS["metrics"]}]
     ended = child(folder, *TRAIN, faults=faults).ended()
-    assert_told(ended, "ENOSPC", r"metrics\.jsonl")
+    assert_one_error(ended, "ENOSPC", r"metrics\.jsonl")
     run = run_in(folder)
-    assert_kept(run)
+    assert_files_complete(run)
     resumed = child(folder, "train", "--resume", "latest", "-q").ended()
     assert resumed.code == 0, resumed.err
-    assert_same_run(run, whole)
+    assert_same_run(run, uninterrupted)
 
 
 @pytest.mark.slow
-def test_a_run_behind_a_link_trains_and_resumes(child, whole, folder):
+def test_run_behind_a_link_trains_and_resumes(child, uninterrupted, folder):
     (folder / "disk").mkdir()
     (folder / "runs").symlink_to(folder / "disk")
     ended = child(folder, *TRAIN, faults=fault("checkpoint", "rename", "EIO", 5)).ended()
-    assert_told(ended, "EIO")
+    assert_one_error(ended, "EIO")
     link = folder / "link"
     link.symlink_to(run_in(folder))
     resumed = child(folder, "train", "--resume", link, "-q").ended()
     assert resumed.code == 0, resumed.err
     assert link.is_symlink()
-    assert_same_run(run_in(folder), whole)
+    assert_same_run(run_in(folder), uninterrupted)
 
 
 @pytest.mark.slow
-def test_a_second_writer_is_kept_out_and_changes_nothing(child, whole, folder):
+def test_second_writer_is_refused_and_changes_nothing(child, uninterrupted, folder):
     wait = [{"kind": "slow", "call": "rlcli.envs.vec_env:VecEnv.step", "pattern": "", "nth": 12, "seconds": 0.3}]
     first = child(folder, *TRAIN, faults=wait)
     first.until(lambda: (folder / "slow").exists())
@@ -199,20 +201,20 @@ def test_a_second_writer_is_kept_out_and_changes_nothing(child, whole, folder):
     assert "written to by another process" in second.err
     ended = first.ended()
     assert ended.code == 0, ended.err
-    assert_same_run(run_in(folder), whole)
+    assert_same_run(run_in(folder), uninterrupted)
 
 
 @pytest.mark.slow
-def test_a_clock_that_goes_back_changes_nothing(child, whole, folder):
+def test_clock_set_back_changes_nothing(child, uninterrupted, folder):
     back = [{"kind": "clock", "call": "rlcli.envs.vec_env:VecEnv.step", "pattern": "", "nth": 9, "code": "-1e8"}]
     ended = child(folder, *TRAIN, faults=back).ended()
     assert ended.code == 0, ended.err
-    assert_same_run(run_in(folder), whole)
+    assert_same_run(run_in(folder), uninterrupted)
     assert [row["iteration"] for row in read_metrics(run_in(folder) / "metrics.jsonl")] == list(range(1, 9))
 
 
-def test_a_lock_that_is_held_is_a_machine_error(whole, tmp_path):
-    shutil.copytree(whole, tmp_path / "r")
+def test_held_lock_raises_machine_error(uninterrupted, tmp_path):
+    shutil.copytree(uninterrupted, tmp_path / "r")
     first, second = open_run(tmp_path / "r"), open_run(tmp_path / "r")
     first.lock()
     with pytest.raises(MachineError, match="another process"):

@@ -1,4 +1,4 @@
-"""MJCF of a stranger: nothing outside the task is opened, nothing runs for ever, the message says what and where."""
+"""Untrusted MJCF: no file outside the task is opened, nothing hangs, and the message names cause and place."""
 
 import os
 import struct
@@ -67,7 +67,7 @@ NAMED = {
         model('<compiler meshdir="../"/>', asset='<mesh name="m" file="outside.obj"/>'),
         "lies outside",
     ),
-    "a mesh folder that is said later": (
+    "a mesh folder that is named later": (
         f'<mujoco><asset><mesh name="m" file="outside.obj"/></asset><worldbody>{BLOCK}</worldbody>'
         '<compiler meshdir=".."/></mujoco>',
         "lies outside",
@@ -137,7 +137,7 @@ NAMED = {
 
 @pytest.fixture
 def task(tmp_path):
-    """A task folder with some traps beside and in it."""
+    """A task folder with links, pipes and other traps in it and beside it."""
     folder = tmp_path / "task"
     (folder / "parts").mkdir(parents=True)
     (folder / "task.yaml").write_text(TASK)
@@ -157,7 +157,7 @@ def task(tmp_path):
 
 
 @pytest.mark.parametrize("name", chosen(list(NAMED), 16))
-def test_a_bad_model_is_refused_by_name_before_it_is_opened(name, task):
+def test_bad_model_is_refused_by_name_before_it_is_opened(name, task):
     text, reason = NAMED[name]
     (task / "model.xml").write_text(text)
     begin = time.perf_counter()
@@ -169,21 +169,21 @@ def test_a_bad_model_is_refused_by_name_before_it_is_opened(name, task):
     assert "task.yaml:6:" in str(caught.value)
 
 
-def test_the_command_says_it_with_exit_code_3(task, capsys, monkeypatch):
+def test_validate_exits_3_for_a_bad_model(task, capsys, monkeypatch):
     monkeypatch.chdir(task.parent)
     (task / "model.xml").write_text(model('<include file="../outside.xml"/>'))
     assert main(["validate", "./task", "--deep"]) == 3
-    said = capsys.readouterr().err
-    assert "model.xml:1: include: '../outside.xml' lies outside of" in said
+    message = capsys.readouterr().err
+    assert "model.xml:1: include: '../outside.xml' lies outside of" in message
 
 
-def test_a_compiled_model_is_not_opened(task):
+def test_compiled_model_is_not_opened(task):
     (task / "task.yaml").write_text(TASK.replace("model.xml", "bin.mjb"))
     with pytest.raises(ConfigError, match=r"compiled models \(.mjb\) are not opened"):
         make_env(resolve(folder_task(task)))
 
 
-def test_parts_of_the_task_its_package_and_its_links_are_opened(tmp_path):
+def test_files_of_task_package_and_links_are_opened(tmp_path):
     package = tmp_path / "robots"
     folder = package / "block"
     (folder / "parts").mkdir(parents=True)
@@ -203,7 +203,7 @@ def test_parts_of_the_task_its_package_and_its_links_are_opened(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the limits of a process are the system's")
-def test_a_model_that_asks_for_much_is_compiled_under_limits_first(tmp_path, monkeypatch):
+def test_large_model_is_first_compiled_under_limits(tmp_path, monkeypatch):
     file = tmp_path / "model.xml"
     many = '<replicate count="6000" offset="1 0 0"><geom size="0.1"/></replicate>'
     file.write_text(model(body=many))
@@ -216,7 +216,7 @@ def test_a_model_that_asks_for_much_is_compiled_under_limits_first(tmp_path, mon
     assert time.perf_counter() - begin < 20
 
 
-def test_a_machine_without_limits_still_reads_models(tmp_path, monkeypatch):
+def test_system_without_limits_reads_models(tmp_path, monkeypatch):
     file = tmp_path / "model.xml"
     file.write_text(model())
     monkeypatch.setattr(untrusted_mjcf, "SUBPROCESS_COST", 0)
@@ -230,7 +230,7 @@ def test_a_machine_without_limits_still_reads_models(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="children are forked")
 @pytest.mark.parametrize("first", range(0, amount(1, 10, 500), 10))
-def test_mutants_are_taken_or_refused_in_words_and_none_crashes_or_hangs(first, tmp_path):
+def test_mutated_models_are_accepted_or_refused_without_a_crash(first, tmp_path):
     count = min(10, amount(1, 10, 500) - first)
     line = [sys.executable, mjcf_mutants.__file__, str(first), str(count), str(tmp_path)]
     done = subprocess.run(line, capture_output=True, text=True, timeout=280)
@@ -238,7 +238,7 @@ def test_mutants_are_taken_or_refused_in_words_and_none_crashes_or_hangs(first, 
     assert done.stdout.count("taken") == count
 
 
-def test_a_costly_model_leaves_no_log_in_the_folder_it_is_read_from(tmp_path, monkeypatch):
+def test_large_model_leaves_no_log_in_its_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     geoms, odd = '<geom size="1"/>' * 6000, '<custom><numeric name="odd" data="NaN"/></custom>'  # which MuJoCo warns of
     (tmp_path / "model.xml").write_text(f"<mujoco>{odd}<worldbody>{geoms}</worldbody></mujoco>")

@@ -1,4 +1,4 @@
-"""ONNX files that name other files for their numbers are not opened."""
+"""ONNX files whose tensors are in other files are not opened."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ def elsewhere(where):
 
 
 def model_of(place, value):
-    """A model with a tensor in this place."""
+    """Return a model with a tensor at this position."""
     obs, action = (helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]) for name in ("obs", "action"))
     nodes, settings = [helper.make_node("Identity", ["obs"], ["action"])], {}
     if place == "initializer":
@@ -40,24 +40,24 @@ def model_of(place, value):
 
 @pytest.mark.parametrize("place", ["initializer", "constant", "branch", "sparse", "function"])
 @pytest.mark.parametrize("where", ["/etc/passwd", "../secret", "weights.bin"])
-def test_a_tensor_in_another_file_is_refused_wherever_it_stands(place, where):
+def test_tensor_in_another_file_is_refused(place, where):
     with pytest.raises(CheckpointError, match=r"policy\.onnx keeps 'w' in another file") as caught:
         require_self_contained(model_of(place, elsewhere(where)), Path("policy.onnx"))
     assert where in str(caught.value)
 
 
 @pytest.mark.parametrize("place", ["initializer", "constant", "branch", "sparse", "function"])
-def test_a_tensor_in_the_file_itself_is_taken(place):
+def test_tensor_in_the_file_is_accepted(place):
     require_self_contained(model_of(place, numpy_helper.from_array(np.ones(1, np.float32), "w")), Path("policy.onnx"))
 
 
 @pytest.mark.parametrize("data", [b"\xff" * 100, b"text, and no model"])
-def test_what_is_no_model_is_refused(data):
+def test_invalid_onnx_file_is_refused(data):
     with pytest.raises(CheckpointError, match="no ONNX file"):
         require_self_contained(data, Path("policy.onnx"))
 
 
-def test_onnx_itself_would_have_read_it(tmp_path):
+def test_onnx_library_reads_external_tensors(tmp_path):
     (tmp_path / "secret").write_bytes(np.ones(1, np.float32).tobytes())
     (tmp_path / "policy.onnx").write_bytes(model_of("initializer", elsewhere("secret")))
     assert onnx.load(tmp_path / "policy.onnx").graph.initializer[0].raw_data == np.ones(1, np.float32).tobytes()

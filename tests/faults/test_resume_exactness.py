@@ -1,4 +1,4 @@
-"""A training that was interrupted and resumed is, bit for bit, the one that never was."""
+"""A training that was interrupted and resumed equals an uninterrupted one, bit by bit."""
 
 import json
 import random
@@ -24,23 +24,23 @@ GRID = [
 ]
 SPECIAL = [("sac", True), ("ppo", True)] if SIZE != "long" else [*product(AGENTS, (True, False))]
 RING = "buffer_size: 12, batch_size: 12"
-"""A ring of three steps, and an iteration takes three: every row is replaced between two checkpoints."""
+"""A replay buffer of three steps, as many as in an iteration: every row is replaced between two checkpoints."""
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
+def base_folder(tmp_path_factory):
     return tmp_path_factory.mktemp("tasks")
 
 
 @pytest.fixture(scope="module")
-def whole(place):
-    """The trainings that nobody interrupted."""
+def uninterrupted(base_folder):
+    """Uninterrupted trainings."""
     done = {}
 
     def of(case, **settings):
         key = case, tuple(sorted(settings.items()))
         if key not in done:
-            done[key] = train(place / f"whole-{len(done)}", case, place, **settings)
+            done[key] = train(base_folder / f"whole-{len(done)}", case, base_folder, **settings)
         return done[key].folder
 
     return of
@@ -56,69 +56,71 @@ def assert_equal(run, reference):
 
 
 @pytest.mark.parametrize(("case", "cut"), chosen(GRID, 3), ids=str)
-def test_a_training_that_was_cut_goes_on_as_if_it_had_not_been(case, cut, place, whole, tmp_path, monkeypatch):
+def test_interrupted_training_resumes_bit_identical(case, cut, base_folder, uninterrupted, tmp_path, monkeypatch):
     if cut == "within":
         monkeypatch.setattr(loop, "LONG_S", -1.0)  # every iteration can be left, and its beginning is only in memory
         draw = random.Random(str(case))
         at = draw.randrange(1, ITERATIONS), draw.randrange(3)
-        run = train(tmp_path / "r", case, place, within=at, save_interval=None).folder
+        run = train(tmp_path / "r", case, base_folder, within=at, save_interval=None).folder
         assert newest(run).iteration == at[0]
     else:
-        run = train(tmp_path / "r", case, place, after=cut).folder
+        run = train(tmp_path / "r", case, base_folder, after=cut).folder
         assert newest(run).iteration == cut
-    train(run, case, place, resume=-1)
-    assert_equal(run, whole(case))
+    train(run, case, base_folder, resume=-1)
+    assert_equal(run, uninterrupted(case))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("agent", "normalize"), chosen(SPECIAL, 1))
-def test_a_training_cut_again_and_again_with_other_threads_is_the_same(agent, normalize, place, whole, tmp_path):
+def test_repeated_resumption_with_other_threads_is_bit_identical(
+    agent, normalize, base_folder, uninterrupted, tmp_path
+):
     case = Case("everything", agent, normalize)
-    run = train(tmp_path / "r", case, place, after=2, threads=2).folder
-    train(run, case, place, resume=-1, after=3)
-    train(run, case, place, resume=-1, after=4, threads=3)
-    train(run, case, place, resume=-1, threads=2)
-    assert_equal(run, whole(case))
+    run = train(tmp_path / "r", case, base_folder, after=2, threads=2).folder
+    train(run, case, base_folder, resume=-1, after=3)
+    train(run, case, base_folder, resume=-1, after=4, threads=3)
+    train(run, case, base_folder, resume=-1, threads=2)
+    assert_equal(run, uninterrupted(case))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("agent", "normalize"), chosen(SPECIAL, 1))
-def test_an_older_checkpoint_leads_to_the_same_end(agent, normalize, place, whole, tmp_path):
+def test_resume_from_an_older_checkpoint_is_bit_identical(agent, normalize, base_folder, uninterrupted, tmp_path):
     case = Case("cartpole-direct", agent, normalize)
-    run = train(tmp_path / "r", case, place, after=8).folder
+    run = train(tmp_path / "r", case, base_folder, after=8).folder
     have = steps(run / "checkpoints")
-    train(run, case, place, resume=have[4], after=5)
+    train(run, case, base_folder, resume=have[4], after=5)
     assert steps(run / "checkpoints") == have[:6]
     assert (run / "checkpoints/latest").read_text().strip() == f"{have[5]:012d}"
-    train(run, case, place, resume=have[2])
-    assert_equal(run, whole(case))
-    assert steps(run / "checkpoints") == steps(whole(case) / "checkpoints")
+    train(run, case, base_folder, resume=have[2])
+    assert_equal(run, uninterrupted(case))
+    assert steps(run / "checkpoints") == steps(uninterrupted(case) / "checkpoints")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("agent", "normalize"), chosen(SPECIAL, 1))
-def test_what_is_kept_changes_nothing_and_every_kept_checkpoint_goes_on(agent, normalize, place, whole, tmp_path):
+def test_every_kept_checkpoint_resumes_bit_identical(agent, normalize, base_folder, uninterrupted, tmp_path):
     case, keep = Case("cartpole-direct", agent, normalize), Keep(2, 3)
-    run = train(tmp_path / "r", case, place, after=8, keep=keep).folder
+    run = train(tmp_path / "r", case, base_folder, after=8, keep=keep).folder
     kept = [open_checkpoint(run / "checkpoints" / f"{step:012d}").iteration for step in steps(run / "checkpoints")]
     assert kept == [0, 3, 6, 7, 8]
     assert leftovers(run) == []
     for step in steps(run / "checkpoints"):
         copy = tmp_path / str(step)
         shutil.copytree(run, copy)
-        train(copy, case, place, resume=step, keep=keep)
-        assert_equal(copy, whole(case))
+        train(copy, case, base_folder, resume=step, keep=keep)
+        assert_equal(copy, uninterrupted(case))
 
 
 @pytest.mark.parametrize(("agent", "normalize"), chosen(SPECIAL, 1))
-def test_evaluations_change_no_bit_and_the_best_is_the_same(agent, normalize, place, whole, tmp_path):
+def test_evaluations_do_not_change_the_training(agent, normalize, base_folder, uninterrupted, tmp_path):
     case = Case("everything", agent, normalize)
-    evaluated = train(tmp_path / "whole", case, place, eval_interval=2).folder
+    evaluated = train(tmp_path / "whole", case, base_folder, eval_interval=2).folder
     rows = [{k: v for k, v in row.items() if not k.startswith("Eval/")} for row in rows_of(evaluated)]
-    assert rows == rows_of(whole(case))
-    assert content(newest(evaluated)) == content(newest(whole(case)))
-    run = train(tmp_path / "r", case, place, after=5, eval_interval=2).folder
-    train(run, case, place, resume=-1, eval_interval=2)
+    assert rows == rows_of(uninterrupted(case))
+    assert content(newest(evaluated)) == content(newest(uninterrupted(case)))
+    run = train(tmp_path / "r", case, base_folder, after=5, eval_interval=2).folder
+    train(run, case, base_folder, resume=-1, eval_interval=2)
     assert_equal(run, evaluated)
     best = max((row["Eval/mean_reward"], -row["step"]) for row in rows_of(evaluated) if "Eval/mean_reward" in row)
     for folder in (run, evaluated):
@@ -131,20 +133,20 @@ def read_best(run):
 
 @pytest.mark.parametrize("cut", chosen([(2, 1), (4, 2), (7, 0), (9, 1)], 1), ids=str)
 @pytest.mark.parametrize("agent", ["sac", "td3"])
-def test_a_ring_that_is_overwritten_in_one_iteration_is_saved_whole(
-    agent, cut, place, whole, tmp_path, monkeypatch
+def test_replay_buffer_overwritten_in_one_iteration_is_saved(
+    agent, cut, base_folder, uninterrupted, tmp_path, monkeypatch
 ):  # fmt: skip
     monkeypatch.setattr(loop, "LONG_S", -1.0)
     case = replace(Case("cartpole-direct", agent, False), more=RING)
-    run = train(tmp_path / "r", case, place, within=cut, save_interval=None).folder
-    train(run, case, place, resume=-1)
-    assert_equal(run, whole(case))
+    run = train(tmp_path / "r", case, base_folder, within=cut, save_interval=None).folder
+    train(run, case, base_folder, resume=-1)
+    assert_equal(run, uninterrupted(case))
 
 
 @pytest.mark.slow
-def test_a_linear_schedule_goes_on_where_it_was(place, whole, tmp_path):
+def test_linear_schedule_continues_after_resumption(base_folder, uninterrupted, tmp_path):
     for agent in ("sb3-ppo", "sac", "a2c"):
         case = replace(Case("cartpole-direct", agent, False), more="schedule: linear")
-        run = train(tmp_path / agent, case, place, after=4).folder
-        train(run, case, place, resume=-1)
-        assert_equal(run, whole(case))
+        run = train(tmp_path / agent, case, base_folder, after=4).folder
+        train(run, case, base_folder, resume=-1)
+        assert_equal(run, uninterrupted(case))

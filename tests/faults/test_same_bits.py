@@ -1,4 +1,4 @@
-"""Physics, episodes and draws are the same bits at any number of threads and environments, in any company."""
+"""Physics, episodes and random draws are bit-identical for any number of threads and environments."""
 
 import functools
 import json
@@ -35,10 +35,10 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def reference(folder):
-    """The lives of many environments on one thread, every physics step made by `mj_step` as well."""
+    """Trajectories of many environments on one thread, each physics step compared with `mj_step`."""
 
     @functools.cache
-    def lives(task, seed=42):
+    def trajectories(task, seed=42):
         torch.set_num_threads(1)
         life = Life(make(task, folder, ENVS, seed=seed))
         differing = against_plain_steps(life.env)
@@ -49,20 +49,18 @@ def reference(folder):
         assert len(set(life.hashes())) == ENVS, "no two lives are alike"
         return life.hashes()
 
-    return lives
+    return trajectories
 
 
 @pytest.mark.parametrize(
     ("task", "num_envs", "threads", "seed"), chosen(list(product(TASKS, NUM_ENVS, THREADS, SEEDS)), 7)
 )
-def test_lives_equal_plain_steps_at_any_number_of_threads_and_environments(
-    task, num_envs, threads, seed, folder, reference
-):
+def test_trajectories_equal_mj_step_for_any_threads_and_num_envs(task, num_envs, threads, seed, folder, reference):
     assert live(make(task, folder, num_envs, threads, seed)) == reference(task, seed)[:num_envs]
 
 
 @pytest.mark.parametrize(("task", "order"), chosen(list(product(TASKS, range(amount(6, 6, 30)))), 4))
-def test_a_partial_reset_is_the_same_in_any_order_and_in_any_parts(task, order, folder):
+def test_partial_reset_does_not_depend_on_order_or_grouping(task, order, folder):
     together, apart = (make(task, folder, 16, 2) for _ in range(2))
     rng = np.random.default_rng(order)
     ids = np.sort(rng.choice(16, size=int(rng.integers(2, 16)), replace=False))
@@ -95,7 +93,7 @@ print(json.dumps({task: live(make(task, pathlib.Path(sys.argv[1]), 7, int(sys.ar
 
 @pytest.fixture(scope="module")
 def process(tmp_path_factory):
-    """The lives of every task in a fresh process, by its hash seed."""
+    """Trajectories of every task in a new process, by its hash seed."""
 
     @functools.cache
     def run(hash_seed):
@@ -114,24 +112,24 @@ HASH_SEEDS = chosen([0, 1, 12345, "random", *(range(100, 100 + amount(0, 0, 7)))
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("hash_seed", "task"), list(product(HASH_SEEDS, TASKS)))
-def test_another_process_with_another_hash_seed_and_past_lives_the_same(hash_seed, task, process, reference):
+def test_another_process_and_hash_seed_give_equal_trajectories(hash_seed, task, process, reference):
     assert process(hash_seed)[task] == reference(task)[:7]
 
 
 @pytest.mark.parametrize(("one", "other"), chosen(list(combinations_with_replacement(TASKS, 2)), 2))
-def test_two_environments_of_one_process_do_not_touch_each_other(one, other, folder, reference):
-    lives = [Life(make(one, folder, 7, 2)), Life(make(other, folder, 3, 1, seed=5))]
+def test_two_environments_in_one_process_are_independent(one, other, folder, reference):
+    trajectories = [Life(make(one, folder, 7, 2)), Life(make(other, folder, 3, 1, seed=5))]
     alone = live(make(other, folder, 3, 1, seed=5))
     for _ in range(STEPS):
-        for life in lives:
+        for life in trajectories:
             life.step()
-    assert lives[0].hashes() == reference(one)[:7]
-    assert lives[1].hashes() == alone
+    assert trajectories[0].hashes() == reference(one)[:7]
+    assert trajectories[1].hashes() == alone
     assert alone != reference(other)[:3]
 
 
 @pytest.mark.parametrize(("task", "work"), chosen(list(product(TASKS, sorted(other_work()))), 3))
-def test_other_work_in_between_changes_nothing(task, work, folder, reference):
+def test_other_work_between_steps_changes_nothing(task, work, folder, reference):
     life = Life(make(task, folder, 7, 2))
     for step in range(STEPS):
         if step % 20 == 0:

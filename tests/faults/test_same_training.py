@@ -31,7 +31,7 @@ KINDS = {
 
 
 def built_in():
-    """Every built-in task with each of its agents whose trainer is built in too."""
+    """Return every built-in task with each of its agents whose trainer is built in."""
     names = json.loads(Path(rlcli_tasks.__file__).with_name("index.json").read_text())
     for name in names:
         agents = strict_yaml.load(find_task(name).config.read_bytes()).data["agents"]
@@ -52,7 +52,7 @@ def _torch_threads():
 
 
 def train(resolved, *, seed=3, threads=1, iterations=4):
-    """What some iterations leave: metrics of each, and every tensor, number and row of the state."""
+    """Train some iterations; return the metrics of each, and every tensor, number and row of the state."""
     env = make_env(resolved, seed=seed)
     trainer = load_object(resolved.trainer.trainer)(env, resolved.agent, seed=seed, device="cpu", torch_threads=threads)
     trainer.start()
@@ -68,7 +68,7 @@ def train(resolved, *, seed=3, threads=1, iterations=4):
 
 
 def disturb():
-    """Leave the process another one: generators, memory, threads."""
+    """Change the state of the process: generators, memory, threads."""
     for work in other_work().values():
         work()
     random.seed(1)
@@ -92,7 +92,7 @@ def configured(tmp_path, task, kind, extra="", num_envs=6):
 
 
 @pytest.mark.parametrize(("task", "kind"), chosen(list(product(TASKS, KINDS)), 5))
-def test_two_trainings_with_one_seed_are_the_same(task, kind, tmp_path):
+def test_trainings_with_one_seed_are_bit_identical(task, kind, tmp_path):
     first = train(configured(tmp_path, task, kind))
     kept = disturb()
     second = train(configured(tmp_path, task, kind, extra=", save_interval: 3"))
@@ -103,7 +103,7 @@ def test_two_trainings_with_one_seed_are_the_same(task, kind, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "threads"), chosen(list(product(["ppo", "sb3-ppo", "sac"], (2, 4))), 1))
-def test_several_torch_threads_give_the_same_every_time(kind, threads, tmp_path):
+def test_training_with_several_torch_threads_is_repeatable(kind, threads, tmp_path):
     size = "{hidden: [256, 256]}"
     wide = f", actor: {size}, critic: {size}" if kind == "ppo" else f", policy: {size}"
     resolved = configured(tmp_path, "ant-direct", kind, extra=wide, num_envs=64)
@@ -115,7 +115,7 @@ def test_several_torch_threads_give_the_same_every_time(kind, threads, tmp_path)
 
 
 @pytest.mark.parametrize(("task", "agent"), chosen(BUILT_IN, 2))
-def test_the_agents_of_built_in_tasks_train_the_same_twice(task, agent):
+def test_agents_of_built_in_tasks_train_bit_identical(task, agent):
     resolved = resolve(find_task(task), agent=agent, overrides=["scene.num_envs=32", "episode_length_s=0.4"])
     first = train(resolved, iterations=3)
     kept = disturb()
@@ -124,7 +124,7 @@ def test_the_agents_of_built_in_tasks_train_the_same_twice(task, agent):
 
 
 @pytest.mark.parametrize(("kind", "threads"), chosen(list(product(["ppo", "sb3-ppo"], (2, 3, 8))), 1))
-def test_engine_threads_change_nothing_in_training(kind, threads, tmp_path):
+def test_engine_threads_do_not_change_the_training(kind, threads, tmp_path):
     one, more = (
         resolve(find_task("ant-direct"), agent="x", config_file=file, overrides=[f"sim.engine_threads={count}"])
         for file, count in ((agent_file(tmp_path, kind), 1), (agent_file(tmp_path, kind), threads))
@@ -167,8 +167,8 @@ class Task(DirectTask):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", chosen(["ppo", "sb3-ppo", "sac"], 1))
-def test_a_task_that_draws_from_global_generators_trains_and_plays_the_same_twice(kind, tmp_path, capsys):
-    """As tasks of other frameworks do; draws of a new process differ from those of any other."""
+def test_task_with_global_generators_trains_and_plays_identically(kind, tmp_path, capsys):
+    """Use global generators, as tasks of other frameworks do; each process seeds them differently."""
     model = '<mujoco><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody></mujoco>'
     yaml = (
         "decimation: 1\nepisode_length_s: 0.1\nsim: {dt: 0.01}\nscene: {num_envs: 4, entities: {r: {model: m.xml}}}\n"

@@ -1,4 +1,4 @@
-"""Being asked to stop, at any moment: soon, with the right exit code, and the resumed run is the one never stopped."""
+"""Signals at any moment: the run stops soon with the right exit code, and resumes bit-identical."""
 
 import json
 import os
@@ -20,7 +20,7 @@ SHORT = ("episode_length_s=0.3", "agent.n_steps=64", "agent.n_epochs=10", "agent
 TRAIN = ("cartpole", *SMALL, *SHORT, "--max-iterations", 4, "--seed", 5)
 STEP, UPDATE = "rlcli.envs.vec_env:VecEnv.step", "rlcli.rl.optimizers:Adam.step"
 LONG_FIRST = {"kind": "sleep", "call": STEP, "pattern": "", "nth": 3, "seconds": 0.2}
-"""The first iteration takes long, so that the second one can be left."""
+"""Delays: the first iteration is slow, so that the second can be interrupted."""
 PHASES = {
     # in the second of four iterations: 64 steps, 40 updates each
     "rollout": {"kind": "slow", "call": STEP, "pattern": "", "nth": 64 + 20, "seconds": 0.3},
@@ -46,7 +46,7 @@ while not Path("go on").exists():
 
 
 @pytest.fixture(scope="module")
-def whole(child, tmp_path_factory):
+def uninterrupted(child, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     assert child(folder, "train", *TRAIN).ended().code == 0
     return run_in(folder)
@@ -62,15 +62,15 @@ def slow_moments(folder):
 
 
 def in_phase(child, folder, phase, *more, **settings):
-    """A training in the middle of a phase that takes seconds."""
+    """Start a training, and return in the middle of a phase that takes seconds."""
     process = child(folder, "train", *TRAIN, *more, faults=[PHASES[phase], LONG_FIRST], **settings)
     process.until(lambda: slow_moments(folder))
     return process
 
 
 @pytest.mark.parametrize(("number", "phase"), chosen(CASES, 1))
-def test_a_signal_stops_soon_and_the_resumed_run_is_the_one_that_was_not_stopped(
-    child, tmp_path, whole, number, phase
+def test_signal_stops_soon_and_the_run_resumes_bit_identical(
+    child, tmp_path, uninterrupted, number, phase
 ):  # fmt: skip
     numbers, code = SIGNALS[number]
     if phase == "plugin import":
@@ -102,11 +102,11 @@ def test_a_signal_stops_soon_and_the_resumed_run_is_the_one_that_was_not_stopped
         assert hint or len(numbers) == 2, ended.err
         resumed = child(tmp_path, *(hint[1].split() if hint else ("train", "--resume", "latest")), "-q").ended()
         assert resumed.code == 0, resumed.err
-    assert_same_run(run, whole)
+    assert_same_run(run, uninterrupted)
 
 
 def stops_in_an_import(child, folder, numbers, code):
-    """While a task's module is imported: there is nothing yet that could be resumed."""
+    """Stop during the import of a task's module, when there is nothing to resume yet."""
     task, cartpole = folder / "mine", Path(rlcli_tasks.cartpole.__file__).parent
     task.mkdir()
     shutil.copy(cartpole / "direct.yaml", task / "task.yaml")
@@ -133,18 +133,18 @@ def stops_in_an_import(child, folder, numbers, code):
 
 
 @pytest.mark.slow
-def test_a_hangup_that_nohup_ignores_does_not_stop(child, tmp_path, whole):
+def test_sighup_ignored_by_nohup_does_not_stop(child, tmp_path, uninterrupted):
     process = in_phase(child, tmp_path, "update", ignored=("SIGHUP",))
     os.kill(process.pid, signal.SIGHUP)
     ended = process.ended()
     assert ended.code == 0, ended.err
-    assert_same_run(run_in(tmp_path), whole)
+    assert_same_run(run_in(tmp_path), uninterrupted)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("streams", [("err",), ("out",), ("out", "err")], ids="+".join)
-def test_a_reader_that_goes_away_stops_nothing(child, tmp_path, whole, streams):
-    """As `rlcli train ... 2>&1 | head -1` does."""
+def test_closed_output_pipe_does_not_stop_the_training(child, tmp_path, uninterrupted, streams):
+    """Close the output as `rlcli train ... 2>&1 | head -1` does."""
     output, readers = tmp_path / "child", []
     for stream in streams:
         os.mkfifo(f"{output}.{stream}")
@@ -161,11 +161,11 @@ def test_a_reader_that_goes_away_stops_nothing(child, tmp_path, whole, streams):
         os.close(reader)
     status = process.ask(wait=process.pid, seconds=60)["status"]
     assert status == 0
-    assert_same_run(run_in(tmp_path), whole)
+    assert_same_run(run_in(tmp_path), uninterrupted)
 
 
 @pytest.mark.slow
-def test_a_terminal_that_is_gone_does_not_stop_what_ignores_its_hangup(child, tmp_path, whole):
+def test_closed_terminal_does_not_stop_a_run_that_ignores_sighup(child, tmp_path, uninterrupted):
     terminal, name = pty.openpty()
     output = tmp_path / "child"
     for stream in ("out", "err"):
@@ -177,4 +177,4 @@ def test_a_terminal_that_is_gone_does_not_stop_what_ignores_its_hangup(child, tm
     os.close(name)
     os.close(terminal)
     assert process.ask(wait=process.pid, seconds=60)["status"] == 0
-    assert_same_run(run_in(tmp_path), whole)
+    assert_same_run(run_in(tmp_path), uninterrupted)

@@ -1,4 +1,4 @@
-"""Any sequence of steps, partial resets, seeds, saving and going back agrees with plain MuJoCo, one by one."""
+"""Any sequence of steps, partial resets, seeds, saves and restores agrees with plain MuJoCo."""
 
 import copy
 import math
@@ -16,7 +16,7 @@ from rlcli.envs.make import make_env
 from rlcli.registry import find_task
 
 N, LENGTH = 4, 9
-"""Environments, and steps of an episode; the cart leaves its track sooner if it is pushed the same way for long."""
+"""Number of environments, and steps of an episode; a cart pushed in one direction leaves its track sooner."""
 WEIGHTS = {"alive": 1.0, "terminating": -2.0, "pole_pos": -1.0, "cart_vel": -0.01, "pole_vel": -0.005}
 CART, POLE = 0.5, 1.0
 PUSHES = st.lists(st.sampled_from([-4.0, -1.0, -0.3, 0.0, 0.7, 1.0, 4.0]), min_size=N, max_size=N)
@@ -29,13 +29,13 @@ def build(threads):
 
 
 class Cartpole:
-    """One cartpole on `mj_step`, its MDP written out."""
+    """One cartpole on `mj_step`, with its MDP in plain Python."""
 
     def __init__(self, model):
         self.model, self.data, self.steps, self.total = model, mujoco.MjData(model), 0, 0.0
 
     def begin(self, qpos, qvel):
-        """An episode from a state that the environment drew."""
+        """Start an episode from a state that the environment has drawn."""
         assert abs(qpos[0]) <= 1.0
         assert np.all(np.abs(qpos[1:]) <= 0.785 + 1e-6)
         assert abs(qvel[0]) <= 0.5 + 1e-6
@@ -66,7 +66,7 @@ class Cartpole:
         return np.concatenate([self.data.qpos, self.data.qvel]).astype(np.float32)
 
 
-class Lives(RuleBasedStateMachine):
+class VecEnvMachine(RuleBasedStateMachine):
     @initialize(seed=st.integers(0, 5))
     def start(self, seed):
         torch.set_num_threads(1)
@@ -150,7 +150,7 @@ class Lives(RuleBasedStateMachine):
             self.env.close()
 
 
-Lives.TestCase.settings = settings(
+VecEnvMachine.TestCase.settings = settings(
     max_examples=amount(12, 200, 5000),
     stateful_step_count=15,
     deadline=None,
@@ -158,4 +158,4 @@ Lives.TestCase.settings = settings(
     database=None,
     derandomize=True,
 )
-test_any_sequence_of_lives_agrees_with_plain_mujoco = Lives.TestCase
+test_any_sequence_agrees_with_plain_mujoco = VecEnvMachine.TestCase

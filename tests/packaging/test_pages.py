@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 import yaml
-from support.fenced import REPOSITORY, Block, blocks, run_commands, success_rate, write_files
+from support.fenced import REPOSITORY, Block, blocks, page_path, run_commands, success_rate, write_files
 from support.worlds import CRITTER, CRITTER_TASK, build, edited, write
 from support.written_runs import learning, write_run
 

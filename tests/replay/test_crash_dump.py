@@ -1,4 +1,4 @@
-"""The dump of a run's first divergence, and `rlcli replay` of it, by whomever it was written."""
+"""Dump of a run's first divergence, and `rlcli replay` of trusted and untrusted dumps."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ from rlcli.envs.direct import DirectTask
 
 
 class Task(DirectTask):
-    """In environment 5 something goes wrong in the fourth and in the sixth step of its first episode."""
+    """Task whose environment 5 diverges in the fourth and sixth step of its first episode."""
 
     num_observations = 1
     num_actions = 1
@@ -44,7 +44,7 @@ class Task(DirectTask):
 
 
 @pytest.fixture
-def breaks(coin):
+def diverging_task(coin):
     task = Path(coin) / "task.yaml"
     lines = task.read_text().splitlines()
     task.write_text("\n".join(line for line in lines if not line.startswith(("params", "success"))))
@@ -53,14 +53,14 @@ def breaks(coin):
 
 
 @pytest.fixture
-def dump(breaks, cli):
-    assert cli("eval", breaks, "--policy", "zero", "--episodes", "32", "--quiet").code == 0
+def dump(diverging_task, cli):
+    assert cli("eval", diverging_task, "--policy", "zero", "--episodes", "32", "--quiet").code == 0
     (file,) = Path("runs/dumps").iterdir()
     return file
 
 
-def rewritten(file, **changes):
-    """A dump as an attacker may write it: with a digest that is right."""
+def rewrite_dump(file, **changes):
+    """Return a dump with changed content and a matching digest, as an attacker may write it."""
     with safe_open(file, "pt") as opened:
         document = json.loads(opened.metadata()["rlcli"])
         tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
@@ -73,8 +73,8 @@ def rewritten(file, **changes):
 
 
 @pytest.mark.slow
-def test_a_run_that_diverges_says_so_once_and_replay_shows_where(breaks, cli, only_run):
-    trained = cli("train", breaks, "--max-iterations", "3", "--logger", "none")
+def test_first_divergence_is_dumped_and_replayed(diverging_task, cli, only_run):
+    trained = cli("train", diverging_task, "--max-iterations", "3", "--logger", "none")
     assert trained.code == 0, trained.err
     (line,) = [line for line in trained.err.splitlines() if "diverged for the first time" in line]
     (file,) = (only_run() / "dumps").iterdir()
@@ -93,16 +93,16 @@ def test_a_run_that_diverges_says_so_once_and_replay_shows_where(breaks, cli, on
     assert (found["env"], found["cause"], found["where"]["call"]) == (5, "BADQVEL", 3)
 
 
-def test_an_evaluation_outside_of_a_run_counts_by_cause_and_dumps_into_the_runs_folder(breaks, cli):
-    said = cli("eval", breaks, "--policy", "zero", "--episodes", "32", "--json")
-    assert said.code == 0
-    assert said.json["diverged_by"] == {"BADQVEL": said.json["diverged"]}
+def test_eval_without_a_run_counts_divergences_and_dumps_one(diverging_task, cli):
+    message = cli("eval", diverging_task, "--policy", "zero", "--episodes", "32", "--json")
+    assert message.code == 0
+    assert message.json["diverged_by"] == {"BADQVEL": message.json["diverged"]}
     (file,) = Path("runs/dumps").iterdir()
-    assert str(file) in said.err
+    assert str(file) in message.err
     assert cli("replay", file).code == 0
 
 
-def test_a_dump_that_differs_from_what_the_task_gives_now_is_a_negative_verdict(dump, cli):
+def test_replay_of_a_changed_state_exits_9(dump, cli):
     model = Path("coin/model.xml")
     model.write_text(model.read_text().replace('type="slide"', 'type="slide" stiffness="10" springref="1"'))
     shown = cli("replay", dump, "--json")
@@ -112,7 +112,7 @@ def test_a_dump_that_differs_from_what_the_task_gives_now_is_a_negative_verdict(
     assert "the task's model is not what it was dumped with" in shown.err
 
 
-def test_a_dump_of_another_model_does_not_fit(dump, cli):
+def test_replay_refuses_a_dump_of_another_model(dump, cli):
     model = Path("coin/model.xml")
     model.write_text(model.read_text().replace("</body>", '<joint name="more" type="slide" axis="1 0 0"/></body>'))
     shown = cli("replay", dump)
@@ -120,15 +120,15 @@ def test_a_dump_of_another_model_does_not_fit(dump, cli):
     assert "does not fit the installed task" in shown.err
 
 
-def test_a_folder_that_cannot_be_written_does_not_stop_the_evaluation(breaks, cli):
+def test_eval_continues_if_the_dump_cannot_be_written(diverging_task, cli):
     Path("runs").mkdir()
     Path("runs/dumps").write_text("in the way")
-    said = cli("eval", breaks, "--policy", "zero", "--episodes", "32")
-    assert said.code == 0
-    assert "there is no dump" in said.err
+    message = cli("eval", diverging_task, "--policy", "zero", "--episodes", "32")
+    assert message.code == 0
+    assert "there is no dump" in message.err
 
 
-def test_options_of_recordings_are_refused_for_dumps(dump, cli):
+def test_replay_refuses_recording_options_for_a_dump(dump, cli):
     assert cli("replay", dump, "--episode", "0").code == 2
 
 
@@ -150,7 +150,7 @@ ATTACKS = {
 
 @pytest.mark.timeout(60)  # a call of 1e9 steps takes many minutes
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_a_strangers_dump_is_refused_with_the_file_and_the_reason(dump, cli, attack):
+def test_untrusted_dump_is_refused_with_file_and_reason(dump, cli, attack):
     changes = ATTACKS[attack]
     if "worlds" in changes:
         with safe_open(dump, "pt") as opened:
@@ -158,13 +158,13 @@ def test_a_strangers_dump_is_refused_with_the_file_and_the_reason(dump, cli, att
         document["worlds"] = []
         safetensors.torch.save_file({}, dump, metadata={"rlcli": json.dumps(document)})
     else:
-        rewritten(dump, **{key: dict(value) if isinstance(value, dict) else value for key, value in changes.items()})
+        rewrite_dump(dump, **{key: dict(value) if isinstance(value, dict) else value for key, value in changes.items()})
     shown = cli("replay", dump)
     assert shown.code == 5
     assert str(dump) in shown.err
 
 
-def test_a_truncated_or_changed_dump_is_refused(dump):
+def test_truncated_or_changed_dump_is_refused(dump):
     whole = dump.read_bytes()
     for end in range(0, len(whole), max(1, len(whole) // 25)):
         dump.write_bytes(whole[:end])
@@ -180,7 +180,7 @@ def test_a_truncated_or_changed_dump_is_refused(dump):
     assert replay_calls(read_trajectory(dump)).difference is None
 
 
-def test_a_header_that_is_nested_a_million_deep_is_refused(tmp_path):
+def test_deeply_nested_header_is_refused(tmp_path):
     file = tmp_path / "deep.safetensors"
     safetensors.torch.save_file({"x": torch.zeros(1)}, file, metadata={"rlcli": "[" * 1_000_000})
     with pytest.raises(CheckpointError, match="corrupt, or no recording or dump"):

@@ -1,4 +1,4 @@
-"""`rlcli play --env E --episode K` is, bit for bit, that episode of `rlcli eval`, or says what it depends on."""
+"""`rlcli play --env E --episode K` equals that episode of `rlcli eval` bit by bit, or reports its dependencies."""
 
 import json
 
@@ -13,7 +13,7 @@ from rlcli.replay.trajectory import read_trajectory
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
-ENVS, WHO, EPISODE, SEED = 5, 3, 4, 11
+ENVS, ENV_ID, EPISODE, SEED = 5, 3, 4, 11
 COMMANDS = {"walk": {"func": "uniform_velocity", "resampling_time_s": [0.1, 0.3], "lin_vel_x": [-1.0, 1.0]}}
 EVENTS = {
     "push": None,
@@ -39,7 +39,7 @@ CONNECTED = {
     "throttled resets": ({"events": {**EVENTS, **SOMETIMES}}, "events.mass"),
     "noise": ({"events": EVENTS, "observations": NOISE}, "observations.policy.asked"),
 }
-"""Change of the critter -> what connects its episodes."""
+"""Change of the critter task -> reason why its episodes depend on each other."""
 
 
 @pytest.fixture(autouse=True)
@@ -48,31 +48,31 @@ def one_thread():
 
 
 def policy(env):
-    """Something that depends on every observation, and on nothing else."""
+    """Return an action function that depends only on all observations."""
     generator = torch.Generator().manual_seed(3)
     weights = torch.randn(env.layout.size(), env.layout.action_size, generator=generator)
     return lambda obs: (obs @ weights).tanh()
 
 
-def made(task):
+def make_task_env(task):
     torch.manual_seed(SEED)
     return build(task, ENVS, "episode_length_s=0.3", seed=SEED)
 
 
 def recorded(task, tmp_path):
-    """The states, actions and rewards of the episode in the whole evaluation, and those of the one alone."""
-    env = made(task)
+    """Record the episode in the whole evaluation and alone: states, actions and rewards of both."""
+    env = make_task_env(task)
     whole, count = tmp_path / "whole.safetensors", ENVS * (EPISODE + 1)
     with EpisodeRecorder(env, count) as recorder:
         evaluate(env, policy(env), count)
     recorder.save(whole)
-    env = made(task)
-    start = start_episode(env, policy(env), WHO, EPISODE)
-    with EpisodeRecorder(env, 1, only=WHO) as recorder:
-        run_episode(env, policy(env), start.obs, WHO)
+    env = make_task_env(task)
+    start = start_episode(env, policy(env), ENV_ID, EPISODE)
+    with EpisodeRecorder(env, 1, env_id=ENV_ID) as recorder:
+        run_episode(env, policy(env), start.obs, ENV_ID)
     recorder.save(tmp_path / "one.safetensors")
     recording = read_trajectory(whole)
-    number = [n for n, e in enumerate(recording.header.episodes) if e.env == WHO][EPISODE]
+    number = [n for n, e in enumerate(recording.header.episodes) if e.env == ENV_ID][EPISODE]
     return parts(recording, number), parts(read_trajectory(tmp_path / "one.safetensors"), 0), start
 
 
@@ -88,7 +88,7 @@ def assert_same(left, right):
 
 
 @pytest.mark.parametrize("task", ["critter", "cartpole"])
-def test_an_episode_that_nothing_connects_to_those_before_it_is_begun_at_once(task, tmp_path):
+def test_independent_episode_starts_at_once(task, tmp_path):
     place = critter(tmp_path, edited(CRITTER_TASK, events=EVENTS)) if task == "critter" else task
     whole, one, start = recorded(place, tmp_path)
     assert (start.episodes_before, start.reasons, start.shared_draws()) == (0, [], False)
@@ -96,7 +96,7 @@ def test_an_episode_that_nothing_connects_to_those_before_it_is_begun_at_once(ta
 
 
 @pytest.mark.parametrize("what", CONNECTED)
-def test_what_connects_episodes_is_named_and_those_before_it_are_lived(what, tmp_path):
+def test_dependent_episode_runs_earlier_ones_with_reasons(what, tmp_path):
     change, named = CONNECTED[what]
     task = critter(tmp_path, edited(CRITTER_TASK, **change))
     whole, one, start = recorded(task, tmp_path)
@@ -104,15 +104,15 @@ def test_what_connects_episodes_is_named_and_those_before_it_are_lived(what, tmp
     assert named in start.reasons
     assert not [other for _, other in CONNECTED.values() if other != named and other in start.reasons]
     assert_same(whole, one)
-    env = made(task)  # the name is not said for nothing: begun at once it is another episode
-    with EpisodeRecorder(env, 1, only=WHO) as recorder:
-        run_episode(env, policy(env), env.reset(seed=SEED, episode=EPISODE)["policy"], WHO)
+    env = make_task_env(task)  # the reason matters: without the earlier episodes it is another episode
+    with EpisodeRecorder(env, 1, env_id=ENV_ID) as recorder:
+        run_episode(env, policy(env), env.reset(seed=SEED, episode=EPISODE)["policy"], ENV_ID)
     recorder.save(tmp_path / "other.safetensors")
     other = parts(read_trajectory(tmp_path / "other.safetensors"), 0)
     assert whole["qpos"].shape != other["qpos"].shape or not torch.equal(whole["qpos"], other["qpos"])
 
 
-def test_a_direct_task_lives_the_episodes_before(tmp_path):
+def test_direct_task_runs_earlier_episodes(tmp_path):
     whole, one, start = recorded("cartpole-direct", tmp_path)
     assert start.episodes_before == EPISODE
     assert start.reasons == ["the class CartpoleTask"]
@@ -120,8 +120,8 @@ def test_a_direct_task_lives_the_episodes_before(tmp_path):
 
 
 @pytest.fixture
-def sampled(coin):
-    """The coin, thrown with torch's own generator, as ported tasks do."""
+def sampled_coin(coin):
+    """The coin task with draws from torch's global generator, as ported tasks make them."""
     file = coin_file(coin)
     text = file.read_text().replace("self.draws(env_ids).uniform(0.0, 1.0, (1,))[:, 0]", "torch.rand(len(env_ids))")
     file.write_text(text)
@@ -134,19 +134,19 @@ def coin_file(coin):
     return Path(coin) / "task.py"
 
 
-def test_a_task_that_draws_from_torchs_generator_says_that_other_numbers_of_environments_live_otherwise(sampled, cli):
+def test_draws_from_torch_depend_on_num_envs_with_a_warning(sampled_coin, cli):
     arguments = ("--policy", "zero", "--env", "3", "--episode", "6", "--num-envs", "5")
-    said = cli("play", sampled, *arguments, "--json")
-    assert said.code == 0
-    assert said.json["shared_draws"] is True
-    assert "with another --num-envs than 5 the episode is another" in said.err
-    whole = cli("eval", sampled, "--policy", "zero", "--num-envs", "5", "--episodes", "35", "--record", "all.st")
+    message = cli("play", sampled_coin, *arguments, "--json")
+    assert message.code == 0
+    assert message.json["shared_draws"] is True
+    assert "with another --num-envs than 5 the episode is another" in message.err
+    whole = cli("eval", sampled_coin, "--policy", "zero", "--num-envs", "5", "--episodes", "35", "--record", "all.st")
     assert whole.code == 0
     mine = [e for e in read_trajectory(coin_file("").parent / "all.st").header.episodes if e.env == 3][6]
-    assert (said.json["length"], said.json["ended_by"]) == (mine.length, mine.causes)
+    assert (message.json["length"], message.json["ended_by"]) == (mine.length, mine.causes)
 
 
-def test_a_reward_of_ones_own_that_draws_from_torchs_generator_is_found_and_the_episodes_are_lived(tmp_path):
+def test_reward_that_draws_from_torch_runs_earlier_episodes(tmp_path):
     task = critter(tmp_path, edited(CRITTER_TASK, events=EVENTS, rewards={"noise": OWN}))
     (task / "terms.py").write_text(
         'import torch\n\n\ndef noise(env):\n    """Noise. (num_envs,)"""\n    return torch.rand(env.num_envs)\n'
@@ -157,10 +157,10 @@ def test_a_reward_of_ones_own_that_draws_from_torchs_generator_is_found_and_the_
     assert_same(whole, one)
 
 
-def test_numbers_and_a_recording_are_those_of_the_evaluation(coin, cli):
-    said = cli("play", coin, "--policy", "zero", "--env", "40", "--episode", "2", "--record", "one.st", "--json")
-    assert said.code == 0
-    document = said.json
+def test_play_episode_equals_the_evaluation(coin, cli):
+    message = cli("play", coin, "--policy", "zero", "--env", "40", "--episode", "2", "--record", "one.st", "--json")
+    assert message.code == 0
+    document = message.json
     assert (document["num_envs"], document["env"], document["episode"], document["lived_before"]) == (41, 40, 2, 2)
     assert cli("replay", "one.st").code == 0
     assert (
@@ -176,7 +176,7 @@ def test_numbers_and_a_recording_are_those_of_the_evaluation(coin, cli):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["--env", "3"], "--env needs --episode"),
         (["--episode", "3"], "--episode needs --env"),
@@ -184,14 +184,14 @@ def test_numbers_and_a_recording_are_those_of_the_evaluation(coin, cli):
         (["--env", "3", "--episode", "0", "--record-mode", "failed"], "--record-mode"),
     ],
 )
-def test_what_names_no_episode_is_refused(coin, cli, arguments, said):
+def test_invalid_episode_options_are_refused(coin, cli, arguments, message):
     done = cli("play", coin, "--policy", "zero", *arguments)
     assert done.code == 2
-    assert said in done.err
+    assert message in done.err
 
 
 @pytest.mark.slow
-def test_the_episode_is_drawn_and_its_frames_are_its_own(cli):
+def test_video_of_one_episode_has_its_frames(cli):
     imageio = pytest.importorskip("imageio.v2")
     arguments = ("--policy", "zero", "--env", "2", "--episode", "3")
     shown = cli("play", "cartpole", *arguments, "--video", "one.gif", "--json")

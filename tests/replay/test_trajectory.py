@@ -1,4 +1,4 @@
-"""`--record` and `rlcli replay`: whole episodes in a file, stepped again bit by bit."""
+"""`--record` and `rlcli replay`: whole episodes in a file, simulated again bit by bit."""
 
 import json
 import os
@@ -26,7 +26,7 @@ EVENTS = {
     "hit": {"func": "apply_body_impulse", "mode": "interval", "interval_range_s": [0.1, 0.2], "bodies": "torso",
             "force": [-5.0, 5.0], "duration_s": [0.02, 0.1]},
 }  # fmt: skip
-"""Everything that happens without the policy: a replay must have it happen again."""
+"""Randomness apart from the policy, which a replay must reproduce."""
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def recorded(task, file, episodes=9, num_envs=4):
     return read_trajectory(file)
 
 
-def test_a_replay_of_every_episode_is_equal_bit_by_bit(task, tmp_path):
+def test_replay_of_every_episode_is_bit_identical(task, tmp_path):
     recording = recorded(task, tmp_path / "r.safetensors")
     assert len(recording.header.episodes) == 9
     env = build(task, 4, seed=1)
@@ -50,7 +50,7 @@ def test_a_replay_of_every_episode_is_equal_bit_by_bit(task, tmp_path):
     assert replay_episodes(recording, env, [4]).difference is None, "the same environment again, another episode"
 
 
-def test_an_episode_holds_its_states_actions_rewards_and_model(task, tmp_path):
+def test_recording_has_states_actions_rewards_and_model_fields(task, tmp_path):
     recording = recorded(task, tmp_path / "r.safetensors")
     masses = set()
     for number, episode in enumerate(recording.header.episodes):
@@ -66,7 +66,7 @@ def test_an_episode_holds_its_states_actions_rewards_and_model(task, tmp_path):
 
 
 @pytest.mark.parametrize("field", ["qpos", "qvel", "ctrl", "rewards"])
-def test_the_first_difference_is_told(task, tmp_path, field):
+def test_replay_reports_the_first_difference(task, tmp_path, field):
     recording = recorded(task, tmp_path / "r.safetensors")
     values = recording.tensors[f"episode.5.{field}"]
     place = (7,) if field == "rewards" else (7, 0)
@@ -77,7 +77,7 @@ def test_the_first_difference_is_told(task, tmp_path, field):
     assert difference.recorded != difference.replayed
 
 
-def test_a_changed_model_gives_a_difference_and_a_changed_task_does_not_fit(task, tmp_path):
+def test_replay_detects_a_changed_model_and_a_changed_task(task, tmp_path):
     recording = recorded(task, tmp_path / "r.safetensors")
     (task / "critter.xml").write_text(CRITTER.replace('damping="0.2"', 'damping="0.21"'))
     difference = replay_episodes(recording, build(task, 4), range(9)).difference
@@ -87,19 +87,19 @@ def test_a_changed_model_gives_a_difference_and_a_changed_task_does_not_fit(task
         replay_episodes(recording, build(other, 3), range(9))
 
 
-def test_eval_records_what_it_counts_and_replay_steps_it_without_the_policy(cli, coin):
-    said = cli("eval", coin, "--policy", "random", "--episodes", 50, "--record", "r.safetensors", "--json").json
-    assert said["recorded"] == ["r.safetensors"]
+def test_eval_recording_is_replayed_without_the_policy(cli, coin):
+    message = cli("eval", coin, "--policy", "random", "--episodes", 50, "--record", "r.safetensors", "--json").json
+    assert message["recorded"] == ["r.safetensors"]
     recording = read_recording_here("r.safetensors")
-    assert len(recording.header.episodes) == said["episodes"] == 50
-    assert sum(e.success for e in recording.header.episodes) == pytest.approx(50 * said["success"]["rate"])
+    assert len(recording.header.episodes) == message["episodes"] == 50
+    assert sum(e.success for e in recording.header.episodes) == pytest.approx(50 * message["success"]["rate"])
     result = cli("replay", "r.safetensors", "--json").json
     assert result["equal"] is True
     assert result["episodes"] == 50
     assert result["steps"] == sum(e.length for e in recording.header.episodes)
 
 
-def ends(result, code):
+def expect_code(result, code):
     assert result.code == code, result.err
     return result
 
@@ -108,7 +108,7 @@ def read_recording_here(name):
     return read_trajectory(Path(name).absolute())
 
 
-def test_modes_choose_the_episodes(cli, coin):
+def test_record_modes_select_episodes(cli, coin):
     def count(*flags):
         cli("play", coin, "--policy", "zero", "--viewer", "none", "--record", "r.safetensors", *flags)
         return [e.success for e in read_recording_here("r.safetensors").header.episodes]
@@ -128,17 +128,17 @@ def test_replay_exits_9_with_the_first_difference(cli, task):
     cli("eval", "./critter", *flags)
     assert cli("replay", "r.safetensors").code == 0
     (task / "critter.xml").write_text(CRITTER.replace('damping="0.2"', 'damping="0.21"'))
-    result = ends(cli("replay", "r.safetensors", "--json"), 9).json
+    result = expect_code(cli("replay", "r.safetensors", "--json"), 9).json
     assert result["equal"] is False
     assert result["difference"]["episode"] == 0
     assert result["difference"]["step"] == 1
     assert result["difference"]["field"] == "qpos"
-    said = ends(cli("replay", "r.safetensors"), 9).out
-    assert "episode 0 differs first at step 1 in qpos: recorded [" in said
+    message = expect_code(cli("replay", "r.safetensors"), 9).out
+    assert "episode 0 differs first at step 1 in qpos: recorded [" in message
 
 
 @pytest.mark.parametrize("damage", ["cut", "bit", "empty", "text", "foreign", "missing", "version"])
-def test_a_file_that_is_not_a_whole_recording_exits_5(cli, coin, damage):
+def test_damaged_recording_exits_5(cli, coin, damage):
     file = Path("r.safetensors")
     cli("eval", coin, "--policy", "random", "--episodes", 4, "--record", file)
     data = bytearray(file.read_bytes())
@@ -151,25 +151,25 @@ def test_a_file_that_is_not_a_whole_recording_exits_5(cli, coin, damage):
         save_file(load_file(file), file, metadata={"rlcli": json.dumps({"format": 99})})
     if damage == "missing":
         os.remove(file)
-    result = ends(cli("replay", file, "--json"), 5)
+    result = expect_code(cli("replay", file, "--json"), 5)
     assert "r.safetensors" in result.json["error"]["message"]
 
 
-def test_what_cannot_be_recorded_is_refused_before_anything_runs(cli, coin):
+def test_invalid_record_options_are_refused_before_the_run(cli, coin):
     flags = ("eval", coin, "--policy", "random", "--record")
-    assert "did you mean 'failed'" in ends(cli(*flags, "r", "--record-mode", "faild"), 2).err
-    assert "there is no folder" in ends(cli(*flags, "no/where"), 10).err
-    assert "is a folder" in ends(cli(*flags, "."), 2).err
-    assert ends(cli("play", coin, "--policy", "zero", "--video", "x.mp4", "--record", "r"), 2).code == 2
+    assert "did you mean 'failed'" in expect_code(cli(*flags, "r", "--record-mode", "faild"), 2).err
+    assert "there is no folder" in expect_code(cli(*flags, "no/where"), 10).err
+    assert "is a folder" in expect_code(cli(*flags, "."), 2).err
+    assert expect_code(cli("play", coin, "--policy", "zero", "--video", "x.mp4", "--record", "r"), 2).code == 2
 
 
-def test_an_episode_that_is_not_there_is_refused_with_how_many_there_are(cli, coin):
+def test_unknown_episode_is_refused_with_the_count(cli, coin):
     cli("eval", coin, "--policy", "random", "--episodes", 4, "--record", "r.safetensors")
-    assert "it has 4" in ends(cli("replay", "r.safetensors", "--episode", 4), 2).err
+    assert "it has 4" in expect_code(cli("replay", "r.safetensors", "--episode", 4), 2).err
 
 
 @pytest.mark.slow
-def test_a_replay_draws_its_episode(cli):
+def test_replay_writes_a_video(cli):
     cli("eval", "cartpole", "--policy", "random", "--episodes", 2, "--num-envs", 2, "--record", "r.safetensors",
         "episode_length_s=0.5")  # fmt: skip
     result = cli("replay", "r.safetensors", "--episode", 1, "--video", "r.gif", "--json").json

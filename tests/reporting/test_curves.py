@@ -194,7 +194,7 @@ def test_a_pipe_in_place_of_the_configuration_is_not_waited_for(tmp_path):
     run = write_run(tmp_path, rows=learning())
     run.config.unlink()
     os.mkfifo(run.config)
-    with pytest.raises(CheckpointError, match="no plain file"):
+    with pytest.raises(CheckpointError, match="not a plain file"):
         gather([run])
 
 

@@ -1,4 +1,4 @@
-"""Files are written whole or not at all, and what the disk said is passed on with what to do."""
+"""Atomic writes: a file is written completely or not at all, and disk errors have a hint."""
 
 import errno
 import json
@@ -15,14 +15,14 @@ def names(folder):
 
 
 @pytest.mark.parametrize(("content", "bytes_"), [("é\n", "é\n".encode()), (b"\x00\xff", b"\x00\xff"), ("", b"")])
-def test_text_and_bytes_are_written_as_they_are_and_nothing_else_is_left(tmp_path, content, bytes_):
+def test_write_atomic_writes_text_and_bytes_unchanged(tmp_path, content, bytes_):
     (tmp_path / "file").write_text("a longer content that was there before")
     atomic_io.write_atomic(tmp_path / "file", content)
     assert (tmp_path / "file").read_bytes() == bytes_
     assert names(tmp_path) == ["file"]
 
 
-def test_what_is_written_is_on_the_disk_before_it_gets_its_name(tmp_path, monkeypatch):
+def test_write_atomic_syncs_before_the_rename(tmp_path, monkeypatch):
     done = []
     fsync, replace = os.fsync, os.replace
     monkeypatch.setattr(os, "fsync", lambda handle: (done.append(("fsync", os.fstat(handle).st_size)), fsync(handle)))
@@ -31,7 +31,7 @@ def test_what_is_written_is_on_the_disk_before_it_gets_its_name(tmp_path, monkey
     assert done == [("fsync", 5), ("replace", "file")]
 
 
-def test_a_link_in_the_temporary_files_place_is_not_followed(tmp_path):
+def test_write_atomic_does_not_follow_a_link_at_the_temporary_path(tmp_path):
     precious = tmp_path / "precious"
     precious.write_text("mine")
     (tmp_path / f".file.tmp-{os.getpid()}").symlink_to(precious)
@@ -43,7 +43,7 @@ def test_a_link_in_the_temporary_files_place_is_not_followed(tmp_path):
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
-def test_when_it_fails_the_old_content_stays_and_nothing_is_left(tmp_path, monkeypatch, call, error):
+def test_write_atomic_keeps_the_old_content_after_an_error(tmp_path, monkeypatch, call, error):
     (tmp_path / "file").write_text("old")
 
     def fail(*_):
@@ -60,7 +60,7 @@ def test_when_it_fails_the_old_content_stays_and_nothing_is_left(tmp_path, monke
         assert caught.value.__cause__ is error
 
 
-def test_what_cannot_even_be_cleaned_away_is_the_disks_error_too(tmp_path):
+def test_write_atomic_reports_an_error_of_the_temporary_path(tmp_path):
     (tmp_path / f".file.tmp-{os.getpid()}").mkdir()
     with pytest.raises(MachineError, match=r"cannot write .*file: "):
         atomic_io.write_atomic(tmp_path / "file", "new")
@@ -70,25 +70,25 @@ def test_what_cannot_even_be_cleaned_away_is_the_disks_error_too(tmp_path):
 @pytest.mark.parametrize(
     ("code", "hint"),
     [
-        (errno.ENOSPC, "free some space, then go on with --resume"),
+        (errno.ENOSPC, "free some space, then continue with --resume"),
         (errno.EACCES, "choose another folder with --runs-dir"),
         (errno.EROFS, "choose another folder with --runs-dir"),
         (errno.EDQUOT, "the disk quota is used up"),
         (errno.EIO, None),
     ],
 )
-def test_the_hint_fits_what_the_disk_said(tmp_path, code, hint):
+def test_disk_error_has_a_hint_for_its_errno(tmp_path, code, hint):
     error = atomic_io.disk_error(tmp_path, OSError(code, os.strerror(code)))
     assert error.message == f"cannot write {tmp_path}: {os.strerror(code)}"
     assert error.hint == hint
 
 
-def test_an_error_without_a_number_is_passed_on_as_it_is(tmp_path):
+def test_disk_error_without_errno_keeps_its_message(tmp_path):
     error = atomic_io.disk_error(tmp_path, OSError("odd"))
     assert (error.message, error.hint) == (f"cannot write {tmp_path}: odd", None)
 
 
-def test_a_folders_entries_are_synced_and_no_handle_is_left(tmp_path, monkeypatch):
+def test_sync_folder_syncs_entries_and_closes_its_handle(tmp_path, monkeypatch):
     synced = []
     fsync = os.fsync
     monkeypatch.setattr(
@@ -107,7 +107,7 @@ def test_a_folders_entries_are_synced_and_no_handle_is_left(tmp_path, monkeypatc
     assert len(os.listdir("/proc/self/fd")) == before
 
 
-def test_json_is_readable_ends_with_a_newline_and_holds_no_nan():
+def test_to_json_is_indented_and_refuses_nan():
     assert atomic_io.to_json({"a": [1]}) == '{\n  "a": [\n    1\n  ]\n}\n'
     assert json.loads(atomic_io.to_json({"a": 0.1})) == {"a": 0.1}
     for value in (float("nan"), float("inf")):

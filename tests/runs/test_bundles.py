@@ -1,4 +1,4 @@
-"""Policies without their training: what a bundle holds, where it may be written, and that it is the same policy."""
+"""Bundles: their content, where they may be written, and equality with the checkpoint's policy."""
 
 import json
 import os
@@ -56,7 +56,7 @@ def run(saved):
     return Run(saved.folder.parents[1], record)
 
 
-def test_a_bundle_acts_as_the_checkpoint_and_holds_nothing_else(saved, run, tmp_path):
+def test_bundle_has_only_the_policy_of_the_checkpoint(saved, run, tmp_path):
     bundle = write_bundle(saved, tmp_path / "out" / "policy", run, EVALUATION)
     assert sorted(os.listdir(bundle.folder)) == ["manifest.json", "policy.json", "policy.safetensors"]
     obs = torch.randn(5, 3)
@@ -65,7 +65,7 @@ def test_a_bundle_acts_as_the_checkpoint_and_holds_nothing_else(saved, run, tmp_
         open_checkpoint(bundle.folder).state()
 
 
-def test_a_bundle_says_what_it_is_for_and_where_it_comes_from(saved, run, tmp_path):
+def test_bundle_manifest_records_task_and_training(saved, run, tmp_path):
     manifest = write_bundle(saved, tmp_path / "policy", run, EVALUATION).manifest
     assert (manifest["step"], manifest["iteration"], manifest["agent"], manifest["seed"]) == (64, 3, "ppo", 7)
     assert manifest["origin"]["gpu"] == "NVIDIA H200"
@@ -75,7 +75,7 @@ def test_a_bundle_says_what_it_is_for_and_where_it_comes_from(saved, run, tmp_pa
     assert manifest["layout"] == LAYOUT
 
 
-def test_no_path_of_the_machine_is_in_a_bundle_and_equal_policies_give_equal_bytes(saved, run, tmp_path):
+def test_bundle_has_no_local_paths_and_is_deterministic(saved, run, tmp_path):
     one, two = (write_bundle(saved, tmp_path / name / "policy", run, EVALUATION).folder for name in ("a", "b"))
     for file in one.iterdir():
         data = file.read_bytes()
@@ -86,13 +86,13 @@ def test_no_path_of_the_machine_is_in_a_bundle_and_equal_policies_give_equal_byt
         assert not tensors.metadata()
 
 
-def test_a_bundle_of_a_bundle_keeps_where_it_comes_from(saved, run, tmp_path):
+def test_bundle_of_a_bundle_keeps_its_training_record(saved, run, tmp_path):
     first = write_bundle(saved, tmp_path / "first", run, EVALUATION)
     second = write_bundle(open_checkpoint(first.folder), tmp_path / "second", None, None)
     assert second.manifest == first.manifest
 
 
-def test_an_older_bundle_is_replaced_and_nothing_is_left_beside_it(saved, tmp_path):
+def test_write_bundle_replaces_an_older_bundle(saved, tmp_path):
     target = tmp_path / "policies" / "arm"
     write_bundle(saved, target, None, None)
     folder = saved.folder.parent
@@ -103,7 +103,7 @@ def test_an_older_bundle_is_replaced_and_nothing_is_left_beside_it(saved, tmp_pa
 
 
 @pytest.mark.parametrize("kind", ["folder", "file", "link"])
-def test_what_is_no_bundle_is_not_replaced(saved, tmp_path, kind):
+def test_write_bundle_does_not_replace_other_files(saved, tmp_path, kind):
     target = tmp_path / "precious"
     if kind == "file":
         target.write_text("mine")
@@ -119,7 +119,7 @@ def test_what_is_no_bundle_is_not_replaced(saved, tmp_path, kind):
     assert kept.read_text() == "mine"
 
 
-def test_a_checkpoint_that_does_not_fit_its_layout_is_not_written(saved, tmp_path):
+def test_write_bundle_refuses_a_checkpoint_with_another_layout(saved, tmp_path):
     file = saved.folder / "manifest.json"
     document = json.loads(file.read_text())
     document["layout"]["observations"]["policy"][0]["size"] = 4
@@ -129,7 +129,7 @@ def test_a_checkpoint_that_does_not_fit_its_layout_is_not_written(saved, tmp_pat
     assert not (tmp_path / "policy").exists()
 
 
-def test_a_bundle_of_a_newer_version_is_refused_by_its_number(saved, tmp_path):
+def test_open_bundle_refuses_another_version(saved, tmp_path):
     folder = write_bundle(saved, tmp_path / "policy", None, None).folder
     document = json.loads((folder / "manifest.json").read_text())
     (folder / "manifest.json").write_text(json.dumps({**document, "bundle": 2}))
@@ -137,7 +137,7 @@ def test_a_bundle_of_a_newer_version_is_refused_by_its_number(saved, tmp_path):
         open_bundle(folder)
 
 
-def test_a_checkpoint_of_a_run_is_no_bundle(saved):
+def test_is_bundle_is_false_for_a_checkpoint_of_a_run(saved):
     assert not is_bundle(saved.folder)
     assert not is_bundle(saved.folder / "nowhere")
     assert not is_bundle(Path("x" * 5000))

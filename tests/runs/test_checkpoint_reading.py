@@ -1,4 +1,4 @@
-"""A checkpoint is read whole, and each thing that can be wrong with it is said in its own words."""
+"""Reading of checkpoints, and a specific error for each kind of damage."""
 
 import json
 import shutil
@@ -45,7 +45,7 @@ def folder(good, tmp_path):
     return tmp_path / "checkpoints" / f"{300:012d}"
 
 
-def test_a_good_one_is_read_whole(folder):
+def test_valid_checkpoint_is_read_completely(folder):
     opened = checkpoint.open_checkpoint(folder)
     assert (opened.step, opened.iteration, opened.manifest["seed"]) == (300, 3, 7)
     state = opened.state()
@@ -58,7 +58,7 @@ def test_a_good_one_is_read_whole(folder):
     opened.verify(whole=True)
 
 
-def test_a_part_is_read_up_to_the_size_that_is_allowed(folder):
+def test_tensors_refuses_a_part_above_its_limit(folder):
     opened = checkpoint.open_checkpoint(folder)
     size = (folder / "env.safetensors").stat().st_size
     assert set(opened.tensors("env", size)) == {"x"}
@@ -68,13 +68,13 @@ def test_a_part_is_read_up_to_the_size_that_is_allowed(folder):
         opened.tensors("own")
 
 
-def test_what_this_machine_has_no_memory_for_is_not_read(folder, monkeypatch):
+def test_tensors_refuses_a_part_larger_than_memory(folder, monkeypatch):
     monkeypatch.setattr(checkpoint, "memory", lambda: 90)
     with pytest.raises(CheckpointError, match=r"env\.safetensors is too large: .* at most 30 are read"):
         checkpoint.open_checkpoint(folder).tensors("env")
 
 
-def test_a_part_has_the_limit_of_its_kind_also_where_there_are_several(folder, monkeypatch):
+def test_numbered_part_has_the_limit_of_its_kind(folder, monkeypatch):
     shutil.copy(folder / "env.safetensors", folder / "env.1.safetensors")
     edit_manifest(lambda m: m["files"].update({"env.1.safetensors": m["files"]["env.safetensors"]}))(folder)
     monkeypatch.setitem(checkpoint._LIMITS, "env", 20)
@@ -161,7 +161,7 @@ SHAPE = f"{HEADER}.shape"
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "output"),
     [
         (edit_manifest(lambda m: m.pop("files")), MANIFEST + "missing key 'files'"),
         (edit_manifest(lambda m: m["files"].update(x=3)), MANIFEST + "files.x: expected"),
@@ -178,7 +178,7 @@ SHAPE = f"{HEADER}.shape"
         (edit_manifest(lambda m: m.pop("step")), MANIFEST + "missing key 'step'"),
         (edit_manifest(lambda m: m.update(step=-1)), MANIFEST + "step: expected a whole number >= 0, found -1"),
         (edit_manifest(lambda m: m.update(step=2**62)), MANIFEST + "step: expected a whole number < "),
-        (edit_manifest(lambda m: m.update(step=200)), "it is of step 200, and its folder of step 300"),
+        (edit_manifest(lambda m: m.update(step=200)), "it is for step 200, but its folder for step 300"),
         (edit_manifest(lambda m: m["files"].pop("rng.safetensors")), "has no rng.safetensors"),
         (edit_manifest(lambda m: m["files"].pop("state.json")), "has no state.json"),
         (edit_manifest(lambda m: m.update(logs=[])), MANIFEST + "logs: expected a mapping, found []"),
@@ -201,13 +201,13 @@ SHAPE = f"{HEADER}.shape"
         (log(first=5), "rows of 'replay' are missing"),
         (log(stop=17), "rows of 'replay' are missing"),
         (shard(size=2**60), "this machine has memory for"),
-        (shard(sha256=DIGEST), "is corrupt: it is not what the manifest says"),
+        (shard(sha256=DIGEST), "is corrupt: it does not match the manifest"),
         (lambda f: shutil.rmtree(f.parent / "logs"), "000000000006-000000000012.safetensors is missing"),
         (values(iteration=-1), STATE + "iteration: expected a whole number >= 0, found -1"),
         (values(updates=1.5), STATE + "updates: expected a whole number, found 1.5"),
         (values(processes="x" * 100), f"processes: expected a whole number, found '{'x' * 56}..."),
         (values(rnd_updates=None), "rnd_updates: expected a whole number, found null"),
-        (values(env_steps=299), "it is of step 299, and the manifest of 300"),
+        (values(env_steps=299), "it is for step 299, but the manifest for step 300"),
         (values(learning_rate=-1e-9), "learning_rate: expected a number >= 0, found -1e-09"),
         (values(learning_rate=1e6), "learning_rate: expected a number < 1e+06, found 1000000.0"),
         (values(learning_rate=True), "learning_rate: expected a number, found true"),
@@ -224,8 +224,8 @@ SHAPE = f"{HEADER}.shape"
         (values(**{"statistics.x": []}), "statistics.x: expected a mapping, found []"),
         (values(**{"statistics.x": 3}), "statistics.x: expected a mapping, found 3"),
         (extra_files(4097), MANIFEST + "files: expected at most 4096 items"),
-        (tensor("trainer", "observations", torch.zeros(2, 4)), "trainer.safetensors: 'observations' is (2, 4)"),
-        (tensor("trainer", "observations", torch.zeros(6)), "trainer.safetensors: 'observations' is (6,)"),
+        (tensor("trainer", "observations", torch.zeros(2, 4)), "trainer.safetensors: 'observations' has shape (2, 4)"),
+        (tensor("trainer", "observations", torch.zeros(6)), "trainer.safetensors: 'observations' has shape (6,)"),
         (tensor("trainer", "critic.w", torch.tensor([1.0, float("nan")])), "'critic.w' holds values that are not"),
         (tensor("trainer", "a.normalizer.var", torch.tensor([1.0, -1.0])), "'a.normalizer.var' is negative"),
         (tensor("trainer", "normalizer.count", torch.tensor(-1)), "'normalizer.count' is negative"),
@@ -235,17 +235,17 @@ SHAPE = f"{HEADER}.shape"
         (header(b'{"x": 3}'), HEADER + ": expected a mapping, found 3"),
         (header(b'{"x": {"dtype": "F32", "shape": [%s], "data_offsets": [0, 4]}}' % b",".join([b"1"] * 17)), SHAPE),
         (header(b'{"x": {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]}}'), "env.safetensors is corrupt: "),
-        (header(b'{"__metadata__": {}, "__metadata__": {}}'), "stands there twice"),
-        (content(b""), "it is no safetensors file, or its header is too long"),
-        (content(b"\x02" + bytes(6)), "it is no safetensors file, or its header is too long"),
-        (content(b"\x03" + bytes(7) + b"{}"), "it is no safetensors file, or its header is too long"),
+        (header(b'{"__metadata__": {}, "__metadata__": {}}'), "appears twice"),
+        (content(b""), "it is not a safetensors file, or its header is too long"),
+        (content(b"\x02" + bytes(6)), "it is not a safetensors file, or its header is too long"),
+        (content(b"\x03" + bytes(7) + b"{}"), "it is not a safetensors file, or its header is too long"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_said(folder, damage, said):
+def test_corrupt_checkpoint_is_refused_with_the_reason(folder, damage, output):
     damage(folder)
     with pytest.raises(CheckpointError) as caught:
         checkpoint.open_checkpoint(folder).verify(whole=True)
-    assert said in caught.value.message
+    assert output in caught.value.message
     assert str(folder.parent) in caught.value.message
 
 
@@ -267,39 +267,41 @@ def test_what_is_wrong_is_said(folder, damage, said):
         extra_files(4096),
     ],
 )
-def test_what_is_only_unusual_is_read(folder, damage):
+def test_unusual_but_valid_checkpoint_is_read(folder, damage):
     damage(folder)
     checkpoint.open_checkpoint(folder).verify(whole=True)
 
 
-def test_files_of_a_log_with_other_columns_do_not_belong_together(folder):
+def test_log_files_with_different_columns_are_refused(folder):
     file = folder.parent / "logs/replay" / f"{12:012d}-{18:012d}.safetensors"
     data = safetensors.torch.save({"x": torch.zeros(6, 1)})
     file.write_bytes(data)
     shard(1, size=len(data), sha256=checkpoint.sha256(data))(folder)
     opened = checkpoint.open_checkpoint(folder).state().logs["replay"]
     assert set(opened.read(13, 15)) == {"x"}
-    with pytest.raises(CheckpointError, match="the files of 'replay' do not belong together"):
+    with pytest.raises(CheckpointError, match="the files of 'replay' have different columns"):
         opened.read(10, 14)
 
 
-def test_a_file_of_a_log_has_the_rows_of_its_name(folder):
+def test_log_file_with_other_rows_than_its_name_is_refused(folder):
     file = folder.parent / "logs/replay" / f"{12:012d}-{18:012d}.safetensors"
     data = safetensors.torch.save({"x": torch.zeros(6, 1), "y": torch.zeros(5)})
     file.write_bytes(data)
     shard(1, size=len(data), sha256=checkpoint.sha256(data))(folder)
-    with pytest.raises(CheckpointError, match=f"{file.name} is corrupt: 'y' has not the rows of its name"):
+    with pytest.raises(
+        CheckpointError, match=f"{file.name} is corrupt: 'y' does not have the rows that the file name states"
+    ):
         checkpoint.open_checkpoint(folder).verify(whole=True)
 
 
 @pytest.mark.parametrize("iteration", [None, "3", -1, True, 1.0])
-def test_without_an_iteration_there_is_none_to_go_on_from(folder, iteration):
+def test_checkpoint_without_an_iteration_cannot_be_resumed(folder, iteration):
     edit_manifest(lambda m: m.update(iteration=iteration))(folder)
     with pytest.raises(CheckpointError, match=r"manifest\.json is corrupt: iteration: expected a whole number"):
         checkpoint.open_checkpoint(folder).iteration  # noqa: B018
 
 
-def test_only_the_policy_is_checked_if_only_it_is_wanted(folder):
+def test_verify_checks_only_the_policy_unless_whole(folder):
     (folder / "env.safetensors").write_bytes(b"gone")
     opened = checkpoint.open_checkpoint(folder)
     opened.verify(whole=False)
@@ -311,7 +313,7 @@ def test_only_the_policy_is_checked_if_only_it_is_wanted(folder):
 
 
 @pytest.mark.parametrize("what", ["nothing", "file", "empty"])
-def test_what_is_no_checkpoint_is_called_so(tmp_path, what):
+def test_open_checkpoint_refuses_other_folders(tmp_path, what):
     place = tmp_path / "place"
     if what == "file":
         place.touch()
@@ -321,14 +323,14 @@ def test_what_is_no_checkpoint_is_called_so(tmp_path, what):
         checkpoint.open_checkpoint(place)
 
 
-def test_a_folder_of_another_name_may_hold_any_step(folder):
+def test_checkpoint_in_a_renamed_folder_may_have_any_step(folder):
     for name in ("best", "300", "12345678901", "²" * 12):
         copy = folder.with_name(name)
         shutil.copytree(folder, copy)
         assert checkpoint.open_checkpoint(copy).step == 300
 
 
-def test_links_are_no_checkpoints_of_a_run(folder):
+def test_steps_ignores_links(folder):
     folder.with_name(f"{400:012d}").symlink_to(folder)
     assert checkpoint.steps(folder.parent) == [100, 200, 300]
     aside = folder.parent.with_name("aside")

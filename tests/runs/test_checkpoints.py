@@ -17,7 +17,6 @@ from support.saved_states import SPEC, rehash, state_of
 
 from rlcli.errors import CheckpointError, MachineError
 from rlcli.runs import checkpoint
-from rlcli.runs.restore import policy_of
 from rlcli.training import checkpoint_writer
 
 
@@ -29,10 +28,10 @@ def saved(tmp_path):
 
 def load_all(folder):
     opened = checkpoint.open_checkpoint(folder)
-    return policy_of(opened), opened.state()
+    return opened.policy(), opened.state()
 
 
-def test_a_checkpoint_loads_what_was_saved(saved):
+def test_checkpoint_round_trip(saved):
     policy, state = load_all(saved)
     wanted = state_of()
     assert saved.name == "000000000768"
@@ -45,7 +44,7 @@ def test_a_checkpoint_loads_what_was_saved(saved):
     assert state.values == wanted.values
 
 
-def test_the_policy_file_holds_tensors_alone_and_equal_weights_give_equal_bytes(tmp_path):
+def test_policy_file_holds_only_tensors_and_is_deterministic(tmp_path):
     files = []
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
@@ -57,7 +56,7 @@ def test_the_policy_file_holds_tensors_alone_and_equal_weights_give_equal_bytes(
     assert set(header) == set(state_of().tensors["policy"])  # no metadata: no time, no path
 
 
-def test_a_step_is_saved_once(saved):
+def test_write_checkpoint_keeps_an_existing_step(saved):
     before = {file.name: file.stat().st_mtime_ns for file in saved.iterdir()}
     assert checkpoint_writer.write_checkpoint(saved.parent, 768, state_of(1), {}) == saved
     assert {file.name: file.stat().st_mtime_ns for file in saved.iterdir()} == before
@@ -67,7 +66,7 @@ def test_a_step_is_saved_once(saved):
     "name", ["policy.safetensors", "trainer.safetensors", "env.safetensors", "rng.safetensors", "state.json"]
 )
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "missing", "longer"])
-def test_a_damaged_file_is_named(saved, name, damage):
+def test_damaged_file_is_named_in_the_error(saved, name, damage):
     file = saved / name
     data = bytearray(file.read_bytes())
     if damage == "missing":
@@ -97,13 +96,13 @@ def test_a_damaged_file_is_named(saved, name, damage):
         b'{"format": 1, "files": {"policy.json": {"size": 0, "sha256": "0"}}, "step": 1}',
     ],
 )
-def test_a_damaged_manifest_is_a_checkpoint_error(saved, content):
+def test_damaged_manifest_raises_checkpoint_error(saved, content):
     (saved / "manifest.json").write_bytes(content)
     with pytest.raises(CheckpointError, match="000000000768"):
         load_all(saved)
 
 
-def test_another_format_names_both_numbers(saved):
+def test_other_format_error_has_both_versions(saved):
     manifest = json.loads((saved / "manifest.json").read_text())
     (saved / "manifest.json").write_text(json.dumps({**manifest, "format": 7}))
     with pytest.raises(CheckpointError, match="format 7; this rlcli reads 1"):
@@ -117,7 +116,7 @@ class Bomb:
 
 @pytest.mark.parametrize("part", checkpoint.PARTS)
 @pytest.mark.parametrize("kind", ["pickle", "torch"])
-def test_a_pickle_is_refused_and_not_run_even_with_a_matching_hash(saved, part, kind, monkeypatch):
+def test_pickle_with_a_matching_hash_is_not_executed(saved, part, kind, monkeypatch):
     monkeypatch.chdir(saved.parent)
     file = saved / f"{part}.safetensors"
     if kind == "pickle":
@@ -152,10 +151,10 @@ def change_policy(folder, change):
 def test_weights_that_do_not_fit_are_named(saved, change, message):
     change_policy(saved, change)
     with pytest.raises(CheckpointError, match=message):
-        policy_of(checkpoint.open_checkpoint(saved))
+        checkpoint.open_checkpoint(saved).policy()
 
 
-def test_a_critic_that_is_not_finite_is_named(saved):
+def test_critic_that_is_not_finite_is_named(saved):
     (saved / "trainer.safetensors").write_bytes(safetensors.torch.save({"critic.w": torch.tensor([1.0, float("nan")])}))
     rehash(saved, "trainer.safetensors")
     with pytest.raises(CheckpointError, match=r"critic\.w"):
@@ -173,16 +172,16 @@ def test_a_critic_that_is_not_finite_is_named(saved):
         {"surprise": 1},
     ],
 )
-def test_a_policy_description_that_makes_no_sense_is_refused(saved, change):
+def test_invalid_policy_description_is_refused(saved, change):
     (saved / "policy.json").write_text(json.dumps({**SPEC, **change}))
     rehash(saved, "policy.json")
     with pytest.raises(CheckpointError, match=r"policy\.(json|safetensors)"):
-        policy_of(checkpoint.open_checkpoint(saved))
+        checkpoint.open_checkpoint(saved).policy()
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS, errno.EDQUOT])
 @pytest.mark.parametrize("call", ["fsync", "rename", "open"])
-def test_a_disk_that_refuses_leaves_no_half_checkpoint_and_the_old_one(saved, monkeypatch, call, code):
+def test_disk_error_keeps_the_old_checkpoint_and_no_partial_one(saved, monkeypatch, call, code):
     def refuse(*args, **kwargs):
         raise OSError(code, os.strerror(code))
 
@@ -200,7 +199,7 @@ def test_a_disk_that_refuses_leaves_no_half_checkpoint_and_the_old_one(saved, mo
     load_all(saved)
 
 
-def test_an_interrupted_save_leaves_nothing(saved, monkeypatch):
+def test_interrupted_save_leaves_no_files(saved, monkeypatch):
     def interrupt(handle):
         raise KeyboardInterrupt
 
@@ -211,7 +210,7 @@ def test_an_interrupted_save_leaves_nothing(saved, monkeypatch):
     assert not list(saved.parent.glob(".tmp-*"))
 
 
-def test_a_vanished_folder_is_not_made_again(tmp_path):
+def test_write_checkpoint_does_not_recreate_a_deleted_folder(tmp_path):
     with pytest.raises(MachineError, match="No such file"):
         checkpoint_writer.write_checkpoint(tmp_path / "gone" / "checkpoints", 5, state_of(), {})
     assert not (tmp_path / "gone").exists()
@@ -234,7 +233,7 @@ while True:
 
 
 @pytest.mark.slow
-def test_kills_in_the_middle_of_saving_leave_a_good_last_checkpoint(tmp_path):
+def test_kill_while_saving_leaves_a_valid_last_checkpoint(tmp_path):
     folder = tmp_path / "checkpoints"
     folder.mkdir()
     for attempt in range(4):
@@ -274,17 +273,17 @@ except MachineError as error:
 """
 
 
-def test_a_file_size_limit_is_a_machine_error_and_leaves_nothing(tmp_path):
+def test_file_size_limit_raises_machine_error_and_leaves_no_files(tmp_path):
     folder = tmp_path / "checkpoints"
     folder.mkdir()
     # -B: under the limit Python would leave modules half-compiled for everybody
     command = [sys.executable, "-B", "-c", LIMITED, str(folder), str(Path(__file__).parents[1])]
-    said = subprocess.run(command, capture_output=True, text=True)
-    assert "File too large" in said.stdout, said.stderr
+    output = subprocess.run(command, capture_output=True, text=True)
+    assert "File too large" in output.stdout, output.stderr
     assert list(folder.iterdir()) == []
 
 
-def test_steps_are_ordered_as_numbers_and_strangers_passed_over(tmp_path):
+def test_steps_are_sorted_and_other_folders_ignored(tmp_path):
     for name in ("000000000002", "000000000010", "1000000000000", "5", "²", "notes", ".tmp-1-x"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "manifest.json").touch()

@@ -1,11 +1,11 @@
-"""Evaluations in a run: what is read back, and what a stranger may have put there."""
+"""Evaluations stored in a run: round trip, and untrusted content."""
 
 import json
 
 import pytest
 
 from rlcli.errors import CheckpointError
-from rlcli.runs.eval_store import keep_evaluation, read_evaluation
+from rlcli.runs.eval_store import read_evaluation, write_evaluation
 from rlcli.runs.run import Run
 
 MEAN = {"mean": 1.5, "std": 0.5, "low": 1.0, "high": 2.0}
@@ -25,13 +25,13 @@ DOCUMENT = {
 }
 
 
-def test_what_was_kept_is_read_back_and_the_newest_wins(tmp_path):
+def test_read_evaluation_returns_the_newest_document(tmp_path):
     run = Run(tmp_path)
     assert read_evaluation(run, "000000000128") is None
-    file = keep_evaluation(run, "000000000128", DOCUMENT)
+    file = write_evaluation(run, "000000000128", DOCUMENT)
     assert file == tmp_path / "evaluations" / "000000000128.json"
     assert read_evaluation(run, "000000000128") == DOCUMENT
-    keep_evaluation(run, "000000000128", {**DOCUMENT, "episodes": 9})
+    write_evaluation(run, "000000000128", {**DOCUMENT, "episodes": 9})
     assert read_evaluation(run, "000000000128")["episodes"] == 9
     assert [file.name for file in file.parent.iterdir()] == ["000000000128.json"]
 
@@ -53,15 +53,15 @@ def test_what_was_kept_is_read_back_and_the_newest_wins(tmp_path):
         {"seed": -1},
     ],
 )
-def test_a_document_that_is_none_is_refused(tmp_path, change):
+def test_read_evaluation_refuses_a_malformed_document(tmp_path, change):
     run = Run(tmp_path)
-    keep_evaluation(run, "0", DOCUMENT | change)
+    write_evaluation(run, "0", DOCUMENT | change)
     with pytest.raises(CheckpointError, match="is corrupt"):
         read_evaluation(run, "0")
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"return": NaN}', "[" * 10_000, '{"a": 1, "a": 2}', " " * 2_000_000])
-def test_what_is_not_strict_json_of_some_size_is_refused(tmp_path, text):
+def test_read_evaluation_refuses_invalid_or_large_json(tmp_path, text):
     (tmp_path / "evaluations").mkdir()
     (tmp_path / "evaluations" / "7.json").write_text(text)
     with pytest.raises(CheckpointError):
@@ -69,13 +69,13 @@ def test_what_is_not_strict_json_of_some_size_is_refused(tmp_path, text):
 
 
 @pytest.mark.parametrize("name", ["../x", "", "7.json", "a", "7/../8", "7" * 31])
-def test_a_name_that_is_no_checkpoints_is_refused(tmp_path, name):
-    for act in (lambda: read_evaluation(Run(tmp_path), name), lambda: keep_evaluation(Run(tmp_path), name, DOCUMENT)):
+def test_invalid_checkpoint_name_is_refused(tmp_path, name):
+    for act in (lambda: read_evaluation(Run(tmp_path), name), lambda: write_evaluation(Run(tmp_path), name, DOCUMENT)):
         with pytest.raises(CheckpointError, match="not the name"):
             act()
 
 
-def test_links_are_followed_neither_to_read_nor_to_write(tmp_path):
+def test_links_are_not_followed(tmp_path):
     run, elsewhere = Run(tmp_path / "run"), tmp_path / "elsewhere"
     run.folder.mkdir()
     elsewhere.mkdir()
@@ -84,7 +84,7 @@ def test_links_are_followed_neither_to_read_nor_to_write(tmp_path):
     with pytest.raises(CheckpointError, match="link"):
         read_evaluation(run, "7")
     with pytest.raises(CheckpointError, match="link"):
-        keep_evaluation(run, "8", DOCUMENT)
+        write_evaluation(run, "8", DOCUMENT)
     (run.folder / "evaluations").unlink()
     (run.folder / "evaluations").mkdir()
     (run.folder / "evaluations" / "7.json").symlink_to(elsewhere / "7.json")

@@ -1,4 +1,4 @@
-"""Which environments a policy fits: the same columns, made and used in the same way."""
+"""Check that a policy fits an environment: the same columns, computed and used in the same way."""
 
 import copy
 from dataclasses import replace
@@ -30,7 +30,7 @@ def layout_of(task, *overrides):
         ("decimation=4", "0.0333"),
     ],
 )
-def test_a_policy_does_not_fit_where_its_columns_mean_something_else(newest, override, says):
+def test_require_fit_refuses_columns_with_another_meaning(newest, override, says):
     checkpoint = open_checkpoint(newest("cartpole"))
     require_fit(checkpoint, layout_of("cartpole"))
     with pytest.raises(CheckpointError) as refusal:
@@ -39,13 +39,13 @@ def test_a_policy_does_not_fit_where_its_columns_mean_something_else(newest, ove
     assert len(refusal.value.message.splitlines()) == 3  # what, the head of the table, and the one field
 
 
-def test_a_policy_fits_a_robot_of_other_limits(newest):
+def test_require_fit_ignores_joint_limits(newest):
     weaker = "scene.entities.robot.joints.slider_to_cart.effort_limit=50"
     require_fit(open_checkpoint(newest("cartpole")), layout_of("cartpole", weaker))
 
 
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
-def test_a_checkpoint_that_knows_less_still_fits(newest, task):
+def test_require_fit_accepts_a_layout_with_missing_keys(newest, task):
     checkpoint = open_checkpoint(newest(task))
     manifest = copy.deepcopy(checkpoint.manifest)
     for terms in (manifest["layout"]["actions"], *manifest["layout"]["observations"].values()):

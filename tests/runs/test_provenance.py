@@ -1,4 +1,4 @@
-"""What run.json says of where a run's bits are from."""
+"""Record of software, sources and hardware in run.json."""
 
 import mujoco
 import pytest
@@ -13,7 +13,7 @@ CUBE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n
 
 @pytest.fixture
 def task(tmp_path):
-    """A task with a term of its own, an included file and a mesh in a folder of its own."""
+    """A task with a custom term, an included file, and a mesh in a separate folder."""
     model = CRITTER.replace("<worldbody>", '<include file="more.xml"/><worldbody>', 1)
     folder = critter(tmp_path, CRITTER_TASK, terms_py='"""Terms."""\n')
     (folder / "critter.xml").write_text(model)
@@ -29,12 +29,12 @@ def sources(folder):
     return environment.sources(resolve(find_task(str(folder))))
 
 
-def test_the_sources_are_the_code_the_models_and_what_they_name(task):
+def test_sources_lists_code_models_and_their_assets(task):
     assert set(sources(task)) == {"rlcli", "terms.py", "critter.xml", "more.xml", "parts/cube.obj"}
 
 
 @pytest.mark.parametrize("file", ["terms.py", "critter.xml", "more.xml", "parts/cube.obj"])
-def test_a_changed_file_changes_its_own_hash(task, file):
+def test_sources_changes_only_the_hash_of_a_changed_file(task, file):
     before = sources(task)
     with (task / file).open("a") as handle:
         handle.write("\n")
@@ -42,12 +42,12 @@ def test_a_changed_file_changes_its_own_hash(task, file):
     assert [name for name in before if before[name] != after[name]] == [file]
 
 
-def test_a_file_that_is_missing_or_names_itself_stops_nothing(task):
+def test_sources_accepts_missing_files_and_circular_includes(task):
     (task / "more.xml").write_text('<mujoco><include file="more.xml"/><include file="nowhere.xml"/></mujoco>')
     assert set(sources(task)) == {"rlcli", "terms.py", "critter.xml", "more.xml"}
 
 
-def test_only_variables_that_choose_kernels_are_recorded(task, monkeypatch):
+def test_only_kernel_variables_are_recorded(task, monkeypatch):
     monkeypatch.setenv("MKL_CBWR", "AVX2")
     monkeypatch.setenv("A_SECRET", "hunter2")
     record = environment.environment_record(resolve(find_task(str(task))), 2, 1)
@@ -64,7 +64,7 @@ def test_only_variables_that_choose_kernels_are_recorded(task, monkeypatch):
         ("", None, ""),
     ],
 )  # fmt: skip
-def test_the_processor_is_the_first_core_of_the_list(tmp_path, text, model, kernels):
+def test_processor_is_read_from_the_first_core(tmp_path, text, model, kernels):
     file = tmp_path / "cpuinfo"
     file.write_text(text)
     record = environment.processor(file)
@@ -73,7 +73,7 @@ def test_the_processor_is_the_first_core_of_the_list(tmp_path, text, model, kern
     assert ("flags" in record) == bool(kernels)
 
 
-def test_the_model_is_known_by_its_numbers_alone():
+def test_model_digest_ignores_names_and_visual_settings():
     def digest(text):
         return environment.model_digest(mujoco.MjModel.from_xml_string(text))
 
@@ -87,7 +87,7 @@ def test_the_model_is_known_by_its_numbers_alone():
     assert digest(CRITTER) == digest(drawn), "what is only looked at"
 
 
-def test_differences_are_of_what_both_know_and_name_each_entry():
+def test_differences_compares_common_entries_by_name():
     was = {"rlcli": "1", "versions": {"torch": "2", "mujoco": "4"}, "pid": 1, "libc": "a", "device": "cpu"}
     now = {"rlcli": "1", "versions": {"torch": "3", "mujoco": "4", "more": "1"}, "pid": 2, "device": "cuda"}
     assert environment.differences(was, now) == [
@@ -97,7 +97,7 @@ def test_differences_are_of_what_both_know_and_name_each_entry():
 
 
 @pytest.mark.parametrize("agent", ["rsl-rl", "sb3-ppo"])
-def test_versions_name_what_the_trainer_of_the_agent_needs(agent):
+def test_versions_include_requirements_of_the_trainer(agent):
     versions = environment.versions(resolve(find_task("cartpole"), agent=agent))
     assert {"torch", "mujoco", "numpy"} <= set(versions)
     assert ({"rlcli-rsl-rl", "rsl-rl-lib"} <= set(versions)) == (agent == "rsl-rl")

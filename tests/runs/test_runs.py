@@ -1,4 +1,4 @@
-"""Run folders and how a command line names them."""
+"""Run folders, and references to them on a command line."""
 
 import json
 import subprocess
@@ -24,7 +24,7 @@ def make_run(runs, task="cartpole", name=None, steps=(), **entries):
     return run
 
 
-def test_a_run_has_its_configuration_and_record_at_once(tmp_path):
+def test_create_run_writes_configuration_and_record(tmp_path):
     run = make_run(tmp_path / "runs", name="test")
     assert run.folder.parent == tmp_path / "runs" / "cartpole"
     assert run.folder.name.endswith("-test")
@@ -45,7 +45,7 @@ print(json.dumps(list(ThreadPoolExecutor(5).map(create, range(5)))))
 """
 
 
-def test_twenty_at_once_make_twenty_folders(tmp_path):
+def test_concurrent_create_run_gives_separate_folders(tmp_path):
     command = [sys.executable, "-c", FIVE, str(tmp_path), json.dumps(RECORD)]
     children = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(4)]
     folders = [folder for child in children for folder in json.loads(child.communicate()[0])]
@@ -54,12 +54,12 @@ def test_twenty_at_once_make_twenty_folders(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a/b", "..", "a:b", "", "é", "a b", "-x"])
-def test_a_name_that_cannot_be_part_of_a_folder_is_refused(tmp_path, name):
+def test_create_run_refuses_an_invalid_name(tmp_path, name):
     with pytest.raises(UsageError, match="folder's name"):
         make_run(tmp_path, name=name)
 
 
-def test_a_second_writer_is_refused(tmp_path):
+def test_lock_refuses_a_second_writer(tmp_path):
     run = make_run(tmp_path)
     holder = subprocess.Popen(
         [sys.executable, "-c",
@@ -75,7 +75,7 @@ def test_a_second_writer_is_refused(tmp_path):
     run.unlock()
 
 
-def test_a_killed_writer_locks_nobody_out(tmp_path):
+def test_lock_of_a_killed_writer_is_released(tmp_path):
     run = make_run(tmp_path)
     subprocess.run(
         [sys.executable, "-c",
@@ -86,7 +86,7 @@ def test_a_killed_writer_locks_nobody_out(tmp_path):
     run.unlock()
 
 
-def test_latest_is_the_newest_started_of_the_task_given(tmp_path):
+def test_latest_is_the_newest_run_of_the_task(tmp_path):
     old, new = make_run(tmp_path), make_run(tmp_path, name="aaa")
     other = make_run(tmp_path, task="ant")
     assert find_run("latest", tmp_path)[0].folder == other.folder
@@ -95,37 +95,37 @@ def test_latest_is_the_newest_started_of_the_task_given(tmp_path):
     assert "newest run of cartpole" in why
 
 
-def test_a_run_is_found_by_name_and_by_folder(tmp_path):
+def test_find_run_by_name_and_by_folder(tmp_path):
     run = make_run(tmp_path, name="one")
     for reference in (run.folder.name, str(run.folder), f"cartpole/{run.folder.name}"):
         assert find_run(reference, tmp_path)[0].folder.resolve() == run.folder.resolve()
 
 
-def test_a_near_miss_is_suggested(tmp_path):
+def test_find_run_suggests_a_similar_name(tmp_path):
     run = make_run(tmp_path, name="one")
     with pytest.raises(CheckpointError) as caught:
         find_run(run.folder.name[:-1], tmp_path)
     assert run.folder.name in caught.value.hint
 
 
-def test_a_name_too_long_for_the_system_is_no_run(tmp_path):
+def test_find_run_refuses_a_too_long_name(tmp_path):
     with pytest.raises(CheckpointError, match="no run 'aaaa"):
         find_checkpoint("a" * 5000, tmp_path)
 
 
-def test_no_run_at_all_says_how_to_make_one(tmp_path):
+def test_find_run_without_runs_has_a_hint(tmp_path):
     with pytest.raises(CheckpointError, match="no run of cartpole") as caught:
         find_run("latest", tmp_path / "nowhere", "cartpole")
     assert "rlcli train cartpole" in caught.value.hint
 
 
-def test_a_run_of_another_task_is_refused(tmp_path):
+def test_find_run_refuses_a_run_of_another_task(tmp_path):
     run = make_run(tmp_path, task="ant")
     with pytest.raises(UsageError, match="run of ant, not of cartpole"):
         find_run(str(run.folder), tmp_path, "cartpole")
 
 
-def test_checkpoints_by_run_best_step_and_folder(tmp_path):
+def test_find_checkpoint_by_run_best_step_and_folder(tmp_path):
     run = make_run(tmp_path, steps=(0, 9, 10), best=9)
     name = run.folder.name
     for reference, step in ((name, 10), (f"{name}@best", 9), (f"{name}@step:0", 0), ("latest", 10), ("latest@best", 9)):
@@ -146,14 +146,14 @@ def test_checkpoints_by_run_best_step_and_folder(tmp_path):
         ("@step:" + "9" * 5000, "does not name a checkpoint", "RUN@step:N"),
     ],
 )
-def test_a_checkpoint_that_is_not_there_says_what_is(tmp_path, which, message, hint):
+def test_find_checkpoint_lists_existing_steps(tmp_path, which, message, hint):
     run = make_run(tmp_path, steps=(0, 9, 10))
     with pytest.raises(CheckpointError, match=message) as caught:
         find_checkpoint(run.folder.name + which, tmp_path)
     assert hint in caught.value.hint
 
 
-def test_a_folder_with_an_at_sign_is_a_folder(tmp_path):
+def test_find_checkpoint_accepts_a_folder_with_an_at_sign(tmp_path):
     run = make_run(tmp_path / "user@host", steps=(3,))
     assert find_checkpoint(str(run.folder), tmp_path)[1].name == "000000000003"
 
@@ -165,7 +165,7 @@ def test_a_folder_with_an_at_sign_is_a_folder(tmp_path):
         b'{"task": {"name": "x"}, "seed": 1}', b'{"task": {"name": "x", "distribution": "d"}}',
     ],
 )  # fmt: skip
-def test_a_damaged_record_is_a_checkpoint_error_and_does_not_hide_other_runs(tmp_path, content):
+def test_damaged_record_does_not_hide_other_runs(tmp_path, content):
     good, bad = make_run(tmp_path, steps=(1,)), make_run(tmp_path)
     (bad.folder / "run.json").write_bytes(content)
     with pytest.raises(CheckpointError, match=r"run\.json is corrupt"):
@@ -173,7 +173,7 @@ def test_a_damaged_record_is_a_checkpoint_error_and_does_not_hide_other_runs(tmp
     assert find_run("latest", tmp_path)[0].folder == good.folder
 
 
-def test_a_runs_folder_that_is_a_file_is_a_machine_error(tmp_path):
+def test_runs_folder_that_is_a_file_raises_machine_error(tmp_path):
     (tmp_path / "runs").touch()
     with pytest.raises(MachineError, match="cannot write"):
         make_run(tmp_path / "runs")
@@ -181,7 +181,7 @@ def test_a_runs_folder_that_is_a_file_is_a_machine_error(tmp_path):
         find_run("latest", tmp_path / "runs")
 
 
-def test_a_disk_that_fills_while_a_run_is_made_leaves_no_folder(tmp_path, monkeypatch):
+def test_full_disk_in_create_run_leaves_no_folder(tmp_path, monkeypatch):
     import os
 
     def full(handle):

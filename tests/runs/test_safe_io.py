@@ -1,4 +1,4 @@
-"""Files of strangers: what is read, and every reason for which it is not."""
+"""Reading of untrusted files, and every reason for a refusal."""
 
 import contextlib
 import json
@@ -18,7 +18,7 @@ def file(tmp_path):
     return tmp_path / "data.json"
 
 
-def test_a_file_is_read_up_to_its_limit_and_not_one_byte_further(file):
+def test_read_file_refuses_one_byte_above_the_limit(file):
     assert read_file(file, 8) == b'{"a": 1}'
     assert read_file(file, 100, size=8) == b'{"a": 1}'
     with pytest.raises(CheckpointError, match=r"data\.json is too large: 8 bytes, at most 7 are read"):
@@ -26,20 +26,20 @@ def test_a_file_is_read_up_to_its_limit_and_not_one_byte_further(file):
 
 
 @pytest.mark.parametrize("size", [7, 9])
-def test_a_file_of_another_size_is_corrupt(file, size):
-    with pytest.raises(CheckpointError, match=rf"is corrupt: .* \(8 bytes of {size}\)") as caught:
+def test_read_file_refuses_another_size(file, size):
+    with pytest.raises(CheckpointError, match=rf"is corrupt: .* \(8 of {size} bytes\)") as caught:
         read_file(file, 100, size=size)
     assert caught.value.hint == "choose an older checkpoint with RUN@step:N"
 
 
-def test_what_is_not_there_is_the_callers_to_name(tmp_path):
+def test_read_file_raises_file_not_found_for_a_missing_file(tmp_path):
     (tmp_path / "file").touch()
     for missing in (tmp_path / "nothing", tmp_path / "file" / "below"):
         with pytest.raises(FileNotFoundError):
             read_file(missing, 10)
 
 
-def test_a_link_is_refused_also_to_a_file_that_is_good_or_missing(file):
+def test_read_file_refuses_links(file):
     for number, target in enumerate((file, file.parent / "nothing")):
         link = file.with_name(f"link{number}")
         link.symlink_to(target)
@@ -47,16 +47,16 @@ def test_a_link_is_refused_also_to_a_file_that_is_good_or_missing(file):
             read_file(link, 100)
 
 
-def test_a_link_that_appears_after_the_check_is_not_followed(file, monkeypatch):
+def test_read_file_refuses_a_link_that_appears_after_the_check(file, monkeypatch):
     link = file.with_name("link")
     link.symlink_to(file)
     monkeypatch.setattr(type(file), "is_symlink", lambda self: False)
-    with pytest.raises(CheckpointError, match="link cannot be read: it is no plain file"):
+    with pytest.raises(CheckpointError, match="link cannot be read: it is not a plain file"):
         read_file(link, 100)
 
 
 @pytest.mark.parametrize("kind", ["folder", "pipe", "device"])
-def test_what_is_no_plain_file_is_refused_without_waiting(tmp_path, kind):
+def test_read_file_refuses_special_files_without_blocking(tmp_path, kind):
     odd = tmp_path / kind
     if kind == "folder":
         odd.mkdir()
@@ -64,11 +64,11 @@ def test_what_is_no_plain_file_is_refused_without_waiting(tmp_path, kind):
         os.mkfifo(odd)
     else:
         odd = type(odd)("/dev/zero")
-    with pytest.raises(CheckpointError, match="is no plain file"):
+    with pytest.raises(CheckpointError, match="is not a plain file"):
         read_file(odd, 100)
 
 
-def test_no_handle_is_left_open(file, tmp_path):
+def test_read_file_closes_its_handle(file, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     before = len(os.listdir("/proc/self/fd"))
     for name, limit, size in (
@@ -82,14 +82,14 @@ def test_no_handle_is_left_open(file, tmp_path):
     assert len(os.listdir("/proc/self/fd")) == before
 
 
-def test_a_name_that_no_file_can_have_is_refused(tmp_path):
-    for name, said in (("x" * 300, "File name too long"), ("a\0b", "embedded null byte")):
+def test_read_file_refuses_an_invalid_name(tmp_path):
+    for name, output in (("x" * 300, "File name too long"), ("a\0b", "embedded null byte")):
         with pytest.raises(CheckpointError) as caught:
             read_file(tmp_path / name, 10)
-        assert caught.value.message.endswith(f"{name} cannot be read: {said}")
+        assert caught.value.message.endswith(f"{name} cannot be read: {output}")
 
 
-def test_a_json_file_has_at_most_4_mib(tmp_path):
+def test_json_limit_is_4_mib(tmp_path):
     manifest = tmp_path / "manifest.json"
     manifest.write_bytes(b" " * (4 * 1024 * 1024 + 1))
     with pytest.raises(CheckpointError, match=r"is too large: 4,194,305 bytes, at most 4,194,304 are read"):
@@ -100,7 +100,7 @@ def test_a_json_file_has_at_most_4_mib(tmp_path):
 
 
 @pytest.mark.parametrize("error", [OSError(5, "Input/output error"), MemoryError()])
-def test_a_file_that_breaks_off_is_an_error_of_the_file(file, monkeypatch, error):
+def test_read_error_names_the_file(file, monkeypatch, error):
     class Broken:
         def __enter__(self):
             return self
@@ -117,12 +117,12 @@ def test_a_file_that_breaks_off_is_an_error_of_the_file(file, monkeypatch, error
         return broken
 
     monkeypatch.setattr(safe_io.os, "fdopen", opened)
-    said = "Input/output error" if isinstance(error, OSError) else "there is not enough memory"
-    with pytest.raises(CheckpointError, match=rf"data\.json cannot be read: {said}"):
+    output = "Input/output error" if isinstance(error, OSError) else "there is not enough memory"
+    with pytest.raises(CheckpointError, match=rf"data\.json cannot be read: {output}"):
         read_file(file, 100)
 
 
-def test_of_a_file_that_grows_its_end_is_read_and_whether_that_is_all(file):
+def test_read_tail_returns_the_end_and_whether_it_is_all(file):
     assert read_tail(file, 100) == (b'{"a": 1}', True)
     assert read_tail(file, 8) == (b'{"a": 1}', True)
     assert read_tail(file, 7) == (b'"a": 1}', False)
@@ -155,11 +155,11 @@ def nested(depth):
         (b'{"a": {"x": 1}, "b": {"x": 2}}', {"a": {"x": 1}, "b": {"x": 2}}),
     ],
 )
-def test_plain_json_is_read(file, data, value):
+def test_parse_json_reads_valid_json(file, data, value):
     assert parse_json(data, file) == value
 
 
-def test_it_may_have_32_levels_the_innermost_value_counted_and_no_more(file):
+def test_parse_json_accepts_at_most_32_levels(file):
     assert json.dumps(parse_json(nested(31), file)).count("{") == 31
     for deep in (nested(32), b'{"a":' + b"[" * 31 + b"1" + b"]" * 31 + b"}"):
         with pytest.raises(CheckpointError, match="is corrupt: it is nested more than 32 levels deep"):
@@ -167,12 +167,12 @@ def test_it_may_have_32_levels_the_innermost_value_counted_and_no_more(file):
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "output"),
     [
-        (b'{"a": 1, "b": 2, "b": 3}', "key 'b' stands there twice"),
-        (b'{"c": {"xy": 1, "xy": 1}}', "key 'xy' stands there twice"),
-        (b'{"a": NaN}', "NaN is no number of JSON"),
-        (b'{"a": -Infinity}', "-Infinity is no number of JSON"),
+        (b'{"a": 1, "b": 2, "b": 3}', "key 'b' appears twice"),
+        (b'{"c": {"xy": 1, "xy": 1}}', "key 'xy' appears twice"),
+        (b'{"a": NaN}', "NaN is not a JSON number"),
+        (b'{"a": -Infinity}', "-Infinity is not a JSON number"),
         (b'{"a": 1e999}', "number 1e999 is out of range"),
         (b'{"a": 123456789012345678901}', "a number has 21 digits"),
         (b"[1]", "not a JSON object"),
@@ -183,20 +183,20 @@ def test_it_may_have_32_levels_the_innermost_value_counted_and_no_more(file):
         (b"[" * 200_000, "not JSON"),
     ],
 )
-def test_what_is_no_strict_json_is_refused_with_the_reason(file, data, said):
+def test_parse_json_refuses_with_the_reason(file, data, output):
     with pytest.raises(CheckpointError, match=r"data\.json is corrupt: ") as caught:
         parse_json(data, file)
-    assert caught.value.message.endswith(said)
+    assert caught.value.message.endswith(output)
 
 
-def test_a_long_key_or_number_is_not_repeated_at_length(file):
+def test_parse_json_error_shortens_keys_and_numbers(file):
     for data in (f'{{"{"k" * 500}": 1, "{"k" * 500}": 2}}', f'{{"a": 1.{"0" * 500}e999}}'):
         with pytest.raises(CheckpointError) as caught:
             parse_json(data, file)
         assert len(caught.value.message) < len(str(file)) + 100
 
 
-def test_the_first_link_of_a_folder_is_named(tmp_path):
+def test_refuse_links_names_the_first_link(tmp_path):
     (tmp_path / "plain").touch()
     refuse_links(tmp_path)
     for name in ("b", "a", "c"):

@@ -1,4 +1,4 @@
-"""The policy that a task ships: when it is taken, what is said, and that every command takes it and bundles like it."""
+"""Shipped policies and bundles: which policy a command uses, its messages, and every command that accepts one."""
 
 import json
 import re
@@ -23,11 +23,11 @@ def folder():
 
 @pytest.fixture
 def copied(folder, tmp_path):
-    """A bundle of a stranger."""
+    """Copy of a shipped bundle as an untrusted folder."""
     return shutil.copytree(folder, tmp_path / "gift")
 
 
-def test_a_task_without_runs_plays_what_it_ships_and_says_so(cli, folder):
+def test_play_without_runs_uses_the_shipped_policy(cli, folder):
     done = cli("play", "cartpole", *NUMBERS)
     assert done.code == 0
     assert f"checkpoint {folder} ({SHIPPED})" in done.err
@@ -35,16 +35,16 @@ def test_a_task_without_runs_plays_what_it_ships_and_says_so(cli, folder):
 
 
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
-def test_the_shipped_policy_succeeds_and_the_documents_name_it(cli, task):
-    said = cli("eval", task, "--episodes", 32, "--num-envs", 32, "--json", "--fail-under", "success=0.95").json
-    assert said["passed"]
-    assert (said["checkpoint"], said["chosen"]) == (str(find_task(task).policy), SHIPPED)
+def test_shipped_policy_succeeds(cli, task):
+    message = cli("eval", task, "--episodes", 32, "--num-envs", 32, "--json", "--fail-under", "success=0.95").json
+    assert message["passed"]
+    assert (message["checkpoint"], message["chosen"]) == (str(find_task(task).policy), SHIPPED)
     played = cli("play", task, *NUMBERS, "--json").json
-    assert (played["checkpoint"], played["chosen"], played["policy"]) == (said["checkpoint"], SHIPPED, "trained")
+    assert (played["checkpoint"], played["chosen"], played["policy"]) == (message["checkpoint"], SHIPPED, "trained")
     assert not Path("runs").exists(), "an evaluation of what is shipped is kept nowhere"
 
 
-def test_an_own_run_comes_first_and_shipped_names_the_other(cli, folder, only_run):
+def test_run_precedes_the_shipped_policy(cli, folder, only_run):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     own = cli("eval", "cartpole", "--episodes", 2, "--num-envs", 2, "--json").json
     assert own["checkpoint"].startswith(str(only_run()))
@@ -58,38 +58,38 @@ def test_an_own_run_comes_first_and_shipped_names_the_other(cli, folder, only_ru
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "message"),
     [
         (("play", "coin"), 5, "there is no run of coin"),
         (("eval", "coin", "--checkpoint", "shipped"), 5, "coin ships no policy"),
         (("eval", "cartpole", "--checkpoint", "latest"), 5, "there is no run of cartpole"),
-        (("eval", "--checkpoint", "shipped"), 2, "with which task?"),
-        (("export", "--checkpoint", "shipped"), 2, "with which task?"),
+        (("eval", "--checkpoint", "shipped"), 2, "needs a task"),
+        (("export", "--checkpoint", "shipped"), 2, "needs a task"),
         (("play", "cartpole-direct", "--checkpoint", "GIFT"), 2, "is a policy for cartpole, not for cartpole-direct"),
         (("play", "cartpole", "decimation=4"), 5, "step_dt  0.0166666667 s     0.0333333333 s"),
         (("export", "cartpole", "--format", "torch"), 2, "--output FILE"),
         (("autopsy", "GIFT", "3"), 2, "without its training"),
     ],
 )
-def test_what_cannot_be_is_said(cli, coin, copied, words, code, said):
+def test_invalid_policy_reference_is_refused(cli, coin, copied, words, code, message):
     words = [str(copied) if word == "GIFT" else "./coin" if word == "coin" else word for word in words]
     done = cli(*words, *(NUMBERS if words[0] == "play" else ()))
-    assert (done.code, said in done.err) == (code, True), done.err
+    assert (done.code, message in done.err) == (code, True), done.err
 
 
-def test_a_bundle_is_a_checkpoint_wherever_one_is_named(cli, copied):
+def test_bundle_is_accepted_as_a_checkpoint(cli, copied):
     assert cli("play", "--checkpoint", copied, *NUMBERS, "--json").json["chosen"] == "as named"
     assert cli("eval", "--checkpoint", copied, "--episodes", 2, "--json").json["success"]["rate"] == 1.0
     out = ("--format", "numpy", "--output", "policy.py")
     assert cli("export", "--checkpoint", copied, *out, "--json").json["metadata"]["agent"] == "sb3-ppo"
-    said = cli("stress", "--checkpoint", copied, "--sweep", "body_mass=1:2:2", "--episodes", 4, "--json").json
-    assert said["checkpoint"] == str(copied)
-    assert said["nominal"]["success"]["rate"] == 1.0
+    message = cli("stress", "--checkpoint", copied, "--sweep", "body_mass=1:2:2", "--episodes", 4, "--json").json
+    assert message["checkpoint"] == str(copied)
+    assert message["nominal"]["success"]["rate"] == 1.0
     assert "no episode was kept: it is a policy without its training" in cli("autopsy", copied).err
 
 
 @pytest.mark.parametrize("reference", ["shipped", "GIFT"])
-def test_training_begins_from_a_bundles_weights(cli, copied, only_run, reference):
+def test_training_starts_from_the_weights_of_a_bundle(cli, copied, only_run, reference):
     reference = str(copied) if reference == "GIFT" else reference
     done = cli("train", "cartpole", *SMALL, "--init-from", reference, "--max-iterations", 1)
     assert done.code == 0, done.err
@@ -99,7 +99,7 @@ def test_training_begins_from_a_bundles_weights(cli, copied, only_run, reference
     assert record["init_from"].endswith("gift" if reference != "shipped" else "cartpole")
 
 
-def test_a_run_becomes_a_bundle_with_the_evaluation_that_it_keeps(cli, only_run):
+def test_exported_bundle_has_the_evaluation_of_the_run(cli, only_run):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     without = cli("export", "cartpole", "--format", "bundle", "--output", "one", "--json")
     assert without.json["metadata"]["evaluation"] is None
@@ -115,20 +115,20 @@ def test_a_run_becomes_a_bundle_with_the_evaluation_that_it_keeps(cli, only_run)
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--format", "bundle", "--output", "policy.onnx"), "--format onnx"),
         (("--format", "bundle", "--verify", "--output", "x"), "without rlcli"),
         (("--format", "bundel", "--output", "x"), "did you mean 'bundle'?"),
-        (("--format", "bundle", "--output", "gift/policy.json"), "is no folder"),
+        (("--format", "bundle", "--output", "gift/policy.json"), "is not a folder"),
     ],
 )
-def test_a_bundle_that_cannot_be_written_is_refused(cli, copied, words, said):
+def test_bundle_that_cannot_be_written_is_refused(cli, copied, words, message):
     done = cli("export", "--checkpoint", copied, *words)
-    assert (done.code, said in done.err) == (2, True), done.err
+    assert (done.code, message in done.err) == (2, True), done.err
 
 
-def test_a_policy_for_a_task_that_was_not_installed_asks_for_its_folder(cli, coin):
+def test_bundle_of_a_task_folder_needs_the_folder(cli, coin):
     cli("train", coin, "--max-iterations", 1, "--logger", "none", "-q")
     cli("export", coin, "--format", "bundle", "--output", "gift")
     done = cli("play", "--checkpoint", "gift", *NUMBERS)
@@ -136,7 +136,7 @@ def test_a_policy_for_a_task_that_was_not_installed_asks_for_its_folder(cli, coi
     assert cli("play", coin, "--checkpoint", "gift", *NUMBERS).code == 0
 
 
-def test_a_run_that_is_damaged_is_told_of_and_not_passed_over(cli, only_run):
+def test_damaged_run_is_reported_instead_of_the_shipped_policy(cli, only_run):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     (only_run() / "run.json").write_text("{")
     done = cli("play", "cartpole", *NUMBERS)

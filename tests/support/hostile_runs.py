@@ -263,7 +263,7 @@ LINKS = {
     "the lock": _linked_file(".lock"),
     "a pipe as the lock": _piped(".lock"),
     "the newest checkpoint's name": _linked_file("checkpoints/latest"),
-    "a stranger's file": _linked_file("notes.txt"),
+    "a file of another user": _linked_file("notes.txt"),
     "the checkpoints": _linked_folder("checkpoints"),
     "TensorBoard's folder": _linked_folder("tb"),
     "the videos": _linked_folder("videos"),
@@ -278,7 +278,7 @@ def place(tmp_path, run):
     cwd = tmp_path / "cwd"
     runs = cwd / "runs" / "cartpole"
     runs.mkdir(parents=True)
-    copy = runs / "stranger"
+    copy = runs / "untrusted-run"
     shutil.copytree(run, copy)
     canary = tmp_path / "canary"
     evil = evil_task(cwd / "evil", canary, (run / "config.yaml").read_text())

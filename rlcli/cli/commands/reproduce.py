@@ -41,10 +41,10 @@ def command(
     console.info(f"reproducing {original.folder} ({why})")
 
     from rlcli.runs.reproduction import require_reproducible
-    from rlcli.runs.run_diff import compare, reached
+    from rlcli.runs.run_diff import compare, last_iteration
 
     require_reproducible(original)
-    last = reached(original)
+    last = last_iteration(original)
     until = last if iterations is None else min(iterations, last)
     run, env_steps, rows = _train_again(original, until, runs, name, force)
     console.info(f"trained {until} of {last} iterations again in {run.folder}")
@@ -63,7 +63,7 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
     from rlcli.cli.ui.progress_view import TrainingView
     from rlcli.machine import available_cores
     from rlcli.runs.provenance import built_record, environment_record
-    from rlcli.runs.reproduction import changed, create_again, milestones
+    from rlcli.runs.reproduction import changed_entries, create_reproduction, milestones
     from rlcli.runs.restore import resolve_run
     from rlcli.training.job import Job
     from rlcli.training.launch import setup_job
@@ -72,10 +72,10 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
     resolved = resolve_run(original, play=False)
     engine = resolved.task.sim.engine_threads or available_cores()
     now = environment_record(resolved, engine, int(original.record.get("torch_threads") or min(4, available_cores())))
-    rows = changed(original, now)
+    rows = changed_entries(original, now)
 
     def check_model(env: VecEnv) -> None:
-        more = changed(original, built_record(env.engine.model, "cpu"))
+        more = changed_entries(original, built_record(env.engine.model, "cpu"))
         rows.extend(more)
         _require(more, force)
 
@@ -83,7 +83,7 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
     if original.record.get("resumed"):
         console.warn("the run was resumed in another environment than it began in; its later bits may not come again")
 
-    run, initial = create_again(original, runs, name, now)
+    run, initial = create_reproduction(original, runs, name, now)
     job = Job(run, resolved, [], init_from=initial, stages=milestones(original, until))
     with StopRequest() as stop:
         trainer, env = setup_job(job, "cpu", stop, check_model)

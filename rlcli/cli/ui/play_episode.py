@@ -125,7 +125,7 @@ def _record(session: Session, start: EpisodeStart, env_id: int, file: Path) -> t
     from rlcli.replay.episode_recorder import EpisodeRecorder
     from rlcli.replay.rerun_episode import run_episode
 
-    with EpisodeRecorder(session.env, 1, only=env_id) as recorder:
+    with EpisodeRecorder(session.env, 1, env_id=env_id) as recorder:
         last = run_episode(session.env, session.act, start.obs, env_id)
     recorded = [str(written) for written in recorder.save(file)]
     console.info(f"recorded to {recorded[0]}")

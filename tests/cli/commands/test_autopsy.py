@@ -148,7 +148,7 @@ def test_a_run_of_a_gpu_says_why_there_is_nothing(trained, cli):
     (trained / "run.json").write_text(json.dumps(record))
     shown = cli("autopsy", trained)
     assert shown.code == 0
-    assert "it was trained on cuda, where a step cannot be stepped again" in shown.err
+    assert "it was trained on cuda, where steps cannot be replayed" in shown.err
     assert cli("autopsy", trained, "0").code == 2
 
 
@@ -196,7 +196,7 @@ def test_a_strangers_case_is_passed_over_with_the_file_and_the_reason(trained, c
     shown = cli("autopsy", trained, "--json")
     assert shown.code == 0
     assert [case["file"] for case in shown.json["cases"]] == [str(file) for file in others]
-    assert f"passed over: {first}" in shown.err
+    assert f"skipped: {first}" in shown.err
     assert cli("replay", first).code == 5
 
 
@@ -229,7 +229,7 @@ def test_what_is_no_file_of_the_run_is_not_followed_nor_waited_for(trained, cli,
             first.mkdir()
     shown = cli("autopsy", trained)
     assert shown.code == (5 if what.startswith("a link") else 0)
-    assert ("is a link" if what.startswith("a link") else f"passed over: {first}") in shown.err
+    assert ("is a link" if what.startswith("a link") else f"skipped: {first}") in shown.err
 
 
 def test_bars_follow_the_values():

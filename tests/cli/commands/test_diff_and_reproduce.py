@@ -156,7 +156,7 @@ def test_records_of_older_runs_are_compared_as_far_as_they_go(cli, run, copy):
     edit(copy / "run.json", forget)
     result = cli("diff", run, copy)
     assert result.code == 0
-    assert "what both have recorded" in result.out
+    assert "the entries that both have recorded" in result.out
 
 
 def test_the_first_metric_that_differs_is_named_and_the_clock_is_not_compared(cli, run, copy):
@@ -397,7 +397,7 @@ def test_a_run_that_began_from_other_weights_begins_from_them_again(cli, trained
     replace(run / "checkpoints" / f"{128:012d}", "policy", lambda tensors: tensors["actor.0.bias"].zero_())
     result = cli("reproduce", second)
     assert result.code == 5
-    assert "is not the one that the run began with" in result.err
+    assert "its policy has changed since the run started from it" in result.err
 
 
 @pytest.mark.parametrize("change", [{"device": "cuda"}, {"processes": 2}])
@@ -405,7 +405,7 @@ def test_bits_are_promised_of_one_process_on_the_cpu_only(cli, run, change):
     edit(run / "run.json", lambda record: record.update(change))
     result = cli("reproduce", run)
     assert result.code == 2
-    assert ("no bits are promised" if "device" in change else "trained by 2 processes") in result.err
+    assert ("cannot be reproduced bit by bit" if "device" in change else "trained by 2 processes") in result.err
 
 
 def test_a_run_without_an_iteration_cannot_be_reproduced(cli, run):

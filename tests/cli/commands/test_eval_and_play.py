@@ -128,7 +128,7 @@ def test_one_episode_has_no_interval(cli, coin):
     done = cli(*arguments, "--fail-under", "return.low=0")
     assert "unknown" in done.out
     assert done.code == 9
-    assert "return.low is not known from one episode" in done.err
+    assert "return.low is unknown after one episode" in done.err
 
 
 def test_the_evaluation_of_a_checkpoint_stays_in_its_run(cli, trained):

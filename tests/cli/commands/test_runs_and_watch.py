@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from rlcli.cli.commands.runs import age, size
-from rlcli.runs.eval_store import keep_evaluation
+from rlcli.runs.eval_store import write_evaluation
 from rlcli.runs.index import overviews
 from rlcli.runs.run import create_run, is_locked, open_run
 
@@ -124,7 +124,7 @@ def test_what_eval_found_is_shown(cli, made):
     mean, none = {"mean": 4.5, "std": 0.1, "low": 4.4, "high": 4.6}, {"rate": 0.875, "low": 0.5, "high": 1.0}
     document = {"command": "eval", "episodes": 8, "seed": 1, "return": mean, "length": mean, "success": none}
     document |= {"reward_terms": {}, "terminations": {}, "diverged": 0, "diverged_by": {}}
-    keep_evaluation(run, f"{64:012d}", document)
+    write_evaluation(run, f"{64:012d}", document)
     (run.folder / "evaluations" / "000000000128.json").write_text("{")
     assert listed(cli)[0]["evaluation"] == {"step": 64, "episodes": 8, "return": 4.5, "success": 0.875}
     assert "87.5%" in cli("runs").out
@@ -169,9 +169,9 @@ BROKEN = {
     "no task": (lambda run: (run / "run.json").write_text("{}"), "missing key 'task'"),
     "a link out": (lambda run: (run / "config.yaml").replace(run.parent / "c") and (run / "config.yaml").symlink_to(
         run.parent / "c"), "is a link"),
-    "a pipe": (lambda run: ((run / "run.json").unlink(), os.mkfifo(run / "run.json")), "no plain file"),
+    "a pipe": (lambda run: ((run / "run.json").unlink(), os.mkfifo(run / "run.json")), "not a plain file"),
     "metrics that are a pipe": (lambda run: ((run / "metrics.jsonl").unlink(), os.mkfifo(run / "metrics.jsonl")),
-                                "no plain file"),
+                                "not a plain file"),
     "no config": (lambda run: (run / "config.yaml").unlink(), "no config.yaml"),
     "a state of its own": (lambda run: _edit(run, state="\x1b[31mfine"), "fine"),
 }  # fmt: skip

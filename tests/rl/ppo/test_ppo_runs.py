@@ -14,7 +14,6 @@ from rlcli.evaluation.evaluate import evaluate
 from rlcli.registry import find_task
 from rlcli.rl.ppo.trainer import PpoTrainer
 from rlcli.runs.checkpoint import open_checkpoint
-from rlcli.runs.restore import policy_of
 
 
 @pytest.fixture
@@ -58,7 +57,7 @@ def test_exported_policy_matches_trained_policy(cli, overrides):
     obs = torch.randn(100, 4) * 3
     (action,) = onnxruntime.InferenceSession("policy.onnx").run(["action"], {"obs": obs.numpy()})
     with torch.no_grad():
-        expected = policy_of(open_checkpoint_of(done))(obs)
+        expected = open_checkpoint_of(done).policy()(obs)
     torch.testing.assert_close(torch.from_numpy(action), expected, rtol=1e-5, atol=1e-5)
 
 

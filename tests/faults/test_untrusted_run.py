@@ -1,4 +1,4 @@
-"""A run folder of a stranger runs nothing, hangs nothing, writes nothing outside itself, and is refused in words."""
+"""Untrusted run folders: no code is executed, nothing hangs, nothing outside is written, refusals have a message."""
 
 import json
 import os
@@ -65,7 +65,7 @@ def cli(capfd):
 
 
 def commands(run, good_run):
-    """Every command that takes a run, as one would type it."""
+    """Return the command line of every command that takes a run."""
     lines = {
         "play": ["play", "--checkpoint", run, "scene.num_envs=4", "--viewer", "none"],
         "play latest": ["play", "cartpole", "scene.num_envs=4", "--viewer", "none"],
@@ -78,7 +78,7 @@ def commands(run, good_run):
 
 
 def reading(run, good_run):
-    """Commands that read a run without its task."""
+    """Return the commands that read a run without its task."""
     lines = {
         "export": ["export", "--checkpoint", run, "--format", "torch"],
         "init-from": ["train", "cartpole", "--init-from", run, "--max-iterations", "1"],
@@ -96,31 +96,33 @@ def reading(run, good_run):
     return {name: line for name, line in lines.items() if line[0] in known}
 
 
-def refused(said, codes, *words):
-    assert said.code in codes, (said.code, said.err)
-    assert all(word in said.err for word in words), said.err
-    assert said.took < 20, said.took
+def refused(message, codes, *words):
+    assert message.code in codes, (message.code, message.err)
+    assert all(word in message.err for word in words), message.err
+    assert message.took < 20, message.took
 
 
 ATTACKS = [(kind, name) for kind in ("CODE", "RECORD") for name in getattr(hostile_runs, kind)]
 
 
 @pytest.mark.parametrize(("kind", "name"), chosen(ATTACKS, 10))
-def test_what_a_stranger_names_is_not_run_and_a_message_says_so(kind, name, at, good, cli):
+def test_code_named_by_an_untrusted_run_is_not_executed(kind, name, at, good, cli):
     getattr(hostile_runs, kind)[name](at)
     before = hostile_runs.outside(at)
     for command, line in commands(at.run, good.run).items():
-        said = cli(*line)
+        message = cli(*line)
         if command == "play latest":
-            assert said.code in (4, 5), (command, said.err)
+            assert message.code in (4, 5), (command, message.err)
         else:
-            refused(said, (5,) if kind == "RECORD" and "distribution that c" not in name else (4, 5), "stranger")
+            refused(
+                message, (5,) if kind == "RECORD" and "distribution that c" not in name else (4, 5), "untrusted-run"
+            )
             assert (
-                "hint: " in said.err
-                or "corrupt" in said.err
-                or "cannot be read" in said.err
-                or "too large" in said.err
-                or said.code == 4
+                "hint: " in message.err
+                or "corrupt" in message.err
+                or "cannot be read" in message.err
+                or "too large" in message.err
+                or message.code == 4
             )
     for line in reading(at.run, good.run).values():
         assert cli(*line).code in (0, 2, 3, 4, 5, 9, 10)
@@ -129,32 +131,32 @@ def test_what_a_stranger_names_is_not_run_and_a_message_says_so(kind, name, at, 
 
 
 @pytest.mark.parametrize("name", chosen(list(hostile_runs.CONFIG), 4))
-def test_a_strangers_configuration_reaches_nothing_but_what_is_installed(name, at, good, cli):
+def test_untrusted_configuration_reaches_only_installed_code(name, at, good, cli):
     hostile_runs.CONFIG[name](at)
     for command, line in commands(at.run, good.run).items():
         line = [word for word in line if "num_envs" not in str(word)] if "billion" in name else line
         codes = (3, 5, 9) if command == "reproduce" else (3, 5)  # 9: it is not what the record says
-        refused(cli(*line), codes, *(() if command == "play latest" else ("stranger",)))
+        refused(cli(*line), codes, *(() if command == "play latest" else ("untrusted-run",)))
     if "diff" in COMMANDS:
         assert cli("diff", at.run, good.run).code in (0, 3, 5, 9)
     assert not at.canary.exists()
 
 
 @pytest.mark.parametrize("name", chosen(list(hostile_runs.LINKS), 2))
-def test_nothing_outside_a_strangers_run_is_written_or_removed(name, at, good, cli):
+def test_files_outside_an_untrusted_run_are_unchanged(name, at, good, cli):
     hostile_runs.LINKS[name](at)
     before = hostile_runs.outside(at)
-    refused(cli("train", "--resume", at.run, "--max-iterations", "2"), (5,), "stranger")
+    refused(cli("train", "--resume", at.run, "--max-iterations", "2"), (5,), "untrusted-run")
     for line in ({**commands(at.run, good.run), **reading(at.run, good.run)}).values():
         assert cli(*line).code in (0, 2, 3, 4, 5, 9, 10)
     after = hostile_runs.outside(at)
     assert {file: after.get(file) for file in before} == before
-    new = {file for file in after if file not in before and "/stranger" not in file}
+    new = {file for file in after if file not in before and "/untrusted-run" not in file}
     assert not {file for file in new if "victim" in file}, new
 
 
 @pytest.mark.parametrize(("part", "command"), [("videos", "play"), ("exports", "export")])
-def test_a_planted_link_is_not_what_a_video_or_an_export_is_written_through(part, command, at, cli):
+def test_video_and_export_are_not_written_through_a_link(part, command, at, cli):
     victim = at.cwd / "victim"
     victim.write_text("kept")
     (at.run / part).mkdir(exist_ok=True)
@@ -188,7 +190,7 @@ RECORDINGS = {
 
 
 def forge(file, changes, at):
-    """A recording with a digest that fits what it says."""
+    """Write a changed recording with a matching digest."""
     from safetensors import safe_open
     from safetensors.torch import save
 
@@ -214,13 +216,13 @@ def forge(file, changes, at):
 
 
 @pytest.mark.parametrize("name", chosen(list(RECORDINGS), 4))
-def test_a_strangers_recording_runs_nothing(name, at, good, cli):
+def test_untrusted_recording_executes_nothing(name, at, good, cli):
     refused(cli("replay", forge(good.recording, RECORDINGS[name], at)), (3, 4, 5), "forged.safetensors")
     assert not at.canary.exists()
 
 
 @pytest.mark.parametrize("kind", ["a pipe", "a device", "a folder"])
-def test_what_is_no_file_is_no_recording(kind, at, cli):
+def test_special_file_is_not_a_recording(kind, at, cli):
     file = at.cwd / "recording"
     {
         "a pipe": lambda: hostile_runs.pipe(file),
@@ -231,7 +233,7 @@ def test_what_is_no_file_is_no_recording(kind, at, cli):
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "policy.json", "policy.safetensors"])
-def test_a_pipe_in_place_of_a_checkpoints_file_is_not_waited_for(name, at, good, cli):
+def test_pipe_in_place_of_a_checkpoint_file_does_not_block(name, at, good, cli):
     for folder in (at.run / "checkpoints").glob("0*"):
         hostile_runs.pipe(folder / name)
     for command, line in commands(at.run, good.run).items():
@@ -241,7 +243,7 @@ def test_a_pipe_in_place_of_a_checkpoints_file_is_not_waited_for(name, at, good,
 
 @pytest.mark.slow
 def test_modules_in_the_current_folder_are_not_imported(at, good):
-    """A fresh process in the stranger's folder, with modules of well-known names and a plugin's metadata beside it."""
+    """Start a process in the untrusted folder, beside modules with well-known names and a plugin's metadata."""
     shutil.copytree(at.evil, at.run, dirs_exist_ok=True)
     for name in ("yaml", "torch", "numpy", "typer", "json", "pydantic", "rlcli_tasks", "stable_baselines3", "evil"):
         (at.run / f"{name}.py").write_text(hostile_runs.code(at.canary))
@@ -284,7 +286,7 @@ def own(tmp_path, monkeypatch):
     return folder
 
 
-def test_a_task_that_was_trained_here_plays_at_once_and_elsewhere_once_it_was_named(own, cli, monkeypatch, tmp_path):
+def test_task_plays_where_it_was_trained_or_has_been_named(own, cli, monkeypatch, tmp_path):
     assert cli("train", "./mine").code == 0
     (run,) = (tmp_path / "runs").glob("*/*")
     assert cli("play", "--checkpoint", "latest", "--viewer", "none").code == 0
@@ -304,13 +306,13 @@ def test_a_task_that_was_trained_here_plays_at_once_and_elsewhere_once_it_was_na
     assert cli("eval", "--checkpoint", run, "--episodes", 2).code == 0
 
 
-def test_naming_an_installed_task_allows_no_folder_of_that_name(at, cli):
+def test_naming_an_installed_task_trusts_no_folder_of_that_name(at, cli):
     hostile_runs.CODE["a folder"](at)
     refused(cli("play", "cartpole", "--checkpoint", at.run, "--viewer", "none"), (5,), "you have not used")
     assert not at.canary.exists()
 
 
-def test_a_task_is_trusted_by_its_path_and_reference_and_not_beyond(own, cli, tmp_path):
+def test_trust_is_limited_to_the_path_and_reference(own, cli, tmp_path):
     from rlcli.runs.trusted_tasks import is_known, named_task
 
     (own / "task.py").write_text("TASK = None\n")
@@ -331,7 +333,7 @@ def test_a_task_is_trusted_by_its_path_and_reference_and_not_beyond(own, cli, tm
         assert not is_known(record), record
 
 
-def test_a_state_folder_that_cannot_be_written_stops_nobody(own, cli, monkeypatch, tmp_path):
+def test_read_only_state_folder_is_not_an_error(own, cli, monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setenv("RLCLI_STATE_DIR", str(tmp_path / "file"))
     assert cli("train", "./mine").code == 0
