@@ -280,7 +280,7 @@ def test_a_program_that_somebody_has_changed_stays(newest, tmp_path, capfd):
     asked = ["export", "--checkpoint", str(run), "--output", str(tmp_path / "policy.py"), "--format", "numpy"]
     assert main([*asked, "--verify", "--episodes", "4"]) == 0
     assert own.read_text() == "raise SystemExit('mine')\n"
-    assert "stays as it is" in capfd.readouterr().err
+    assert "is not replaced" in capfd.readouterr().err
 
 
 def test_nothing_takes_the_place_of_somebodys_own_file(newest, tmp_path, capfd):

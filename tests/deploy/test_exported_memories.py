@@ -103,7 +103,7 @@ def test_an_episode_of_the_numpy_file_keeps_histories_and_the_memory(tmp_path):
 
 def test_a_memory_of_unequal_layers_is_refused_with_a_reason(tmp_path):
     checkpoint = saved(tmp_path / "run", [4, 5])
-    with pytest.raises(UsageError, match="layers differ in size"):
+    with pytest.raises(UsageError, match="recurrent layers of different sizes"):
         export(checkpoint, tmp_path / "policy.py", "numpy")
     assert not (tmp_path / "policy.py").exists()
 

@@ -180,9 +180,9 @@ def lives(walker):
 
 def controller_of(about):
     controller = copy.copy(Controller.__new__(Controller))
-    controller.about, controller.plan = about, about["deployment"]
+    controller.metadata, controller.plan = about, about["deployment"]
     ranges = [actuator["range"] or (-np.inf, np.inf) for actuator in controller.plan["actuators"]]
-    controller.ends = np.reshape(ranges, (-1, 2)).T
+    controller.bounds = np.reshape(ranges, (-1, 2)).T
     controller.reset()
     return controller
 

@@ -232,8 +232,8 @@ def test_a_map_of_three_sweeps_shows_the_worst_over_the_third():
     sweeps = read_sweeps(["gravity=1,2", "action_delay=0:2", "push=0,1"], 5)
     values = {at: at[0] + 10 * at[1] - 100 * at[2] for at in grid(sweeps)}
     found = heat_map("success", sweeps, values)
-    assert found.rows == ("1", "2")
-    assert found.columns == ("0", "1", "2")
+    assert found.rows.values == ("1", "2")
+    assert found.columns.values == ("0", "1", "2")
     assert found.cells == ((-99, -89, -79), (-98, -88, -78))
     assert found.title == "success, the worst over push"
     assert (found.share(found.low), found.share(found.high)) == (0.0, 1.0)
@@ -242,7 +242,7 @@ def test_a_map_of_three_sweeps_shows_the_worst_over_the_third():
 def test_a_map_of_one_sweep_is_a_row():
     sweeps = read_sweeps(["gravity=1,2,3"], 5)
     found = heat_map("success", sweeps, {(1.0,): 0.5, (2.0,): 0.2, (3.0,): 0.9})
-    assert (found.rows, found.columns, found.cells) == (("",), ("1", "2", "3"), ((0.5, 0.2, 0.9),))
+    assert (found.rows.values, found.columns.values, found.cells) == (("",), ("1", "2", "3"), ((0.5, 0.2, 0.9),))
 
 
 def test_on_a_terminal_the_map_has_colours(capfd, monkeypatch):

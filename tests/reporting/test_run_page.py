@@ -321,4 +321,4 @@ def test_where_nothing_can_draw_the_page_says_so_and_has_the_rest(cli, trained, 
     (trained / "videos").mkdir(exist_ok=True)
     (trained / "videos" / "000000000000.mp4").write_bytes(MP4)
     assert cli("report", trained, "--json").json["video"] == "older"
-    assert "of the newest checkpoint there is none" in read(trained / "report.html").text
+    assert "The newest checkpoint has no video" in read(trained / "report.html").text

@@ -121,7 +121,7 @@ def test_a_direct_task_has_its_parameters_and_the_words_of_its_hooks():
     assert rows(content, "Parameters")["max_effort"] == {
         "Parameter": "max_effort", "Value": "250", "What": "Force at action 1 [N].", "Default": "400",
     }  # fmt: skip
-    words = rows(content, "In the task's words")
+    words = rows(content, "Docstrings of the task")
     assert words["Reward"]["What"] == "Upright and calm is good, out of bounds costs 2."
     assert words["Start of an episode"]["Hook"] == "reset_idx"
     assert rows(content, "Observations: policy")["pole_vel"]["Unit"] == "rad/s"
@@ -142,7 +142,7 @@ def test_hooks_that_a_direct_task_inherits_have_their_words_too(tmp_path):
         '    def is_done(self):\n        """Never."""\n\n    class Params:\n'
         "        reset_dist: float = 1.0\n        max_effort: float = 1.0\n        pole_vel_weight: float = 1.0\n"
     )
-    words = rows(built(tmp_path), "In the task's words")
+    words = rows(built(tmp_path), "Docstrings of the task")
     assert {row["Hook"]: row["What"] for row in words.values()} == {
         "Task": "Balance.", "reset": "From below.", "is_done": "Never."}  # fmt: skip
 

@@ -393,7 +393,7 @@ def test_a_checkpoint_that_was_pruned_is_said_to_be_gone_and_the_policy_stays(pl
     assert playback.act is act
     assert playback.view.checkpoint == newest
     assert first not in playback.view.checkpoints
-    assert f"step {first} cannot be played, step {newest} goes on" in log.messages[0]
+    assert f"step {first} cannot be played, step {newest} continues" in log.messages[0]
     assert "not there any more" in playback.view.message
 
 
