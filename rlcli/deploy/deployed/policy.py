@@ -20,11 +20,8 @@ def run(inputs):
     x = np.asarray(inputs["obs"], np.float32)
     if NETWORK["normalize"]:
         x = (x - _W["mean"]) * _W["scale"]
-        x = (
-            x
-            if NETWORK["normalize_clip"] is None
-            else np.clip(x, -NETWORK["normalize_clip"], NETWORK["normalize_clip"])
-        )
+        clip = NETWORK["normalize_clip"]
+        x = x if clip is None else np.clip(x, -clip, clip)
     x, outputs = x.astype(np.float64), {}
     if NETWORK["pictures"]:
         x = _convolve_pictures(x)
