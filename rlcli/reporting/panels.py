@@ -10,11 +10,7 @@ from rlcli.errors import UsageError, did_you_mean, listing
 from rlcli.reporting.curves import Curve, Line
 
 REWARDS, TERMINATIONS = "Episode_Reward/", "Episode_Termination/"
-METRICS = {
-    "return": "Train/mean_reward",
-    "success": "Train/success_rate",
-    "length": "Train/mean_episode_length",
-}
+METRICS = {"return": "Train/mean_reward", "success": "Train/success_rate", "length": "Train/mean_episode_length"}
 """Short name -> metric."""
 GROUPS = {"rewards": REWARDS, "terminations": TERMINATIONS}
 """Short name -> prefix of its metrics."""

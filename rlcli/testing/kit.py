@@ -8,15 +8,7 @@ from pathlib import Path
 
 import torch
 
-from rlcli.errors import (
-    ConfigError,
-    DependencyError,
-    DeviceError,
-    MachineError,
-    ShapeError,
-    TaskError,
-    require_known,
-)
+from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError, ShapeError, TaskError, require_known
 from rlcli.testing import episode_checks, portability_checks, value_checks
 from rlcli.testing.task_under_test import Finding, NotRunError, TaskUnderTest, error_text, open_task
 

@@ -36,11 +36,7 @@ class TrainingVideos(StepObserver):
     """
 
     def __init__(
-        self,
-        make_env: Callable[[], VecEnv],
-        folder: Path,
-        interval: int,
-        stopping: Callable[[], bool] = lambda: False,
+        self, make_env: Callable[[], VecEnv], folder: Path, interval: int, stopping: Callable[[], bool] = lambda: False
     ) -> None:
         self._make_env, self._folder, self._interval = make_env, folder, interval
         self._stopping = stopping
