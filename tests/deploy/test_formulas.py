@@ -194,20 +194,20 @@ def answer(action, inputs):
 
 
 @pytest.mark.parametrize("name", [*TERMS, *PREPARED])
-def test_formula_of_a_term_computes_what_the_term_does(lives, name):
+def test_observation_formula_equals_term(lives, name):
     expected, found = (np.stack(rows) for rows in lives[0][name])
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2e-5)
     if name != "joint_effort":
         assert len(np.unique(expected.round(4), axis=0)) > 2  # a constant would agree with much
 
 
-def test_formulas_of_actions_write_the_controls_that_the_environment_writes(lives):
+def test_action_formulas_equal_environment_controls(lives):
     expected, found = (np.concatenate(rows) for rows in lives[1])
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
     assert len(np.unique(expected[:, 0])) > 50
 
 
-def test_every_observation_term_that_mjdata_can_tell_has_a_formula():
+def test_all_mjdata_observation_terms_have_formulas():
     ours = set(builtin_terms("observations"))
     without = {  # contacts, rays, pictures and memories of the environment's own
         "height_scan", "foot_air_time", "foot_contact", "foot_contact_forces", "fingers_contact_force_b",
@@ -223,7 +223,7 @@ def aliases(ours, known):
     return {name for name in ours if builtin_terms("observations")[name].attribute in known}
 
 
-def test_the_program_and_the_reader_know_the_same_operations():
+def test_program_and_reader_have_same_operations():
     assert set(OPS) | {"filter"} == set(KNOWN)
 
 
@@ -245,12 +245,12 @@ def test_the_program_and_the_reader_know_the_same_operations():
         None,
     ],
 )
-def test_what_is_no_formula_is_refused(value):
+def test_invalid_formula_is_rejected(value):
     with pytest.raises(ValueError, match=r"."):
         check_formula(value)
 
 
-def test_terms_that_read_a_terrain_or_a_gravity_of_their_own_have_no_formula(walker):
+def test_terrain_and_own_gravity_have_no_formula(walker):
     text = (walker / "task.yaml").read_text()
     terrain = "  terrain: {kind: generator, rows: 1, columns: 1, sub_terrains: {flat: {kind: flat}}}\n"
     (walker / "hilly.yaml").write_text(text.replace("scene:\n", f"scene:\n{terrain}"))
@@ -265,7 +265,7 @@ def test_terms_that_read_a_terrain_or_a_gravity_of_their_own_have_no_formula(wal
     env.close()
 
 
-def test_one_step_of_mjdata_is_current_after_step1():
+def test_mj_step1_updates_derived_fields():
     model = mujoco.MjModel.from_xml_string(WALKER)
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 3)

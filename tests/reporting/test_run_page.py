@@ -75,7 +75,7 @@ def trained(template, tmp_path):
     return Path(shutil.copytree(template, tmp_path / "runs" / "cartpole" / template.name))
 
 
-def test_a_run_has_its_page_with_everything_of_it(cli, tmp_path):
+def test_report_has_all_sections(cli, tmp_path):
     run = write_run(tmp_path / "runs", rows=learning(), overrides=["rewards.alive.weight=1.5"], cpu={"model": "A chip"})
     said = cli("report", "latest", "--json")
     assert said.code == 0
@@ -96,7 +96,7 @@ def test_a_run_has_its_page_with_everything_of_it(cli, tmp_path):
     }
 
 
-def test_the_page_forbids_everything_external_before_anything_else(cli, tmp_path):
+def test_page_starts_with_content_security_policy(cli, tmp_path):
     write_run(tmp_path / "runs", rows=learning())
     text = Path(cli("report", "latest").out.strip()).read_text()
     head = text[: text.index("<title>")]
@@ -107,7 +107,7 @@ def test_the_page_forbids_everything_external_before_anything_else(cli, tmp_path
     assert {rules["img-src"], rules["media-src"]} == {"data:"}
 
 
-def test_every_value_of_the_configuration_says_where_it_was_written(cli, tmp_path):
+def test_settings_have_origins(cli, tmp_path):
     runs = tmp_path / "runs"
     write_run(runs, rows=learning(), overrides=["rewards.alive.weight=1.5"])
     text = Path(cli("report", "latest").out.strip()).read_text()
@@ -121,7 +121,7 @@ def test_every_value_of_the_configuration_says_where_it_was_written(cli, tmp_pat
     assert origin("sim.gravity") == "default"
 
 
-def test_a_value_that_the_installed_task_no_longer_has_is_a_line_of_the_run(cli, tmp_path):
+def test_origin_of_changed_value_is_run_file(cli, tmp_path):
     run = write_run(tmp_path / "runs", rows=learning())
     text = run.config.read_text()
     run.config.write_text(text.replace("episode_length_s: 5.0", "episode_length_s: 7.0"))
@@ -130,14 +130,14 @@ def test_a_value_that_the_installed_task_no_longer_has_is_a_line_of_the_run(cli,
     assert written(page, "episode_length_s") == f"config.yaml:{line}:1 (the installed task differs)"
 
 
-def test_a_direct_tasks_page_has_its_parameters_and_words(cli, tmp_path):
+def test_direct_task_page_has_parameters_and_docstrings(cli, tmp_path):
     write_run(tmp_path / "runs", "cartpole-direct", rows=learning())
     page = read(cli("report", "latest").out.strip())
     assert "Upright and calm is good" in page.text
     assert "Force at action 1 [N]." in page.text
 
 
-def test_text_of_a_stranger_is_text(cli, tmp_path):
+def test_untrusted_text_is_escaped(cli, tmp_path):
     rows = learning(**{f"Episode_Reward/{ATTACK}": 1.0, f"Episode_Termination/{ATTACK}": 0.5})
     run = write_run(tmp_path / "runs", rows=rows)
     run.update(
@@ -169,7 +169,7 @@ def test_text_of_a_stranger_is_text(cli, tmp_path):
     assert not re.search("[\x00-\x08\u202e]", text)
 
 
-def test_a_run_that_names_code_of_a_stranger_runs_none_of_it_and_still_has_a_page(cli, tmp_path, coin):
+def test_untrusted_task_code_is_not_executed(cli, tmp_path, coin):
     canary = tmp_path / "canary"
     Path("coin/task.py").write_text(f"open({str(canary)!r}, 'w')\n")
     run = write_run(tmp_path / "runs", rows=learning())
@@ -182,7 +182,7 @@ def test_a_run_that_names_code_of_a_stranger_runs_none_of_it_and_still_has_a_pag
 
 
 @pytest.mark.parametrize("config", ["a: [", "rewards: 7", "x: !!python/object/apply:os.system [ls]", ""])
-def test_a_configuration_that_is_none_is_said_on_the_page(cli, tmp_path, config):
+def test_invalid_configuration_is_reported_on_page(cli, tmp_path, config):
     run = write_run(tmp_path / "runs", rows=learning(), config=config)
     said = cli("report", run.folder)
     assert said.code == 0, said.err
@@ -190,13 +190,13 @@ def test_a_configuration_that_is_none_is_said_on_the_page(cli, tmp_path, config)
     assert "cannot be described" in said.err
 
 
-def test_a_run_that_has_told_nothing_has_a_page(cli, tmp_path):
+def test_run_without_metrics_has_page(cli, tmp_path):
     run = write_run(tmp_path / "runs")
     assert cli("report", run.folder).code == 0
     assert "has no metrics yet" in read(run.folder / "report.html").text
 
 
-def test_without_matplotlib_the_page_says_what_to_install_and_has_the_rest(cli, tmp_path, monkeypatch):
+def test_page_without_matplotlib_names_pip_command(cli, tmp_path, monkeypatch):
     from importlib import util
 
     find = util.find_spec
@@ -219,7 +219,7 @@ def test_without_matplotlib_the_page_says_what_to_install_and_has_the_rest(cli, 
         ([], 2, "Missing argument"),
     ],
 )
-def test_what_cannot_be_reported_is_refused_in_words(cli, tmp_path, arguments, code, said):
+def test_invalid_arguments_are_rejected(cli, tmp_path, arguments, code, said):
     run = write_run(tmp_path / "runs", rows=learning())
     result = cli("report", *arguments)
     assert (result.code, result.out) == (code, "")
@@ -229,7 +229,7 @@ def test_what_cannot_be_reported_is_refused_in_words(cli, tmp_path, arguments, c
 
 
 @pytest.mark.parametrize("name", ["report.html", "videos"])
-def test_a_link_in_a_strangers_run_is_not_followed(cli, tmp_path, name):
+def test_symlink_in_untrusted_run_is_not_followed(cli, tmp_path, name):
     run = write_run(tmp_path / "runs", rows=learning())
     outside = tmp_path / "outside"
     outside.write_text("mine")
@@ -238,7 +238,7 @@ def test_a_link_in_a_strangers_run_is_not_followed(cli, tmp_path, name):
     assert outside.read_text() == "mine"
 
 
-def test_an_evaluation_is_made_once_and_kept_with_its_intervals(cli, trained):
+def test_evaluation_is_made_once_and_stored(cli, trained):
     said = cli("report", trained, "--no-video", "--json")
     assert (said.code, said.json["evaluation"], said.json["video"]) == (0, "made", None)
     page = read(trained / "report.html")
@@ -256,7 +256,7 @@ def test_an_evaluation_is_made_once_and_kept_with_its_intervals(cli, trained):
     assert "is corrupt" in broken.json["missing"]["evaluation"]
 
 
-def test_a_report_of_a_checkpoint_is_of_that_one_and_one_episode_has_no_interval(cli, trained):
+def test_report_of_given_checkpoint_and_single_episode(cli, trained):
     assert cli("eval", "--checkpoint", f"{trained}@step:0", "--episodes", 1, "-q").code == 0
     said = cli("report", f"{trained}@step:0", "--no-video", "-o", "page.html", "--json")
     assert (said.code, said.json["evaluation"]) == (0, "stored")
@@ -269,7 +269,7 @@ def test_a_report_of_a_checkpoint_is_of_that_one_and_one_episode_has_no_interval
     assert newest.json["checkpoint"] != said.json["checkpoint"]
 
 
-def test_nothing_is_evaluated_or_drawn_where_that_is_asked(cli, trained):
+def test_no_eval_and_no_video_flags(cli, trained):
     said = cli("report", trained, "--no-eval", "--no-video", "-o", "page.html", "--json")
     assert (said.code, said.json["evaluation"], said.json["video"]) == (0, None, None)
     assert not (trained / "evaluations").exists()
@@ -278,7 +278,7 @@ def test_nothing_is_evaluated_or_drawn_where_that_is_asked(cli, trained):
     assert "rlcli eval --checkpoint" in read("page.html").text
 
 
-def test_a_video_of_the_checkpoint_is_in_the_page(cli, trained):
+def test_page_contains_checkpoint_video(cli, trained):
     step = sorted((trained / "checkpoints").glob("0*"))[-1].name
     (trained / "videos").mkdir()
     (trained / "videos" / f"{step}.mp4").write_bytes(MP4)
@@ -290,7 +290,7 @@ def test_a_video_of_the_checkpoint_is_in_the_page(cli, trained):
 
 
 @pytest.mark.parametrize("kind", ["text", "link", "large", "pipe"])
-def test_what_is_no_video_of_the_run_is_not_in_the_page(cli, trained, tmp_path, kind, monkeypatch):
+def test_invalid_video_is_not_in_page(cli, trained, tmp_path, kind, monkeypatch):
     step = sorted((trained / "checkpoints").glob("0*"))[-1].name
     (trained / "videos").mkdir()
     file = trained / "videos" / f"{step}.mp4"
@@ -312,7 +312,7 @@ def test_what_is_no_video_of_the_run_is_not_in_the_page(cli, trained, tmp_path, 
     assert "video" not in read("page.html").tags
 
 
-def test_where_nothing_can_draw_the_page_says_so_and_has_the_rest(cli, trained, monkeypatch):
+def test_page_without_renderer_reports_missing_video(cli, trained, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
     said = cli("report", trained, "--json")
     assert said.code == 0, said.err

@@ -72,7 +72,7 @@ def pixels(element):
         return np.asarray(image.convert("RGB"), dtype=float)
 
 
-def test_the_page_shows_curves_and_plays_the_video_and_asks_for_nothing(browser, report):
+def test_page_shows_curves_and_video_without_network(browser, report):
     page = browser(report)
     wait(page, "document.querySelector('video').readyState >= 3")
     charts = page.locator(".charts svg")
@@ -99,7 +99,7 @@ def test_the_page_shows_curves_and_plays_the_video_and_asks_for_nothing(browser,
 
 
 @pytest.mark.parametrize(("scheme", "bright"), [("light", True), ("dark", False)])
-def test_a_phone_has_it_in_its_width_and_colours(browser, report, scheme, bright):
+def test_page_fits_phone_width_and_colour_scheme(browser, report, scheme, bright):
     page = browser(report, width=390, color_scheme=scheme)
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     background = page.evaluate("getComputedStyle(document.body).backgroundColor")
@@ -108,7 +108,7 @@ def test_a_phone_has_it_in_its_width_and_colours(browser, report, scheme, bright
     assert (sum(map(int, text[4:-1].split(","))) < 200) == bright
 
 
-def test_in_print_all_of_the_configuration_is_there(browser, report):
+def test_print_shows_whole_configuration(browser, report):
     page = browser(report)
     page.emulate_media(media="print")
     closed = page.locator("details:not([open]) td").first
@@ -140,7 +140,7 @@ def listener():
     server.server_close()
 
 
-def test_what_a_stranger_wrote_does_not_run(browser, cli, tmp_path):
+def test_untrusted_text_does_not_run(browser, cli, tmp_path):
     rows = learning(**{f"Episode_Reward/{ATTACK}": 1.0})
     run = write_run(tmp_path / "runs", rows=rows, versions={ATTACK: ATTACK}, platform=ATTACK)
     run.update(state=ATTACK)
@@ -153,7 +153,7 @@ def test_what_a_stranger_wrote_does_not_run(browser, cli, tmp_path):
     assert page.locator("img, script").count() == 0
 
 
-def test_even_markup_that_got_in_would_reach_nobody_and_run_nothing(browser, cli, tmp_path, listener):
+def test_injected_markup_is_blocked_by_policy(browser, cli, tmp_path, listener):
     place, asked = listener
     run = write_run(tmp_path / "runs", rows=learning())
     assert cli("report", run.folder, "-o", "page.html").code == 0

@@ -84,7 +84,7 @@ def pole(page):
     return (seen[..., 0] > 90) & (seen[..., 0] - seen[..., 2] > 60)
 
 
-def test_a_trained_cartpole_moves_is_paused_and_changes_its_policy(cartpole_run):
+def test_browser_shows_pauses_and_switches_policy(cartpole_run):
     with Playing("--checkpoint", cartpole_run, "--viewer", "web", "--port", 0) as playing:
         with page_of(playing.url) as page:
             until("the pole", lambda: pole(page).sum() > 20)

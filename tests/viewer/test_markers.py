@@ -103,7 +103,7 @@ def coloured(seen, bare, color):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
-def test_the_goal_of_reach_is_seen_where_it_is(number):
+def test_reach_goal_is_drawn_at_its_position(number):
     env = build("reach", 2)
     env.reset(seed=3)
     seen, bare = pictures(env, number)
@@ -122,7 +122,7 @@ def test_the_goal_of_reach_is_seen_where_it_is(number):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("vx", "vy"), [(0.8, 0.0), (-0.8, 0.0), (0.0, 0.8), (0.5, -0.5)])
-def test_green_points_where_the_velocity_is_asked_and_blue_where_it_is(tmp_path, vx, vy):
+def test_green_arrow_is_commanded_blue_arrow_is_actual_velocity(tmp_path, vx, vy):
     above = "viewer.eye=[-0.05,0.0,3.5]"  # else an arrow's head may hide its tip
     env = asking(tmp_path, 1, above, still=False, walk=VELOCITY)
     for name, value in {"vx": vx, "vy": vy, "wz": 0.0}.items():
@@ -144,7 +144,7 @@ def test_green_points_where_the_velocity_is_asked_and_blue_where_it_is(tmp_path,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wz", [0.7, -0.7])
-def test_a_point_ahead_shows_how_fast_to_turn(tmp_path, wz):
+def test_turn_rate_marker_position(tmp_path, wz):
     env = asking(tmp_path, 1, still=False, walk=VELOCITY)
     for name, value in {"vx": 0.0, "vy": 0.0, "wz": wz}.items():
         env.command_manager.hold(name, value)
@@ -159,7 +159,7 @@ def test_a_point_ahead_shows_how_fast_to_turn(tmp_path, wz):
     assert len(coloured(seen, bare, COMMANDED)) > 20
 
 
-def test_a_place_on_the_ground_is_a_ball_with_an_arrow(tmp_path):
+def test_pose_command_is_sphere_with_arrow(tmp_path):
     env = asking(tmp_path, 3, still=False, place=PLACE)
     run(env, 3, reset=False)
     ball, arrow = env.markers()
@@ -182,7 +182,7 @@ def test_a_place_on_the_ground_is_a_ball_with_an_arrow(tmp_path):
     ],
     ids=["no command", "a command without markers", "no velocity, asked or actual", "not finite"],
 )
-def test_nothing_is_drawn_where_nothing_is_asked(tmp_path, commands):
+def test_no_markers_for_zero_commands(tmp_path, commands):
     env = asking(tmp_path, 2, **commands)
     seen, bare = pictures(env)
     np.testing.assert_array_equal(seen, bare)
@@ -190,7 +190,7 @@ def test_nothing_is_drawn_where_nothing_is_asked(tmp_path, commands):
 
 
 @pytest.mark.slow
-def test_a_term_of_ones_own_is_drawn_and_asked_by_pictures_alone(tmp_path):
+def test_custom_command_markers_are_computed_only_for_pictures(tmp_path):
     env = asking(tmp_path, 2, own={"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9})
     term = env.command_manager.get_term("own")
     run(env, 3)
@@ -204,7 +204,7 @@ def test_a_term_of_ones_own_is_drawn_and_asked_by_pictures_alone(tmp_path):
 
 
 @pytest.mark.slow
-def test_cameras_that_are_sensors_see_no_markers(tmp_path):
+def test_camera_sensors_do_not_render_markers(tmp_path):
     front = {"kind": "camera", "data": "rgb", "width": 64, "height": 48, "eye": [-2, 0, 0.9], "lookat": [0, 0, 0.9]}
     own = {"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9}
     images = {}
@@ -223,7 +223,7 @@ def test_cameras_that_are_sensors_see_no_markers(tmp_path):
 
 
 @pytest.mark.slow
-def test_pictures_change_nothing_of_what_is_simulated(tmp_path):
+def test_rendering_does_not_change_simulation(tmp_path):
     commands = {"walk": VELOCITY, "pose": POSE, "place": PLACE}
     lives = {}
     for drawn in (False, True):
@@ -248,7 +248,7 @@ def shapes(scene):
     return [(int(geom.type), geom.pos.copy()) for geom in decor]
 
 
-def test_in_a_crowd_each_has_its_own_at_its_place(tmp_path):
+def test_grid_draws_markers_of_each_environment(tmp_path):
     env = asking(tmp_path, 5, still=False, pose=POSE)
     scene = mujoco.MjvScene(env.engine.model, maxgeom=1000)
     env_grid = EnvGrid(env, 3)
@@ -261,7 +261,7 @@ def test_in_a_crowd_each_has_its_own_at_its_place(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_crowds_picture_shows_them_all(tmp_path):
+def test_grid_picture_shows_all_markers(tmp_path):
     env = asking(tmp_path, 4, "scene.env_spacing=2", own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
     env_grid, counts = EnvGrid(env, 4), {}
     env.command_manager.get_term("own").given = []
@@ -279,7 +279,7 @@ def test_a_crowds_picture_shows_them_all(tmp_path):
     assert min(counts.values()) > 20
 
 
-def test_the_browser_gets_them_as_copies(tmp_path):
+def test_browser_gets_marker_copies(tmp_path):
     env = asking(tmp_path, 2, pose=POSE)
     scene = mujoco.MjvScene(env.engine.model, maxgeom=1024)
     found = list(EnvGrid(env, 1).geoms(scene, 1, mujoco.MjvOption()))
@@ -292,7 +292,7 @@ def test_the_browser_gets_them_as_copies(tmp_path):
     assert {geom.castshadow for geom in found} == {0}
 
 
-def test_the_window_gets_them_too(tmp_path):
+def test_window_gets_markers(tmp_path):
     env = asking(tmp_path, 2, pose=POSE)
     playback = Playback(env, zero_policy(env))
     model, _ = env.world(0)
@@ -306,7 +306,7 @@ def test_the_window_gets_them_too(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_film_shows_what_is_asked(tmp_path):
+def test_video_shows_markers(tmp_path):
     from PIL import Image
 
     env = asking(tmp_path, 1, pose=POSE)
@@ -316,7 +316,7 @@ def test_a_film_shows_what_is_asked(tmp_path):
     assert ((last[..., 1] - np.maximum(last[..., 0], last[..., 2])) > 60).sum() > 20
 
 
-def test_of_more_than_a_scene_holds_as_many_as_it_holds_are_drawn(tmp_path):
+def test_markers_are_limited_by_scene_size(tmp_path):
     env = asking(tmp_path, 4, pose=POSE)
     scene = mujoco.MjvScene(env.engine.model, maxgeom=6)
     add_markers(scene, env.markers(), range(4), np.zeros((4, 3)))
@@ -334,7 +334,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("said", WRONG)
-def test_what_is_no_marker_of_every_environment_is_refused_by_the_terms_name(tmp_path, said):
+def test_invalid_marker_error_names_term(tmp_path, said):
     env = asking(tmp_path, 4, own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
     env.command_manager.get_term("own").given = [WRONG[said](4)]
     with pytest.raises(ConfigError, match=f"commands.own: markers\\(\\) {said}"):

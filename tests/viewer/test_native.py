@@ -38,7 +38,7 @@ def pressed(playback, *keys):
     return playback.view
 
 
-def test_the_keys_ask_the_player(playback):
+def test_keys_submit_requests(playback):
     assert pressed(playback, SPACE).paused
     assert not pressed(playback, SPACE).paused
     assert pressed(playback, EQUAL, EQUAL).speed == 4.0
@@ -54,12 +54,12 @@ def test_the_keys_ask_the_player(playback):
 
 
 @pytest.mark.parametrize("key", [PAGE_UP, 65, 0, -1])
-def test_keys_that_mean_nothing_here_do_nothing(playback, key):
+def test_unknown_keys_are_ignored(playback, key):
     before = playback.view
     assert pressed(playback, key) == before
 
 
-def test_keys_turn_commands_within_their_ranges(tmp_path):
+def test_keys_adjust_commands_within_ranges(tmp_path):
     playback = commanded(tmp_path)
     assert pressed(playback, END).held == {}
     assert pressed(playback, INSERT, INSERT).held == {"vy": pytest.approx(0.4)}
@@ -72,7 +72,7 @@ def test_keys_turn_commands_within_their_ranges(tmp_path):
     assert "vx" not in pressed(playback, DELETE).held
 
 
-def test_the_captions_say_what_is_shown(playback):
+def test_captions_show_view(playback):
     names, values = captions(pressed(playback, SPACE, UP))
     said = dict(zip(names.splitlines(), values.splitlines(), strict=True))
     assert said["speed"] == "paused"

@@ -17,7 +17,7 @@ np.savez(sys.argv[2], frames=np.stack([frame for frame in reader]), fps=reader.g
 """
 
 
-def test_the_pole_of_a_trained_policy_stands_in_its_video(cartpole_run, tmp_path):
+def test_video_of_trained_policy_shows_upright_pole(cartpole_run, tmp_path):
     variables = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")}
     words = ["play", "--checkpoint", "latest", "--video", "x.mp4", "--json", "--runs-dir", cartpole_run.parent.parent]
     words += ["viewer.width=320", "viewer.height=240"]
