@@ -1,4 +1,4 @@
-"""The pages of the benchmarks: their figures are those that were measured, wherever they stand."""
+"""Pages of the benchmarks: their figures equal the stored results."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The instruments of the benchmarks: children that take turns, peers that fail, commands that end at a call."""
+"""Tools of the benchmarks: alternating subprocesses, failing peers, and commands that end at a call."""
 
 import subprocess
 import sys
@@ -68,7 +68,7 @@ def test_closed_side_ends_its_subprocesses(child):
 
 
 def running(process):
-    """Whether it lives; one that nobody has waited for does not."""
+    """Return whether a process runs; a zombie process does not."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:

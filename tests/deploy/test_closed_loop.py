@@ -1,4 +1,4 @@
-"""`rlcli export --verify`: an exported file drives plain MuJoCo, and what is wrong with it shows."""
+"""`rlcli export --verify`: an exported file controls plain MuJoCo, and errors in the file are found."""
 
 import json
 import os
@@ -50,7 +50,7 @@ agents:
         torch_threads: 1, actor: {hidden: [8]}, critic: {hidden: [8]}, compile: false}
 """
 TERMS = '''
-"""Terms that no formula stands for."""
+"""Terms without a formula."""
 import torch
 
 from rlcli.task import Address, Entity, Joints
@@ -118,7 +118,7 @@ def test_verify_passes_for_each_built_in_task(newest, tmp_path, capfd, label):
 
 @pytest.fixture(scope="module")
 def pushed(tmp_path_factory):
-    """A run of a task with all that a controller must keep, and a term that only the task knows."""
+    """Run of a task with histories, an RNN, pushes and commands, and with a term without a formula."""
     folder = tmp_path_factory.mktemp("pushed")
     task = folder / "pushed"
     task.mkdir()
@@ -140,7 +140,7 @@ def test_verify_covers_histories_rnn_pushes_and_commands(pushed, tmp_path, capfd
 
 @pytest.fixture
 def copied(newest, tmp_path):
-    """A run of the cartpole to be tampered with."""
+    """Copy of a cartpole run that a test may change."""
     return Path(shutil.copytree(newest("cartpole").parent.parent, tmp_path / "copied"))
 
 
@@ -197,7 +197,7 @@ ELSEWHERE = {
 
 @pytest.mark.parametrize("place", ELSEWHERE)
 def test_verify_fails_on_wrong_robot_description(copied, tmp_path, capfd, place):
-    """None of it need show in the episodes that are lived."""
+    """The differences need not show in the episodes."""
     tamper(copied, ELSEWHERE[place])
     document = verify(capfd, copied, tmp_path / "policy.py", "--format", "numpy", "--episodes", "2", code=9)
     assert not checks(document)["description"]

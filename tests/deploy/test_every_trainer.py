@@ -1,4 +1,4 @@
-"""Policies of every trainer and every algorithm: exported in every format without the simulator, and verified."""
+"""Policies of all trainers and algorithms: exported in all formats without the simulator, and verified."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""`rlcli export` on the command line: where it writes, what it says, and what it refuses."""
+"""`rlcli export` on the command line: its files, its output and its errors."""
 
 import hashlib
 import json
@@ -41,7 +41,7 @@ COMMAND = "from rlcli.cli.app import main\nsys.exit(main(sys.argv[1:]))"
 
 @pytest.fixture
 def copied(newest, tmp_path):
-    """A checkpoint folder of the PPO cartpole, on its own, to be damaged."""
+    """Copy of a checkpoint folder of the PPO cartpole that a test may damage."""
     return Path(shutil.copytree(newest("cartpole"), tmp_path / "checkpoint"))
 
 
@@ -189,7 +189,7 @@ def test_torch_format_needs_no_extra(copied, tmp_path, monkeypatch):
 
 
 def damage(folder, how):
-    """Spoil a checkpoint; where the manifest is to agree with the damage, it is made to."""
+    """Damage a checkpoint; for some kinds of damage the manifest is changed to agree with it."""
     manifest = json.loads((folder / "manifest.json").read_text())
     policy = folder / "policy.safetensors"
     if how == "truncated weights":

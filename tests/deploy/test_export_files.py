@@ -1,4 +1,4 @@
-"""What an exported file computes and what it says of itself."""
+"""Outputs and metadata of exported files."""
 
 import copy
 import hashlib
@@ -88,7 +88,7 @@ def test_export_equals_policy_on_1000_observations(exported, newest, task, forma
 
 
 def test_outputs_stay_in_bound_despite_runtime_tanh(newest, tmp_path):
-    """onnxruntime's float32 tanh of 8.3 .. 9 is 1.0000001 here and there."""
+    """For some inputs from 8.3 to 9, onnxruntime's float32 tanh is 1.0000001."""
     folder = Path(shutil.copytree(newest("cartpole-direct sac"), tmp_path / "checkpoint"))
     weights = {name: torch.zeros_like(t) for name, t in open_checkpoint(folder).tensors("policy").items()}
     for layer in (0, 2, 4):

@@ -1,4 +1,4 @@
-"""Policies with a memory: exported with the memory as input and output."""
+"""Recurrent policies: exported with the hidden state as input and output."""
 
 import runpy
 
@@ -49,7 +49,7 @@ def saved(folder, memory, **changes):
 
 
 def runner(file):
-    """A file as its own library runs it: inputs by name -> outputs by name, numpy."""
+    """Return the function of a file, run by its own library: inputs by name -> outputs by name, numpy."""
     if file.suffix == ".py":
         return runpy.run_path(str(file))["run"]
     if file.suffix == ".onnx":

@@ -1,4 +1,4 @@
-"""Formulas against the terms that they stand for: numpy on an MjData, by the program that users get."""
+"""Formulas compared with their terms: computed by the exported program, with numpy, from an MjData."""
 
 import copy
 import functools
@@ -138,7 +138,7 @@ def walker(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def lives(walker):
-    """What the environment and what the formulas saw in each step, over several episodes: name -> two lists of rows."""
+    """Values of the environment and of the formulas in each step of several episodes: name -> two lists of rows."""
     torch.set_num_threads(1)
     env = make_env(resolve(folder_task(walker, "task.yaml")), seed=5)
     plan = json.loads(json.dumps(describe(env)))
@@ -188,7 +188,7 @@ def controller_of(about):
 
 
 def answer(action, inputs):
-    """What a policy file gives for the walker: its knee is affine, its hip in the term's own way."""
+    """Return the outputs of a policy file for the walker: its knee has an affine term, its hip another one."""
     command = torch.stack([action[0] * 0.5 + (0.4 + 0.2), action[1]])
     return {"action": action[None].numpy(), "command": command[None].numpy()}
 
@@ -219,7 +219,7 @@ def test_all_mjdata_observation_terms_have_formulas():
 
 
 def aliases(ours, known):
-    """Names of YAML that stand for a function of another name."""
+    """Return the names in YAML whose function has another name."""
     return {name for name in ours if builtin_terms("observations")[name].attribute in known}
 
 

@@ -179,7 +179,7 @@ def test_a_run_a_checkpoint_or_a_task_is_stressed(cli, only_run):
         (("cartpole", "--policy", "zero", "--sweep", "gravity=1:2", "--against", "lqrr"), 2, "did you mean 'lqr'"),
         (("cartpole", "--policy", "zero", "--sweep", "gravity=1:2", "--against", "trained"), 2, "--against trained"),
         (("cartpole", "--sweep", "gravity=1:2", "--fail-under", "succes=1"), 2, "--fail-under"),
-        (("cartpole", "--sweep", "gravity=1:2", "-o", "x.jpg"), 2, "is no picture"),
+        (("cartpole", "--sweep", "gravity=1:2", "-o", "x.jpg"), 2, "is not a picture"),
         (("cartpole", "--sweep", "gravity=1:2", "-o", "nowhere/x.png"), 10, "no folder"),
         (("cartpole", "--sweep", "gravity=1:2:200", "--sweep", "push=0:1:200"), 2, "40,000 variants"),
         (("cartpol", "--sweep", "gravity=1:2"), 4, "did you mean 'cartpole"),

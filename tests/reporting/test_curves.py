@@ -1,4 +1,4 @@
-"""Learning curves: what is read of runs, which belong together, and what several seeds tell."""
+"""Learning curves: reading of runs, grouping by settings, and statistics over seeds."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""`rlcli report`: what stands on the page, what is said where something is missing, and that it is text and no more."""
+"""`rlcli report`: content of the page, messages for missing parts, and escaping of untrusted text."""
 
 import base64
 import html
@@ -21,7 +21,7 @@ ATTACK = "<script>document.title='run'</script><img src=x onerror=alert(1)>\"'&{
 
 
 class Reader(HTMLParser):
-    """The tags, the attributes and the text of a page."""
+    """Parser of the tags, the attributes and the text of a page."""
 
     def __init__(self, text):
         super().__init__()
@@ -45,13 +45,13 @@ def read(file):
 
 
 def written(text, key):
-    """Where a page says that a value was written."""
+    """Return the origin of a value on a page."""
     row = rf"<code>{re.escape(key)}</code></td><td><code>[^<]*</code></td><td class=\"origin\">([^<]*)</td>"
     return html.unescape(re.search(row, text)[1])
 
 
 def require_harmless(page):
-    """Nothing that runs, nothing from elsewhere."""
+    """Check that a page has no scripts and no external resources."""
     assert not {"script", "iframe", "object", "embed", "link", "base", "form", "foreignobject"} & set(page.tags)
     assert not [name for name, _ in page.attributes if name.startswith("on")]
     places = [value for name, value in page.attributes if name in ("src", "href", "xlink:href", "srcset", "data")]
@@ -61,7 +61,7 @@ def require_harmless(page):
 
 @pytest.fixture(scope="module")
 def template(tmp_path_factory):
-    """A run of a task with short episodes, trained once."""
+    """Run of a task with short episodes, trained once."""
     runs = tmp_path_factory.mktemp("trained")
     words = ["scene.num_envs=4", "episode_length_s=0.5", "agent.n_steps=32", "agent.num_minibatches=2"]
     train = ["train", "cartpole", *words, "--max-iterations", "2", "--logger", "none", "-q", "--runs-dir", str(runs)]
@@ -177,7 +177,7 @@ def test_untrusted_task_code_is_not_executed(cli, tmp_path, coin):
     said = cli("report", run.folder)
     assert said.code == 0, said.err
     page = read(run.folder / "report.html")
-    assert "Squared joint deviation from" in page.text  # rlcli's own terms are known all the same
+    assert "Squared joint deviation from" in page.text  # rlcli's own terms are described
     assert not canary.exists()
 
 

@@ -1,4 +1,4 @@
-"""A run's page in a real Chromium without a network: curves and video are seen, and nothing is asked of anybody."""
+"""A run's page in a real Chromium without a network: curves and video are visible, and no request is sent."""
 
 import io
 import shutil
@@ -22,7 +22,7 @@ pytestmark = [
 
 @pytest.fixture
 def browser():
-    """Opens a file as a page that is cut off from every network, and notes what it asks for and says."""
+    """Function that opens a file without a network and records the page's requests and messages."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -47,7 +47,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    """The page of a run that was trained, with an evaluation and a video."""
+    """Page of a trained run, with an evaluation and a video."""
     from rlcli.cli.app import main
 
     runs = tmp_path_factory.mktemp("runs")
@@ -59,7 +59,7 @@ def report(tmp_path_factory):
 
 
 def wait(page, condition):
-    """Until a condition holds; the page's policy forbids the evaluation that the browser's own waiting needs."""
+    """Wait for a condition; the browser's own wait function needs an evaluation that the page's policy forbids."""
     for _ in range(300):
         if page.evaluate(condition):
             return
@@ -118,7 +118,7 @@ def test_print_shows_whole_configuration(browser, report):
 
 @pytest.fixture
 def listener():
-    """A server on this machine that notes who asks."""
+    """Local server that records its requests."""
     asked = []
 
     class Handler(BaseHTTPRequestHandler):

@@ -1,4 +1,4 @@
-"""The card of a task: what its MDP is, from configuration and docstrings, as data and as Markdown."""
+"""Task card: description of the MDP from configuration and docstrings, as data and as Markdown."""
 
 import json
 
@@ -28,7 +28,7 @@ def built(task, *overrides, layout=None, **settings):
 
 
 def rows(content, title):
-    """A table's rows, by column; no table, no rows."""
+    """Return the rows of a table as dicts by column; an empty list if there is no such table."""
     table = next((table for table in content.tables if table.title == title), None)
     titles = [column.title for column in table.columns] if table else []
     return {row[0]: dict(zip(titles, row, strict=True)) for row in table.rows} if table else {}

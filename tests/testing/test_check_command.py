@@ -1,4 +1,4 @@
-"""`rlcli check` and the pytest fixture, as their users meet them: in processes of their own."""
+"""`rlcli check` and the pytest fixture, partly in separate processes."""
 
 import json
 import os
@@ -11,7 +11,7 @@ from rlcli.cli.app import main
 
 
 def check(capsys, *arguments):
-    """(exit code, stdout, stderr) of `rlcli check`."""
+    """Run `rlcli check`; return (exit code, stdout, stderr)."""
     code = main(["check", *map(str, arguments)])
     return code, *capsys.readouterr()
 
@@ -100,7 +100,7 @@ def test_import_error_of_task_exits_4(direct, capsys):
 
 @pytest.fixture
 def plugin_of_the_future(tmp_path):
-    """An installed package whose task was written for a newer rlcli."""
+    """Installed package whose task was written for a newer rlcli."""
     site = tmp_path / "site"
     (site / "future_task").mkdir(parents=True)
     (site / "future_task" / "__init__.py").write_text(

@@ -1,4 +1,4 @@
-"""The linter finds each planted defect by its rule and place, and nothing in tasks that are in order."""
+"""The linter finds each planted defect with its rule and place, and nothing in correct tasks."""
 
 import json
 from pathlib import Path
@@ -18,14 +18,14 @@ def lint(folder, **arguments):
 
 
 def rules(folder, **arguments):
-    """Rule -> its first remark."""
+    """Return rule -> its first remark."""
     found = {}
     for remark in lint(folder, **arguments):
         found.setdefault(remark.rule, remark)
     return found
 
 
-# --- what is in order ---
+# --- correct tasks ---
 
 
 def test_example_plugin_has_no_remarks():
@@ -271,7 +271,7 @@ def test_rules_have_docstrings():
 
 
 def command(capsys, *arguments):
-    """(exit code, stdout, stderr) of `rlcli lint`."""
+    """Run `rlcli lint`; return (exit code, stdout, stderr)."""
     code = main(["lint", *map(str, arguments)])
     return code, *capsys.readouterr()
 

@@ -1,4 +1,4 @@
-"""Each clause of the contract finds the defect that breaks it, by its name, and says where."""
+"""Each check finds the planted defect that breaks its clause of the contract, and its place."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ ACROBOT = Path(__file__).parents[2] / "plugins" / "rlcli-example-acrobot" / "rlc
 
 
 OTHER_ENGINE = ("engines", "captured")
-"""Checks with tests of their own: what they run on is slow to build."""
+"""Checks with separate tests: their environments are slow to build."""
 
 
 def check(folder):
@@ -20,7 +20,7 @@ def check(folder):
 
 
 def errors(folder):
-    """Check name -> its first error."""
+    """Return check -> its first error."""
     found = {}
     for finding in check(folder):
         if finding.severity == "error":
@@ -97,7 +97,7 @@ def test_yaml_round_trip_finds_infinite_value(managed):
     assert "rewards.near.limit" in errors(managed)["yaml-round-trip"].where
 
 
-# --- what a step gives ---
+# --- results of a step ---
 
 
 def test_finite_finds_late_nan_and_names_term(managed):
@@ -176,7 +176,7 @@ def test_aliasing_finds_action_written_in_place(direct):
     assert errors(direct)["aliasing"].where == "the action"
 
 
-# --- seeds, starts, ends ---
+# --- seeds, start states, ends ---
 
 
 def test_same_seed_finds_torch_rand_in_reset(direct):
@@ -290,7 +290,7 @@ def test_replaced_reset_buf_is_accepted(direct):
     assert check(direct) == []
 
 
-# --- looking twice ---
+# --- repeated observations ---
 
 
 def test_repeated_observation_finds_change_in_direct_task(direct):

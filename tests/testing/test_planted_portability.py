@@ -1,4 +1,4 @@
-"""The checks of threads, sizes, engines, restarts, versions and speed find what is planted for them."""
+"""The checks of threads, sizes, engines, checkpoints, versions and speed find planted defects."""
 
 import json
 import shutil
@@ -14,7 +14,7 @@ from rlcli.testing.task_under_test import TaskUnderTest
 
 
 def only(folder, *names):
-    """(findings, notes) of some checks."""
+    """Run some checks; return (findings, notes)."""
     notes = {}
     found = check_task(folder.write(), only=names, on_note=notes.__setitem__)
     assert all(f.check in names and f.where and f.message and f.hint for f in found)
@@ -74,7 +74,7 @@ def level(env) -> Tensor:
     assert "curriculum" in notes["back-fill"]
 
 
-# --- restarts ---
+# --- checkpoints and resets ---
 
 
 HISTORY = """
@@ -382,7 +382,7 @@ def test_engines_is_not_run_for_unsupported_model(managed):
 
 @pytest.fixture
 def shipped(tmp_path):
-    """cartpole with a policy in a folder of the test's own, and that folder."""
+    """Source of cartpole with a copy of its policy, and the folder of the copy."""
     source = find_task("cartpole")
     folder = shutil.copytree(source.policy, tmp_path / "policies" / "cartpole")
     return replace(source, policy=folder), folder

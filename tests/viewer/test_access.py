@@ -1,4 +1,4 @@
-"""Which requests the browser's viewer answers."""
+"""Requests that the browser's viewer answers or refuses."""
 
 import pytest
 

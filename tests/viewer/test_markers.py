@@ -1,4 +1,4 @@
-"""What commands ask for, in pictures: where it is drawn, in which colour, and where it is not."""
+"""Markers of commands in pictures: their positions and colours, and pictures without them."""
 
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -64,7 +64,7 @@ def _headless(monkeypatch):
 
 
 def asking(folder, num_envs=2, *overrides, still=True, sensors=None, **commands):
-    """Critters that are asked for something; unless still, they begin anywhere and move."""
+    """Environment of critters with commands; unless `still`, they start at random positions and move."""
     task = yaml.safe_load(CRITTER_TASK) | {"commands": commands, "viewer": VIEWER}
     task["scene"]["sensors"] = sensors or {}
     if still:
@@ -75,13 +75,13 @@ def asking(folder, num_envs=2, *overrides, still=True, sensors=None, **commands)
 
 
 def pictures(env, number=0):
-    """With what is asked, and without."""
+    """Return a picture with markers, and one without."""
     with Renderer(env.engine.model, env.config.viewer) as renderer:
         return renderer.picture(env, number).astype(int), renderer.draw(*env.world(number)).astype(int)
 
 
 def pixel(env, place):
-    """Column and row at which a place of the world is seen."""
+    """Return the column and row of a point of the world in the picture."""
     viewer = env.config.viewer
     eye, ahead = np.array(viewer.eye), np.subtract(viewer.lookat, viewer.eye)
     ahead = ahead / np.linalg.norm(ahead)
@@ -94,7 +94,7 @@ def pixel(env, place):
 
 
 def coloured(seen, bare, color):
-    """Columns and rows of what has been added in a colour. (n, 2)"""
+    """Return the columns and rows of added pixels of a colour. (n, 2)"""
     channel = int(np.argmax(color[:3]))
     rest = np.delete(seen, channel, axis=2).max(axis=2)
     rows, columns = np.nonzero((seen != bare).any(axis=2) & (seen[..., channel] - rest > 60))
@@ -243,7 +243,7 @@ def test_rendering_does_not_change_simulation(tmp_path):
 
 
 def shapes(scene):
-    """Kind and place of every marker of a scene."""
+    """Return kind and position of all markers of a scene."""
     decor = [geom for geom in scene.geoms[: scene.ngeom] if geom.category == mujoco.mjtCatBit.mjCAT_DECOR]
     return [(int(geom.type), geom.pos.copy()) for geom in decor]
 

@@ -1,4 +1,4 @@
-"""The window's keys and captions; the window itself needs a display."""
+"""Keys and captions of the window. The window itself would need a display."""
 
 import pytest
 import yaml
@@ -22,7 +22,7 @@ def playback():
 
 
 def commanded(folder):
-    """A playback of a task with a velocity command."""
+    """Return a playback of a task with a velocity command."""
     task = yaml.safe_load(CRITTER_TASK)
     task["commands"] = {
         "velocity": {"func": "uniform_velocity", "resampling_time_s": [1.0, 2.0], "lin_vel_x": [-1.0, 2.0]}

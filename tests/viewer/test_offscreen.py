@@ -188,7 +188,7 @@ def test_unwritable_folder_is_machine_error(tmp_path):
 
 def test_missing_ffmpeg_rejects_mp4_but_not_gif(monkeypatch, tmp_path):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "nothing"))
-    with pytest.raises(MachineError, match="IMAGEIO_FFMPEG_EXE names no program") as caught:
+    with pytest.raises(MachineError, match="IMAGEIO_FFMPEG_EXE is not a program") as caught:
         check_video(tmp_path / "x.mp4")
     assert ".gif" in caught.value.hint
     check_video(tmp_path / "x.gif")

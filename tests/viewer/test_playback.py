@@ -1,4 +1,4 @@
-"""What a person at a viewer may ask of a policy in its environment, without any viewer."""
+"""Requests of a viewer's user, tested without a viewer."""
 
 import copy
 import json
@@ -34,7 +34,7 @@ def playback():
 
 @pytest.fixture
 def counted(playback, monkeypatch):
-    """The playback, and a list that grows with every step of its environment."""
+    """Playback, and a list that grows with every step of its environment."""
     steps, real = [], playback.env.step
 
     def step(*arguments):
@@ -167,7 +167,7 @@ def test_submitted_request_runs_between_steps(playback):
 
 
 def forces(env, newtons):
-    """On the cart, along its rail."""
+    """Return a force on the cart along its rail. (nbody, 6) [N, N m]"""
     model = env.engine.model
     given = np.zeros((model.nbody, 6))
     given[model.nbody - 2, np.abs(model.jnt_axis[0]).argmax()] = newtons
@@ -311,7 +311,7 @@ def test_hold_command_without_commands_is_usage_error(task):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A run with a few checkpoints, that nobody has trained for long."""
+    """Run with a few checkpoints, trained only briefly."""
     from rlcli.cli.app import main
 
     runs = tmp_path_factory.mktemp("runs")
@@ -326,7 +326,7 @@ def trained(tmp_path_factory):
 
 @pytest.fixture
 def playing(trained, tmp_path, caplog):
-    """A playback of a copy of that run, the copy, and the captured log."""
+    """Playback of a copy of that run, the copy, and the captured log."""
     folder = tmp_path / "run"
     shutil.copytree(trained, folder)
     env = cartpole()
@@ -337,7 +337,7 @@ def playing(trained, tmp_path, caplog):
 
 
 def copy_as(folder, step):
-    """A further checkpoint, as training writes it: whole, under its name at once."""
+    """Add a checkpoint as training does: complete, by renaming it to its final name."""
     newest = sorted((folder / "checkpoints").glob("0*"))[-1]
     fresh = folder / "checkpoints" / "writing"
     shutil.copytree(newest, fresh)
@@ -394,7 +394,7 @@ def test_removed_checkpoint_is_reported_and_policy_stays(playing):
     assert playback.view.checkpoint == newest
     assert first not in playback.view.checkpoints
     assert f"step {first} cannot be played, step {newest} continues" in log.messages[0]
-    assert "not there any more" in playback.view.message
+    assert "does not exist any more" in playback.view.message
 
 
 @pytest.mark.parametrize(

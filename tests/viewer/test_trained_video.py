@@ -1,4 +1,4 @@
-"""`play --video` of a policy that balances: as many pictures as steps, at the control rate, of a pole that stands."""
+"""`play --video` of a balancing policy: one frame for each step, at the control rate, with an upright pole."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""`train --video-every`: clips of the policy as it learns, which training neither notices nor fails with."""
+"""`train --video-every`: videos of the current policy, which neither change nor stop the training."""
 
 import json
 import subprocess
@@ -138,7 +138,7 @@ def test_training_continues_if_video_cannot_be_written(cli):
     (run / "videos").write_text("in the way")
     done = cli("train", "--resume", run, "--max-iterations", 3, "--video-every", 1, "-q")
     assert done.code == 0
-    assert done.err.count("warning: no clip") == 1
+    assert done.err.count("warning: no video") == 1
     assert len(without_times(run)) == 3
 
 
@@ -155,6 +155,7 @@ def test_video_is_aborted_when_training_stops(cli, caplog):
     env = make_env(resolve_run(run, play=True, flags={"scene.num_envs": 1}))
     policy = open_checkpoint(checkpoint).policy()
     films = TrainingVideos(lambda: env, run.folder / "videos", 1, lambda: int(env.episode_length_buf[0]) > 2)
+    caplog.clear()  # records of the training
     assert films.record(lambda: policy, 1) is None
     assert (caplog.messages, clips(run_of("a"))) == ([], [])
     films.close()

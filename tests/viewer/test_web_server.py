@@ -1,4 +1,4 @@
-"""The server of `play --viewer web`, asked as a stranger would ask it; no browser takes part."""
+"""Server of `play --viewer web`: requests of other pages and programs, sent without a browser."""
 
 import json
 import signal
@@ -25,7 +25,7 @@ def playing(tmp_path_factory):
 
 
 def ask(playing, path, *lines):
-    """The head and the first bytes of the body of the answer to a request of these header lines."""
+    """Send a request with these header lines; return the head and the first bytes of the body of the response."""
     text = "\r\n".join([f"GET {path} HTTP/1.1", *lines, "", ""])
     with socket.create_connection(("127.0.0.1", playing.port), timeout=PATIENCE) as connection:
         connection.sendall(text.encode())
@@ -110,7 +110,7 @@ def test_local_files_are_not_served(playing, path):
 
 
 def listening(process):
-    """Addresses at which a process listens, as the kernel writes them."""
+    """Return the addresses at which a process listens, in the format of the kernel."""
     links = [link.readlink().name for link in Path(f"/proc/{process}/fd").iterdir() if link.is_symlink()]
     inodes = {name[8:-1] for name in map(str, links) if name.startswith("socket:[")}
     found = []

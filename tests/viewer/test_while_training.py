@@ -1,4 +1,4 @@
-"""A policy is watched while it trains."""
+"""Playback of a policy during its training."""
 
 import logging
 import os
