@@ -207,7 +207,7 @@ def test_verify_fails_on_wrong_robot_description(copied, tmp_path, capfd, place)
 SENSELESS = {
     "a control that is not there": lambda d: d["controls"][0].update(ctrl=[7]),
     "a command that is not there": lambda d: d["controls"][0]["value"].update(at=[7]),
-    "a formula that nobody computes": lambda d: d["observations"]["policy"][0].update(closed=False),
+    "a formula that is marked as open": lambda d: d["observations"]["policy"][0].update(closed=False),
     "a control without a formula": lambda d: d["controls"][0].update(value=None),
 }
 

@@ -260,7 +260,7 @@ def test_unwritable_folder_is_machine_error(copied, tmp_path, capsys, place):
         folder = tmp_path / "file" / "deep"
         folder.parent.write_text("")
     elif not Path("/proc").is_dir():
-        pytest.skip("no /proc on this system, the one folder that nobody can write to")
+        pytest.skip("no /proc on this system, the one folder that not even root can write to")
     before = files(tmp_path)
     assert main(["export", "--checkpoint", str(copied), "--output", str(folder / "policy.onnx")]) == 10
     err = capsys.readouterr().err

@@ -137,7 +137,7 @@ def walker(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def lives(walker):
+def trajectories(walker):
     """Values of the environment and of the formulas in each step of several episodes: name -> two lists of rows."""
     torch.set_num_threads(1)
     env = make_env(resolve(folder_task(walker, "task.yaml")), seed=5)
@@ -194,15 +194,15 @@ def answer(action, inputs):
 
 
 @pytest.mark.parametrize("name", [*TERMS, *PREPARED])
-def test_observation_formula_equals_term(lives, name):
-    expected, found = (np.stack(rows) for rows in lives[0][name])
+def test_observation_formula_equals_term(trajectories, name):
+    expected, found = (np.stack(rows) for rows in trajectories[0][name])
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2e-5)
     if name != "joint_effort":
         assert len(np.unique(expected.round(4), axis=0)) > 2  # a constant would agree with much
 
 
-def test_action_formulas_equal_environment_controls(lives):
-    expected, found = (np.concatenate(rows) for rows in lives[1])
+def test_action_formulas_equal_environment_controls(trajectories):
+    expected, found = (np.concatenate(rows) for rows in trajectories[1])
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
     assert len(np.unique(expected[:, 0])) > 50
 

@@ -126,7 +126,7 @@ def test_runs_with_different_seeds_are_one_curve(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"overrides": ["rewards.cart_vel.weight=-0.5"]}, "rewards.cart_vel.weight=-0.5"),
         ({"overrides": ["agent.gamma=0.5"]}, "agents.sb3-ppo.gamma=0.5"),
@@ -137,11 +137,11 @@ def test_runs_with_different_seeds_are_one_curve(tmp_path):
         ({"device": "cuda:0"}, "device=cuda"),
     ],
 )
-def test_runs_with_different_settings_are_separate_curves(tmp_path, change, said):
+def test_runs_with_different_settings_are_separate_curves(tmp_path, change, message):
     curves, _ = gather([write_run(tmp_path, rows=learning()), write_run(tmp_path, seed=2, rows=learning(), **change)])
     one, other = (curve.label for curve in curves)
-    assert said in other
-    assert said not in one
+    assert message in other
+    assert message not in one
 
 
 def test_label_names_three_settings(tmp_path):

@@ -77,10 +77,10 @@ def trained(template, tmp_path):
 
 def test_report_has_all_sections(cli, tmp_path):
     run = write_run(tmp_path / "runs", rows=learning(), overrides=["rewards.alive.weight=1.5"], cpu={"model": "A chip"})
-    said = cli("report", "latest", "--json")
-    assert said.code == 0
-    assert Path(said.json["file"]) == Path("runs/cartpole") / run.folder.name / "report.html"
-    page = read(said.json["file"])
+    result = cli("report", "latest", "--json")
+    assert result.code == 0
+    assert Path(result.json["file"]) == Path("runs/cartpole") / run.folder.name / "report.html"
+    page = read(result.json["file"])
     require_harmless(page)
     for words in (
         "cartpole", "Balance a pole on a cart", "1,000 steps in 10 iterations", "Squared joint deviation from",
@@ -89,8 +89,8 @@ def test_report_has_all_sections(cli, tmp_path):
     ):  # fmt: skip
         assert words in page.text, words
     assert page.tags.count("svg") == 5
-    assert said.json["charts"] == ["Return", "Success", "Episode length", "Reward terms", "Why episodes ended"]
-    assert said.json["missing"] == {
+    assert result.json["charts"] == ["Return", "Success", "Episode length", "Reward terms", "Why episodes ended"]
+    assert result.json["missing"] == {
         "evaluation": "There is no evaluation: the run has no complete checkpoint.",
         "video": "There is no video: the run has no complete checkpoint.",
     }
@@ -159,8 +159,8 @@ def test_untrusted_text_is_escaped(cli, tmp_path):
         )
     )
     folder = run.folder.rename(run.folder.with_name("a<b onclick=x>'\""))
-    said = cli("report", folder)
-    assert said.code == 0, said.err
+    result = cli("report", folder)
+    assert result.code == 0, result.err
     text = (folder / "report.html").read_text()
     page = Reader(text)
     require_harmless(page)
@@ -174,8 +174,8 @@ def test_untrusted_task_code_is_not_executed(cli, tmp_path, coin):
     Path("coin/task.py").write_text(f"open({str(canary)!r}, 'w')\n")
     run = write_run(tmp_path / "runs", rows=learning())
     run.update(task={"name": "coin", "distribution": None, "version": None, "folder": str(tmp_path / "coin")})
-    said = cli("report", run.folder)
-    assert said.code == 0, said.err
+    result = cli("report", run.folder)
+    assert result.code == 0, result.err
     page = read(run.folder / "report.html")
     assert "Squared joint deviation from" in page.text  # rlcli's own terms are described
     assert not canary.exists()
@@ -184,10 +184,10 @@ def test_untrusted_task_code_is_not_executed(cli, tmp_path, coin):
 @pytest.mark.parametrize("config", ["a: [", "rewards: 7", "x: !!python/object/apply:os.system [ls]", ""])
 def test_invalid_configuration_is_reported_on_page(cli, tmp_path, config):
     run = write_run(tmp_path / "runs", rows=learning(), config=config)
-    said = cli("report", run.folder)
-    assert said.code == 0, said.err
+    result = cli("report", run.folder)
+    assert result.code == 0, result.err
     assert "cannot be described" in read(run.folder / "report.html").text
-    assert "cannot be described" in said.err
+    assert "cannot be described" in result.err
 
 
 def test_run_without_metrics_has_page(cli, tmp_path):
@@ -210,7 +210,7 @@ def test_page_without_matplotlib_names_pip_command(cli, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["latest", "-o", "x.pdf"], 2, "name it *.html"),
         (["latest", "-o", "nowhere/x.html"], 10, "there is no folder"),
@@ -219,11 +219,11 @@ def test_page_without_matplotlib_names_pip_command(cli, tmp_path, monkeypatch):
         ([], 2, "Missing argument"),
     ],
 )
-def test_invalid_arguments_are_rejected(cli, tmp_path, arguments, code, said):
+def test_invalid_arguments_are_rejected(cli, tmp_path, arguments, code, message):
     run = write_run(tmp_path / "runs", rows=learning())
     result = cli("report", *arguments)
     assert (result.code, result.out) == (code, "")
-    assert said in result.err
+    assert message in result.err
     assert cli("report", *arguments, "--json").json["error"]["exit_code"] == code
     assert not (run.folder / "report.html").exists()
 
@@ -239,8 +239,8 @@ def test_symlink_in_untrusted_run_is_not_followed(cli, tmp_path, name):
 
 
 def test_evaluation_is_made_once_and_stored(cli, trained):
-    said = cli("report", trained, "--no-video", "--json")
-    assert (said.code, said.json["evaluation"], said.json["video"]) == (0, "made", None)
+    result = cli("report", trained, "--no-video", "--json")
+    assert (result.code, result.json["evaluation"], result.json["video"]) == (0, "made", None)
     page = read(trained / "report.html")
     assert "200 episodes of the deterministic policy" in page.text
     assert re.search(r"Success [\d.]+ % [\d.]+ to [\d.]+ %", page.text)
@@ -258,20 +258,20 @@ def test_evaluation_is_made_once_and_stored(cli, trained):
 
 def test_report_of_given_checkpoint_and_single_episode(cli, trained):
     assert cli("eval", "--checkpoint", f"{trained}@step:0", "--episodes", 1, "-q").code == 0
-    said = cli("report", f"{trained}@step:0", "--no-video", "-o", "page.html", "--json")
-    assert (said.code, said.json["evaluation"]) == (0, "stored")
+    result = cli("report", f"{trained}@step:0", "--no-video", "-o", "page.html", "--json")
+    assert (result.code, result.json["evaluation"]) == (0, "stored")
     page = read("page.html")
     assert "Checkpoint step 0" in page.text
     assert "1 episode of the deterministic policy" in page.text
     assert "unknown" in page.text
     newest = cli("report", trained, "--no-video", "--no-eval", "--json")
     assert newest.json["evaluation"] is None
-    assert newest.json["checkpoint"] != said.json["checkpoint"]
+    assert newest.json["checkpoint"] != result.json["checkpoint"]
 
 
 def test_no_eval_and_no_video_flags(cli, trained):
-    said = cli("report", trained, "--no-eval", "--no-video", "-o", "page.html", "--json")
-    assert (said.code, said.json["evaluation"], said.json["video"]) == (0, None, None)
+    result = cli("report", trained, "--no-eval", "--no-video", "-o", "page.html", "--json")
+    assert (result.code, result.json["evaluation"], result.json["video"]) == (0, None, None)
     assert not (trained / "evaluations").exists()
     assert not (trained / "videos").exists()
     assert not (trained / "report.html").exists()
@@ -282,8 +282,8 @@ def test_page_contains_checkpoint_video(cli, trained):
     step = sorted((trained / "checkpoints").glob("0*"))[-1].name
     (trained / "videos").mkdir()
     (trained / "videos" / f"{step}.mp4").write_bytes(MP4)
-    said = cli("report", trained, "--no-eval", "--json")
-    assert said.json["video"] == "stored"
+    result = cli("report", trained, "--no-eval", "--json")
+    assert result.json["video"] == "stored"
     page = read(trained / "report.html")
     require_harmless(page)
     assert ("src", f"data:video/mp4;base64,{base64.b64encode(MP4).decode()}") in page.attributes
@@ -305,19 +305,19 @@ def test_invalid_video_is_not_in_page(cli, trained, tmp_path, kind, monkeypatch)
         with file.open("wb") as handle:
             handle.write(MP4)
             handle.truncate(25 << 20)
-    said = cli("report", trained, "--no-eval", "--json", "-o", "page.html")
-    assert said.code == 0, said.err
-    assert said.json["video"] is None
-    assert "There is no video" in said.json["missing"]["video"]
+    result = cli("report", trained, "--no-eval", "--json", "-o", "page.html")
+    assert result.code == 0, result.err
+    assert result.json["video"] is None
+    assert "There is no video" in result.json["missing"]["video"]
     assert "video" not in read("page.html").tags
 
 
 def test_page_without_renderer_reports_missing_video(cli, trained, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
-    said = cli("report", trained, "--json")
-    assert said.code == 0, said.err
-    assert "drawing is switched off by MUJOCO_GL=disable" in said.json["missing"]["video"]
-    assert said.json["evaluation"] == "made"
+    result = cli("report", trained, "--json")
+    assert result.code == 0, result.err
+    assert "drawing is switched off by MUJOCO_GL=disable" in result.json["missing"]["video"]
+    assert result.json["evaluation"] == "made"
     (trained / "videos").mkdir(exist_ok=True)
     (trained / "videos" / "000000000000.mp4").write_bytes(MP4)
     assert cli("report", trained, "--json").json["video"] == "older"

@@ -33,11 +33,11 @@ def browser():
         def visit(file, *, offline=True, width=1200, **settings):
             context = chromium.new_context(offline=offline, viewport={"width": width, "height": 900}, **settings)
             page = context.new_page()
-            page.asked, page.said = [], []
-            page.on("request", lambda request: page.asked.append(request.url))
-            page.on("console", lambda message: page.said.append(message.text))
-            page.on("pageerror", lambda error: page.said.append(str(error)))
-            page.on("dialog", lambda dialog: (page.said.append("dialog"), dialog.dismiss()))
+            page.requests, page.messages = [], []
+            page.on("request", lambda request: page.requests.append(request.url))
+            page.on("console", lambda message: page.messages.append(message.text))
+            page.on("pageerror", lambda error: page.messages.append(str(error)))
+            page.on("dialog", lambda dialog: (page.messages.append("dialog"), dialog.dismiss()))
             page.goto(file.absolute().as_uri())
             return page
 
@@ -94,8 +94,8 @@ def test_page_shows_curves_and_video_without_network(browser, report):
     middle = pixels(film)[100:-100, 100:-100]
     assert middle.std() > 10  # a picture, and neither black nor white
     assert middle.mean() > 20
-    assert [url for url in page.asked if not url.startswith("data:video/mp4;")] == [report.absolute().as_uri()]
-    assert page.said == []
+    assert [url for url in page.requests if not url.startswith("data:video/mp4;")] == [report.absolute().as_uri()]
+    assert page.messages == []
 
 
 @pytest.mark.parametrize(("scheme", "bright"), [("light", True), ("dark", False)])
@@ -119,11 +119,11 @@ def test_print_shows_whole_configuration(browser, report):
 @pytest.fixture
 def listener():
     """Local server that records its requests."""
-    asked = []
+    requests = []
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
-            asked.append(self.path)
+            requests.append(self.path)
             self.send_response(404)
             self.send_header("Content-Length", "0")
             self.send_header("Connection", "close")
@@ -134,7 +134,7 @@ def listener():
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
-    yield f"http://127.0.0.1:{server.server_address[1]}", asked
+    yield f"http://127.0.0.1:{server.server_address[1]}", requests
     server.shutdown()
     thread.join()
     server.server_close()
@@ -149,12 +149,12 @@ def test_untrusted_text_does_not_run(browser, cli, tmp_path):
     page = browser(folder / "report.html")
     page.wait_for_timeout(500)
     assert page.title() == f"cartpole · {folder.name}"
-    assert page.said == []
+    assert page.messages == []
     assert page.locator("img, script").count() == 0
 
 
 def test_injected_markup_is_blocked_by_policy(browser, cli, tmp_path, listener):
-    place, asked = listener
+    place, requests = listener
     run = write_run(tmp_path / "runs", rows=learning())
     assert cli("report", run.folder, "-o", "page.html").code == 0
     smuggled = (
@@ -168,9 +168,9 @@ def test_injected_markup_is_blocked_by_policy(browser, cli, tmp_path, listener):
     (tmp_path / "open.html").write_text(f"<!doctype html>{smuggled}")
     page = browser(tmp_path / "smuggled.html", offline=False)
     page.wait_for_timeout(1000)
-    assert asked == []
+    assert requests == []
     assert page.title() != "run"
     page = browser(tmp_path / "open.html", offline=False)  # without the policy all of it would have worked
     wait(page, "document.title === 'run'")
     page.wait_for_timeout(1000)
-    assert {"/img", "/script", "/css", "/frame"} <= set(asked)
+    assert {"/img", "/script", "/css", "/frame"} <= set(requests)

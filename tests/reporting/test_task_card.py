@@ -134,7 +134,7 @@ def test_inherited_hooks_have_docstrings(tmp_path):
         (tmp_path / name.replace("direct", "task")).write_text((source.root / name).read_text())
     (tmp_path / "base.py").write_text(
         'raise SystemExit("run")\nfrom rlcli.envs.direct import DirectTask\n\n'
-        'class Other(DirectTask):\n    """Not said."""\n    def reset(self, selection):\n        """From below."""\n'
+        'class Other(DirectTask):\n    """Not shown."""\n    def reset(self, selection):\n        """From below."""\n'
         '    def is_done(self):\n        """Replaced."""\n'
     )
     (tmp_path / "task.py").write_text(

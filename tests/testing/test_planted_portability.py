@@ -399,7 +399,7 @@ def test_policy_accepts_fitting_shipped_policy(shipped):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda m: m["layout"].update(step_dt=0.02), "does not fit the installed task"),
         (lambda m: m["layout"]["observations"]["policy"].reverse(), "does not fit the installed task"),
@@ -408,12 +408,12 @@ def test_policy_accepts_fitting_shipped_policy(shipped):
         (lambda m: m["files"]["policy.safetensors"].update(sha256="0" * 64), "is corrupt"),
     ],
 )
-def test_policy_finds_misfit_of_shipped_policy(shipped, change, said):
+def test_policy_finds_misfit_of_shipped_policy(shipped, change, message):
     source, folder = shipped
     edit_manifest(folder, change)
     (finding,) = portability_checks.policy(TaskUnderTest(source))
     assert finding.severity == "error"
-    assert said in finding.message
+    assert message in finding.message
 
 
 def test_policy_is_not_run_without_shipped_policy(managed):

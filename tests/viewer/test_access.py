@@ -95,14 +95,14 @@ def test_path_traversal_is_refused(path):
 )
 @pytest.mark.parametrize("site", ["cross-site", "same-site"])
 def test_foreign_page_may_link_but_not_embed(site, mode, target, path, answered):
-    said = {**OWN, "sec-fetch-site": [site], "sec-fetch-mode": [mode], "sec-fetch-dest": [target]}
-    assert (refusal_reason(8080, path, said) is None) is answered
+    headers = {**OWN, "sec-fetch-site": [site], "sec-fetch-mode": [mode], "sec-fetch-dest": [target]}
+    assert (refusal_reason(8080, path, headers) is None) is answered
 
 
 @pytest.mark.parametrize("site", ["none", "same-origin"])
 def test_own_fetches_are_answered(site):
-    said = {**OWN, "sec-fetch-site": [site], "sec-fetch-mode": ["no-cors"], "sec-fetch-dest": ["script"]}
-    assert refusal_reason(8080, "/web_client.js", said) is None
+    headers = {**OWN, "sec-fetch-site": [site], "sec-fetch-mode": ["no-cors"], "sec-fetch-dest": ["script"]}
+    assert refusal_reason(8080, "/web_client.js", headers) is None
 
 
 def test_port_80_is_optional_in_host():

@@ -225,7 +225,7 @@ def test_camera_sensors_do_not_render_markers(tmp_path):
 @pytest.mark.slow
 def test_rendering_does_not_change_simulation(tmp_path):
     commands = {"walk": VELOCITY, "pose": POSE, "place": PLACE}
-    lives = {}
+    steps = {}
     for drawn in (False, True):
         env = asking(tmp_path / str(drawn), 3, still=False, **commands)
         results = []
@@ -235,9 +235,9 @@ def test_rendering_does_not_change_simulation(tmp_path):
                     renderer.picture(env)
                 results += run(env, 2, reset=False)
         state = env.state_dict()
-        lives[drawn] = [*(value for result in results for value in (*result.obs.values(), result.reward)), state]
-    states = [lives[drawn].pop() for drawn in (False, True)]
-    assert all(torch.equal(one, other) for one, other in zip(*lives.values(), strict=True))
+        steps[drawn] = [*(value for result in results for value in (*result.obs.values(), result.reward)), state]
+    states = [steps[drawn].pop() for drawn in (False, True)]
+    assert all(torch.equal(one, other) for one, other in zip(*steps.values(), strict=True))
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
 
@@ -333,9 +333,9 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("said", WRONG)
-def test_invalid_marker_error_names_term(tmp_path, said):
+@pytest.mark.parametrize("message", WRONG)
+def test_invalid_marker_error_names_term(tmp_path, message):
     env = asking(tmp_path, 4, own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
-    env.command_manager.get_term("own").given = [WRONG[said](4)]
-    with pytest.raises(ConfigError, match=f"commands.own: markers\\(\\) {said}"):
+    env.command_manager.get_term("own").given = [WRONG[message](4)]
+    with pytest.raises(ConfigError, match=f"commands.own: markers\\(\\) {message}"):
         env.markers()

@@ -65,8 +65,8 @@ def test_keys_adjust_commands_within_ranges(tmp_path):
     assert pressed(playback, INSERT, INSERT).held == {"vy": pytest.approx(0.4)}
     assert pressed(playback, HOME, DELETE).held["vx"] == pytest.approx(-0.3)
     names, values = captions(playback.view)
-    said = dict(zip(names.splitlines(), values.splitlines(), strict=True))
-    assert (said["> vx"], said["vy"], said["wz"]) == ("-0.3", "0.4", "as drawn")
+    captions_by_name = dict(zip(names.splitlines(), values.splitlines(), strict=True))
+    assert (captions_by_name["> vx"], captions_by_name["vy"], captions_by_name["wz"]) == ("-0.3", "0.4", "as drawn")
     pressed(playback, DELETE, DELETE)
     assert playback.view.held["vx"] == pytest.approx(-0.9)
     assert "vx" not in pressed(playback, DELETE).held
@@ -74,7 +74,7 @@ def test_keys_adjust_commands_within_ranges(tmp_path):
 
 def test_captions_show_view(playback):
     names, values = captions(pressed(playback, SPACE, UP))
-    said = dict(zip(names.splitlines(), values.splitlines(), strict=True))
-    assert said["speed"] == "paused"
-    assert said["environment"] == "1 of 3"
-    assert "checkpoint" not in said
+    captions_by_name = dict(zip(names.splitlines(), values.splitlines(), strict=True))
+    assert captions_by_name["speed"] == "paused"
+    assert captions_by_name["environment"] == "1 of 3"
+    assert "checkpoint" not in captions_by_name

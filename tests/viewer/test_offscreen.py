@@ -112,10 +112,10 @@ def test_missing_gl_lists_backends_and_packages():
         "try: open_context(64, 48)\nexcept MachineError as e: print(e.message, '|', e.hint)"
     )
     env = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")}
-    said = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True).stdout
-    assert "tried egl" in said
-    assert "osmesa" in said
-    assert "apt install libegl1 libosmesa6" in said
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True).stdout
+    assert "tried egl" in done
+    assert "osmesa" in done
+    assert "apt install libegl1 libosmesa6" in done
 
 
 @pytest.mark.slow
@@ -221,5 +221,5 @@ def test_check_video_imports_nothing_heavy():
         "import sys; from pathlib import Path\nfrom rlcli.viewer.video_writer import check_video\n"
         "check_video(Path('x.mp4')); print([m for m in ('torch', 'mujoco', 'numpy', 'imageio') if m in sys.modules])"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert said.stdout.strip() == "[]", said.stderr
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr

@@ -24,11 +24,11 @@ def test_video_of_trained_policy_shows_upright_pole(cartpole_run, tmp_path):
     command = [sys.executable, "-m", "rlcli", *map(str, words)]
     done = subprocess.run(command, cwd=tmp_path, env=variables, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
-    said = json.loads(done.stdout)
+    document = json.loads(done.stdout)
     subprocess.run([sys.executable, "-c", READ, tmp_path / "x.mp4", tmp_path / "x.npz"], check=True)
     with np.load(tmp_path / "x.npz") as read:
         frames, fps = read["frames"], float(read["fps"])
-    assert len(frames) == said["frames"] == 300
+    assert len(frames) == document["frames"] == 300
     assert fps == pytest.approx(60.0, rel=1e-3)
     assert min(frame.std() for frame in frames) > 10
     for frame in frames[120:].astype(int):

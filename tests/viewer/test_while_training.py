@@ -47,7 +47,7 @@ def test_playback_follows_checkpoints_of_running_training(tmp_path, caplog):
             played.add(playback.view.checkpoint)
         steps = playback.steps
         assert steps > 0
-        assert all(said.startswith("now playing step ") for said in caplog.messages)
+        assert all(message.startswith("now playing step ") for message in caplog.messages)
     finally:
         training.send_signal(signal.SIGINT)
         training.wait(timeout=240)
