@@ -1,4 +1,4 @@
-"""How long commands take from the start of their process: `python benchmarks/startup.py`.
+"""Duration of commands from the start of their process: `python benchmarks/startup.py`.
 
 Medians of runs in turn: `rlcli --help` beside a typer program with one empty command, listing tasks beside mjlab's
 `list-envs`, the help of rl_zoo3's `train`, and `rlcli train cartpole` until its first update beside rl_zoo3's.
@@ -34,7 +34,7 @@ LABELS = {
 
 
 def commands(folder: Path) -> dict[str, tuple[str, list[str]]]:
-    """Name -> the environment that it runs in, and what is run."""
+    """Return name -> (virtual environment, command)."""
     (folder / "empty.py").write_text(EMPTY)
     train = ["rlcli.cli.app:main", "train", "cartpole", "--device", "cpu", "--quiet", "--runs-dir", str(folder)]
     return {
@@ -50,7 +50,7 @@ def commands(folder: Path) -> dict[str, tuple[str, list[str]]]:
 
 
 def measure(quick: bool) -> dict[str, Any]:
-    """Seconds of each."""
+    """Measure the seconds of each command."""
     repeats = 1 if quick else 9
     with tempfile.TemporaryDirectory() as folder:
         runs, failed = {}, {}
@@ -72,7 +72,7 @@ def measure(quick: bool) -> dict[str, Any]:
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """The table."""
+    """Return the table in Markdown."""
     rows = [[LABELS[name], f"{seconds:.2f} s"] for name, seconds in result["seconds"].items()]
     rows += [[LABELS[name], f"failed: {reason}"] for name, reason in result["failed"].items()]
     said = [f"`rlcli --help` takes **{result['help_over_empty_s']:.2f} s** longer than the empty program"]

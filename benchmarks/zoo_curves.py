@@ -1,4 +1,4 @@
-"""Learning curves of the built-in tasks: a small CSV, and an SVG whose text is text."""
+"""Learning curves of the built-in tasks: a small CSV, and an SVG with selectable text."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 ROWS = 120
-"""Of a seed."""
+"""Number of points for each seed."""
 RETURN, SUCCESS = "Train/mean_reward", "Train/success_rate"
 _VALUES = ("Task/", "Metrics/")
 _MOST_VALUES = 6
@@ -18,7 +18,7 @@ _THIN, _THICK = "#9db8d2", "#0b5394"
 
 
 def columns(histories: Sequence[Any]) -> list[str]:
-    """Success, return and the task's values, as far as all runs tell them."""
+    """Return success, return and the task's values that all runs have."""
     first, *others = histories
     told = [name for name in first.metrics if all(name in other.metrics for other in others)]
     values = [name for name in told if name.startswith(_VALUES)][:_MOST_VALUES]
@@ -26,7 +26,7 @@ def columns(histories: Sequence[Any]) -> list[str]:
 
 
 def table(histories: Sequence[Any]) -> str:
-    """A CSV: seed, steps, seconds, and a column of each metric."""
+    """Return a CSV: seed, steps, seconds, and a column for each metric."""
     names = columns(histories)
     lines = [",".join(["seed", "steps", "seconds", *(short(name) for name in names)])]
     for history in sorted(histories, key=lambda one: one.run.record["seed"]):
@@ -39,12 +39,12 @@ def table(histories: Sequence[Any]) -> str:
 
 
 def short(name: str) -> str:
-    """A metric's name in a column's head."""
+    """Return a metric's name for the head of a column."""
     return {RETURN: "return", SUCCESS: "success"}.get(name, name.partition("/")[2].replace(",", " "))
 
 
 def drawing(task: str, histories: Sequence[Any]) -> str:
-    """An SVG: a panel of each of at most three metrics, seeds as thin lines, their median as a thick one."""
+    """Return an SVG with a panel for each of at most three metrics: thin lines for seeds, a thick line for medians."""
     names = columns(histories)[:3]
     width = _PANEL * len(names)
     seeds = ", ".join(str(seed) for seed in sorted(history.run.record["seed"] for history in histories))
@@ -107,7 +107,7 @@ def _points(history: Any, name: str) -> tuple[Any, Any]:
 
 
 def _thinned(count: int) -> list[int]:
-    """Rows evenly spread, the last one among them."""
+    """Return evenly spaced rows, including the last one."""
     return sorted({round(number) for number in np.linspace(0, count - 1, min(count, ROWS))}) if count else []
 
 
