@@ -16,7 +16,7 @@ from typing import Any
 import peers
 from machine import cores
 from sides import HERE, Failed, Side, alternate, opened, ratio, steps_for
-from tables import geometric_mean, main, rate, spread, stands, table
+from tables import geometric_mean, main, rate, spread, measured_on, table
 
 NAME = "envpool"
 MUJOCO_OF_ENVPOOL = "3.6.0"
@@ -122,7 +122,7 @@ def measure(quick: bool) -> dict[str, Any]:
 def markdown(result: dict[str, Any]) -> str:
     """Return the table in Markdown."""
     if "failed" in result:
-        return f"{stands(result)}\n\nEnvPool: {result['failed']}"
+        return f"{measured_on(result)}\n\nEnvPool: {result['failed']}"
     heads = ["task"]
     for num_envs in (64, 1024):
         heads += [f"{num_envs:,}: of EnvPool", "min .. max", "limit", "environment steps/s", "EnvPool"]
@@ -141,7 +141,7 @@ def markdown(result: dict[str, Any]) -> str:
     for key in ("64", "1024"):
         last += [f"**{result['means'][key]:.2f}**", "", f"{result['limits'][key]:.2f}", "", ""]
     rows.append([*last, f"{result['means']['mujoco']:.2f}"])
-    return f"{stands(result, result['envpool'])}\n\n{table([*heads, 'of it MuJoCo'], rows)}"
+    return f"{measured_on(result, result['envpool'])}\n\n{table([*heads, 'of it MuJoCo'], rows)}"
 
 
 if __name__ == "__main__":

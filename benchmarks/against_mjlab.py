@@ -15,7 +15,7 @@ from typing import Any
 import peers
 from machine import cores
 from sides import CACHE, CHECKOUT, HERE, Failed, Side, alternate, opened, ratio, steps_for, wall
-from tables import main, rate, spread, stands, table
+from tables import main, rate, spread, measured_on, table
 
 NAME = "mjlab"
 NUM_ENVS = 1024
@@ -101,7 +101,7 @@ def measure(quick: bool) -> dict[str, Any]:
 def markdown(result: dict[str, Any]) -> str:
     """Return the table in Markdown."""
     if "failed" in result:
-        return f"{stands(result)}\n\nmjlab: {result['failed']}"
+        return f"{measured_on(result)}\n\nmjlab: {result['failed']}"
     versions = result["versions"]
     peer = f"mjlab {versions['mjlab']} (mujoco-warp {versions['mujoco-warp']}, rsl_rl {versions['rsl-rl-lib']})"
     rates, memory = result["rates"], result["memory_mb"]
@@ -117,7 +117,7 @@ def markdown(result: dict[str, Any]) -> str:
     rows.append(
         ["memory at its most, stepping", f"{memory['ours']:.0f} MB", f"{memory['theirs']:.0f} MB", f"{share:.2f}"]
     )
-    return f"{stands(result, peer)}\n\n{table(['', 'rlcli', 'mjlab on the CPU', ''], rows)}"
+    return f"{measured_on(result, peer)}\n\n{table(['', 'rlcli', 'mjlab on the CPU', ''], rows)}"
 
 
 if __name__ == "__main__":

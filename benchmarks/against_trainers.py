@@ -15,7 +15,7 @@ from typing import Any
 
 import peers
 from sides import CHECKOUT, HERE, Block, Failed, Side, alternate, opened, ratio, steps_for
-from tables import main, rate, spread, stands, table
+from tables import main, rate, spread, measured_on, table
 
 NAME = "trainers"
 NUM_ENVS = 4096
@@ -120,7 +120,7 @@ def markdown(result: dict[str, Any]) -> str:
     ]
     peer = ", ".join(f"{name} {versions[name]}" for name in ("rsl-rl-lib", "skrl", "gymnasium") if name in versions)
     tried = f"\n\nTraining steps/s by number of environments: {'; '.join(scans)}." if scans else ""
-    return f"{stands(result, *([peer] if peer else []))}\n\n{table(heads, rows)}{tried}"
+    return f"{measured_on(result, *([peer] if peer else []))}\n\n{table(heads, rows)}{tried}"
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import Any
 
 from sides import HERE, child_environment
-from tables import PAGES, filled, keep, results, stands, table
+from tables import PAGES, filled, keep, results, measured_on, table
 
 SCRIPTS = {
     "env_step": ["--repeats", "2", "--seconds", "0.05", "--num-envs", "64"],
@@ -69,27 +69,27 @@ def printed(result: dict[str, Any]) -> str:
     """Return the table of a program, with a column for each key."""
     keys = dict.fromkeys(key for row in result["rows"] for key in row if not key.endswith(("_min", "_max")))
     rows = [[shown(key, row) for key in keys] for row in result["rows"]]
-    return f"{stands(result)}\n\n{table([HEADS.get(key, key) for key in keys], rows)}"
+    return f"{measured_on(result)}\n\n{table([HEADS.get(key, key) for key in keys], rows)}"
 
 
 def readme(kept: dict[str, Any]) -> str:
     """Return the figures in the README's sentences."""
     rows = kept["env_step"]["rows"]
     ratio = next(row["ratio"] for row in rows if (row["task"], row["num_envs"]) == ("cartpole", 4096))
-    said = [f"The environment step runs at {ratio:.3f} of the bare physics at 4,096 cartpoles"]
+    clauses = [f"The environment step runs at {ratio:.3f} of the bare physics at 4,096 cartpoles"]
     if "ratio" in kept.get("mjlab", {}):
-        said.append(f"takes 1/{kept['mjlab']['ratio']:.1f} of mjlab's time on a CPU at 1,024")
+        clauses.append(f"takes 1/{kept['mjlab']['ratio']:.1f} of mjlab's time on a CPU at 1,024")
     means = kept.get("envpool", {}).get("means")
     if means:
-        said.append(f"is {means['1024']:.2f} times as fast as EnvPool's over Gymnasium's eleven tasks")
+        clauses.append(f"is {means['1024']:.2f} times as fast as EnvPool's over Gymnasium's eleven tasks")
     times = {
         row["name"]: row["times"]["ppo"]["ratio"] for row in kept.get("trainers", {}).get("rows", []) if row["times"]
     }
     if "dummy" in times:
-        said.append(f"training is {times['dummy']:.1f} times as fast as SB3's on a plain Gymnasium cartpole")
-    if len(said) > 1:
-        said[-1] = f"and {said[-1]}"
-    return f"{', '.join(said)}\n([figures](docs/benchmarks.md))."
+        clauses.append(f"training is {times['dummy']:.1f} times as fast as SB3's on a plain Gymnasium cartpole")
+    if len(clauses) > 1:
+        clauses[-1] = f"and {clauses[-1]}"
+    return f"{', '.join(clauses)}\n([figures](docs/benchmarks.md))."
 
 
 def texts(kept: dict[str, Any]) -> dict[str, str]:

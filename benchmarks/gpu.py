@@ -251,11 +251,11 @@ def measure_solve(seeds):
                 report(what="solve failed", error=(trained.stderr + trained.stdout)[-1500:])
                 continue
             run = json.loads(trained.stdout)["run"]
-            judged = rlcli("eval", "--checkpoint", run, "--episodes", "1000", "--json")
+            evaluated = rlcli("eval", "--checkpoint", run, "--episodes", "1000", "--json")
             try:
-                success = json.loads(judged.stdout)["success"]["rate"]
+                success = json.loads(evaluated.stdout)["success"]["rate"]
             except (ValueError, KeyError):
-                success = (judged.stdout + judged.stderr)[-600:]
+                success = (evaluated.stdout + evaluated.stderr)[-600:]
             report(what="solve", seed=seed, seconds=wall, success=success)
 
 

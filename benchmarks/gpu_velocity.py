@@ -82,7 +82,7 @@ def our_terms(env, states):
         env.sim.on_moved(env._select_all())
         env.sim.forward_moved()
         for sensor in env.sensors.values():
-            sensor.air_time.fill_(1e-9)  # contact that there is has just begun
+            sensor.air_time.fill_(1e-9)  # existing contacts have just started
             sensor.update(env.step_dt)
         row = {f"reward.{term.name}": term.call().float().clone() for term in env.reward_manager.terms}
         groups = {"policy": "actor", "critic": "critic"}

@@ -15,7 +15,7 @@ from typing import Any
 
 from machine import cores
 from sides import CHECKOUT, HERE, Side, alternate, opened, steps_for
-from tables import main, stands, table
+from tables import main, measured_on, table
 
 NAME = "growth"
 SIZES = (16, 64, 256, 1024, 4096, 16384)
@@ -107,7 +107,7 @@ def markdown(result: dict[str, Any]) -> str:
     heads = ["us an environment step", "of it bare `Batch`", "ratio", "memory"]
     large = [row["us"] for row in result["num_envs"] if row["num_envs"] >= 1024]
     parts = [
-        stands(result),
+        measured_on(result),
         table(["cartpoles", *heads], [[f"{row['num_envs']:,}", *cells(row)] for row in result["num_envs"]]),
         f"From 1,024 environments on: within **{max(large) / min(large) - 1:.0%}**." if large else "",
         table(["threads", *heads], [[str(row["threads"]), *cells(row)] for row in result["threads"]]),

@@ -94,7 +94,7 @@ def share_outside(env: VecEnv, steps: int, repeats: int) -> list[tuple[float, fl
     generator = torch.Generator().manual_seed(0)
     actions = [0.5 * torch.randn(env.num_envs, env.layout.action_size, generator=generator) for _ in range(8)]
     env.reset()
-    for _ in range(50):  # until they fall and begin anew, a few at a time
+    for _ in range(50):  # until a few of them fall and are reset in each step
         env.step(actions[0])
     rows = []
     for _ in range(repeats):

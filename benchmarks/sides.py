@@ -98,8 +98,8 @@ class Side:
                     pipe.close()
 
     def _failure(self, what: str) -> Failed:
-        said = [line for line in self._log.read_text(errors="replace").splitlines() if line.strip()]
-        return Failed(f"{self.name} {what}" + (f": {said[-1].strip()[:200]}" if said else ""))
+        lines = [line for line in self._log.read_text(errors="replace").splitlines() if line.strip()]
+        return Failed(f"{self.name} {what}" + (f": {lines[-1].strip()[:200]}" if lines else ""))
 
 
 def child_environment(changes: Mapping[str, str] | None = None) -> dict[str, str]:
@@ -176,6 +176,6 @@ def wall(command: Sequence[str], environment: Mapping[str, str] | None = None, t
         raise Failed(f"{Path(command[0]).name}: {' '.join(str(error).split())[:200]}") from None
     took = time.perf_counter() - begin
     if done.returncode:
-        said = [line for line in done.stderr.splitlines() if line.strip()] or ["no message"]
-        raise Failed(f"{' '.join(map(str, command))}: exit {done.returncode}: {said[-1].strip()[:200]}")
+        lines = [line for line in done.stderr.splitlines() if line.strip()] or ["no message"]
+        raise Failed(f"{' '.join(map(str, command))}: exit {done.returncode}: {lines[-1].strip()[:200]}")
     return took

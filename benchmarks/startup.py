@@ -15,7 +15,7 @@ from typing import Any
 import peers
 from against_mjlab import quietly
 from sides import HERE, Failed, wall
-from tables import main, stands, table
+from tables import main, measured_on, table
 
 NAME = "startup"
 EMPTY = "import typer\napp = typer.Typer()\n\n@app.command()\ndef main() -> None: ...\n\napp()\n"
@@ -75,10 +75,10 @@ def markdown(result: dict[str, Any]) -> str:
     """Return the table in Markdown."""
     rows = [[LABELS[name], f"{seconds:.2f} s"] for name, seconds in result["seconds"].items()]
     rows += [[LABELS[name], f"failed: {reason}"] for name, reason in result["failed"].items()]
-    said = [f"`rlcli --help` takes **{result['help_over_empty_s']:.2f} s** longer than the empty program"]
+    sentences = [f"`rlcli --help` takes **{result['help_over_empty_s']:.2f} s** longer than the empty program"]
     if "mjlab_list_ratio" in result:
-        said.append(f"listing tasks takes 1/**{result['mjlab_list_ratio']:.0f}** of mjlab's time")
-    return f"{stands(result)}\n\n{table(['', 'from start to end'], rows)}\n\n{'; '.join(said)}."
+        sentences.append(f"listing tasks takes 1/**{result['mjlab_list_ratio']:.0f}** of mjlab's time")
+    return f"{measured_on(result)}\n\n{table(['', 'from start to end'], rows)}\n\n{'; '.join(sentences)}."
 
 
 if __name__ == "__main__":

@@ -64,7 +64,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def stands(result: dict[str, Any], *more: str) -> str:
+def measured_on(result: dict[str, Any], *more: str) -> str:
     """Return the line that names the machine of a table."""
     return ", ".join([result["machine"], *more])
 

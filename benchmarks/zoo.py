@@ -58,16 +58,16 @@ class Entry:
 
     def missed(self, evaluation: dict[str, Any]) -> list[str]:
         """Return the misses of the bar in an evaluation, as text."""
-        said = []
+        misses = []
         for name, bound in self.bar.items():
             value = value_of(evaluation, name)
             highest = bound["max"] if isinstance(bound, dict) else math.inf
             lowest = -math.inf if isinstance(bound, dict) else bound
             if value is None:
-                said.append(f"{name} is not known")
+                misses.append(f"{name} is unknown")
             elif not lowest <= value <= highest:
-                said.append(f"{name} is {value:.4g}, {'above' if value > highest else 'below'} {bar_text(bound)}")
-        return said
+                misses.append(f"{name} is {value:.4g}, {'above' if value > highest else 'below'} {bar_text(bound)}")
+        return misses
 
 
 def entries() -> dict[str, Entry]:
@@ -244,10 +244,10 @@ def adopt(task: str, other: str) -> None:
         evaluation = _evaluate(copy, entry)
         write_bundle(open_checkpoint(copy), source.root / "policies" / task, None, evaluation)
     (row,) = [row for row in _results(other) if row["seed"] == given.manifest["seed"]]
-    judged = {name: evaluation[name] for name in row["evaluation"] if evaluation.get(name) is not None}
+    evaluated = {name: evaluation[name] for name in row["evaluation"] if evaluation.get(name) is not None}
     values = {"values": evaluation["values"]} if evaluation.get("values") else {}
     command = f"{row['command']} (the other form)"
-    rows = [{**row, "command": command, "evaluation": {**judged, **values}}]
+    rows = [{**row, "command": command, "evaluation": {**evaluated, **values}}]
     (ZOO / "results" / f"{task}.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     for kind in ("csv", "svg"):
         shutil.copy(ZOO / "curves" / f"{other}.{kind}", ZOO / "curves" / f"{task}.{kind}")
@@ -277,12 +277,12 @@ def _documents(folder: Path) -> dict[str, Any]:
     found = {}
     for file in folder.rglob("*.json"):
         try:
-            said = json.loads(file.read_text(encoding="utf-8"))
+            record = json.loads(file.read_text(encoding="utf-8"))
         except ValueError:
             continue
-        if isinstance(said, dict) and said.get("command") == "eval" and isinstance(said.get("checkpoint"), str):
-            run, _, step = Path(said["checkpoint"]).parts[-3:]
-            found[f"{run}/{step}"] = said
+        if isinstance(record, dict) and record.get("command") == "eval" and isinstance(record.get("checkpoint"), str):
+            run, _, step = Path(record["checkpoint"]).parts[-3:]
+            found[f"{run}/{step}"] = record
     return found
 
 
@@ -297,9 +297,9 @@ def _evaluated(run: Any, checkpoint: Path, entry: Entry, known: dict[str, Any]) 
     from rlcli.runs.eval_store import read_evaluation
 
     there = [read_evaluation(run, checkpoint.name), known.get(f"{run.folder.name}/{checkpoint.name}")]
-    for said in there:
-        if said is not None and said["episodes"] >= entry.episodes and "values" in said and not said["stochastic"]:
-            return said
+    for record in there:
+        if record is not None and record["episodes"] >= entry.episodes and "values" in record and not record["stochastic"]:
+            return record
     return _evaluate(checkpoint, entry)
 
 

@@ -20,9 +20,9 @@ _THIN, _THICK = "#9db8d2", "#0b5394"
 def columns(histories: Sequence[Any]) -> list[str]:
     """Return success, return and the task's values that all runs have."""
     first, *others = histories
-    told = [name for name in first.metrics if all(name in other.metrics for other in others)]
-    values = [name for name in told if name.startswith(_VALUES)][:_MOST_VALUES]
-    return [name for name in (SUCCESS, RETURN) if name in told] + values
+    names = [name for name in first.metrics if all(name in other.metrics for other in others)]
+    values = [name for name in names if name.startswith(_VALUES)][:_MOST_VALUES]
+    return [name for name in (SUCCESS, RETURN) if name in names] + values
 
 
 def table(histories: Sequence[Any]) -> str:
@@ -63,12 +63,12 @@ def drawing(task: str, histories: Sequence[Any]) -> str:
 
 
 def _panel(name: str, histories: Sequence[Any]) -> list[str]:
-    told = [_points(history, name) for history in histories]
-    told = [(x, y) for x, y in told if len(x)]
-    if not told:
+    curves = [_points(history, name) for history in histories]
+    curves = [(x, y) for x, y in curves if len(x)]
+    if not curves:
         return []
-    last = max(float(x[-1]) for x, _ in told)
-    low, high = _span(name, [y for _, y in told])
+    last = max(float(x[-1]) for x, _ in curves)
+    low, high = _span(name, [y for _, y in curves])
     right, bottom = _PANEL - 14, _HEIGHT - _BOTTOM
 
     def place(step: float, value: float) -> str:
@@ -86,14 +86,14 @@ def _panel(name: str, histories: Sequence[Any]) -> list[str]:
         anchor = "end" if share == 1.0 else "middle"
         parts.append(f'<text x="{x:.0f}" y="{bottom + 14}" font-size="10" text-anchor="{anchor}">'
                      f"{_number(last * share)}{' steps' if share == 1.0 else ''}</text>")  # fmt: skip
-    one = len(told) == 1
-    for x, y in told:
+    one = len(curves) == 1
+    for x, y in curves:
         path = " ".join(place(float(a), float(b)) for a, b in zip(x, y, strict=True))
         style = f'stroke="{_THICK if one else _THIN}" stroke-width="{2 if one else 1}"'
         parts.append(f'<polyline points="{path}" fill="none" {style}/>')
     if not one:
-        grid = np.linspace(max(float(x[0]) for x, _ in told), min(float(x[-1]) for x, _ in told), ROWS)
-        middle = np.median([np.interp(grid, x, y) for x, y in told], axis=0)
+        grid = np.linspace(max(float(x[0]) for x, _ in curves), min(float(x[-1]) for x, _ in curves), ROWS)
+        middle = np.median([np.interp(grid, x, y) for x, y in curves], axis=0)
         path = " ".join(place(float(a), float(b)) for a, b in zip(grid, middle, strict=True))
         parts.append(f'<polyline points="{path}" fill="none" stroke="{_THICK}" stroke-width="2.2"/>')
     return parts
