@@ -16,7 +16,7 @@ from typing import Any
 import peers
 from machine import cores
 from sides import HERE, Failed, Side, alternate, opened, ratio, steps_for
-from tables import geometric_mean, main, rate, spread, measured_on, table
+from tables import geometric_mean, main, measured_on, rate, spread, table
 
 NAME = "envpool"
 MUJOCO_OF_ENVPOOL = "3.6.0"

@@ -15,7 +15,7 @@ from typing import Any
 import peers
 from machine import cores
 from sides import CACHE, CHECKOUT, HERE, Failed, Side, alternate, opened, ratio, steps_for, wall
-from tables import main, rate, spread, measured_on, table
+from tables import main, measured_on, rate, spread, table
 
 NAME = "mjlab"
 NUM_ENVS = 1024

@@ -15,7 +15,7 @@ from typing import Any
 
 import peers
 from sides import CHECKOUT, HERE, Block, Failed, Side, alternate, opened, ratio, steps_for
-from tables import main, rate, spread, measured_on, table
+from tables import main, measured_on, rate, spread, table
 
 NAME = "trainers"
 NUM_ENVS = 4096

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import Any
 
 from sides import HERE, child_environment
-from tables import PAGES, filled, keep, results, measured_on, table
+from tables import PAGES, filled, keep, measured_on, results, table
 
 SCRIPTS = {
     "env_step": ["--repeats", "2", "--seconds", "0.05", "--num-envs", "64"],

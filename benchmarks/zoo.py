@@ -296,9 +296,11 @@ def _evaluated(run: Any, checkpoint: Path, entry: Entry, known: dict[str, Any]) 
     """Return a stored evaluation of the run or of `known`; evaluate again if it has too few episodes."""
     from rlcli.runs.eval_store import read_evaluation
 
-    there = [read_evaluation(run, checkpoint.name), known.get(f"{run.folder.name}/{checkpoint.name}")]
-    for record in there:
-        if record is not None and record["episodes"] >= entry.episodes and "values" in record and not record["stochastic"]:
+    records = [read_evaluation(run, checkpoint.name), known.get(f"{run.folder.name}/{checkpoint.name}")]
+    for record in records:
+        if record is None or "values" not in record:
+            continue
+        if record["episodes"] >= entry.episodes and not record["stochastic"]:
             return record
     return _evaluate(checkpoint, entry)
 

@@ -156,7 +156,7 @@ def index(zoo: Path, found: list[Any]) -> str:
         "Each has a page with its numbers and where they come from, a policy that ships with it (`rlcli play TASK`",
         "right after the installation), learning curves, and a bar that `make learn-TASK` checks: tier A over three",
         "seeds within its minutes, tier B a stated level of one seed. `cpu` is two cores, `cuda` one H200. What a task",
-        "is held to measured_on in [zoo.yaml](zoo.yaml); `python benchmarks/zoo.py pages` writes this table and the",
+        "is held to stands in [zoo.yaml](zoo.yaml); `python benchmarks/zoo.py pages` writes this table and the",
         "generated parts of the pages.",
         "",
         "| | task | workflow | obs | act | tier | device | minutes | bar | result |",

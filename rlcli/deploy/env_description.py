@@ -55,8 +55,10 @@ def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[dict[str, A
     for group in env.config.observations:
         begin, terms = 0, []
         for pipeline in env.observation_manager.pipelines(group):
-            value = _processed_formula(env, pipeline.term, pipeline.width)
-            terms.append(_term_observation(pipeline.term, begin, pipeline.width, pipeline.history, value))
+            term, width = pipeline.term, pipeline.width
+            value = _processed_formula(env, term, width)
+            name, func, params = term.name, term.config.func, term.config.params
+            terms.append(_observation(name, func, params, begin, width, pipeline.history, value))
             begin += pipeline.size
         groups[group] = terms
     return groups, _controls(env, env.action_manager.terms)
@@ -65,7 +67,7 @@ def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[dict[str, A
 def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     task, in_terms = env.task, env.task.in_terms()
     groups = {
-        group: [_observation(name, f"{type(task).__name__}.{hook}", {}, (0, width), 1, None)]
+        group: [_observation(name, f"{type(task).__name__}.{hook}", {}, 0, width)]
         for group, name, hook, width in (
             ("policy", "obs_buf", "get_observations", task.num_observations),
             ("critic", "states_buf", "get_states", task.num_states),
@@ -87,7 +89,7 @@ def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any
         is_last_action = term.config.func == "last_action"
         width = task.num_actions if is_last_action else int(term.call().shape[1])
         value = _processed_formula(env, term, width, env.config.clip_observations)
-        terms.append(_term_observation(term, begin, width, 1, value))
+        terms.append(_observation(term.name, term.config.func, term.config.params, begin, width, value=value))
         begin += width
     if begin != task.num_observations:
         message = f"{type(task).__name__}.in_terms() has {begin} columns, the task has {task.num_observations}"
@@ -110,22 +112,17 @@ def _bind(env: DirectEnv, section: str, number: int, entry: Mapping[str, Any]) -
 
 
 def _observation(
-    name: str, func: str, params: Mapping[str, Any], columns: tuple[int, int], history: int, value: Formula | None
+    name: str, func: str, params: dict[str, Any], begin: int, width: int, history: int = 1, value: Formula | None = None
 ) -> dict[str, Any]:
     return {
         "name": name,
         "func": func,
-        "params": to_jsonable_python(dict(params), fallback=str),
-        "columns": list(columns),
+        "params": to_jsonable_python(params, fallback=str),
+        "columns": [begin, begin + width * history],
         "history": history,
         "closed": value is not None,
         "value": given(_INPUT + name) if value is None else value,
     }
-
-
-def _term_observation(term: BoundTerm, begin: int, width: int, history: int, value: Formula | None) -> dict[str, Any]:
-    columns = begin, begin + width * history
-    return _observation(term.name, term.config.func, term.config.params, columns, history, value)
 
 
 def _controls(env: VecEnv, terms: Iterable[BoundTerm]) -> list[dict[str, Any]]:

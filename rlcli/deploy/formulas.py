@@ -331,11 +331,8 @@ _OBSERVATIONS: Mapping[str, Callable[..., Formula]] = {
     "remaining_time_s": lambda env: op(
         "mul", op("sub", [float(env.max_episode_length)], given("steps")), [env.step_dt]
     ),
-    "sensor_data": _sensor,
-    "imu_orientation": _sensor,
+    **dict.fromkeys(("sensor_data", "imu_orientation", "imu_ang_vel", "imu_lin_acc"), _sensor),
     "imu_projected_gravity": lambda env, entity, sensors: op("unrotate", _sensor(env, entity, sensors), _down(entity)),
-    "imu_ang_vel": _sensor,
-    "imu_lin_acc": _sensor,
     "foot_height": lambda env, entity, sites: _site_pos(env, entity, sites, [2]),
     "ee_pos": _site_pos,
     "ee_frame_pos": _site_pos,

@@ -32,11 +32,10 @@ class DeployedPolicy(nn.Module):
         self.scaled = any(term.scale is not None for term in actions)
         self.register_buffer("scale", _row(term.scale or [1.0] * term.size for term in actions))
         self.register_buffer("offset", _row(term.offset or [0.0] * term.size for term in actions))
-        free = [(None, None)]
-        clip = [[_finite(pair) for pair in term.clip or free * term.size] for term in actions]
-        limits = [[_finite(pair) for pair in term.limits or free * term.size] for term in actions]
-        for name, pairs in (("clip", clip), ("limits", limits)):
-            bounds = _row(pairs)
+        unbounded = [(None, None)]
+        for name in ("clip", "limits"):
+            pairs = [getattr(term, name) or unbounded * term.size for term in actions]
+            bounds = _row([[_infinite_for_none(pair) for pair in term] for term in pairs])
             self.register_buffer(name, bounds.T.contiguous() if bool(bounds.isfinite().any()) else None)
 
     @property
@@ -92,6 +91,6 @@ def _row(terms: Iterable[list[Any]]) -> Tensor:
     return torch.tensor([value for values in terms for value in values], dtype=torch.float32)
 
 
-def _finite(pair: tuple[float | None, float | None] | None) -> tuple[float, float]:
+def _infinite_for_none(pair: tuple[float | None, float | None] | None) -> tuple[float, float]:
     low, high = pair or (None, None)
     return -math.inf if low is None else low, math.inf if high is None else high

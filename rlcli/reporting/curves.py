@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -139,12 +139,8 @@ def read_history(run: Run) -> History:
         raise CheckpointError(f"{run.folder} has no metrics yet", hint="the first iteration writes them")
     for column in columns.values():
         column.extend([math.nan] * (count - len(column)))
-    as_array: Callable[[array[float]], Array] = np.asarray
-    return History(
-        run,
-        {name: as_array(values) for name, values in axes.items()},
-        {name: as_array(values) for name, values in columns.items()},
-    )
+    arrays = ({name: np.asarray(values, np.float64) for name, values in each.items()} for each in (axes, columns))
+    return History(run, *arrays)
 
 
 def gather(runs: Sequence[Run]) -> tuple[list[Curve], list[str]]:

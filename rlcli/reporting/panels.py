@@ -81,12 +81,6 @@ def choose(curves: Sequence[Curve], names: Sequence[str] | None = None, axis: st
     return [panel for panel in panels if panel.items]
 
 
-def available(known: Sequence[str]) -> list[str]:
-    """Return every name that `choose` accepts for runs with these metrics."""
-    short = [name for name in DEFAULT if _metrics(name, known)]
-    return [*short, *known]
-
-
 def _metrics(name: str, known: Sequence[str]) -> list[str]:
     if name in GROUPS:
         return [metric for metric in known if metric.startswith(GROUPS[name])]
@@ -95,7 +89,7 @@ def _metrics(name: str, known: Sequence[str]) -> list[str]:
 
 
 def _unknown(name: str, known: Sequence[str]) -> UsageError:
-    names = available(known)
+    names = [*(short for short in DEFAULT if _metrics(short, known)), *known]
     tails = {each.rpartition("/")[2]: each for each in reversed(names)}
     tail = next(iter(difflib.get_close_matches(name, list(tails), n=1)), None)
     near = did_you_mean(name, names) or (f"did you mean '{tails[tail]}'?" if tail else None)

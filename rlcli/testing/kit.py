@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -111,7 +112,11 @@ def record_layout(task: str | Path, *, agent: str | None = None, overrides: Sequ
         ConfigError: if the task is not valid.
         TaskError: if there is no such task, or it cannot be imported.
     """
-    return portability_checks.record_layout(open_task(task, agent, overrides))
+    subject = open_task(task, agent, overrides)
+    record, file = subject.env().layout.record(), portability_checks.layout_file(subject)
+    columns = {part: record[part] for part in ("observations", "actions")}
+    file.write_text(json.dumps(columns, indent=1) + "\n", encoding="utf-8")
+    return file
 
 
 def _build(subject: TaskUnderTest) -> Iterator[Finding]:

@@ -149,15 +149,6 @@ def layout_file(subject: TaskUnderTest) -> Path:
     return config.with_name(f"{config.stem}.layout.json")
 
 
-def record_layout(subject: TaskUnderTest) -> Path:
-    """Write the columns of the task's observations and actions to a file."""
-    record = subject.env().layout.record()
-    file = layout_file(subject)
-    columns = {part: record[part] for part in ("observations", "actions")}
-    file.write_text(json.dumps(columns, indent=1) + "\n", encoding="utf-8")
-    return file
-
-
 def layout(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that observations and actions have the recorded columns in the recorded order, if they were recorded."""
     file = layout_file(subject)

@@ -12,7 +12,9 @@ import torch
 from torch import Tensor
 
 from rlcli.config.dump import to_data, to_yaml
+from rlcli.config.layers import leaves
 from rlcli.config.load import resolve
+from rlcli.config.messages import dotted
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DivergedError, listing
@@ -68,20 +70,15 @@ def yaml_round_trip(subject: TaskUnderTest) -> Iterator[Finding]:
                     problem.hint or "use a value that YAML has (finite numbers, text, lists)",
                 )
             return
-    for path, was, now in _differences(data, again):
-        yield error_at(
-            path,
-            f"is {was!r}, and {now!r} after writing and reading the configuration",
-            "a run stores its configuration as YAML: use a value that YAML has",
-        )
-
-
-def _differences(was: object, now: object, path: str = "") -> Iterator[tuple[str, object, object]]:
-    if isinstance(was, dict) and isinstance(now, dict):
-        for key in {**was, **now}:
-            yield from _differences(was.get(key), now.get(key), f"{path}.{key}" if path else str(key))
-    elif was != now and not (isinstance(was, list | tuple) and list(was) == now):
-        yield path, was, now
+    before, after = dict(leaves(data)), dict(leaves(again))
+    for path in {**before, **after}:
+        was, now = before.get(path), after.get(path)
+        if was != now and not (isinstance(was, list | tuple) and list(was) == now):  # YAML has no tuples
+            yield error_at(
+                dotted(path),
+                f"is {was!r}, and {now!r} after writing and reading the configuration",
+                "a run stores its configuration as YAML: use a value that YAML has",
+            )
 
 
 # --- results of a step ---
