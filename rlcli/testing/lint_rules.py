@@ -13,6 +13,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from rlcli.config.layers import leaves
 from rlcli.config.schema import AgentConfig
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
@@ -367,16 +368,11 @@ def horizon(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 def discount_of(agent: AgentConfig | None) -> float | None:
     """Return the discount factor in an agent's settings, also in nested ones; None if there is none."""
-    return None if agent is None else _find_gamma(agent.model_dump())
-
-
-def _find_gamma(data: object) -> float | None:
-    if not isinstance(data, dict):
+    if agent is None:
         return None
-    for key in ("gamma", "discount", "discount_factor"):
-        if isinstance(data.get(key), int | float):
-            return float(data[key])
-    return next((found for value in data.values() if (found := _find_gamma(value)) is not None), None)
+    settings = sorted(leaves(agent.model_dump()), key=lambda leaf: len(leaf[0]))  # the least nested one first
+    discounts = (v for path, v in settings if path and path[-1] in ("gamma", "discount", "discount_factor"))
+    return next((float(value) for value in discounts if isinstance(value, int | float)), None)
 
 
 RULES: dict[str, Callable[[RolloutEvidence], Iterable[Remark]]] = {

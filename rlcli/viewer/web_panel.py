@@ -22,6 +22,12 @@ from rlcli.viewer.protocol import View
 TITLE = "Options"
 """Title of the window that MuJoCo's viewer docks to the left."""
 _SPEEDS = ["1/8 x", "1/4 x", "1/2 x", "real time", "2 x", "4 x", "8 x"]
+_REQUESTS = {
+    "Space": "pause", "RightArrow": "step", "Backspace": "reset", "Minus": "slower", "Equal": "faster",
+    "UpArrow": "next environment", "DownArrow": "previous environment", "PageUp": "newer checkpoint",
+    "PageDown": "older checkpoint",
+}  # fmt: skip
+"""Name of a key in Dear ImGui -> request of the playback."""
 _LAST = 0
 """Priority of handlers that run after those of MuJoCo."""
 
@@ -183,20 +189,8 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
     def _keys(self) -> None:
         if imgui.GetIO().WantCaptureKeyboard:
             return
-        key = imgui.Key
-        requests: dict[int, str] = {
-            key.Space: "pause",
-            key.RightArrow: "step",
-            key.Backspace: "reset",
-            key.Minus: "slower",
-            key.Equal: "faster",
-            key.UpArrow: "next environment",
-            key.DownArrow: "previous environment",
-            key.PageUp: "newer checkpoint",
-            key.PageDown: "older checkpoint",
-        }
-        for code, request in requests.items():
-            if imgui.IsKeyChordPressed(code):
+        for key, request in _REQUESTS.items():
+            if imgui.IsKeyChordPressed(getattr(imgui.Key, key)):
                 self._playback.submit(self._playback.requests()[request])
                 return
         is_free_camera = self._ux.camera_index == ux.FREE_CAMERA_IDX

@@ -226,7 +226,7 @@ def test_layout_needs_recorded_file(managed):
     ("change", "says"),
     [
         ("order", "column 0 was 'angle[hinge]' and is 'rate[hinge]'"),
-        ("gone", "had 2 columns and has 1, other ones from column 1 on"),
+        ("gone", "had 2 columns and has 1; the first difference is column 1"),
         ("scale", "'rate': scale was [0.1] and is [0.2]"),
         ("group", "is new"),
     ],
@@ -254,14 +254,14 @@ def test_layout_finds_changed_actions(direct):
     direct.replace("num_actions = 1", "num_actions = 2")
     direct.replace("self.params.max_effort * actions", "self.params.max_effort * actions[:, :1]")
     ((finding,), _) = only(direct, "layout")
-    assert (finding.where, finding.message) == ("actions", "had 1 columns and has 2, other ones from column 1 on")
+    assert (finding.where, finding.message) == ("actions", "had 1 columns and has 2; the first difference is column 1")
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"observations": 3}'])
 def test_layout_finds_invalid_file(text, managed):
     (managed.write() / "task.layout.json").write_text(text)
     ((finding,), _) = only(managed, "layout")
-    assert "is no recorded layout" in finding.message
+    assert "is not a recorded layout" in finding.message
 
 
 def test_command_records_layout(managed, capsys):
@@ -377,7 +377,7 @@ def test_engines_is_not_run_for_unsupported_model(managed):
     managed.xml = managed.xml.replace("</mujoco>", '<option solver="PGS"/></mujoco>')
     found, notes = only(managed, "engines")
     assert found == []
-    assert "not take it" in notes["engines"]
+    assert "cannot run the model" in notes["engines"]
 
 
 @pytest.fixture
