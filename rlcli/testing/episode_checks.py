@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 
 import torch
@@ -43,18 +43,17 @@ def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
     first, second, third = (record_trajectory(one, random_actions(one, subject.bound, 30)) for one in (env, other, env))
     message = "differs between two new environments, one seed and one set of actions"
     hint = "draw from the selection (uniform, normal, choice) or from self.draws(env_ids) instead of torch.rand, numpy"
-    findings = list(compare_trajectories(env, first, second, message, f"{hint} or time"))
+    findings = list(compare_trajectories(env, (first, second), message, f"{hint} or time"))
     if not findings:
         message = "differs between a new environment, and the same one after reset(seed), with one set of actions"
         hint = "something outlives the episode: clear it in the term's reset(selection), or in reset_idx"
-        findings = list(compare_trajectories(env, first, third, message, hint))
+        findings = list(compare_trajectories(env, (first, third), message, hint))
     yield from findings
 
 
 def compare_trajectories(
     env: VecEnv,
-    left: list[dict[str, Tensor]],
-    right: list[dict[str, Tensor]],
+    trajectories: Sequence[list[dict[str, Tensor]]],
     message: str,
     hint: str,
     make: Callable[[str, str, str], Finding] = error_at,
@@ -63,13 +62,12 @@ def compare_trajectories(
 
     Args:
         env: an environment with their layout.
-        left: one trajectory.
-        right: the other one, equally long.
+        trajectories: both trajectories, equally long.
         message: message without the values, which are appended.
         hint: hint of the finding.
         make: `error_at` or `warning_at`.
     """
-    for step, (a, b) in enumerate(zip(left, right, strict=True)):
+    for step, (a, b) in enumerate(zip(*trajectories, strict=True)):
         for name in a:
             if not bitwise_equal(a[name], b[name]):
                 where, values = _difference(env, name, a[name], b[name], f"after {step} steps")
@@ -123,9 +121,10 @@ class _EnvPair:
 
     def step(self, count: int = 1) -> tuple[StepResult, StepResult]:
         """Make steps with the next actions; return the results of the last one."""
-        results = []
         for _ in range(count):
-            action, self._steps, results = next(self._actions), self._steps + 1, []
+            action = next(self._actions)
+            self._steps += 1
+            results = []
             for env, factor in ((self.kept, 1.0), (self.ended, self._scale)):
                 torch.manual_seed(self._steps)  # draws from torch's own generator are checked by `same-seed`
                 results.append(env.step(factor * action))

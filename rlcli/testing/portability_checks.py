@@ -55,7 +55,7 @@ def threads(subject: TaskUnderTest) -> Iterator[Finding]:
         torch.manual_seed(0)
         trajectories.append(record_trajectory(env, random_actions(env, subject.bound, STEPS)))
     hint = "let nothing depend on engine_threads or on the number of cores"
-    yield from compare_trajectories(env, *trajectories, "differs between 1 and 3 engine threads", hint)
+    yield from compare_trajectories(env, trajectories, "differs between 1 and 3 engine threads", hint)
 
 
 FEW = 3
@@ -84,7 +84,7 @@ def num_envs(subject: TaskUnderTest) -> Iterator[Finding]:
         hint = "compute each row only from its environment; torch's sum over dim 0, atan2 and pow round differently for"
         hint += " other sizes (rlcli.sim.rotations has an atan2 that does not)"
     message = f"differs between {NUM_ENVS} and {FEW} environments{reason}"
-    yield from compare_trajectories(many, of_many, of_few, message, hint, make)
+    yield from compare_trajectories(many, (of_many, of_few), message, hint, make)
 
 
 # --- checkpoints and versions ---
@@ -111,11 +111,8 @@ def checkpoint(subject: TaskUnderTest) -> Iterator[Finding]:
         hint += " of the task"
     if unsaved := env.unsaved_state():
         hint = f"no checkpoint can hold {', '.join(unsaved)}; {hint}"
-    message, hint = (
-        "differs after saving and restoring",
-        f"{hint}; else a resumed run differs from an uninterrupted one",
-    )
-    yield from compare_trajectories(env, *trajectories, message, hint)
+    hint += "; else a resumed run differs from an uninterrupted one"
+    yield from compare_trajectories(env, trajectories, "differs after saving and restoring", hint)
 
 
 def _continue(env: VecEnv, actions: list[Tensor]) -> list[dict[str, Tensor]]:
