@@ -176,17 +176,17 @@ def _settings(run: Run, document: strict_yaml.Document) -> list[Setting]:
     task: if they are equal, the origin is the line of the installed task; else it is the line of the run's own file.
     """
     recorded = run.record.get("given", {})
-    installed, places = _installed(run)
+    installed, lines = _installed(run)
     rows = []
     for path, value in leaves(document.data):
         key = dotted(path)
         if key in recorded:
             origin = str(recorded[key])
-        elif key in places and as_text(installed.get(key)) == as_text(value):
-            origin = places[key]
+        elif key in lines and as_text(installed.get(key)) == as_text(value):
+            origin = lines[key]
         else:
             line, column = document.marks.get(path, (0, 0))
-            origin = f"{run.config.name}:{line}:{column}" + (" (the installed task differs)" if key in places else "")
+            origin = f"{run.config.name}:{line}:{column}" + (" (the installed task differs)" if key in lines else "")
         text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
         rows.append(Setting(key, text, origin))
     return rows
@@ -204,7 +204,7 @@ def _installed(run: Run) -> tuple[dict[str, Any], dict[str, str]]:
         return {}, {}
     values = {dotted(path): value for path, value in leaves(to_data(resolved))}
     # without the folder of the task's files: the page may be read on another machine
-    return values, {key: place.replace(source.label, source.config.name) for key, place in origins(resolved).items()}
+    return values, {key: line.replace(source.label, source.config.name) for key, line in origins(resolved).items()}
 
 
 def _sections(settings: list[Setting]) -> list[tuple[str, list[Setting]]]:

@@ -150,4 +150,4 @@ def _stopped(name: str, subject: TaskUnderTest, error: Exception, before: list[F
     message = f"the check was stopped by {error_text(error)}"
     earlier = next((f.check for f in before if f.message == message), None)
     hint = "correct the code that raises it, then check again" if earlier is None else f"see {earlier}"
-    return Finding(name, "error", subject.place(error), message, hint)
+    return Finding(name, "error", subject.location(error), message, hint)

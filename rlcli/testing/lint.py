@@ -81,4 +81,4 @@ def _apply_rule(name: str, evidence: RolloutEvidence) -> Iterator[Remark]:
     except Exception as error:
         message = f"the rule was stopped by {error_text(error)}"
         hint = "correct the code that raises it, then lint again"
-        yield Remark(name, "error", evidence.subject.place(error), message, hint)
+        yield Remark(name, "error", evidence.subject.location(error), message, hint)

@@ -63,7 +63,7 @@ def runs_without_error(evidence: RolloutEvidence) -> Iterator[Remark]:
             step = len(rollout.reward)
             message = f"the {rollout.agent} agent was stopped after {step} steps by {text}"
             hint = "correct the code that raises it; `rlcli check` finds more details"
-            yield error_at(evidence.subject.place(rollout.error), message, hint, {"step": step})
+            yield error_at(evidence.subject.location(rollout.error), message, hint, {"step": step})
 
 
 EARLY = 5

@@ -212,7 +212,7 @@ def speed(subject: TaskUnderTest) -> Iterator[Finding]:
     rate = LARGE / seconds[1]
     subject.notes["speed"] = f"{rate:,.0f} steps/s with {LARGE} environments on one engine thread"
     grown = lines[1] - lines[0]
-    loops = {place: count for place, count in grown.items() if count >= (LARGE - SMALL) // 2}
+    loops = {line: count for line, count in grown.items() if count >= (LARGE - SMALL) // 2}
     if not loops:
         return
     own = {p: c for p, c in loops.items() if Path(p[0]).is_relative_to(subject.source.root)}
@@ -264,15 +264,15 @@ def engines(subject: TaskUnderTest) -> Iterator[Finding]:
     for when, cpu, gpu in zip(("at the start", "after a step"), *outputs, strict=True):
         for name, values in cpu.items():
             others = gpu[name].to(values.device)
-            make, found, expected, place = error_at, "", "", ""
+            make, found, expected, where = error_at, "", "", ""
             if values.shape != others.shape or values.dtype != others.dtype:
                 found, expected = (f"{tuple(tensor.shape)} {tensor.dtype}" for tensor in (others, values))
             elif bool((far := (values.float() - others.float()).abs() > CLOSE * (1.0 + values.float().abs())).any()):
                 index = tuple(far.nonzero()[0].tolist())
-                make, place = warning_at, f" in environment {index[0]}"
+                make, where = warning_at, f" in environment {index[0]}"
                 found, expected = (f"{float(tensor[index]):.5g}" for tensor in (others, values))
             if found:
-                message = f"{name} is {expected} on the CPU engine and {found} on the GPU engine{place}, {when}"
+                message = f"{name} is {expected} on the CPU engine and {found} on the GPU engine{where}, {when}"
                 yield make("sim.engine = warp", message, hint)
                 return
 
@@ -295,7 +295,7 @@ def captured(subject: TaskUnderTest) -> Iterator[Finding]:
                 env.step(action)
     except HostSyncError as error:
         hint = "compute with torch.where and masks over all rows: docs/gpu.md; else a GPU is several times slower"
-        yield warning_at(subject.place(error), f"{error}, in a step", hint)
+        yield warning_at(subject.location(error), f"{error}, in a step", hint)
 
 
 def _warp_env(subject: TaskUnderTest) -> VecEnv:

@@ -139,7 +139,7 @@ class TaskUnderTest:
                 raise self._recording.error
         return self._recording
 
-    def place(self, error: Exception) -> str:
+    def location(self, error: Exception) -> str:
         """Return the innermost line of the task's own files in an error's traceback; else the task's name."""
         frames = traceback.extract_tb(error.__traceback__)
         own = [f for f in frames if Path(f.filename).is_relative_to(self.source.root)]

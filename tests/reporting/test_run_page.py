@@ -44,7 +44,7 @@ def read(file):
     return Reader(Path(file).read_text(encoding="utf-8"))
 
 
-def written(text, key):
+def origin_of(text, key):
     """Return the origin of a value on a page."""
     row = rf"<code>{re.escape(key)}</code></td><td><code>[^<]*</code></td><td class=\"origin\">([^<]*)</td>"
     return html.unescape(re.search(row, text)[1])
@@ -113,7 +113,7 @@ def test_settings_have_origins(cli, tmp_path):
     text = Path(cli("report", "latest").out.strip()).read_text()
 
     def origin(key):
-        return written(text, key)
+        return origin_of(text, key)
 
     assert origin("rewards.alive.weight") == "override 'rewards.alive.weight=1.5'"
     assert re.fullmatch(r"task\.yaml:\d+:\d+", origin("episode_length_s"))
@@ -127,7 +127,7 @@ def test_origin_of_changed_value_is_run_file(cli, tmp_path):
     run.config.write_text(text.replace("episode_length_s: 5.0", "episode_length_s: 7.0"))
     line = text[: text.index("episode_length_s")].count("\n") + 1
     page = Path(cli("report", "latest").out.strip()).read_text()
-    assert written(page, "episode_length_s") == f"config.yaml:{line}:1 (the installed task differs)"
+    assert origin_of(page, "episode_length_s") == f"config.yaml:{line}:1 (the installed task differs)"
 
 
 def test_direct_task_page_has_parameters_and_docstrings(cli, tmp_path):

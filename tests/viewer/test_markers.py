@@ -63,7 +63,7 @@ def _headless(monkeypatch):
         monkeypatch.delenv(name, raising=False)
 
 
-def asking(folder, num_envs=2, *overrides, still=True, sensors=None, **commands):
+def commanded_env(folder, num_envs=2, *overrides, still=True, sensors=None, **commands):
     """Environment of critters with commands; unless `still`, they start at random positions and move."""
     task = yaml.safe_load(CRITTER_TASK) | {"commands": commands, "viewer": VIEWER}
     task["scene"]["sensors"] = sensors or {}
@@ -124,7 +124,7 @@ def test_reach_goal_is_drawn_at_its_position(number):
 @pytest.mark.parametrize(("vx", "vy"), [(0.8, 0.0), (-0.8, 0.0), (0.0, 0.8), (0.5, -0.5)])
 def test_green_arrow_is_commanded_blue_arrow_is_actual_velocity(tmp_path, vx, vy):
     above = "viewer.eye=[-0.05,0.0,3.5]"  # else an arrow's head may hide its tip
-    env = asking(tmp_path, 1, above, still=False, walk=VELOCITY)
+    env = commanded_env(tmp_path, 1, above, still=False, walk=VELOCITY)
     for name, value in {"vx": vx, "vy": vy, "wz": 0.0}.items():
         env.command_manager.hold(name, value)
     env.step(torch.zeros(1, 4))
@@ -145,7 +145,7 @@ def test_green_arrow_is_commanded_blue_arrow_is_actual_velocity(tmp_path, vx, vy
 @pytest.mark.slow
 @pytest.mark.parametrize("wz", [0.7, -0.7])
 def test_turn_rate_marker_position(tmp_path, wz):
-    env = asking(tmp_path, 1, still=False, walk=VELOCITY)
+    env = commanded_env(tmp_path, 1, still=False, walk=VELOCITY)
     for name, value in {"vx": 0.0, "vy": 0.0, "wz": wz}.items():
         env.command_manager.hold(name, value)
     env.step(torch.zeros(1, 4))
@@ -160,7 +160,7 @@ def test_turn_rate_marker_position(tmp_path, wz):
 
 
 def test_pose_command_is_sphere_with_arrow(tmp_path):
-    env = asking(tmp_path, 3, still=False, place=PLACE)
+    env = commanded_env(tmp_path, 3, still=False, place=PLACE)
     run(env, 3, reset=False)
     ball, arrow = env.markers()
     term = env.command_manager.get_term("place")
@@ -183,7 +183,7 @@ def test_pose_command_is_sphere_with_arrow(tmp_path):
     ids=["no command", "a command without markers", "no velocity, asked or actual", "not finite"],
 )
 def test_no_markers_for_zero_commands(tmp_path, commands):
-    env = asking(tmp_path, 2, **commands)
+    env = commanded_env(tmp_path, 2, **commands)
     seen, bare = pictures(env)
     np.testing.assert_array_equal(seen, bare)
     assert bare.std() > 5
@@ -191,7 +191,7 @@ def test_no_markers_for_zero_commands(tmp_path, commands):
 
 @pytest.mark.slow
 def test_custom_command_markers_are_computed_only_for_pictures(tmp_path):
-    env = asking(tmp_path, 2, own={"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9})
+    env = commanded_env(tmp_path, 2, own={"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9})
     term = env.command_manager.get_term("own")
     run(env, 3)
     assert term.calls == 0
@@ -209,7 +209,7 @@ def test_camera_sensors_do_not_render_markers(tmp_path):
     own = {"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9}
     images = {}
     for name, commands in {"asked": {"own": own}, "alone": {}}.items():
-        env = asking(tmp_path / name, 2, sensors={"front": front}, **commands)
+        env = commanded_env(tmp_path / name, 2, sensors={"front": front}, **commands)
         seen, bare = pictures(env, 1)
         before = env.sensors["front"].image.clone()
         env.sensors["front"].update(0.0)
@@ -227,7 +227,7 @@ def test_rendering_does_not_change_simulation(tmp_path):
     commands = {"walk": VELOCITY, "pose": POSE, "place": PLACE}
     steps = {}
     for drawn in (False, True):
-        env = asking(tmp_path / str(drawn), 3, still=False, **commands)
+        env = commanded_env(tmp_path / str(drawn), 3, still=False, **commands)
         results = []
         with Renderer(env.engine.model, env.config.viewer, EnvGrid(env, 3)) if drawn else nullcontext() as renderer:
             for _ in range(20):
@@ -249,7 +249,7 @@ def shapes(scene):
 
 
 def test_grid_draws_markers_of_each_environment(tmp_path):
-    env = asking(tmp_path, 5, still=False, pose=POSE)
+    env = commanded_env(tmp_path, 5, still=False, pose=POSE)
     scene = mujoco.MjvScene(env.engine.model, maxgeom=1000)
     env_grid = EnvGrid(env, 3)
     env_grid.add(scene, 3, mujoco.MjvOption())
@@ -262,7 +262,9 @@ def test_grid_draws_markers_of_each_environment(tmp_path):
 
 @pytest.mark.slow
 def test_grid_picture_shows_all_markers(tmp_path):
-    env = asking(tmp_path, 4, "scene.env_spacing=2", own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
+    env = commanded_env(
+        tmp_path, 4, "scene.env_spacing=2", own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0}
+    )
     env_grid, counts = EnvGrid(env, 4), {}
     env.command_manager.get_term("own").given = []
     with Renderer(env.engine.model, env.config.viewer, env_grid) as renderer:
@@ -280,7 +282,7 @@ def test_grid_picture_shows_all_markers(tmp_path):
 
 
 def test_browser_gets_marker_copies(tmp_path):
-    env = asking(tmp_path, 2, pose=POSE)
+    env = commanded_env(tmp_path, 2, pose=POSE)
     scene = mujoco.MjvScene(env.engine.model, maxgeom=1024)
     found = list(EnvGrid(env, 1).geoms(scene, 1, mujoco.MjvOption()))
     kinds = [int(geom.type) for geom in found]
@@ -293,7 +295,7 @@ def test_browser_gets_marker_copies(tmp_path):
 
 
 def test_window_gets_markers(tmp_path):
-    env = asking(tmp_path, 2, pose=POSE)
+    env = commanded_env(tmp_path, 2, pose=POSE)
     playback = Playback(env, zero_policy(env))
     model, _ = env.world(0)
     scene = mujoco.MjvScene(model, maxgeom=100)
@@ -309,7 +311,7 @@ def test_window_gets_markers(tmp_path):
 def test_video_shows_markers(tmp_path):
     from PIL import Image
 
-    env = asking(tmp_path, 1, pose=POSE)
+    env = commanded_env(tmp_path, 1, pose=POSE)
     record_episode(env, zero_policy(env), tmp_path / "x.gif", longest_s=0.1)
     with Image.open(tmp_path / "x.gif") as image:
         last = np.asarray(image.convert("RGB")).astype(int)
@@ -317,7 +319,7 @@ def test_video_shows_markers(tmp_path):
 
 
 def test_markers_are_limited_by_scene_size(tmp_path):
-    env = asking(tmp_path, 4, pose=POSE)
+    env = commanded_env(tmp_path, 4, pose=POSE)
     scene = mujoco.MjvScene(env.engine.model, maxgeom=6)
     add_markers(scene, env.markers(), range(4), np.zeros((4, 3)))
     assert scene.ngeom == 6
@@ -335,7 +337,7 @@ WRONG = {
 
 @pytest.mark.parametrize("message", WRONG)
 def test_invalid_marker_error_names_term(tmp_path, message):
-    env = asking(tmp_path, 4, own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
+    env = commanded_env(tmp_path, 4, own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
     env.command_manager.get_term("own").given = [WRONG[message](4)]
     with pytest.raises(ConfigError, match=f"commands.own: markers\\(\\) {message}"):
         env.markers()
