@@ -151,10 +151,10 @@ def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | N
         named: the task on the command line, if there is one.
     """
     resolved = choice.configure(named)
+    groups = resolved.task.observations.items()
     # corruption is random, so an exported file cannot reproduce it
-    corrupted = [name for name, group in resolved.task.observations.items() if group.enable_corruption]
-    if corrupted:
-        clean = [f"observations.{name}.enable_corruption=false" for name in corrupted]
+    clean = [f"observations.{name}.enable_corruption=false" for name, group in groups if group.enable_corruption]
+    if clean:
         resolved = choice.configure(named, overrides=clean)
     torch.set_num_threads(1)
     seed_generators(derive(_SEED, "task"))

@@ -135,12 +135,9 @@ def _facts(task: TaskConfig, layout: Mapping[str, Any]) -> Iterable[tuple[str, s
         terms = terms.get("policy", []) if isinstance(terms, Mapping) else terms
         if terms:
             yield title, columns_text(sum(term["size"] for term in terms))
-    for clip, title in (
-        (task.clip_observations, "Observations are clipped to"),
-        (task.clip_actions, "Actions are clipped to"),
-    ):
+    for kind, clip in (("Observations", task.clip_observations), ("Actions", task.clip_actions)):
         if clip is not None:
-            yield title, f"±{number(clip)}"
+            yield f"{kind} are clipped to", f"±{number(clip)}"
     yield "Environments", f"{task.scene.num_envs:,}"
     for name, entity in task.scene.entities.items():
         shape = f"{entity.shape} {text_of(entity.size)}" if entity.shape else str(entity.model)
