@@ -103,7 +103,7 @@ def mjlab_properties(metadata: dict[str, Any], entity: str = "robot") -> dict[st
     """Return the metadata properties of mjlab 1.6's ONNX files, so that programs for those can read these.
 
     Items of a list are separated by commas, items of an inner list by semicolons. Properties that the checkpoint does
-    not have are left out.
+    not have are left out, and lists of names if a name contains a separator.
     """
     terms, actions = metadata["observations"], metadata["actions"]
     widths = [term["size"] // term["history"] for term in terms]
@@ -130,19 +130,17 @@ def mjlab_properties(metadata: dict[str, Any], entity: str = "robot") -> dict[st
             "default_joint_pos": [joint["default"] for joint in joints],
             "command_names": [command["name"] for command in deployment["commands"]],
         }
-    found = {name: ",".join(map(_entry, values)) for name, values in lists.items() if not _ambiguous(values)}
-    return {"run_path": str(metadata["run"] or ""), **found}
+    properties = {"run_path": str(metadata["run"] or "")}
+    for name, values in lists.items():
+        if not any(isinstance(value, str) and ("," in value or ";" in value) for value in values):
+            properties[name] = ",".join(map(_entry, values))
+    return properties
 
 
 def _entry(value: object) -> str:
     if isinstance(value, list):
         return ";".join(map(_entry, value))
     return f"{value:.9g}" if isinstance(value, float) else str(value)
-
-
-def _ambiguous(values: list[Any]) -> bool:
-    """Return whether a name contains a separator."""
-    return any(isinstance(value, str) and ("," in value or ";" in value) for value in values)
 
 
 def _columns(terms: list[Any]) -> list[list[int]]:

@@ -19,12 +19,11 @@ MODEL = "model.xml"
 _MARK = "<!-- written by rlcli export -->\n"
 """First line of an exported model. A model file with this line may be overwritten."""
 _TEMPLATE = Path(__file__).parent / "deployed" / PROGRAM
-_OPEN_ONNX = """        session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+_OPEN = {
+    "onnx": """        session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
         self.metadata = json.loads(session.get_modelmeta().custom_metadata_map["rlcli"])
         self.policy = lambda x: dict(zip([o.name for o in session.get_outputs()], session.run(None, x), strict=True))
-"""
-_OPEN = {
-    "onnx": _OPEN_ONNX,
+""",
     "numpy": """        space = runpy.run_path(str(file))
         self.metadata, self.policy = space["METADATA"], space["run"]
 """,
