@@ -1,10 +1,10 @@
 """Environment steps against EnvPool's, on Gymnasium's eleven MuJoCo v5 tasks: `python benchmarks/against_envpool.py`.
 
-Same models (compared field by field), frame skip, threads and range of random actions, automatic restarts; both begin
-together and take blocks of equally many steps in turn, so that their episodes are equally old. EnvPool has MuJoCo 3.6
-built in: how much of a ratio is MuJoCo's own is what a bare loop of `mj_step` does on both versions. Its calls that
-reset an environment, and simulate nothing, are not counted as steps. What the ratio would be if everything besides the
-call of the engine cost nothing is its limit.
+Both sides have the same models (compared field by field), frame skip, threads, range of random actions and automatic
+resets. They start together and run blocks with the same number of steps in turn, so that their episodes have the same
+age. EnvPool contains MuJoCo 3.6; a bare loop of `mj_step` on both versions shows how much of a ratio is due to MuJoCo.
+EnvPool's calls that only reset an environment are not counted as steps. The limit of a ratio is its value if everything
+except the engine's call took no time.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import peers
 from machine import cores
 from sides import HERE, Failed, Side, alternate, opened, ratio, steps_for
-from tables import geometric_mean, main, rate, spread, stands, table
+from tables import geometric_mean, main, measured_on, rate, spread, table
 
 NAME = "envpool"
 MUJOCO_OF_ENVPOOL = "3.6.0"
@@ -36,16 +36,16 @@ TASKS = {
 
 
 FORCES = {"gym-ant", "gym-humanoid", "gym-humanoid-standup"}
-"""Those that observe `cfrc_ext`, which `mujoco.batch` does not compute."""
+"""Tasks that observe `cfrc_ext`, which `mujoco.batch` does not compute."""
 
 
 def side(name: str, environment: str) -> Side:
-    """A program of this folder in one of the environments."""
+    """Return a program of this folder in one of the virtual environments."""
     return Side(f"{NAME}-{name}-{environment}", [str(peers.python(environment)), str(HERE / f"side_{name}.py")])
 
 
 def one(task: str, num_envs: int, ours: Side, theirs: Side, repeats: int, seconds: float) -> dict[str, Any]:
-    """A task with so many environments."""
+    """Return a task with `num_envs` environments."""
     here = ours("open_env", task=task, num_envs=num_envs, threads=cores())
     there = theirs("open_env", task=TASKS[task], num_envs=num_envs, threads=cores())
     for key in ("physics_steps", "max_episode_length"):
@@ -73,7 +73,7 @@ def one(task: str, num_envs: int, ours: Side, theirs: Side, repeats: int, second
 def mujocos_part(
     model: str, physics_steps: int, new: Side, old: Side, repeats: int, seconds: float
 ) -> dict[str, float]:
-    """How many times as fast this release's MuJoCo simulates a model as EnvPool's, on one thread."""
+    """Return the speed of this release's MuJoCo relative to EnvPool's for a model, on one thread."""
     for each in (new, old):
         each("open_model", path=model, physics_steps=physics_steps)
     blocks = {"new": lambda n: new("step", steps=n), "old": lambda n: old("step", steps=n)}
@@ -84,7 +84,7 @@ def mujocos_part(
 
 
 def row_of(task: str, repeats: int, seconds: float) -> dict[str, Any]:
-    """A task, in processes of its own: one that fails spoils no other."""
+    """Measure a task in separate processes, so that a failure affects no other task."""
     row: dict[str, Any] = {"task": task}
     try:
         sides = side("rlcli", "rlcli"), side("envpool", "envpool"), side("mujoco", "rlcli"), side("mujoco", "envpool")
@@ -103,7 +103,7 @@ def row_of(task: str, repeats: int, seconds: float) -> dict[str, Any]:
 
 
 def measure(quick: bool) -> dict[str, Any]:
-    """A row a task."""
+    """Measure all tasks, one row each."""
     repeats, seconds = (2, 0.05) if quick else (7, 0.4)
     try:
         peers.add("envpool", f"mujoco=={MUJOCO_OF_ENVPOOL}")
@@ -120,9 +120,9 @@ def measure(quick: bool) -> dict[str, Any]:
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """The table."""
+    """Return the table in Markdown."""
     if "failed" in result:
-        return f"{stands(result)}\n\nEnvPool: {result['failed']}"
+        return f"{measured_on(result)}\n\nEnvPool: {result['failed']}"
     heads = ["task"]
     for num_envs in (64, 1024):
         heads += [f"{num_envs:,}: of EnvPool", "min .. max", "limit", "environment steps/s", "EnvPool"]
@@ -141,7 +141,7 @@ def markdown(result: dict[str, Any]) -> str:
     for key in ("64", "1024"):
         last += [f"**{result['means'][key]:.2f}**", "", f"{result['limits'][key]:.2f}", "", ""]
     rows.append([*last, f"{result['means']['mujoco']:.2f}"])
-    return f"{stands(result, result['envpool'])}\n\n{table([*heads, 'of it MuJoCo'], rows)}"
+    return f"{measured_on(result, result['envpool'])}\n\n{table([*heads, 'of it MuJoCo'], rows)}"
 
 
 if __name__ == "__main__":

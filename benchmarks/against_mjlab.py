@@ -1,8 +1,8 @@
 """Against mjlab on its CPU device: `python benchmarks/against_mjlab.py`.
 
-The environment step of the same cartpole (`gpu_mdp_check.py` compares rewards and observations) with 1,024 environments
-under random actions; the wait from starting each library's own `train` of its own cartpole to the end of the first step
-and of the first update, with compiled kernels at hand and without; listing what is installed; memory.
+It measures the environment step of the same cartpole (`gpu_mdp_check.py` compares rewards and observations) with 1,024
+environments under random actions; the time from the start of each library's own `train` of its own cartpole to the end
+of the first step and of the first update, with and without cached kernels; the time to list the tasks; and memory.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import peers
 from machine import cores
 from sides import CACHE, CHECKOUT, HERE, Failed, Side, alternate, opened, ratio, steps_for, wall
-from tables import main, rate, spread, stands, table
+from tables import main, measured_on, rate, spread, table
 
 NAME = "mjlab"
 NUM_ENVS = 1024
@@ -30,7 +30,7 @@ FIRST = {
 
 
 def steps_of_both(repeats: int, seconds: float) -> dict[str, Any]:
-    """Environment steps in turn, and what both sides hold in memory then."""
+    """Measure environment steps in turn, and the memory of both sides afterwards."""
     ours = Side("mjlab-rlcli", [sys.executable, str(HERE / "side_rlcli.py")], environment=CHECKOUT)
     theirs = Side("mjlab-mjlab", [str(peers.python("mjlab")), str(HERE / "side_mjlab.py")], environment=quietly())
     with opened(ours, theirs):
@@ -38,7 +38,7 @@ def steps_of_both(repeats: int, seconds: float) -> dict[str, Any]:
         theirs("open_env", num_envs=NUM_ENVS, threads=cores())
         blocks = {"ours": lambda n: ours("step", steps=n), "theirs": lambda n: theirs("step", steps=n)}
         blocks["theirs"](50)
-        blocks["ours"](600)  # until episodes no longer end all at once
+        blocks["ours"](600)  # until episodes no longer end in the same step
         steps = {name: steps_for(block, seconds) for name, block in blocks.items()}
         found = alternate(blocks, steps, repeats)
         memory = {name: side("memory_mb")["most"] for name, side in (("ours", ours), ("theirs", theirs))}
@@ -48,12 +48,12 @@ def steps_of_both(repeats: int, seconds: float) -> dict[str, Any]:
 
 
 def quietly(**more: str) -> dict[str, str]:
-    """Variables for mjlab on a machine without a display or a GPU; kernels compiled once are kept."""
+    """Return variables for mjlab on a machine without a display or a GPU; compiled kernels are kept."""
     return {"MUJOCO_GL": "disabled", "CUDA_VISIBLE_DEVICES": "", "WARP_CACHE_PATH": str(CACHE / "warp"), **more}
 
 
 def waits(repeats: int, cold: bool) -> dict[str, Any]:
-    """Seconds from the start of a process to what the user waits for, in turn."""
+    """Measure the seconds from the start of a process to a result that the user waits for, in turn."""
     here, there, found = peers.python("rlcli"), peers.python("mjlab"), {}
     program = str(HERE / "first_call.py")
 
@@ -85,13 +85,13 @@ def waits(repeats: int, cold: bool) -> dict[str, Any]:
 
 
 def columns(rounds: list[tuple[float, float]]) -> dict[str, float]:
-    """Medians of both sides, and of how many times as long theirs takes."""
+    """Return the medians of both sides, and of the ratio of mjlab's time to ours."""
     ours, theirs = zip(*rounds, strict=True)
     return {"ours": statistics.median(ours), "theirs": statistics.median(theirs), **ratio(theirs, ours)}
 
 
 def measure(quick: bool) -> dict[str, Any]:
-    """Steps, waits, memory."""
+    """Measure steps, waiting times and memory."""
     try:
         return {**steps_of_both(2 if quick else 7, 0.2 if quick else 1.0), "waits": waits(1 if quick else 5, not quick)}
     except Failed as error:
@@ -99,9 +99,9 @@ def measure(quick: bool) -> dict[str, Any]:
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """The table."""
+    """Return the table in Markdown."""
     if "failed" in result:
-        return f"{stands(result)}\n\nmjlab: {result['failed']}"
+        return f"{measured_on(result)}\n\nmjlab: {result['failed']}"
     versions = result["versions"]
     peer = f"mjlab {versions['mjlab']} (mujoco-warp {versions['mujoco-warp']}, rsl_rl {versions['rsl-rl-lib']})"
     rates, memory = result["rates"], result["memory_mb"]
@@ -117,7 +117,7 @@ def markdown(result: dict[str, Any]) -> str:
     rows.append(
         ["memory at its most, stepping", f"{memory['ours']:.0f} MB", f"{memory['theirs']:.0f} MB", f"{share:.2f}"]
     )
-    return f"{stands(result, peer)}\n\n{table(['', 'rlcli', 'mjlab on the CPU', ''], rows)}"
+    return f"{measured_on(result, peer)}\n\n{table(['', 'rlcli', 'mjlab on the CPU', ''], rows)}"
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """Training against other libraries' PPO: `python benchmarks/against_trainers.py`.
 
-Stable-Baselines3 with the same cartpole written as a plain Gymnasium environment, in a `DummyVecEnv` and in a
-`SubprocVecEnv`, each with the number of environments that suits it best; RSL-RL and skrl on rlcli's own environment.
-The sizes are the same everywhere: 16 steps, 5 epochs, 4 minibatches, two networks of 32-32 ELU; an iteration has more
-samples where there are more environments, and steps a second are what is compared.
+Stable-Baselines3 runs the same cartpole, written as a plain Gymnasium environment, in a `DummyVecEnv` and in a
+`SubprocVecEnv`, each with its fastest number of environments. RSL-RL and skrl run rlcli's own environment. The sizes
+are the same everywhere: 16 steps, 5 epochs, 4 minibatches, two networks of 32-32 ELU. An iteration with more
+environments has more samples, so steps per second are compared.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 import peers
 from sides import CHECKOUT, HERE, Block, Failed, Side, alternate, opened, ratio, steps_for
-from tables import main, rate, spread, stands, table
+from tables import main, measured_on, rate, spread, table
 
 NAME = "trainers"
 NUM_ENVS = 4096
@@ -23,13 +23,13 @@ SIZES = (8, 16, 32, 64, 128, 256, 512)
 OURS = {"ppo": "rlcli, trainer `ppo`", "sb3-ppo": "rlcli, trainer `sb3`"}
 PEERS = {"dummy": "SB3, `DummyVecEnv`", "subproc": "SB3, `SubprocVecEnv`", "rsl_rl": "RSL-RL", "skrl": "skrl"}
 PLAIN = ("dummy", "subproc")
-"""Those that step plain Gymnasium environments; the others step rlcli's."""
+"""Sides that step plain Gymnasium environments; the others step rlcli's."""
 
 
 def best_size(peer: Side, kind: str, seconds: float) -> tuple[int, dict[str, float]]:
-    """The number of environments at which SB3 trains fastest, and what was tried.
+    """Return the number of environments at which SB3 trains fastest, and all measured numbers.
 
-    Larger ones are left out once two in a row are slower than the best by a fifth.
+    The search ends when two numbers in a row are slower than the best one by a fifth.
     """
     found: dict[int, float] = {}
     for num_envs in SIZES:
@@ -44,14 +44,14 @@ def best_size(peer: Side, kind: str, seconds: float) -> tuple[int, dict[str, flo
 
 
 def prepared(side: Side, open_it: Callable[[], Any], warm: int) -> Block:
-    """A side with its trainer made and a few iterations behind it."""
+    """Return a side whose trainer has made a few iterations."""
     open_it()
     side("train", steps=warm)
     return lambda n: side("train", steps=n)
 
 
 def measure(quick: bool) -> dict[str, Any]:
-    """Steps a second of each, and how many times as many ours are."""
+    """Measure the steps per second of each side, and the ratio of ours to theirs."""
     repeats, seconds, warm = (2, 0.05, 1) if quick else (7, 1.0, 3)
     sizes = {name: 64 if quick else NUM_ENVS for name in (*OURS, "rsl_rl", "skrl")}
     scans: dict[str, dict[str, float]] = {}
@@ -106,7 +106,7 @@ def measure(quick: bool) -> dict[str, Any]:
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """The table."""
+    """Return the table in Markdown."""
     names, versions = {**OURS, **PEERS}, result["versions"]
     rows = []
     for row in result["rows"]:
@@ -120,7 +120,7 @@ def markdown(result: dict[str, Any]) -> str:
     ]
     peer = ", ".join(f"{name} {versions[name]}" for name in ("rsl-rl-lib", "skrl", "gymnasium") if name in versions)
     tried = f"\n\nTraining steps/s by number of environments: {'; '.join(scans)}." if scans else ""
-    return f"{stands(result, *([peer] if peer else []))}\n\n{table(heads, rows)}{tried}"
+    return f"{measured_on(result, *([peer] if peer else []))}\n\n{table(heads, rows)}{tried}"
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""What keeping the ends of episodes costs a training: `python benchmarks/autopsy.py`.
+"""Cost of the failure recorder for a training: `python benchmarks/autopsy.py`.
 
-Two trainings of the same seed, one that keeps them and one that does not, take iterations in turn; the figure is the
-ratio of their environment steps a second, the median of blocks, by the clock and by the processor's time, which a busy
-machine disturbs less. Checkpoints, with what was kept, are written after every block, within the time that is measured.
+Two trainings with the same seed, with and without the recorder, run iterations in turn. The figure is the ratio of
+their environment steps per second, the median of blocks, by the clock and by processor time, which depends less on
+other processes. After every block both write a checkpoint with the recorded episodes; this is part of the measured
+time.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from rlcli.training.checkpoint_writer import CheckpointWriter, Keep
 
 
 class Training:
-    """A training that takes iterations when it is told."""
+    """Training that runs iterations on request."""
 
     def __init__(self, task: str, agent: str, num_envs: int, folder: Path, config: AutopsyConfig | None) -> None:
         resolved = resolve(find_task(task), agent=agent, flags={"scene.num_envs": num_envs, "agent.torch_threads": 1})
@@ -43,7 +44,7 @@ class Training:
         self.saver = CheckpointWriter(folder / "checkpoints", Keep(2), {}, cases=cases)
 
     def block(self, iterations: int) -> tuple[float, float]:
-        """Environment steps a second, and a second of the processor."""
+        """Return environment steps per second, by the clock and by processor time."""
         steps, begin, used = self.trainer.env_steps, time.perf_counter(), time.process_time()
         for _ in range(iterations):
             self.trainer.iterate()
@@ -56,7 +57,7 @@ class Training:
 
 
 def measure(task: str, agent: str, num_envs: int, blocks: int, iterations: int) -> dict[str, Any]:
-    """One row of the table."""
+    """Return one row of the table."""
     with tempfile.TemporaryDirectory() as place:
         on = Training(task, agent, num_envs, Path(place) / "on", AutopsyConfig())
         off = Training(task, agent, num_envs, Path(place) / "off", None)

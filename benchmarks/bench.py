@@ -1,8 +1,8 @@
-"""Every table of the CPU in `docs/explanation/benchmarks.md`: `make bench`, or `python benchmarks/bench.py [TABLE...]`.
+"""All CPU tables of `docs/explanation/benchmarks.md`: `make bench`, or `python benchmarks/bench.py [TABLE...]`.
 
-Each table runs in a process of its own, one after the other, and keeps its result in `results.json`; then the generated
-parts of the pages are written from that. `--pages` only writes the pages; `--quick` tries everything out and keeps
-nothing. Run it on a machine that does nothing else.
+Each table runs in a separate process, one after the other, and stores its result in `results.json`. Then the generated
+parts of the pages are written from these results. `--pages` only writes the pages; `--quick` is a short trial that
+stores nothing. Run it on an idle machine.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from collections.abc import Callable
 from typing import Any
 
 from sides import HERE, child_environment
-from tables import PAGES, filled, keep, results, stands, table
+from tables import PAGES, filled, keep, measured_on, results, table
 
 SCRIPTS = {
     "env_step": ["--repeats", "2", "--seconds", "0.05", "--num-envs", "64"],
     "train": ["--repeats", "2", "--num-envs", "64"],
 }
-"""Programs that print their result with `--json`; what a trial of them is given."""
+"""Programs that print their result with `--json`, and their arguments for a quick trial."""
 MODULES = {
     "mjlab": "against_mjlab",
     "envpool": "against_envpool",
@@ -31,7 +31,7 @@ MODULES = {
     "startup": "startup",
     "growth": "growth",
 }
-"""Tables that keep their own results (tables.py)."""
+"""Tables that store their own results (tables.py)."""
 TABLES = [*SCRIPTS, *MODULES]
 
 
@@ -46,11 +46,11 @@ HEADS = {
     "train_steps_per_s": "training steps/s",
     "ms": "ms an iteration",
 }
-"""Keys of the programs' rows that have a longer name in the page."""
+"""Keys of the programs' rows -> longer column titles in the page."""
 
 
 def shown(key: str, row: dict[str, Any]) -> str:
-    """A value of a row, as the page has it."""
+    """Return a value of a row as text for the page."""
     value = row.get(key)
     if value is None:
         return ""
@@ -66,10 +66,10 @@ def shown(key: str, row: dict[str, Any]) -> str:
 
 
 def printed(result: dict[str, Any]) -> str:
-    """The table of a program: a column a key."""
+    """Return the table of a program, with a column for each key."""
     keys = dict.fromkeys(key for row in result["rows"] for key in row if not key.endswith(("_min", "_max")))
     rows = [[shown(key, row) for key in keys] for row in result["rows"]]
-    return f"{stands(result)}\n\n{table([HEADS.get(key, key) for key in keys], rows)}"
+    return f"{measured_on(result)}\n\n{table([HEADS.get(key, key) for key in keys], rows)}"
 
 
 def readme(kept: dict[str, Any]) -> str:
@@ -83,7 +83,7 @@ def readme(kept: dict[str, Any]) -> str:
 
 
 def texts(kept: dict[str, Any]) -> dict[str, str]:
-    """Name of a part -> its text, of what has been measured."""
+    """Return name of a part -> its text, for all stored results."""
     makers: dict[str, Callable[[dict[str, Any]], str]] = dict.fromkeys(SCRIPTS, printed)
     makers |= {name: importlib.import_module(module).markdown for name, module in MODULES.items() if name in kept}
     found = {name: makers[name](kept[name]) for name in TABLES if name in kept}
@@ -91,14 +91,14 @@ def texts(kept: dict[str, Any]) -> dict[str, str]:
 
 
 def write_pages() -> None:
-    """Write the generated parts of the pages anew."""
+    """Write the generated parts of the pages."""
     parts = texts(results())
     for page in PAGES:
         page.write_text(filled(page.read_text(), parts))
 
 
 def run(name: str, quick: bool) -> bool:
-    """Measure a table; whether that went well."""
+    """Measure a table; return whether that succeeded."""
     begin = time.perf_counter()
     print(f"== {name}", flush=True)
     script = name if name in SCRIPTS else MODULES[name]

@@ -1,7 +1,7 @@
-"""What a checkpoint costs: `python benchmarks/checkpoint.py`.
+"""Cost of a checkpoint: `python benchmarks/checkpoint.py`.
 
-Training waits for the copy in memory; the files are written beside it. The task is the humanoid of `humanoid.py`,
-its agent PPO with networks of 512, 256 and 128.
+Training waits for the copy in memory; another thread writes the files. The task is the humanoid of `humanoid.py`, its
+agent is PPO with networks of 512, 256 and 128.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ agents:
 
 
 def make_trainer(folder: Path, num_envs: int) -> object:
-    """The trainer, after an iteration: its optimiser has moments."""
+    """Return the trainer after one iteration, so that its optimiser has moments."""
     (folder / "humanoid.xml").write_text(humanoid())
     (folder / "task.yaml").write_text(TASK.read_text() + AGENT)
     resolved = resolve(find_task(str(folder)), agent="ppo", overrides=[f"scene.num_envs={num_envs}"])
@@ -44,7 +44,7 @@ def make_trainer(folder: Path, num_envs: int) -> object:
 
 
 def measure(trainer: object, checkpoints: Path, repeats: int) -> dict[str, float]:
-    """Medians: the copy, what `save` waits for in all, writing, loading [ms]; and the size [MB]."""
+    """Return medians of the copy, the whole wait in `save`, writing, loading [ms], and the size [MB]."""
     rows = []
     saver = CheckpointWriter(checkpoints, Keep(2), {})
     for number in range(repeats):

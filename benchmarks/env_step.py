@@ -1,12 +1,12 @@
-"""The whole environment step against the bare physics of the same model: `python benchmarks/env_step.py`.
+"""Environment step compared with the bare physics of the same model: `python benchmarks/env_step.py`.
 
-Both are timed in turn in one process, block by block; the ratio of each pair of neighbouring blocks is taken, and the
-median of the ratios is the figure. It may be above 1.00: the engine leaves out what changes nothing
-(`rlcli/sim/skippable_work.py`), and `mujoco.batch.Batch`, as it comes, does not. `physics` is the share of a step that
-the engine's call takes; the rest are actions, observations, rewards, terminations, resets and episode sums.
+Both are timed in turn in one process, block by block. The figure is the median of the ratios of neighbouring blocks.
+It may be above 1.00: the engine skips work that has no effect (`rlcli/sim/skippable_work.py`), and an unmodified
+`mujoco.batch.Batch` does not. `physics` is the engine's share of a step; the rest is for actions, observations,
+rewards, terminations, resets and episode sums.
 
-The bare physics begins where the environments are and is given their controls; it is put back there before it leaves
-them far behind. `of bare Batch` computes the stage that the task's terms read, `of stage NONE` none.
+The bare physics starts from the environments' states with their controls, and is reset to them before the two differ
+much. `of bare Batch` computes the stage that the task's terms read, `of stage NONE` computes none.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
 def bare_block(
     batch: Batch, controls: Sequence[np.ndarray] | np.ndarray, substeps: int, steps: int, stage: int = NONE
 ) -> float:
-    """Seconds of `steps` bare steps: the controls are written, as the environment's are."""
+    """Return the seconds of `steps` bare steps; the controls are written as in the environment."""
     ctrl = batch.bind("ctrl")
     begin = time.perf_counter()
     for step in range(steps):
@@ -46,17 +46,17 @@ def bare_block(
 
 @dataclass(frozen=True, slots=True)
 class Bare:
-    """The physics alone, from where the environments were and with the controls that they gave then."""
+    """Physics alone, from the environments' states and with their controls."""
 
     batch: Batch
     start: np.ndarray
     """(num_envs, nstate)"""
     controls: list[np.ndarray]
-    """One a step. (num_envs, nu) each"""
+    """Controls of each step. (num_envs, nu) each"""
     substeps: int
 
     def block(self, steps: int, stage: int) -> float:
-        """Seconds of `steps` bare steps."""
+        """Return the seconds of `steps` bare steps."""
         seconds = 0.0
         for first in range(0, steps, len(self.controls)):
             self.batch.state[:] = self.start
@@ -66,7 +66,7 @@ class Bare:
 
 
 def bare_of(env: VecEnv, actions: torch.Tensor) -> Bare:
-    """The physics of an environment as it is, with the controls of its next steps."""
+    """Return the physics of an environment in its current state, with the controls of its next steps."""
     start = env.engine.state_rows(np.arange(env.num_envs))
     controls = []
     for action in actions:
@@ -77,7 +77,7 @@ def bare_of(env: VecEnv, actions: torch.Tensor) -> Bare:
 
 
 def env_block(env: VecEnv, actions: torch.Tensor, steps: int) -> float:
-    """Seconds of `steps` environment steps."""
+    """Return the seconds of `steps` environment steps."""
     begin = time.perf_counter()
     with torch.inference_mode():
         for step in range(steps):
@@ -86,13 +86,13 @@ def env_block(env: VecEnv, actions: torch.Tensor, steps: int) -> float:
 
 
 def measure(task: str, num_envs: int, repeats: int, seconds: float) -> dict[str, float | int | str]:
-    """One row of the table."""
+    """Return one row of the table."""
     env = make_env(resolve(find_task(task), flags={"scene.num_envs": num_envs}), seed=0)
     env.final_obs_of = "truncated"  # what a trainer asks for
     env.reset(seed=0)
     generator = torch.Generator().manual_seed(0)
     actions = torch.rand(16, num_envs, env.layout.action_size, generator=generator) * 2.0 - 1.0
-    # until episodes no longer end all at once
+    # until episodes no longer end in the same step
     env_block(env, actions, 2 * min(env.max_episode_length, 600))
     bare_physics, stage = bare_of(env, actions), env.engine.step_stage
     steps = max(16, int(seconds / (bare_physics.block(16, stage) / 16)))

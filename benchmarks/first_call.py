@@ -1,8 +1,9 @@
-"""Runs a command of a library until a method of it has returned for the first time, and ends there.
+"""Run a command of a library and end it after the first call of one of its methods.
 
     python benchmarks/first_call.py MODULE:CLASS.METHOD MODULE:FUNCTION ARGUMENT...
 
-So `time` of it is how long a user waits for that. Nothing is imported that the command does not import itself.
+The duration of this program is the time that a user waits for that call. It imports nothing that the command does not
+import.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any
 
 
 class Ender(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Lets a module load as it would, and then makes a method of it end the process."""
+    """Importer that loads a module as usual, and then makes one of its methods end the process."""
 
     def __init__(self, place: str) -> None:
         self.module, _, method = place.partition(":")

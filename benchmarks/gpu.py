@@ -30,7 +30,7 @@ DEVICE = "cuda"
 REPEATS = 7
 ENVS = (4096, 16384)
 STEPS = 32
-"""Environment steps in one captured graph."""
+"""Number of environment steps in one captured graph."""
 EQUAL = {
     "num_steps": 16, "num_epochs": 5, "num_minibatches": 4, "entropy_coef": 0.005, "max_iterations": 100000,
     "schedule": "adaptive", "desired_kl": 0.01, "actor.hidden": [32, 32], "critic.hidden": [32, 32],
@@ -45,7 +45,7 @@ def report(**row):
 
 
 def seconds(work, repeats=REPEATS, times=1):
-    """Seconds of one run of the work: median of several blocks, measured by events on the device."""
+    """Return the seconds of one run of `work`: median of several blocks, measured by device events."""
     found = []
     for _ in range(repeats):
         begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
@@ -59,7 +59,7 @@ def seconds(work, repeats=REPEATS, times=1):
 
 
 def recorded(work):
-    """The work as a CUDA graph of torch and Warp."""
+    """Return `work` as a CUDA graph of torch and Warp."""
     work()
     graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream()
     torch.cuda.synchronize()
@@ -79,10 +79,10 @@ def environment(task, num_envs, **flags):
 
 
 def bare(env, controls):
-    """MuJoCo Warp alone: the environment's own model and room, the controls it was given, no resets, no task.
+    """Return MuJoCo Warp alone with the environment's model, memory and controls, without resets and task.
 
     Returns:
-        The recorded work, and what puts it into the states that the environment is in now.
+        The recorded work, and a function that restores the current states of the environment.
     """
     engine = env.engine
     with wp.ScopedDevice(DEVICE):
@@ -112,7 +112,7 @@ def bare(env, controls):
 
 
 def measure_env(task, num_envs):
-    """Bare physics and whole steps from the same states under the same actions, in turn."""
+    """Measure bare physics and whole steps from the same states under the same actions, in turn."""
     env = environment(task, num_envs)
     env.reset()
 
@@ -170,7 +170,7 @@ def measure_train(
 
 
 def without(part):
-    """Switch off what the environment or the trainer does beside learning."""
+    """Switch off everything that the environment or the trainer does besides learning."""
 
     def change(trainer):
         if part == "statistics":
@@ -198,7 +198,7 @@ FEATURES = {
 
 
 def alone(what, *arguments):
-    """A measurement in a process of its own, so that none is left with another's memory."""
+    """Run a measurement in a separate process, so that it does not share GPU memory with another."""
     command = [sys.executable, str(HERE / "gpu.py"), "--one", json.dumps([what, *arguments])]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
@@ -225,7 +225,7 @@ def rlcli(*arguments):
 
 
 def measure_scaling(num_envs, most):
-    """Weak scaling: as many environments for each GPU, however many there are."""
+    """Measure weak scaling: the same number of environments for each GPU."""
     single = None
     for gpus in [n for n in (1, 2, 4, 8) if n <= most]:
         with tempfile.TemporaryDirectory() as runs:
@@ -241,7 +241,7 @@ def measure_scaling(num_envs, most):
 
 
 def measure_solve(seeds):
-    """Wall-clock of `rlcli train cartpole`, from the process's start to its end, and what the policy is worth."""
+    """Measure the wall-clock time of `rlcli train cartpole` from process start to end, and evaluate the policy."""
     for seed in seeds:
         with tempfile.TemporaryDirectory() as runs:
             begin = time.time()
@@ -251,11 +251,11 @@ def measure_solve(seeds):
                 report(what="solve failed", error=(trained.stderr + trained.stdout)[-1500:])
                 continue
             run = json.loads(trained.stdout)["run"]
-            judged = rlcli("eval", "--checkpoint", run, "--episodes", "1000", "--json")
+            evaluated = rlcli("eval", "--checkpoint", run, "--episodes", "1000", "--json")
             try:
-                success = json.loads(judged.stdout)["success"]["rate"]
+                success = json.loads(evaluated.stdout)["success"]["rate"]
             except (ValueError, KeyError):
-                success = (judged.stdout + judged.stderr)[-600:]
+                success = (evaluated.stdout + evaluated.stderr)[-600:]
             report(what="solve", seed=seed, seconds=wall, success=success)
 
 

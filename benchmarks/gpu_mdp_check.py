@@ -1,9 +1,10 @@
-"""Whether `gpu_mjlab.py` is the same task as ours: both step the same states under the same actions on a CPU.
+"""Check that `gpu_mjlab.py` is the same task as ours: both step the same states under the same actions on a CPU.
 
     python benchmarks/gpu_mdp_check.py --peer-path FOLDER[:FOLDER]
 
-The states reach beyond the cart's bounds, the actions beyond the actuator's limit, and the ages past the time-out.
-The physics differ in precision (float64 here, float32 there), and so do observations and rewards, by less than 1e-4.
+Some states are beyond the cart's bounds, some actions beyond the actuator's limit, and some ages beyond the time-out.
+The precision of the physics differs (float64 in rlcli, float32 in mjlab); observations and rewards differ by less than
+1e-4.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ START = np.array([1.0, 0.785398163, 0.5, 0.785398163])  # x, theta, x', theta': 
 
 
 def draw_states(batches: int, num_envs: int, steps: int) -> dict[str, np.ndarray]:
-    """Where each batch begins and what is done for `steps` steps from there."""
+    """Return the start states and actions of `steps` steps."""
     rng = np.random.default_rng(0)
     shape = (batches, num_envs)
     return {
@@ -40,7 +41,7 @@ def draw_states(batches: int, num_envs: int, steps: int) -> dict[str, np.ndarray
 
 
 def our_steps(states: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The steps on rlcli's CPU engine. (steps, num_envs, ...) each"""
+    """Return the steps on rlcli's CPU engine. (steps, num_envs, ...) each"""
     env = make_env(resolve(find_task("cartpole"), flags={"scene.num_envs": states["qpos"].shape[1]}), seed=0)
     rows: dict[str, list[torch.Tensor]] = {"obs": [], "reward": [], "terminated": [], "truncated": []}
     for batch, actions in enumerate(states["action"]):
@@ -56,7 +57,7 @@ def our_steps(states: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def peer_steps(states: dict[str, np.ndarray], path: str) -> dict[str, np.ndarray]:
-    """The same steps on mjlab, in a process with its packages; and the `start` of each of its episodes."""
+    """Return the same steps on mjlab, in a process with its packages, and the `start` of each of its episodes."""
     script = Path(__file__).with_name("gpu_mjlab.py")
     with tempfile.TemporaryDirectory() as folder:
         given, taken = Path(folder, "states.npz"), Path(folder, "steps.npz")

@@ -1,8 +1,8 @@
 """The cartpole of `tasks/rlcli_tasks/cartpole/task.yaml` on mjlab and rsl_rl: the peer in `benchmarks/gpu.py`'s table.
 
-Runs on mjlab's packages alone (mjlab, mujoco, mujoco_warp, warp-lang, rsl-rl-lib, torch) and imports nothing of rlcli,
-so that each side has the versions it asks for. Every measurement is one line of JSON on stdout; what mjlab, Warp and
-rsl_rl say goes to stderr.
+It needs only mjlab's packages (mjlab, mujoco, mujoco_warp, warp-lang, rsl-rl-lib, torch) and imports nothing of rlcli,
+so that each side has the versions that it requires. Every measurement is one line of JSON on stdout; messages of mjlab,
+Warp and rsl_rl go to stderr.
 
     python benchmarks/gpu_mjlab.py version
     python benchmarks/gpu_mjlab.py env   --num-envs 4096 16384 --steps 300 --device cuda:0
@@ -12,11 +12,11 @@ rsl_rl say goes to stderr.
 
 `env` and `train` take `--task velocity`: mjlab's own task of a Go1 (gpu_mjlab_velocity.py, gpu_velocity.py).
 
-mjlab is set up as its own cartpole is: its terms where it has them, CUDA graphs on, contacts off, no terrain, no
-sensors, its torch settings (TF32), episodes begun at random ages. Where there was a choice, it is the faster one: room
-for the model's one constraint, one observation group for actor and critic, and rsl_rl's log writer, episode sums and
-checkpoints off (`--logs` turns the first two on). rsl_rl's check for NaN is on, as it is by default.
-`gpu_mdp_check.py` shows that the task is ours.
+mjlab is configured like its own cartpole: its own terms where they exist, CUDA graphs on, contacts off, no terrain, no
+sensors, its torch settings (TF32), episodes that start at random ages. Other choices are the faster ones: memory for
+the model's single constraint, one observation group for actor and critic, and no log writer, episode sums and
+checkpoints of rsl_rl (`--logs` turns the first two on). rsl_rl's check for NaN is on, its default. `gpu_mdp_check.py`
+checks that the task equals ours.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ PACKAGES = ("mjlab", "mujoco", "mujoco-warp", "warp-lang", "rsl-rl-lib", "tensor
 
 
 def cartpole_cfg(num_envs: int, seed: int | None = None) -> Any:
-    """The task as mjlab's configuration."""
+    """Return the task as mjlab's configuration."""
     from mjlab.actuator import BuiltinMotorActuatorCfg
     from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
     from mjlab.envs import ManagerBasedRlEnvCfg, mdp
@@ -135,12 +135,12 @@ def joint_out_of_bounds(env, asset_cfg):
 
 
 def wrap_to_pi(angle):
-    """The same angle in [-pi, pi)."""
+    """Wrap an angle to [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def ppo_cfg(seed: int) -> Any:
-    """The agent as mjlab's configuration of rsl_rl."""
+    """Return the agent as mjlab's configuration of rsl_rl."""
     from mjlab.rl import RslRlModelCfg, RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
 
     gaussian = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "scalar"}
@@ -168,7 +168,7 @@ def ppo_cfg(seed: int) -> Any:
 
 
 def make_env(num_envs: int, device: str, seed: int | None = None, endless: bool = False, task: str = "cartpole") -> Any:
-    """The environment; `endless` ones neither end nor reset episodes, for whoever judges the states himself."""
+    """Return the environment; with `endless`, episodes neither end nor reset, for evaluations."""
     from mjlab.envs import ManagerBasedRlEnv
 
     cfg = velocity.env_cfg(num_envs, seed) if task == "velocity" else cartpole_cfg(num_envs, seed)
@@ -178,7 +178,7 @@ def make_env(num_envs: int, device: str, seed: int | None = None, endless: bool 
 
 
 def make_runner(env: Any, options: argparse.Namespace) -> Any:
-    """rsl_rl's runner as mjlab's `train` makes it, without a log folder unless it is asked for."""
+    """Return rsl_rl's runner as in mjlab's `train`, without a log folder unless one is given."""
     from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 
     agent = velocity.ppo_cfg(options.seed) if _task(options) == "velocity" else ppo_cfg(options.seed)
@@ -194,7 +194,7 @@ def make_runner(env: Any, options: argparse.Namespace) -> Any:
 
 
 def version(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
-    """Packages and device."""
+    """Print packages and device."""
     import torch
 
     row = {"python": platform.python_version(), **{name: metadata.version(name) for name in PACKAGES}}
@@ -204,7 +204,7 @@ def version(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
 
 
 def env(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
-    """Environment steps under random actions, with auto-reset."""
+    """Measure environment steps under random actions, with automatic resets."""
     import torch
 
     begin = time.perf_counter()
@@ -238,7 +238,7 @@ def env(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
 
 
 def train(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
-    """Training iterations, timed as rsl_rl times them itself."""
+    """Measure training iterations by rsl_rl's own times."""
     begin = time.perf_counter()
     environment = make_env(num_envs, options.device, options.seed, task=options.task)
     runner = make_runner(environment, options)
@@ -282,7 +282,7 @@ def train(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
 
 
 def solve(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
-    """Wall-clock from the creation of the process to the first evaluation that succeeds."""
+    """Measure the wall-clock time from process creation to the first successful evaluation."""
     started, source = process_start(options.started)
     environment = make_env(num_envs, options.device, options.seed)
     runner = make_runner(environment, options)
@@ -323,7 +323,7 @@ def solve(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
 
 
 def trace(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
-    """Observations, rewards and ends of steps from given states under given actions, for comparison."""
+    """Write observations, rewards and ends of steps from given states under given actions."""
     import numpy as np
     import torch
 
@@ -345,9 +345,9 @@ def trace(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
 
 
 def success_rate(environment: Any, runner: Any, device: str) -> float:
-    """Share of episodes, one an environment, that last their time and hold the pole up for the last second of it.
+    """Return the share of episodes (one per environment) that reach the time limit with the pole up in the last second.
 
-    The environment does not end episodes: what happens after a cart has left its bounds is not looked at.
+    The environment does not end episodes; states after a cart has left its bounds are ignored.
     """
     import torch
     from tensordict import TensorDict
@@ -371,7 +371,7 @@ def success_rate(environment: Any, runner: Any, device: str) -> float:
 
 
 def process_start(given: float | None) -> tuple[float, str]:
-    """Unix time at which this process was created, and how it is known."""
+    """Return the Unix time at which this process was created, and its source."""
     if given is not None:
         return given, "argument"
     with contextlib.suppress(OSError, ValueError, IndexError):
@@ -394,7 +394,7 @@ def _read_model() -> Any:
 
 
 def _timed(device: str, work: Callable[[], Any]) -> tuple[Any, float]:
-    """The result, and the seconds until the device has finished it."""
+    """Return the result, and the seconds until the device has finished it."""
     begin = time.perf_counter()
     result = work()
     _synchronize(device)
@@ -409,7 +409,7 @@ def _synchronize(device: str) -> None:
 
 
 def _prepare() -> None:
-    """What mjlab's own `train` sets, and stand-ins for its viewers where they are not installed."""
+    """Apply the settings of mjlab's own `train`, and replace its viewers if they are not installed."""
     os.environ.setdefault("MUJOCO_GL", "disabled")
     with contextlib.suppress(ImportError):
         importlib.import_module("stub_viewers")

@@ -1,7 +1,7 @@
 """mjlab's own velocity task of the Go1 on flat ground: configuration, robot and reward terms for `gpu_mjlab.py`.
 
-As mjlab has it, but for three things: no share of commands straight ahead and no wider commands later on (rlcli's task
-has neither), and weights for two terms that mjlab switches off, so that a dozen are computed.
+There are three changes to mjlab's task: no share of commands straight ahead, no command curriculum (rlcli's task has
+neither), and weights for two terms that mjlab disables, so that a dozen terms are computed.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ WEIGHTS = {"body_ang_vel": -0.05, "angular_momentum": -0.02}
 
 
 def env_cfg(num_envs: int, seed: int | None = None) -> Any:
-    """The task."""
+    """Return the task."""
     from mjlab.tasks.velocity.config.go1.env_cfgs import unitree_go1_flat_env_cfg
 
     cfg = unitree_go1_flat_env_cfg()
@@ -30,7 +30,7 @@ def env_cfg(num_envs: int, seed: int | None = None) -> Any:
 
 
 def ppo_cfg(seed: int) -> Any:
-    """The agent."""
+    """Return the agent."""
     from mjlab.tasks.velocity.config.go1.rl_cfg import unitree_go1_ppo_runner_cfg
 
     cfg = unitree_go1_ppo_runner_cfg()
@@ -40,7 +40,7 @@ def ppo_cfg(seed: int) -> Any:
 
 
 def export(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
-    """Write the robot as mjlab simulates it into an MJCF: its collisions, actuators and solver options."""
+    """Write mjlab's robot to an MJCF: its collisions, actuators and solver options."""
     import mujoco
     from mjlab.asset_zoo.robots.unitree_go1 import go1_constants
     from mjlab.entity import Entity
@@ -61,7 +61,7 @@ def export(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
 
 
 def terms(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
-    """Rewards and observations in given states, without noise, for comparison: each state stands still."""
+    """Write rewards and observations of given states, without noise, for comparison. The states are at rest."""
     import numpy as np
     import torch
     from mjlab.envs import ManagerBasedRlEnv
@@ -102,7 +102,7 @@ def terms(options: argparse.Namespace, num_envs: int) -> dict[str, Any]:
 
 
 def add_commands(command: Any) -> None:
-    """What `gpu_mjlab.py` offers beside its own measurements."""
+    """Add the commands of this task to those of `gpu_mjlab.py`."""
     writing = command(export)
     writing.add_argument("--output", type=Path, required=True)
     comparing = command(terms)

@@ -2,9 +2,9 @@
 
     python benchmarks/gpu_velocity.py --peer-path FOLDER:FOLDER [--only mdp,env,split,train] [--output FILE.json]
 
-mjlab's own robot, written out as mjlab simulates it, with the terms of mjlab's own task (velocity.yaml), in a folder
-that is made at run time. `mdp` compares rewards and observations of given states, on a CPU; it needs no GPU. `split`
-says where our step's time goes. Figures are medians; one JSON line a measurement.
+The task folder is made at run time from mjlab's own robot, exported from mjlab, and the terms of mjlab's own task
+(velocity.yaml). `mdp` compares rewards and observations of given states on a CPU and needs no GPU. `split` measures the
+parts of our step. Figures are medians, one JSON line for each measurement.
 """
 
 import argparse
@@ -29,18 +29,18 @@ from rlcli.registry import find_task
 
 HERE = Path(__file__).parent
 TOLERANCE = 2e-3
-"""Of the largest value: a different release of MuJoCo Warp computes the peer's contact forces."""
+"""Tolerance relative to the largest value: the peer's release of MuJoCo Warp computes contact forces differently."""
 OWN_WAY = {
     "body_ang_vel": "about the body's axes here, about the world's there",
     "foot_swing_height": "a swing's highest point may be that of touching down here, not there",
 }
-"""Rewards that mean something else."""
+"""Rewards with another definition on each side."""
 TERMS = ("lin", "ang", "gravity", "pos", "vel", "action", "command", "foot_height", "foot_air_time", "foot_contact",
          "foot_forces")  # fmt: skip
 
 
 def prepare(folder, path):
-    """The task as a folder."""
+    """Write the task folder."""
     shutil.copy(HERE / "velocity.yaml", folder / "task.yaml")
     before = len(gpu.rows)
     gpu.peer(path, "export", "--device", "cpu", "--output", folder / "go1.xml")
@@ -49,7 +49,7 @@ def prepare(folder, path):
 
 
 def draw_states(env, states):
-    """States in which the robot stands and tilts with some feet on the ground, and what is asked for in them."""
+    """Return standing and tilted states with some feet on the ground, and their commands."""
     rng, n, model = np.random.default_rng(0), env.num_envs, env.engine.model
     qpos = np.tile(model.qpos0, (states, n, 1))
     qpos[..., 3:7] = np.eye(4)[0] + rng.normal(0.0, 0.05, (states, n, 4))
@@ -68,7 +68,7 @@ def draw_states(env, states):
 
 
 def our_terms(env, states):
-    """Rewards and observations of each state, as `gpu_mjlab_velocity.terms` gives them."""
+    """Return rewards and observations of each state in the format of `gpu_mjlab_velocity.terms`."""
     rows = []
     command = env.command_manager.get_command("twist")
     for number in range(len(states["qpos"])):
@@ -82,7 +82,7 @@ def our_terms(env, states):
         env.sim.on_moved(env._select_all())
         env.sim.forward_moved()
         for sensor in env.sensors.values():
-            sensor.air_time.fill_(1e-9)  # contact that there is has just begun
+            sensor.air_time.fill_(1e-9)  # existing contacts have just started
             sensor.update(env.step_dt)
         row = {f"reward.{term.name}": term.call().float().clone() for term in env.reward_manager.terms}
         groups = {"policy": "actor", "critic": "critic"}
@@ -92,7 +92,7 @@ def our_terms(env, states):
 
 
 def compare(folder, path, num_envs=16, states=8):
-    """Whether terms of the same name give the same in the same state."""
+    """Check that terms of the same name have the same values in the same states."""
     off = {"observations.policy.enable_corruption": False, "sim.engine": "warp", "sim.forces_after_reset": True,
            **{f"events.{name}": None for name in ("slide", "spin", "roll", "com")}}  # fmt: skip
     resolved = resolve(find_task(str(folder)), device="cpu", flags={"scene.num_envs": num_envs, **off})
@@ -123,12 +123,12 @@ def compare(folder, path, num_envs=16, states=8):
 
 
 def apart(ours, theirs):
-    """Largest difference as a share of the largest value."""
+    """Return the largest difference relative to the largest value."""
     return float(np.abs(ours - theirs).max() / max(1e-3, np.abs(theirs).max()))
 
 
 def measure_split(task, num_envs):
-    """Where the step's time goes: each part of it recorded on its own. [us]"""
+    """Measure the parts of a step; each is recorded separately. [us]"""
     env = gpu.environment(task, num_envs)
     env.reset()
     for _ in range(100):
@@ -170,7 +170,7 @@ def measure_split(task, num_envs):
 
 
 def alone(folder, args, *arguments):
-    """A measurement in a process of its own."""
+    """Run a measurement in a separate process."""
     same = ["--peer-path", args.peer_path, "--num-envs", str(args.num_envs), "--iterations", str(args.iterations)]
     command = [sys.executable, __file__, *same, "--one", str(folder), *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -1,9 +1,9 @@
-"""How the cost of a step grows with environments, threads and models, and what training holds in memory.
+"""Cost of a step for different numbers of environments, threads and models, and memory of a training.
 
     python benchmarks/growth.py
 
-Every setting is a process of its own, and they take blocks in turn. Cost is per environment step; the bare physics of
-the same model and number of environments stands beside it.
+Every setting runs in a separate process, and they run blocks in turn. The cost is that of one environment step, beside
+the bare physics of the same model and number of environments.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from typing import Any
 
 from machine import cores
 from sides import CHECKOUT, HERE, Side, alternate, opened, steps_for
-from tables import main, stands, table
+from tables import main, measured_on, table
 
 NAME = "growth"
 SIZES = (16, 64, 256, 1024, 4096, 16384)
 MODELS = ("cartpole", "ant-direct", "humanoid", "quadruped-flat")
 ENVIRONMENT_STEPS = 10_000_000
-"""Of the long training."""
+"""Number of environments of the long training."""
 
 
 def side(name: str) -> Side:
-    """A process of rlcli's."""
+    """Return a process of rlcli."""
     return Side(f"{NAME}-{name}", [sys.executable, str(HERE / "side_rlcli.py")], environment=CHECKOUT)
 
 
 def costs(settings: Mapping[str, Mapping[str, Any]], repeats: int, seconds: float) -> list[dict[str, Any]]:
-    """Microseconds of an environment step in each setting of `open_env`, bare physics beside it, and memory."""
+    """Measure the microseconds of an environment step and of bare physics in each setting of `open_env`, and memory."""
     sides = {name: side(name) for name in settings}
     with opened(*sides.values()):
         blocks, steps = {}, {}
@@ -39,7 +39,7 @@ def costs(settings: Mapping[str, Mapping[str, Any]], repeats: int, seconds: floa
             each("open_bare")
             blocks[name] = lambda n, each=each: each("step", steps=n)
             blocks[f"{name}/bare"] = lambda n, each=each: each("step_bare", steps=n)
-            # until episodes no longer end all at once, as far as that takes no more than some seconds
+            # until episodes no longer end in the same step, as far as that takes no more than some seconds
             a_step = blocks[name](4) / 4
             blocks[name](max(1, min(2 * opening["max_episode_length"], round(5 * seconds / a_step))))
             steps[name] = steps[f"{name}/bare"] = steps_for(blocks[name], seconds)
@@ -62,12 +62,12 @@ def costs(settings: Mapping[str, Mapping[str, Any]], repeats: int, seconds: floa
 
 
 def powers(most: int) -> Sequence[int]:
-    """1, 2, 4, ... and the largest."""
+    """Return 1, 2, 4, ... and the largest number."""
     return sorted({*(2**k for k in range(most.bit_length()) if 2**k <= most), most})
 
 
 def training_memory(agent: str, num_envs: int, environment_steps: int) -> dict[str, Any]:
-    """What a training holds in memory after a tenth of its steps and after all, and at its most."""
+    """Measure the memory of a training after a tenth of its steps and at its end, and the peak."""
     with opened(side(f"train-{agent}")) as (each,):
         samples = each("open_trainer", agent=agent, num_envs=num_envs)["samples"]
         iterations = max(2, environment_steps // samples)
@@ -81,7 +81,7 @@ def training_memory(agent: str, num_envs: int, environment_steps: int) -> dict[s
 
 
 def measure(quick: bool) -> dict[str, Any]:
-    """All of it."""
+    """Measure everything."""
     repeats, seconds = (1, 0.02) if quick else (7, 0.4)
     sizes, models = ((16, 64), MODELS[:2]) if quick else (SIZES, MODELS)
     of_sizes = {str(n): {"task": "cartpole", "num_envs": n} for n in sizes}
@@ -98,7 +98,7 @@ def measure(quick: bool) -> dict[str, Any]:
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """The tables."""
+    """Return the tables in Markdown."""
 
     def cells(row: dict[str, Any]) -> list[str]:
         costs = [f"{row[key]:.3g}" for key in ("us", "bare_us")]
@@ -107,7 +107,7 @@ def markdown(result: dict[str, Any]) -> str:
     heads = ["us an environment step", "of it bare `Batch`", "ratio", "memory"]
     large = [row["us"] for row in result["num_envs"] if row["num_envs"] >= 1024]
     parts = [
-        stands(result),
+        measured_on(result),
         table(["cartpoles", *heads], [[f"{row['num_envs']:,}", *cells(row)] for row in result["num_envs"]]),
         f"From 1,024 environments on: within **{max(large) / min(large) - 1:.0%}**." if large else "",
         table(["threads", *heads], [[str(row["threads"]), *cells(row)] for row in result["threads"]]),

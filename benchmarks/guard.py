@@ -1,6 +1,6 @@
-"""What the divergence guard costs in an environment step, history included: `python benchmarks/guard.py`.
+"""Cost of the divergence guard in an environment step, including its history: `python benchmarks/guard.py`.
 
-Each part of the guard is timed where it runs, inside the step, as trainers run it. The share is the median of blocks.
+Each part of the guard is timed inside the step, with the settings of trainers. The share is the median of blocks.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from rlcli.replay.crash_dump import CrashDumper
 
 
 class Stopwatch:
-    """Adds up the seconds that methods take."""
+    """Timer that sums the seconds of methods."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
     def time(self, owner: Any, method: str, name: str) -> None:
-        """Time a method of an object from now on."""
+        """Start to time a method of an object."""
         call: Callable = getattr(owner, method)
         self.seconds[name] = 0.0
 
@@ -44,7 +44,7 @@ class Stopwatch:
 
 
 def measure(task: str, num_envs: int, blocks: int, steps: int) -> dict[str, Any]:
-    """One row of the table."""
+    """Return one row of the table."""
     env = make_env(resolve(find_task(task), flags={"scene.num_envs": num_envs}), seed=0)
     env.final_obs_of = "truncated"
     CrashDumper(env, Path(tempfile.gettempdir()))

@@ -1,12 +1,12 @@
 """Scores of PPO after a million steps of Gymnasium's tasks, beside rl-zoo3's: `python benchmarks/gym_scores.py -j 4`.
 
-Trains the agent `ppo-1m` of each task with each seed, `-j` at a time, evaluates 100 episodes of each final policy
-without exploration noise, and prints a table of ours and theirs; `--output FILE` has it as JSON, `--page FILE` puts it
-into a page. It needs the plugin `plugins/rlcli-gymnasium`. What is finished in `--runs-dir` is not trained again.
+It trains the agent `ppo-1m` of each task with each seed, `-j` at a time, evaluates 100 episodes of each final policy
+without exploration noise, and prints a table of both scores. `--output FILE` writes it as JSON, `--page FILE` into a
+page. It needs the plugin `plugins/rlcli-gymnasium`. Finished runs in `--runs-dir` are not trained again.
 
-rl-zoo3 publishes v3 tasks. What they count differently from v5 is computed by a second evaluation, of the same policy:
-v3 pays `healthy_reward` in the step that fails too, so an episode that fails is worth so much more; mujoco-py, which
-simulated v3, leaves the ant's contact forces at 0, so they cost nothing; v3's walker has one foot of friction 0.9, and
+rl-zoo3 publishes scores of v3 tasks. A second evaluation of the same policy applies the rules of v3 that differ from
+v5: v3 gives `healthy_reward` also in the step that fails, so a failing episode has a higher return; mujoco-py, which
+simulated v3, leaves the ant's contact forces at 0, so their cost is 0; v3's walker has one foot with friction 0.9, and
 is trained with it.
 """
 
@@ -29,7 +29,7 @@ AGENT, STEPS = "ppo-1m", 1_000_000
 
 
 class Score(NamedTuple):
-    """What rl-zoo3's benchmark.md says of PPO: one run of 1 M steps, v3."""
+    """Scores of PPO in rl-zoo3's benchmark.md: one run of 1 M steps, v3."""
 
     mean: float
     std: float
@@ -50,13 +50,13 @@ V3_OVERRIDES = {
 }
 V5_OVERRIDES = {"gym-walker2d": [f"scene.entities.robot.model={ASSETS}/walker2d_v5.xml"]}
 TRAINED_AS_V3 = ("gym-walker2d",)
-"""Tasks whose v3 is another one to learn; the others learn v5."""
+"""Tasks whose v3 must be trained separately; the others are trained as v5."""
 V3_FAILURE_PAYS = {"gym-walker2d": 1.0, "gym-hopper": 1.0, "gym-ant": 1.0}
 """`healthy_reward` of the tasks that can fail."""
 
 
 def rlcli(*arguments: str, threads: int) -> str:
-    """What a command prints on stdout."""
+    """Return the output of a command on stdout."""
     command = [sys.executable, "-m", "rlcli", *arguments]
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
@@ -66,7 +66,7 @@ def rlcli(*arguments: str, threads: int) -> str:
 
 
 def finished(folder: Path, task: str, name: str) -> Path | None:
-    """A run of that name that went to its end."""
+    """Return the finished run of that name."""
     for run in sorted(folder.glob(f"{task}/*-{name}"), reverse=True):
         if json.loads((run / "run.json").read_text()).get("state") == "finished":
             return run
@@ -74,7 +74,7 @@ def finished(folder: Path, task: str, name: str) -> Path | None:
 
 
 def train(task: str, seed: int, options: argparse.Namespace) -> Path:
-    """The run of a seed, trained if it is not there."""
+    """Return the run of a seed; train it if it does not exist."""
     name = f"seed{seed}{options.label}"
     run = finished(options.runs_dir, task, name)
     if run is None:
@@ -93,7 +93,7 @@ def train(task: str, seed: int, options: argparse.Namespace) -> Path:
 
 
 def evaluate(task: str, run: Path, options: argparse.Namespace) -> dict[str, Any]:
-    """Returns of the final policy, as v5 counts and as v3 does."""
+    """Return the returns of the final policy, by the rules of v5 and of v3."""
     common = ["--checkpoint", str(run), "--episodes", str(options.episodes), "--num-envs", str(options.episodes)]
     common += ["--json", "--quiet", f"sim.engine_threads={options.threads}"]
     v5 = json.loads(rlcli("eval", *common, *V5_OVERRIDES.get(task, []), threads=options.threads))
@@ -110,13 +110,13 @@ def evaluate(task: str, run: Path, options: argparse.Namespace) -> dict[str, Any
 
 
 def one(task: str, seed: int, options: argparse.Namespace) -> dict[str, Any]:
-    """A row: train and evaluate."""
+    """Train and evaluate a task; return its row."""
     run = train(task, seed, options)
     return {"task": task, "seed": seed, **evaluate(task, run, options)}
 
 
 def tabulate(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row a task: the median of the seeds, lowest and highest, theirs."""
+    """Return a row for each task: median, lowest and highest of the seeds, and rl-zoo3's score."""
     table = []
     for task, theirs in THEIRS.items():
         seeds = [row for row in rows if row["task"] == task]
@@ -131,7 +131,7 @@ def tabulate(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def markdown(table: list[dict[str, Any]], rows: list[dict[str, Any]]) -> str:
-    """Both as tables."""
+    """Return both tables in Markdown."""
     lines = [
         "| task | ours, as v3: median (lowest .. highest seed) | rl-zoo3 | ours, as v5 |",
         "| --- | ---: | ---: | ---: |",
@@ -150,7 +150,7 @@ def markdown(table: list[dict[str, Any]], rows: list[dict[str, Any]]) -> str:
 
 
 def put(page: Path, text: str) -> None:
-    """Write between the marks of a page."""
+    """Replace the text between the marks of a page."""
     before, begin, rest = page.read_text().partition("<!-- scores -->\n")
     _, end, after = rest.partition("<!-- end scores -->")
     if not (begin and end):
@@ -159,7 +159,7 @@ def put(page: Path, text: str) -> None:
 
 
 def main() -> None:
-    """Train, evaluate, print, write."""
+    """Train, evaluate, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", choices=list(THEIRS), default=list(THEIRS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])

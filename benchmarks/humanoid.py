@@ -1,4 +1,4 @@
-"""How much of a step a manager-based task spends outside physics: `python benchmarks/humanoid.py`.
+"""Share of a manager-based task's step outside physics: `python benchmarks/humanoid.py`.
 
 A humanoid of 29 hinges that follows a velocity: 12 rewards, 3 observation groups with noise and history, 5 events.
 """
@@ -22,7 +22,7 @@ from rlcli.registry import find_task
 
 
 def limb(name: str, at: str, joints: list[tuple[str, str, str]], length: float, mass: float, end: str = "") -> str:
-    """A chain of a link a joint (name, axis, range in degrees), the last one of them long."""
+    """Chains with one link for each joint (name, axis, range in degrees); the last link is long."""
     text, closing = "", ""
     for number, (joint, axis, limits) in enumerate(joints):
         last = number == len(joints) - 1
@@ -59,7 +59,7 @@ FOOT = '<geom name="{0}_foot" type="box" size="0.09 0.04 0.015" pos="0.03 0 -0.0
 
 
 def humanoid() -> str:
-    """MJCF of the robot."""
+    """Return the MJCF of the robot."""
     legs = "".join(
         limb(side, f"0 {y} -0.08", LEG, 0.33, 6.0, FOOT.format(side)) for side, y in (("left", 0.1), ("right", -0.1))
     )
@@ -83,18 +83,18 @@ TASK = Path(__file__).with_name("humanoid.yaml")
 
 
 def environment(folder: Path, num_envs: int) -> VecEnv:
-    """The task, built."""
+    """Return the environment."""
     (folder / "humanoid.xml").write_text(humanoid())
     (folder / "task.yaml").write_text(TASK.read_text())
     return make_env(resolve(find_task(str(folder)), overrides=[f"scene.num_envs={num_envs}"]))
 
 
 def share_outside(env: VecEnv, steps: int, repeats: int) -> list[tuple[float, float, float]]:
-    """(share of a step outside physics, physics ms, step ms), a row a repeat."""
+    """Return (share of a step outside physics, physics ms, step ms) for each repeat."""
     generator = torch.Generator().manual_seed(0)
     actions = [0.5 * torch.randn(env.num_envs, env.layout.action_size, generator=generator) for _ in range(8)]
     env.reset()
-    for _ in range(50):  # until they fall and begin anew, a few at a time
+    for _ in range(50):  # until a few of them fall and are reset in each step
         env.step(actions[0])
     rows = []
     for _ in range(repeats):

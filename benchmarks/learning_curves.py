@@ -1,7 +1,7 @@
 """Learning curves of runs as one small CSV and one SVG: `python benchmarks/learning_curves.py NAME RUN ...`.
 
-Writes docs/reference/curves/NAME.csv and docs/reference/curves/NAME.svg: the success rate of each run over its environment steps, in
-training, exploration included. A run is called by the seed that it was trained with.
+It writes docs/reference/curves/NAME.csv and docs/reference/curves/NAME.svg: the success rate of each run over its environment steps, during
+training, with exploration. The label of a run is its seed.
 """
 
 import csv

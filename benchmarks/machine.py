@@ -1,4 +1,4 @@
-"""What a figure was measured on."""
+"""Description of the machine of a measurement."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def describe() -> str:
-    """Processor, cores and versions, one line."""
+    """Return processor, cores and versions as one line."""
     versions = ", ".join(
         f"{name} {metadata.version(name)}" for name in ("mujoco", "torch", "stable-baselines3", "numpy")
     )
@@ -17,7 +17,7 @@ def describe() -> str:
 
 
 def cores() -> int:
-    """Cores that this process may run on."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -30,6 +30,6 @@ def _processor() -> str:
 
 
 def memory_mb() -> dict[str, float]:
-    """What this process holds in memory now, and the most it has held."""
+    """Return the current and the peak memory of this process."""
     fields = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     return {"now": int(fields["VmRSS"].split()[0]) / 1024, "most": int(fields["VmHWM"].split()[0]) / 1024}

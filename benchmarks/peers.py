@@ -1,4 +1,4 @@
-"""Other libraries, each in an environment of its own under `.bench`: `python benchmarks/peers.py` installs them."""
+"""Other libraries, each in a virtual environment under `.bench`: `python benchmarks/peers.py` installs them."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ PEERS = {
     "rl-zoo3": ["rl_zoo3==2.9.2"],
     "rlcli": ["-e", str(ROOT), "-e", str(ROOT / "plugins" / "rlcli-gymnasium"), "rsl-rl-lib", "skrl==2.1.1"],
 }
-"""Environment -> what pip is asked for. `rlcli` holds this checkout, with all of its pins, and the trainers that run on
-its environments; peers have pins of their own, which contradict those, but this release's torch."""
+"""Virtual environment -> requirements for pip. `rlcli` has this checkout with all its pins, and the trainers that run
+on its environments; the peers have pins that contradict those, except for this release's torch."""
 
 
 def python(name: str) -> Path:
-    """The Python of a peer's environment, which is made if it is not there.
+    """Return the Python of a peer's virtual environment, and create it if it does not exist.
 
     Raises:
         Failed: if pip cannot install it.
@@ -50,10 +50,10 @@ def python(name: str) -> Path:
 
 
 def add(name: str, *requirements: str) -> None:
-    """Install something more into a peer's environment, unless it is there.
+    """Install a further package into a peer's virtual environment, unless it is installed.
 
     Raises:
-        Failed: if pip cannot.
+        Failed: if pip cannot install it.
     """
     _run([str(python(name)), "-m", "pip", "--disable-pip-version-check", "-q", "install", *requirements])
 

@@ -1,4 +1,4 @@
-"""The cartpole of `tasks/rlcli_tasks/cartpole/task.yaml` as one writes it for Gymnasium: `mj_step` in Python."""
+"""The cartpole of `tasks/rlcli_tasks/cartpole/task.yaml` as a typical Gymnasium environment: `mj_step` in Python."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ QUARTER_PI = 0.785398163
 
 
 class PlainCartpole(gymnasium.Env):
-    """One cartpole: the same model, observations, rewards, ends and start states as the task's."""
+    """Cartpole with the model, observations, rewards, ends and start states of the task."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -31,7 +31,7 @@ class PlainCartpole(gymnasium.Env):
         self.steps = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        """Begin an episode."""
+        """Start an episode."""
         super().reset(seed=seed)
         mujoco.mj_resetData(self.model, self.data)
         draw = self.np_random.uniform(-1.0, 1.0, 4)
@@ -41,7 +41,7 @@ class PlainCartpole(gymnasium.Env):
         return self.observe(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Two physics steps."""
+        """Make two physics steps."""
         self.data.ctrl[0] = 100.0 * action[0]
         mujoco.mj_step(self.model, self.data, DECIMATION)
         self.steps += 1
@@ -52,7 +52,7 @@ class PlainCartpole(gymnasium.Env):
         return self.observe(), reward * DT * DECIMATION, terminated, self.steps >= STEPS, {}
 
     def observe(self) -> np.ndarray:
-        """Positions and velocities."""
+        """Return positions and velocities."""
         return np.concatenate([self.data.qpos, self.data.qvel]).astype(np.float32)
 
 

@@ -12,12 +12,12 @@ theirs: dict[str, Any] = {}
 
 
 def version() -> dict[str, str]:
-    """Of EnvPool."""
+    """Return the version of EnvPool."""
     return {"envpool": metadata.version("envpool")}
 
 
 def open_env(task: str, num_envs: int, threads: int) -> dict[str, Any]:
-    """Make a pool and uniform random actions within its limits; the model's file, for comparison."""
+    """Make a pool and uniform random actions within its limits; return the path of the model for comparison."""
     import envpool
     import numpy as np
 
@@ -37,10 +37,10 @@ def open_env(task: str, num_envs: int, threads: int) -> dict[str, Any]:
 
 
 def step(steps: int) -> float:
-    """Seconds of so many environment steps, with its own auto-reset.
+    """Return the seconds of `steps` environment steps, with EnvPool's automatic resets.
 
-    After an episode's end EnvPool resets an environment in the place of a step, and simulates nothing. Such calls are
-    no steps: the time is that of as many as were asked for.
+    At the end of an episode EnvPool resets an environment instead of a step, and simulates nothing. Such calls are not
+    counted as steps: the time is scaled to the requested number of steps.
     """
     pool, actions = theirs["pool"], theirs["actions"]
     begin = clock()

@@ -12,14 +12,14 @@ theirs: dict[str, Any] = {}
 
 
 def version() -> dict[str, Any]:
-    """Of mjlab and what it stands on."""
+    """Return the versions of mjlab and its dependencies."""
     import argparse
 
     return gpu_mjlab.version(argparse.Namespace(device="cpu"), 0)
 
 
 def open_env(num_envs: int, threads: int) -> None:
-    """Make the environment, with episodes begun at random ages, and random actions."""
+    """Make the environment, with episodes that start at random ages, and random actions."""
     import torch
 
     gpu_mjlab._prepare()
@@ -32,7 +32,7 @@ def open_env(num_envs: int, threads: int) -> None:
 
 
 def step(steps: int) -> float:
-    """Seconds of so many environment steps."""
+    """Return the seconds of `steps` environment steps."""
     import torch
 
     environment, actions = theirs["env"], theirs["actions"]

@@ -1,4 +1,4 @@
-"""A bare loop of `mj_step` on one thread (see sides.py): what a version of MuJoCo itself does to a model."""
+"""Bare loop of `mj_step` on one thread (see sides.py), to compare versions of MuJoCo."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ world: dict[str, Any] = {}
 
 
 def version() -> dict[str, str]:
-    """Of MuJoCo."""
+    """Return the version of MuJoCo."""
     return {"mujoco": mujoco.__version__}
 
 
 def open_model(path: str, physics_steps: int) -> None:
-    """A model at its start, and so many physics steps a step."""
+    """Load a model in its default state, with a number of physics steps for each step."""
     model = mujoco.MjModel.from_xml_path(path)
     low, high = model.actuator_ctrlrange.T
     controls = np.random.default_rng(0).uniform(low, high, (256, model.nu))
@@ -25,7 +25,7 @@ def open_model(path: str, physics_steps: int) -> None:
 
 
 def step(steps: int) -> float:
-    """Seconds of so many steps of the task, begun anew every 100 of them."""
+    """Return the seconds of `steps` steps of the task; the state is reset every 100 steps."""
     model, data, controls, nstep = (world[key] for key in ("model", "data", "controls", "physics_steps"))
     begin = clock()
     for index in range(steps):

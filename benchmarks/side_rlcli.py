@@ -13,12 +13,12 @@ SEED_SIZES = {
     "ppo": ["agent.num_steps=16", "agent.num_epochs=5", "agent.num_minibatches=4"],
     "sb3-ppo": ["agent.n_steps=16", "agent.n_epochs=5", "agent.num_minibatches=4"],
 }
-"""4,096 x 16 samples, 5 epochs, 4 minibatches; the networks of cartpole's agents have 32-32 ELU already."""
+"""4,096 x 16 samples, 5 epochs, 4 minibatches; the networks of cartpole's agents are 32-32 ELU already."""
 ours: dict[str, Any] = {}
 
 
 def machine() -> str:
-    """Processor and versions."""
+    """Return processor and versions."""
     return describe()
 
 
@@ -49,7 +49,7 @@ def open_env(task: str, num_envs: int, threads: int = 0, overrides: list[str] | 
 
 
 def step(steps: int) -> float:
-    """Seconds of so many environment steps."""
+    """Return the seconds of `steps` environment steps."""
     import torch
 
     env, actions = ours["env"], ours["actions"]
@@ -61,12 +61,12 @@ def step(steps: int) -> float:
 
 
 def physics() -> float:
-    """The engine's share of the time of the environment's steps so far."""
+    """Return the engine's share of the time of the environment's steps so far."""
     return ours["env"].seconds["physics"] / ours["env"].seconds["step"]
 
 
 def differs(path: str) -> list[str]:
-    """Fields that physics reads in which a model file, once compiled, is not the environment's model."""
+    """Return the physics fields in which a compiled model file differs from the environment's model."""
     import mujoco
     import numpy as np
 
@@ -86,7 +86,7 @@ def differs(path: str) -> list[str]:
 
 
 def open_bare() -> None:
-    """The physics of the environment alone, on as many threads."""
+    """Open only the physics of the environment, with the same number of threads."""
     from mujoco.batch import Batch
 
     env = ours["env"]
@@ -98,7 +98,7 @@ def open_bare() -> None:
 
 
 def step_bare(steps: int) -> float:
-    """Seconds of so many steps of bare physics, from the default state on."""
+    """Return the seconds of `steps` steps of bare physics, from the default state on."""
     batch, controls = ours["batch"], ours["controls"]
     substeps, ctrl = ours["env"].config.decimation, batch.bind("ctrl")
     batch.reset()
@@ -110,7 +110,7 @@ def step_bare(steps: int) -> float:
 
 
 def open_trainer(agent: str, num_envs: int) -> dict[str, Any]:
-    """Make a trainer of the cartpole with the sizes of the field's."""
+    """Make a trainer of the cartpole with the common sizes."""
     from rlcli.config.load import resolve
     from rlcli.envs.make import make_env
     from rlcli.machine import available_cores
@@ -132,7 +132,7 @@ def open_trainer(agent: str, num_envs: int) -> dict[str, Any]:
 
 
 def train(steps: int) -> float:
-    """Seconds of so many iterations."""
+    """Return the seconds of `iterations` iterations."""
     begin = clock()
     for _ in range(steps):
         ours["trainer"].iterate()
@@ -140,7 +140,7 @@ def train(steps: int) -> float:
 
 
 def close() -> None:
-    """Let go of what was opened."""
+    """Close everything that was opened."""
     if "env" in ours:
         ours["env"].close()
     ours.clear()

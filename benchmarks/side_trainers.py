@@ -18,12 +18,12 @@ opened: dict[str, Any] = {}
 
 
 def version() -> dict[str, str]:
-    """Of the libraries."""
+    """Return the versions of the libraries."""
     return {name: metadata.version(name) for name in ("stable-baselines3", "rsl-rl-lib", "skrl", "gymnasium")}
 
 
 def open_sb3(kind: str, num_envs: int) -> None:
-    """SB3's PPO with a `DummyVecEnv` or a `SubprocVecEnv` of plain cartpoles."""
+    """Make SB3's PPO with a `DummyVecEnv` or a `SubprocVecEnv` of plain cartpoles."""
     from plain_cartpole import PlainCartpole
     from stable_baselines3 import PPO
     from stable_baselines3.common.logger import Logger
@@ -57,7 +57,7 @@ def open_sb3(kind: str, num_envs: int) -> None:
 
 
 def open_rsl_rl(num_envs: int) -> None:
-    """RSL-RL's own runner on rlcli's environment."""
+    """Make RSL-RL's own runner on rlcli's environment."""
     from rsl_rl.runners import OnPolicyRunner
 
     from rlcli.adapters.rsl_rl import RslRlVecEnv
@@ -94,7 +94,7 @@ def open_rsl_rl(num_envs: int) -> None:
 
 
 def open_skrl(num_envs: int) -> None:
-    """skrl's PPO on rlcli's environment, through a wrapper of its own kind."""
+    """Make skrl's PPO on rlcli's environment, through a wrapper."""
     from skrl_cartpole import trainer
 
     close()
@@ -104,7 +104,7 @@ def open_skrl(num_envs: int) -> None:
 
 
 def train(steps: int) -> float:
-    """Seconds of so many iterations."""
+    """Return the seconds of `iterations` iterations."""
     iterate: Callable[[], None] = opened["iterate"]
     begin = clock()
     for _ in range(steps):
@@ -113,14 +113,14 @@ def train(steps: int) -> float:
 
 
 def close() -> None:
-    """Let go of what was opened."""
+    """Close everything that was opened."""
     if "close" in opened:
         opened["close"]()
     opened.clear()
 
 
 def cartpole(num_envs: int) -> Any:
-    """rlcli's cartpole."""
+    """Return rlcli's cartpole."""
     from rlcli.config.load import resolve
     from rlcli.envs.make import make_env
     from rlcli.registry import find_task

@@ -1,7 +1,7 @@
-"""Programs that are timed in turn: each a child process that does a block of its work when it is asked to.
+"""Programs that are timed in turn: child processes that run a block of their work on request.
 
-A child is a Python script, of an environment of its own if need be, that hands its methods to `serve`; this module is
-all that it shares with the others, and needs the standard library alone. Requests and answers are lines of JSON.
+A child is a Python script, possibly in another virtual environment, that passes its methods to `serve`. This module is
+the only code that all children share; it needs only the standard library. Requests and results are lines of JSON.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 CHECKOUT = {"PYTHONPATH": os.pathsep.join([str(HERE.parent), str(HERE.parent / "tasks")])}
-"""What makes this process' own Python run the checkout that the benchmarks are of, whichever is installed."""
+"""Variables with which this process's own Python imports the measured checkout, whichever version is installed."""
 CACHE = HERE.parent / ".bench"
 LOGS = CACHE / "logs"
 Block = Callable[[int], float]
-"""Seconds that so many steps took."""
+"""Function that returns the seconds of a number of steps."""
 
 
 clock = time.process_time if os.environ.get("RLCLI_BENCH_CLOCK") == "cpu" else time.perf_counter
-"""What blocks are timed by. `RLCLI_BENCH_CLOCK=cpu` counts the processor time of all threads of a side: for looking
-into ratios on a busy machine, with one thread."""
+"""Clock for blocks. `RLCLI_BENCH_CLOCK=cpu` counts the processor time of all threads of a side: for studies of
+ratios on a busy machine, with one thread."""
 
 
 class Failed(Exception):
-    """A side could not be made, or did not do what it was asked to: the reason stands in its row."""
+    """Raised if a side could not be started, or failed; the reason is shown in its row."""
 
 
 class Side:
-    """A child process. `side("step", steps=3)` calls its method of that name and gives what that returns.
+    """Child process. `side("step", steps=3)` calls its method `step` and returns the result.
 
     Args:
-        name: of the log of what it prints, in `.bench/logs`.
+        name: name of its log file in `.bench/logs`.
         command: the program and its arguments.
-        timeout: seconds that an answer may take, unless a call says otherwise.
-        environment: variables that differ from this process' own.
+        timeout: seconds until a result must arrive, unless a call gives another limit.
+        environment: variables that differ from those of this process.
 
     Raises:
-        Failed: from calls, if the child ends, raises, or does not answer in time.
+        Failed: from calls, if the child ends, raises, or exceeds the time limit.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Side:
         assert self._process.stdout is not None
         try:
             self._process.stdin.write(json.dumps({"method": method, "arguments": arguments}) + "\n")
-        except (OSError, ValueError):  # the pipe is broken, or closed
+        except (OSError, ValueError):  # the child has closed the pipe
             raise self._failure("ended") from None
         limit = self.timeout if timeout is None else timeout
         if not select.select([self._process.stdout], [], [], limit)[0]:
@@ -88,24 +88,24 @@ class Side:
         return answer["result"]
 
     def close(self) -> None:
-        """End the child and what it has started, and wait for it."""
-        if self._process.returncode is None:  # not waited for yet: its number is still its group's
+        """End the child and its own subprocesses, and wait for it."""
+        if self._process.returncode is None:  # the child is not reaped yet, so its id is still that of its group
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
-                with contextlib.suppress(OSError):  # it held a request that nobody will read
+                with contextlib.suppress(OSError):  # a request may be left in its buffer
                     pipe.close()
 
     def _failure(self, what: str) -> Failed:
-        said = [line for line in self._log.read_text(errors="replace").splitlines() if line.strip()]
-        return Failed(f"{self.name} {what}" + (f": {said[-1].strip()[:200]}" if said else ""))
+        lines = [line for line in self._log.read_text(errors="replace").splitlines() if line.strip()]
+        return Failed(f"{self.name} {what}" + (f": {lines[-1].strip()[:200]}" if lines else ""))
 
 
 def child_environment(changes: Mapping[str, str] | None = None) -> dict[str, str]:
-    """This process' environment without what is set for rlcli alone, so that every side runs as its users run it.
+    """Return this process's variables without those for rlcli alone, so that every side runs as for its users.
 
-    The peers were compiled to bytecode when they were installed; this checkout must be allowed to keep its own.
+    Pip has compiled the peers to bytecode; this checkout must be allowed to write its own.
     """
     own = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "PYTHONPATH", "PYTHONDONTWRITEBYTECODE")
     kept = {name: value for name, value in os.environ.items() if name not in own}
@@ -114,7 +114,7 @@ def child_environment(changes: Mapping[str, str] | None = None) -> dict[str, str
 
 @contextlib.contextmanager
 def opened(*sides: Side) -> Iterator[tuple[Side, ...]]:
-    """Close them at the end."""
+    """Close the sides at the end."""
     try:
         yield sides
     finally:
@@ -123,7 +123,7 @@ def opened(*sides: Side) -> Iterator[tuple[Side, ...]]:
 
 
 def serve(methods: Mapping[str, Callable[..., Any]]) -> None:
-    """What a child does: answer until nobody asks. What it prints otherwise goes to its log."""
+    """Run the loop of a child: execute requests until stdin ends. Other prints go to the child's log."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     for line in sys.stdin:
@@ -139,7 +139,7 @@ def serve(methods: Mapping[str, Callable[..., Any]]) -> None:
 
 
 def steps_for(block: Block, seconds: float, least: int = 1) -> int:
-    """How many steps take so long, found by doubling."""
+    """Return the number of steps that take a given time, found by doubling."""
     steps = least
     while (took := block(steps)) < 0.25 * seconds:
         steps = max(2 * steps, min(16 * steps, int(0.5 * seconds / max(took, 1e-6) * steps)))
@@ -147,7 +147,7 @@ def steps_for(block: Block, seconds: float, least: int = 1) -> int:
 
 
 def alternate(blocks: Mapping[str, Block], steps: Mapping[str, int], repeats: int) -> dict[str, list[float]]:
-    """Seconds a step of each, a value a round; every round runs each block once, in turn."""
+    """Return the seconds per step of each block, one value per round; every round runs each block once, in turn."""
     found: dict[str, list[float]] = {name: [] for name in blocks}
     for _ in range(repeats):
         for name, block in blocks.items():
@@ -156,16 +156,16 @@ def alternate(blocks: Mapping[str, Block], steps: Mapping[str, int], repeats: in
 
 
 def ratio(numerator: Sequence[float], denominator: Sequence[float]) -> dict[str, float]:
-    """Median, lowest and highest of the ratios of the rounds."""
+    """Return median, lowest and highest of the ratios of the rounds."""
     ratios = [above / below for above, below in zip(numerator, denominator, strict=True)]
     return {"ratio": statistics.median(ratios), "ratio_min": min(ratios), "ratio_max": max(ratios)}
 
 
 def wall(command: Sequence[str], environment: Mapping[str, str] | None = None, timeout: float = 300.0) -> float:
-    """Seconds from starting a program to its end.
+    """Return the seconds from the start of a program to its end.
 
     Raises:
-        Failed: if it does not end well.
+        Failed: if it exits with an error.
     """
     begin = time.perf_counter()
     try:
@@ -176,6 +176,6 @@ def wall(command: Sequence[str], environment: Mapping[str, str] | None = None, t
         raise Failed(f"{Path(command[0]).name}: {' '.join(str(error).split())[:200]}") from None
     took = time.perf_counter() - begin
     if done.returncode:
-        said = [line for line in done.stderr.splitlines() if line.strip()] or ["no message"]
-        raise Failed(f"{' '.join(map(str, command))}: exit {done.returncode}: {said[-1].strip()[:200]}")
+        lines = [line for line in done.stderr.splitlines() if line.strip()] or ["no message"]
+        raise Failed(f"{' '.join(map(str, command))}: exit {done.returncode}: {lines[-1].strip()[:200]}")
     return took

@@ -1,4 +1,4 @@
-"""skrl's PPO on an environment of rlcli's: the wrapper and the models that skrl asks for."""
+"""skrl's PPO on an environment of rlcli: the wrapper and the models that skrl requires."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rlcli.envs.vec_env import VecEnv
 
 
 class Wrapped(Wrapper):
-    """The policy group of a `VecEnv`, tensors all the way. A second reset gives the running episodes."""
+    """Policy group of a `VecEnv` without copies to the host. A second reset returns the running episodes."""
 
     def __init__(self, env: VecEnv) -> None:
         super().__init__(env)
@@ -31,23 +31,23 @@ class Wrapped(Wrapper):
     state_space = property(lambda self: None)
 
     def reset(self) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Observations. (num_envs, d)"""
+        """Return the observations. (num_envs, d)"""
         if self._seen is None:
             self._seen = self._env.reset(seed=0)["policy"]
         return self._seen, {}
 
     def step(self, actions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, Any]:
-        """Step; flags and rewards as columns."""
+        """Step; return rewards and flags as columns."""
         result = self._env.step(actions)
         self._seen = result.obs["policy"]
         columns = (values.view(-1, 1) for values in (result.reward, result.terminated, result.truncated))
         return self._seen, *columns, {}
 
     def state(self) -> None:
-        """None."""
+        """Return None: there is no state."""
 
     def render(self, *args: Any, **kwargs: Any) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def close(self) -> None:
         """Close the environment."""
@@ -55,13 +55,13 @@ class Wrapped(Wrapper):
 
 
 def layers(inputs: int, outputs: int) -> torch.nn.Sequential:
-    """32-32 ELU."""
+    """Return layers of 32-32 ELU."""
     elu, linear = torch.nn.ELU, torch.nn.Linear
     return torch.nn.Sequential(linear(inputs, 32), elu(), linear(32, 32), elu(), linear(32, outputs))
 
 
 class Actor(GaussianMixin, Model):
-    """Mean of the action, and a deviation of its own."""
+    """Gaussian policy with a learned standard deviation that does not depend on the observation."""
 
     def __init__(self, observations: Any, actions: Any) -> None:
         Model.__init__(self, observation_space=observations, action_space=actions, device="cpu")
@@ -70,12 +70,12 @@ class Actor(GaussianMixin, Model):
         self.log_std_parameter = torch.nn.Parameter(torch.zeros(self.num_actions))
 
     def compute(self, inputs: dict[str, Any], role: str = "") -> tuple[torch.Tensor, dict[str, Any]]:
-        """Of observations."""
+        """Compute the mean of the action from the observations."""
         return self.net(inputs["observations"]), {"log_std": self.log_std_parameter}
 
 
 class Critic(DeterministicMixin, Model):
-    """The value."""
+    """Value function."""
 
     def __init__(self, observations: Any, actions: Any) -> None:
         Model.__init__(self, observation_space=observations, action_space=actions, device="cpu")
@@ -83,12 +83,12 @@ class Critic(DeterministicMixin, Model):
         self.net = layers(self.num_observations, 1)
 
     def compute(self, inputs: dict[str, Any], role: str = "") -> tuple[torch.Tensor, dict[str, Any]]:
-        """Of observations."""
+        """Compute the value from the observations."""
         return self.net(inputs["observations"]), {}
 
 
 def trainer(env: VecEnv, steps: int, epochs: int, minibatches: int) -> Callable[[], None]:
-    """What runs an iteration, without writing anything to a disk."""
+    """Return a trainer that writes nothing to disk."""
     wrapped = Wrapped(env)
     spaces = wrapped.observation_space, wrapped.action_space
     settings = PPO_CFG(

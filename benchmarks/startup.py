@@ -1,4 +1,4 @@
-"""How long commands take from the start of their process: `python benchmarks/startup.py`.
+"""Duration of commands from the start of their process: `python benchmarks/startup.py`.
 
 Medians of runs in turn: `rlcli --help` beside a typer program with one empty command, listing tasks beside mjlab's
 `list-envs`, the help of rl_zoo3's `train`, and `rlcli train cartpole` until its first update beside rl_zoo3's.
@@ -15,7 +15,7 @@ from typing import Any
 import peers
 from against_mjlab import quietly
 from sides import HERE, Failed, wall
-from tables import main, stands, table
+from tables import main, measured_on, table
 
 NAME = "startup"
 EMPTY = "import typer\napp = typer.Typer()\n\n@app.command()\ndef main() -> None: ...\n\napp()\n"
@@ -34,7 +34,7 @@ LABELS = {
 
 
 def commands(folder: Path) -> dict[str, tuple[str, list[str]]]:
-    """Name -> the environment that it runs in, and what is run."""
+    """Return name -> (virtual environment, command)."""
     (folder / "empty.py").write_text(EMPTY)
     train = ["rlcli.cli.app:main", "train", "cartpole", "--device", "cpu", "--quiet", "--runs-dir", str(folder)]
     return {
@@ -50,7 +50,7 @@ def commands(folder: Path) -> dict[str, tuple[str, list[str]]]:
 
 
 def measure(quick: bool) -> dict[str, Any]:
-    """Seconds of each."""
+    """Measure the seconds of each command."""
     repeats = 1 if quick else 9
     with tempfile.TemporaryDirectory() as folder:
         runs, failed = {}, {}
@@ -72,13 +72,13 @@ def measure(quick: bool) -> dict[str, Any]:
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """The table."""
+    """Return the table in Markdown."""
     rows = [[LABELS[name], f"{seconds:.2f} s"] for name, seconds in result["seconds"].items()]
     rows += [[LABELS[name], f"failed: {reason}"] for name, reason in result["failed"].items()]
-    said = [f"`rlcli --help` takes **{result['help_over_empty_s']:.2f} s** longer than the empty program"]
+    sentences = [f"`rlcli --help` takes **{result['help_over_empty_s']:.2f} s** longer than the empty program"]
     if "mjlab_list_ratio" in result:
-        said.append(f"listing tasks takes 1/**{result['mjlab_list_ratio']:.0f}** of mjlab's time")
-    return f"{stands(result)}\n\n{table(['', 'from start to end'], rows)}\n\n{'; '.join(said)}."
+        sentences.append(f"listing tasks takes 1/**{result['mjlab_list_ratio']:.0f}** of mjlab's time")
+    return f"{measured_on(result)}\n\n{table(['', 'from start to end'], rows)}\n\n{'; '.join(sentences)}."
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""The tables of `docs/explanation/benchmarks.md`: what was measured is kept in `results.json`, and the pages are written from that.
+"""Tables of `docs/explanation/benchmarks.md`: results are stored in `results.json`, and the pages are written from them.
 
-A table is a module with `NAME`, `measure(quick)`, which gives a JSON object, and `markdown(result)`. Run as a program
-it measures, keeps the result and writes it into the pages; `--quick` only tries it out and prints.
+A table is a module with `NAME`, `measure(quick)`, which returns a JSON object, and `markdown(result)`. Run as a
+program, the module measures, stores the result and writes it into the pages; `--quick` is a short trial that only
+prints.
 """
 
 from __future__ import annotations
@@ -27,19 +28,19 @@ _MARKED = re.compile(
 
 
 def results() -> dict[str, Any]:
-    """Name of a table -> what was measured last."""
+    """Return name of a table -> its last result."""
     return json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
 
 
 def keep(name: str, result: dict[str, Any]) -> None:
-    """Replace what was measured last."""
+    """Replace the stored result of a table."""
     RESULTS.write_text(json.dumps({**results(), name: rounded(result)}, indent=1) + "\n")
 
 
 def filled(text: str, texts: dict[str, str]) -> str:
-    """A page with its generated parts written anew; those not given stay.
+    """Return a page with its generated parts replaced; parts that are not given stay.
 
-    A part stands between the comments `bench: NAME` and `end bench`, and is indented as they are.
+    A part is between the comments `bench: NAME` and `end bench`, and gets their indentation.
     """
 
     def part(found: re.Match[str]) -> str:
@@ -53,23 +54,23 @@ def filled(text: str, texts: dict[str, str]) -> str:
 
 
 def marked(text: str) -> list[str]:
-    """The names of a page's generated parts."""
+    """Return the names of a page's generated parts."""
     return [found["name"] for found in _MARKED.finditer(text)]
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     lines = [heads, ["---"] * len(heads), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def stands(result: dict[str, Any], *more: str) -> str:
-    """The line that says what a table was measured on."""
+def measured_on(result: dict[str, Any], *more: str) -> str:
+    """Return the line that names the machine of a table."""
     return ", ".join([result["machine"], *more])
 
 
 def rounded(value: Any) -> Any:
-    """Numbers to five digits: more are noise."""
+    """Round numbers to five digits: more are noise."""
     if isinstance(value, dict):
         return {key: rounded(each) for key, each in value.items()}
     if isinstance(value, list):
@@ -78,17 +79,17 @@ def rounded(value: Any) -> Any:
 
 
 def spread(row: dict[str, Any], name: str = "ratio") -> str:
-    """Lowest and highest of a ratio."""
+    """Return the lowest and highest ratio as text."""
     return f"{row[f'{name}_min']:.2f} .. {row[f'{name}_max']:.2f}"
 
 
 def geometric_mean(values: Sequence[float]) -> float:
-    """Of ratios."""
+    """Return the geometric mean of ratios."""
     return statistics.geometric_mean(values)
 
 
 def rate(value: float) -> str:
-    """A number of steps a second."""
+    """Return a number of steps per second as text."""
     return f"{value / 1e6:.3g} M" if value >= 1e6 else f"{value:,.0f}"
 
 

@@ -1,7 +1,8 @@
-"""Microseconds a call of every observation, reward, termination and success term: `python benchmarks/terms.py`.
+"""Microseconds per call of every observation, reward, termination and success term: `python benchmarks/terms.py`.
 
-The environments are those of the terms' tests, in their three states in turn. What is computed once a step (rotations,
-velocities of bodies, readings as float32) is counted to each term that asks for it: between calls it is forgotten.
+The environments are those of the terms' tests, in their three states in turn. Quantities that are computed once per
+step (rotations, velocities of bodies, float32 copies) count for each term that reads them: their cache is cleared
+between calls.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ SECTIONS = {"observations": OBSERVATIONS, "rewards": REWARDS, "terminations": TE
 
 
 def forces(env: Any) -> dict[str, list[tuple[Any, dict[str, Any], None]]]:
-    """The terms that the table leaves to a test of their own."""
+    """Return the terms that a separate test measures."""
     from rlcli.mdp import observations, rewards
 
     return {
@@ -38,7 +39,7 @@ def forces(env: Any) -> dict[str, list[tuple[Any, dict[str, Any], None]]]:
 
 
 def microseconds(env: Any, call: Callable[[], Any], seconds: float) -> float:
-    """The fastest of several blocks, with nothing remembered from call to call."""
+    """Return the fastest of several blocks; caches are cleared between calls."""
     best, calls = float("inf"), 4
     end = time.perf_counter() + seconds
     with torch.inference_mode():
@@ -53,7 +54,7 @@ def microseconds(env: Any, call: Callable[[], Any], seconds: float) -> float:
 
 
 def measure(num_envs: int, seconds: float) -> dict[str, float]:
-    """`section.term` -> microseconds, the slowest row of each term."""
+    """Return `section.term` -> microseconds, the slowest row of each term."""
     found: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as folder:
         env = hand_made(Path(folder), num_envs=num_envs)

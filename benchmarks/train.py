@@ -1,9 +1,9 @@
-"""Training speed as a share of the bare physics: `python benchmarks/train.py`.
+"""Training speed relative to the bare physics: `python benchmarks/train.py`.
 
-PPO with the sizes of the field's cartpole (4,096 environments x 16 steps, 5 epochs, 4 minibatches, two networks of
-32-32 ELU) against `mujoco.batch.Batch.step` of the same model, in turn in one process: the built-in trainer `ppo`, the
-trainer `sb3`, and stock Stable-Baselines3 on the same environment through its plain VecEnv interface. Medians of the
-ratios.
+PPO with the usual sizes for a cartpole (4,096 environments x 16 steps, 5 epochs, 4 minibatches, two networks of 32-32
+ELU) is compared with `mujoco.batch.Batch.step` of the same model, in turn in one process: the built-in trainer `ppo`,
+the trainer `sb3`, and unmodified Stable-Baselines3 on the same environment through its VecEnv interface. Figures are
+medians of the ratios.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ STOCK = "stock SB3"
 
 
 def trainer_of(agent: str, num_envs: int, threads: int) -> Any:
-    """A trainer of ours on the field's cartpole, its first iterations done."""
+    """Return one of rlcli's trainers on the common cartpole, after its first iterations."""
     flags = {"scene.num_envs": num_envs}
     resolved = resolve(find_task("cartpole"), agent=agent, overrides=SIZES[agent], flags=flags)
     trainer = TRAINERS[agent](
@@ -52,21 +52,21 @@ def trainer_of(agent: str, num_envs: int, threads: int) -> Any:
 
 
 def own_block(trainer: PpoTrainer | Sb3Trainer) -> tuple[float, dict[str, float]]:
-    """Seconds of one iteration, and its parts."""
+    """Return the seconds of one iteration and of its parts."""
     begin = time.perf_counter()
     report = trainer.iterate()
     return time.perf_counter() - begin, report.seconds
 
 
 def stock_block(model: PPO) -> float:
-    """Seconds of one iteration of SB3's own loop."""
+    """Return the seconds of one iteration of SB3's own loop."""
     begin = time.perf_counter()
     model.learn(model.n_steps * model.n_envs, reset_num_timesteps=False)
     return time.perf_counter() - begin
 
 
 def stock_model(num_envs: int) -> PPO:
-    """SB3's PPO as it comes, on the same task with the same sizes."""
+    """Return unmodified SB3 PPO on the same task with the same sizes."""
     env = make_env(resolve(find_task("cartpole"), flags={"scene.num_envs": num_envs}), seed=0)
     model = PPO(
         "MlpPolicy",
@@ -82,7 +82,7 @@ def stock_model(num_envs: int) -> PPO:
 
 
 def measure(num_envs: int, repeats: int) -> list[dict[str, Any]]:
-    """The rows of one number of environments: bare physics, then an iteration of each, then again."""
+    """Return the rows of one number of environments: bare physics, then an iteration of each trainer, in turn."""
     threads = available_cores()
     trainers = {agent: trainer_of(agent, num_envs, threads) for agent in SIZES}
     stock = stock_model(num_envs)

@@ -1,15 +1,15 @@
-"""The built-in tasks: trained, judged and shown. What each is held to stands in docs/reference/zoo/zoo.yaml.
+"""Training, evaluation and documentation of the built-in tasks. Their bars are in docs/reference/zoo/zoo.yaml.
 
     python benchmarks/zoo.py learn TASK            train the default agent here, evaluate, compare with the bar
-    python benchmarks/zoo.py collect TASK RUN ...  finished runs, from this or another machine, become results and
-                                                   curves; --ship also puts the best policy into the package, and draws
-    python benchmarks/zoo.py collect --all FOLDER  the same of every task with runs below a folder, and the pages;
-                                                   documents of `rlcli eval --json` that lie there are taken
-    python benchmarks/zoo.py adopt TASK OTHER      ship the policy of the task's other form, judged in this one
-    python benchmarks/zoo.py picture TASK          a strip of pictures of the shipped policy
+    python benchmarks/zoo.py collect TASK RUN ...  write results and curves of finished runs from any machine; --ship
+                                                   also puts the best policy into the package, and draws its picture
+    python benchmarks/zoo.py collect --all FOLDER  do this for every task with runs below a folder, and write the pages;
+                                                   uses documents of `rlcli eval --json` in that folder
+    python benchmarks/zoo.py adopt TASK OTHER      ship the policy of the task's other form, evaluated in this form
+    python benchmarks/zoo.py picture TASK          draw a strip of pictures of the shipped policy
     python benchmarks/zoo.py pages                 fill the generated parts of docs/reference/zoo/*.md, and write its index
 
-`learn` exits with 9 where the bar or the minutes are missed, and appends a line to RUNS/learn.jsonl.
+`learn` exits with 9 if the bar or the time limit is missed, and appends a line to RUNS/learn.jsonl.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ ZOO = Path(__file__).resolve().parents[1] / "docs" / "reference" / "zoo"
 _LARGEST_PICTURE = 80_000
 _FRAMES = 5
 _NOT_THE_TRAINING = ("--runs-dir", "--name", "--logger", "--video-every")
-"""Flags with a value that say where and how a training is told of."""
+"""Options with a value that only change where a training is written or how it is reported."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """What zoo.yaml says of a task."""
+    """Entry of a task in zoo.yaml."""
 
     name: str
     tier: str
@@ -57,21 +57,21 @@ class Entry:
     seeds: tuple[int, ...] = field(default=())
 
     def missed(self, evaluation: dict[str, Any]) -> list[str]:
-        """Where an evaluation misses the bar, in words."""
-        said = []
+        """Return the misses of the bar in an evaluation, as text."""
+        misses = []
         for name, bound in self.bar.items():
             value = value_of(evaluation, name)
             highest = bound["max"] if isinstance(bound, dict) else math.inf
             lowest = -math.inf if isinstance(bound, dict) else bound
             if value is None:
-                said.append(f"{name} is not known")
+                misses.append(f"{name} is unknown")
             elif not lowest <= value <= highest:
-                said.append(f"{name} is {value:.4g}, {'above' if value > highest else 'below'} {bar_text(bound)}")
-        return said
+                misses.append(f"{name} is {value:.4g}, {'above' if value > highest else 'below'} {bar_text(bound)}")
+        return misses
 
 
 def entries() -> dict[str, Entry]:
-    """Every task of zoo.yaml, by name."""
+    """Return every task of zoo.yaml by name."""
     document = yaml.safe_load((ZOO / "zoo.yaml").read_text(encoding="utf-8"))
     seeds = tuple(document["seeds"])
     rows = document["tasks"]
@@ -79,12 +79,12 @@ def entries() -> dict[str, Entry]:
 
 
 def bar_text(bound: Any) -> str:
-    """A bound as people write it."""
+    """Return a bound as text."""
     return f"{bound['max']:g}" if isinstance(bound, dict) else f"{bound:g}"
 
 
 def value_of(evaluation: dict[str, Any], name: str) -> float | None:
-    """A number of an evaluation: success, return, length or a value of the task."""
+    """Return a number of an evaluation: success, return, length or a value of the task."""
     from rlcli.errors import UsageError
     from rlcli.evaluation.limits import Limit
 
@@ -98,7 +98,7 @@ def value_of(evaluation: dict[str, Any], name: str) -> float | None:
 
 
 def learn(task: str, overrides: list[str], device: str | None, seed: int, runs: Path) -> int:
-    """Train, evaluate, judge; the exit status."""
+    """Train, evaluate and compare with the bar; return the exit status."""
     entry = entries()[task]
     device = device or entry.device
     agent = ["--agent", entry.agent] if entry.agent else []
@@ -145,7 +145,7 @@ def learn(task: str, overrides: list[str], device: str | None, seed: int, runs: 
 
 
 def _rlcli(*arguments: str) -> dict[str, Any]:
-    """What a command prints with --json; its messages go on to the terminal."""
+    """Run rlcli with --json and return its document; its messages go to the terminal."""
     done = subprocess.run([sys.executable, "-m", "rlcli", *arguments, "--json"], stdout=subprocess.PIPE, text=True)
     if done.returncode:
         sys.exit(done.returncode)
@@ -161,7 +161,7 @@ def _gpu(run: Path) -> str:
 
 
 def collect_all(folder: Path, hardware: str | None, ship: bool) -> None:
-    """Every run below a folder, task by task; with `ship` the pictures, and the pages at the end."""
+    """Collect every run below a folder, task by task; with `ship` also draw the pictures and write the pages."""
     from rlcli.errors import RlcliError
 
     found: dict[str, list[Path]] = {}
@@ -178,7 +178,7 @@ def collect_all(folder: Path, hardware: str | None, ship: bool) -> None:
 
 
 def collect(task: str, runs: list[Path], hardware: str | None, ship: bool, known: dict[str, Any]) -> None:
-    """Results and curves of finished runs, and, if asked for, the best policy as the one that is shipped."""
+    """Write results and curves of finished runs; with `ship`, put the best policy into the package."""
     from rlcli.reporting.curves import read_history
     from rlcli.runs.run_ref import find_checkpoint
 
@@ -220,7 +220,7 @@ def _results(task: str) -> list[dict[str, Any]]:
 
 
 def adopt(task: str, other: str) -> None:
-    """The policy that the task's other form ships, judged in this one: both forms step alike, column by column."""
+    """Ship the policy of the task's other form, evaluated in this form; both forms step alike, column by column."""
     from rlcli.config.load import resolve
     from rlcli.deploy.env_description import describe
     from rlcli.envs.make import make_env
@@ -244,10 +244,10 @@ def adopt(task: str, other: str) -> None:
         evaluation = _evaluate(copy, entry)
         write_bundle(open_checkpoint(copy), source.root / "policies" / task, None, evaluation)
     (row,) = [row for row in _results(other) if row["seed"] == given.manifest["seed"]]
-    judged = {name: evaluation[name] for name in row["evaluation"] if evaluation.get(name) is not None}
+    evaluated = {name: evaluation[name] for name in row["evaluation"] if evaluation.get(name) is not None}
     values = {"values": evaluation["values"]} if evaluation.get("values") else {}
     command = f"{row['command']} (the other form)"
-    rows = [{**row, "command": command, "evaluation": {**judged, **values}}]
+    rows = [{**row, "command": command, "evaluation": {**evaluated, **values}}]
     (ZOO / "results" / f"{task}.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     for kind in ("csv", "svg"):
         shutil.copy(ZOO / "curves" / f"{other}.{kind}", ZOO / "curves" / f"{task}.{kind}")
@@ -257,7 +257,7 @@ def adopt(task: str, other: str) -> None:
 
 
 def _of_one_agent(entry: Entry, folders: list[Path]) -> list[Any]:
-    """The newest run of each seed, of the agent that the task is held to its bar with; without one, of any agent."""
+    """Return the newest run of each seed with the agent of the bar; without such an agent, of any agent."""
     from rlcli.config.load import resolve
     from rlcli.runs.run import open_run
 
@@ -273,33 +273,35 @@ def _of_one_agent(entry: Entry, folders: list[Path]) -> list[Any]:
 
 
 def _documents(folder: Path) -> dict[str, Any]:
-    """What `rlcli eval --json` printed into files of this folder, by RUN/STEP of the checkpoint."""
+    """Return the documents of `rlcli eval --json` in this folder by RUN/STEP of the checkpoint."""
     found = {}
     for file in folder.rglob("*.json"):
         try:
-            said = json.loads(file.read_text(encoding="utf-8"))
+            record = json.loads(file.read_text(encoding="utf-8"))
         except ValueError:
             continue
-        if isinstance(said, dict) and said.get("command") == "eval" and isinstance(said.get("checkpoint"), str):
-            run, _, step = Path(said["checkpoint"]).parts[-3:]
-            found[f"{run}/{step}"] = said
+        if isinstance(record, dict) and record.get("command") == "eval" and isinstance(record.get("checkpoint"), str):
+            run, _, step = Path(record["checkpoint"]).parts[-3:]
+            found[f"{run}/{step}"] = record
     return found
 
 
 def _evaluate(policy: Path, entry: Entry) -> dict[str, Any]:
-    """A new evaluation, in many environments: the few that `play:` has would take longer."""
+    """Evaluate again with many environments: the few of `play:` would take longer."""
     several = ("--num-envs", str(min(entry.episodes, entry.envs)))
     return _rlcli("eval", "--checkpoint", str(policy), "--episodes", str(entry.episodes), *several)
 
 
 def _evaluated(run: Any, checkpoint: Path, entry: Entry, known: dict[str, Any]) -> dict[str, Any]:
-    """An evaluation that is there, in the run or in `known`, or a new one where it is of too few episodes."""
+    """Return a stored evaluation of the run or of `known`; evaluate again if it has too few episodes."""
     from rlcli.runs.eval_store import read_evaluation
 
-    there = [read_evaluation(run, checkpoint.name), known.get(f"{run.folder.name}/{checkpoint.name}")]
-    for said in there:
-        if said is not None and said["episodes"] >= entry.episodes and "values" in said and not said["stochastic"]:
-            return said
+    records = [read_evaluation(run, checkpoint.name), known.get(f"{run.folder.name}/{checkpoint.name}")]
+    for record in records:
+        if record is None or "values" not in record:
+            continue
+        if record["episodes"] >= entry.episodes and not record["stochastic"]:
+            return record
     return _evaluate(checkpoint, entry)
 
 
@@ -324,7 +326,7 @@ def _row(run: Any, checkpoint: Path, evaluation: dict[str, Any], hardware: str |
 
 
 def _command(words: list[str]) -> str:
-    """What was typed, without where it was written to."""
+    """Return the command line without output paths."""
     kept, skip = [], False
     for word in words[1:]:
         if skip or word in ("--json", "--quiet", "-q", "--headless"):
@@ -338,7 +340,7 @@ def _command(words: list[str]) -> str:
 
 
 def _goodness(entry: Entry, evaluation: dict[str, Any]) -> tuple[float, ...]:
-    """Larger is better, in the order of the bar; then the return."""
+    """Return a sort key: larger is better, in the order of the bar, then by return."""
     values = []
     for name, bound in entry.bar.items():
         value = value_of(evaluation, name)
@@ -351,7 +353,7 @@ def _goodness(entry: Entry, evaluation: dict[str, Any]) -> tuple[float, ...]:
 
 
 def picture(task: str) -> None:
-    """A strip of pictures of the first episode of the shipped policy."""
+    """Write a strip of pictures of the first episode of the shipped policy."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     import numpy as np
 
@@ -380,7 +382,7 @@ def picture(task: str) -> None:
 
 
 def _jpeg(pixels: Any) -> bytes:
-    """As good as fits."""
+    """Return a JPEG with the best quality that fits the size limit."""
     import io
 
     from PIL import Image

@@ -1,4 +1,4 @@
-"""Learning curves of the built-in tasks: a small CSV, and an SVG whose text is text."""
+"""Learning curves of the built-in tasks: a small CSV, and an SVG with selectable text."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 ROWS = 120
-"""Of a seed."""
+"""Number of points for each seed."""
 RETURN, SUCCESS = "Train/mean_reward", "Train/success_rate"
 _VALUES = ("Task/", "Metrics/")
 _MOST_VALUES = 6
@@ -18,15 +18,15 @@ _THIN, _THICK = "#9db8d2", "#0b5394"
 
 
 def columns(histories: Sequence[Any]) -> list[str]:
-    """Success, return and the task's values, as far as all runs tell them."""
+    """Return success, return and the task's values that all runs have."""
     first, *others = histories
-    told = [name for name in first.metrics if all(name in other.metrics for other in others)]
-    values = [name for name in told if name.startswith(_VALUES)][:_MOST_VALUES]
-    return [name for name in (SUCCESS, RETURN) if name in told] + values
+    names = [name for name in first.metrics if all(name in other.metrics for other in others)]
+    values = [name for name in names if name.startswith(_VALUES)][:_MOST_VALUES]
+    return [name for name in (SUCCESS, RETURN) if name in names] + values
 
 
 def table(histories: Sequence[Any]) -> str:
-    """A CSV: seed, steps, seconds, and a column of each metric."""
+    """Return a CSV: seed, steps, seconds, and a column for each metric."""
     names = columns(histories)
     lines = [",".join(["seed", "steps", "seconds", *(short(name) for name in names)])]
     for history in sorted(histories, key=lambda one: one.run.record["seed"]):
@@ -39,12 +39,12 @@ def table(histories: Sequence[Any]) -> str:
 
 
 def short(name: str) -> str:
-    """A metric's name in a column's head."""
+    """Return a metric's name for the head of a column."""
     return {RETURN: "return", SUCCESS: "success"}.get(name, name.partition("/")[2].replace(",", " "))
 
 
 def drawing(task: str, histories: Sequence[Any]) -> str:
-    """An SVG: a panel of each of at most three metrics, seeds as thin lines, their median as a thick one."""
+    """Return an SVG with a panel for each of at most three metrics: thin lines for seeds, a thick line for medians."""
     names = columns(histories)[:3]
     width = _PANEL * len(names)
     seeds = ", ".join(str(seed) for seed in sorted(history.run.record["seed"] for history in histories))
@@ -63,12 +63,12 @@ def drawing(task: str, histories: Sequence[Any]) -> str:
 
 
 def _panel(name: str, histories: Sequence[Any]) -> list[str]:
-    told = [_points(history, name) for history in histories]
-    told = [(x, y) for x, y in told if len(x)]
-    if not told:
+    curves = [_points(history, name) for history in histories]
+    curves = [(x, y) for x, y in curves if len(x)]
+    if not curves:
         return []
-    last = max(float(x[-1]) for x, _ in told)
-    low, high = _span(name, [y for _, y in told])
+    last = max(float(x[-1]) for x, _ in curves)
+    low, high = _span(name, [y for _, y in curves])
     right, bottom = _PANEL - 14, _HEIGHT - _BOTTOM
 
     def place(step: float, value: float) -> str:
@@ -86,14 +86,14 @@ def _panel(name: str, histories: Sequence[Any]) -> list[str]:
         anchor = "end" if share == 1.0 else "middle"
         parts.append(f'<text x="{x:.0f}" y="{bottom + 14}" font-size="10" text-anchor="{anchor}">'
                      f"{_number(last * share)}{' steps' if share == 1.0 else ''}</text>")  # fmt: skip
-    one = len(told) == 1
-    for x, y in told:
+    one = len(curves) == 1
+    for x, y in curves:
         path = " ".join(place(float(a), float(b)) for a, b in zip(x, y, strict=True))
         style = f'stroke="{_THICK if one else _THIN}" stroke-width="{2 if one else 1}"'
         parts.append(f'<polyline points="{path}" fill="none" {style}/>')
     if not one:
-        grid = np.linspace(max(float(x[0]) for x, _ in told), min(float(x[-1]) for x, _ in told), ROWS)
-        middle = np.median([np.interp(grid, x, y) for x, y in told], axis=0)
+        grid = np.linspace(max(float(x[0]) for x, _ in curves), min(float(x[-1]) for x, _ in curves), ROWS)
+        middle = np.median([np.interp(grid, x, y) for x, y in curves], axis=0)
         path = " ".join(place(float(a), float(b)) for a, b in zip(grid, middle, strict=True))
         parts.append(f'<polyline points="{path}" fill="none" stroke="{_THICK}" stroke-width="2.2"/>')
     return parts
@@ -107,7 +107,7 @@ def _points(history: Any, name: str) -> tuple[Any, Any]:
 
 
 def _thinned(count: int) -> list[int]:
-    """Rows evenly spread, the last one among them."""
+    """Return evenly spaced rows, including the last one."""
     return sorted({round(number) for number in np.linspace(0, count - 1, min(count, ROWS))}) if count else []
 
 

@@ -1,4 +1,4 @@
-"""The generated parts of docs/reference/zoo/*.md: what a task is, what came of its trainings, and how they went."""
+"""Generated parts of docs/reference/zoo/*.md: the task card, the results of the trainings, and their learning curves."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BLOCKS = ("card", "results", "curves")
 
 
 def built_in() -> list[str]:
-    """The built-in tasks whose package is there."""
+    """Return the built-in tasks whose package is installed."""
     from rlcli.errors import TaskError
 
     found = []
@@ -31,7 +31,7 @@ def built_in() -> list[str]:
 
 
 def write_all(zoo: Path, entries: Mapping[str, Any]) -> None:
-    """Fill every page that there is, and write the index."""
+    """Fill all existing pages, and write the index."""
     tasks = [name for name in built_in() if name in entries]
     for name in tasks:
         file = zoo / f"{name}.md"
@@ -48,7 +48,7 @@ def write_all(zoo: Path, entries: Mapping[str, Any]) -> None:
 
 
 def filled(text: str, zoo: Path, entry: Any) -> str:
-    """A page with its generated blocks as they should be."""
+    """Return a page with its generated blocks filled."""
     made = {"card": card(entry.name), "results": results(zoo, entry), "curves": curves(zoo, entry)}
     for block in BLOCKS:
         text = re.sub(
@@ -61,13 +61,13 @@ def filled(text: str, zoo: Path, entry: Any) -> str:
 
 
 def block(text: str, name: str) -> str | None:
-    """What stands in a block of a page; None where it has no such block."""
+    """Return the content of a block of a page; None if there is no such block."""
     found = re.search(rf"<!-- {name} -->\n(.*?)<!-- end {name} -->", text, re.DOTALL)
     return None if found is None else found[1]
 
 
 def card(task: str) -> str:
-    """The MDP card, folded."""
+    """Return the MDP card, folded."""
     source = find_task(task)
     resolved = resolve(source)
     file = source.config.with_name(f"{source.config.stem}.layout.json")
@@ -77,13 +77,13 @@ def card(task: str) -> str:
 
 
 def rows_of(zoo: Path, task: str) -> list[dict[str, Any]]:
-    """The results of a task; empty where none are there."""
+    """Return the results of a task; an empty list if there are none."""
     file = zoo / "results" / f"{task}.json"
     return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else []
 
 
 def results(zoo: Path, entry: Any) -> str:
-    """The bar, and a row of each seed."""
+    """Return the bar, and a row for each seed."""
     where = "one H200" if entry.device == "cuda" else "two CPU cores"
     held = (
         f"Tier {entry.tier}: {bars(entry)} over {entry.episodes:,} episodes, trained in {entry.minutes:g} min on"
@@ -111,7 +111,7 @@ def results(zoo: Path, entry: Any) -> str:
 
 
 def bars(entry: Any) -> str:
-    """The bar in words."""
+    """Return the bar as text."""
     return ", ".join(
         f"{name} <= {bound['max']:g}" if isinstance(bound, dict) else f"{name} >= {bound:g}"
         for name, bound in entry.bar.items()
@@ -119,7 +119,7 @@ def bars(entry: Any) -> str:
 
 
 def with_interval(evaluation: dict[str, Any], name: str) -> str:
-    """A number and the interval behind it."""
+    """Return a number with its interval as text."""
     found = evaluation.get(name)
     if found is None:
         values = evaluation.get("values", {})
@@ -133,7 +133,7 @@ def with_interval(evaluation: dict[str, Any], name: str) -> str:
 
 
 def curves(zoo: Path, entry: Any) -> str:
-    """The learning curves, and what the shipped policy looks like."""
+    """Return the learning curves, and the pictures of the shipped policy."""
     parts = []
     if (zoo / "pictures" / f"{entry.name}.jpg").is_file():
         parts.append(

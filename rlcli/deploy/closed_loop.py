@@ -1,14 +1,14 @@
-"""Closed-loop check of an exported file: read back from the disk, it drives plain MuJoCo by its metadata alone.
+"""Closed-loop check of an exported policy: the file controls plain MuJoCo and is compared with the environment.
 
-The program that the user gets computes observations and controls from an MjData, and `mj_step` moves that; nothing of
-the environment stands in between. The environment is the reference: it resets, draws commands and disturbances, reads
-the resulting states, and its own terms compute rewards and terminations. Both sides run the same episodes, once as the
-run's evaluation and once in plain MuJoCo.
+The generated program `run_policy.py` computes observations and controls from an MjData, and `mj_step` advances it. No
+code of the environment takes part in that loop. The environment is the reference: it resets, samples commands and
+disturbances, reads the resulting states, and computes rewards and terminations. Both sides run the same episodes: once
+as the run's evaluation, once in plain MuJoCo.
 
-In a legged robot rounding errors grow until two simulations of one episode have nothing in common. Where returns differ
-although every number agrees, the episodes are run again and re-synchronised: in each step plain MuJoCo and the engine
-start from one state, and where they arrive within rounding of each other they go on from one state. A step in which
-they disagree is not corrected, so that an error shows in the return.
+In a legged robot rounding errors grow until two simulations of one episode have nothing in common. If every observation
+and action agrees but the returns differ, the episodes are run again and re-synchronised: plain MuJoCo and the engine
+start each step from the same state. If both arrive at the same state within rounding, the engine's state is copied to
+plain MuJoCo. A step in which they disagree is not corrected, so that an error shows in the return.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from torch import Tensor
 
 from rlcli.config.load import resolve
 from rlcli.deploy.env_description import describe
-from rlcli.deploy.export import TOLERANCE
-from rlcli.deploy.onboard_program import PROGRAM, open_model, program, write_model, write_program
+from rlcli.deploy.export import TOLERANCE, relative_difference
+from rlcli.deploy.onboard_program import PROGRAM, generate_program, open_model, write_model, write_program
 from rlcli.envs.direct import DirectEnv
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
@@ -56,24 +56,27 @@ ROUNDING = 1e-3
 RETURN = 0.02
 """Largest accepted difference of the mean return, relative to the evaluation's mean |return|."""
 _SEED = 42
+_FREE = (-np.inf, np.inf)
+_BAD_METADATA = (KeyError, IndexError, TypeError, ValueError)
+"""Errors that metadata raises in the program if they do not fit the model."""
 
 
 @dataclass(slots=True)
 class ReferenceEnv:
-    """The run's environment, as an evaluation has it, and what plain code must know of it."""
+    """The run's environment, built as for an evaluation, and its description for code without rlcli."""
 
     env: VecEnv
     deployment: dict[str, Any]
 
 
 @dataclass(slots=True)
-class Verdict:
+class ClosedLoopResult:
     """Result of the closed-loop check. Differences are relative to max(1, |value|)."""
 
     model: Path
     program: Path
     differing: list[str]
-    """Places where the metadata describes another robot than the task."""
+    """Keys of the metadata whose values differ from the task's."""
     episodes: int
     steps: int
     differences: dict[str, float]
@@ -87,11 +90,11 @@ class Verdict:
     by_metadata: list[str]
     """Terms that plain code computed from the metadata."""
     by_task: list[str]
-    """Terms that only the task's own code can compute; it did so from the plain states."""
+    """Terms without a formula. The task's own code computed them from the states of plain MuJoCo."""
     synchronized_return: float | None = None
-    """Mean return of re-synchronised episodes; None: there was no need for them."""
+    """Mean return of the re-synchronised episodes; None: they were not needed."""
     disagreeing_steps: int = 0
-    """Steps in which the two sides did not arrive at one state."""
+    """Re-synchronised steps after which the states of the two sides differed by more than rounding."""
 
     @property
     def return_difference(self) -> float:
@@ -99,22 +102,22 @@ class Verdict:
         return self._relative(self.plain_return)
 
     def rows(self) -> list[tuple[str, float, float, bool]]:
-        """Return the checks: (what, found, allowed, whether it holds) each."""
+        """Return the checks as (name, value found, largest value allowed, whether the check passed)."""
         synchronized = self.synchronized_return
         returns = self.return_difference if synchronized is None else self._relative(synchronized)
-        aside = "" if synchronized is None else ", rounding set aside"
+        suffix = "" if synchronized is None else ", rounding set aside"
         checks = (
             ("description: places unlike the task", float(len(self.differing)), 0.0),
             ("action: the file against the policy", self.differences["action"], TOLERANCE),
             ("observation: formulas against the task", self.differences["observation"], CLOSE),
             ("control: formulas against the task", self.differences["control"], CLOSE),
-            (f"return: plain MuJoCo against the evaluation{aside}", returns, RETURN),
+            (f"return: plain MuJoCo against the evaluation{suffix}", returns, RETURN),
         )
-        return [(what, found, allowed, found <= allowed) for what, found, allowed in checks]
+        return [(name, found, allowed, found <= allowed) for name, found, allowed in checks]
 
     @property
     def holds(self) -> bool:
-        """Whether every check holds; NaN never does."""
+        """Whether every check passed. A NaN fails its check."""
         return all(row[3] for row in self.rows())
 
     def record(self) -> dict[str, Any]:
@@ -137,23 +140,24 @@ class Verdict:
             "closed_by_task": self.by_task,
         }
 
-    def _relative(self, found: float) -> float:
-        return abs(found - self.evaluation_return) / max(self.scale, 1e-9)
+    def _relative(self, mean_return: float) -> float:
+        return abs(mean_return - self.evaluation_return) / max(self.scale, 1e-9)
 
 
 def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | None) -> ReferenceEnv:
-    """Build the environment that a policy is for, without what corrupts observations: no file can know that.
+    """Build the environment that a policy was trained for, without observation noise, bias and delay.
 
     Args:
         choice: the policy.
         checkpoint: its checkpoint.
-        named: the task that the command line names, if it does.
+        named: the task on the command line, if there is one.
     """
     configure = partial(resolve, choice.source(named), agent=choice.agent, play=True)
     resolved = configure()
-    corrupted = [name for name, group in resolved.task.observations.items() if group.enable_corruption]
-    if corrupted:
-        clean = [f"observations.{name}.enable_corruption=false" for name in corrupted]
+    groups = resolved.task.observations.items()
+    # corruption is random, so an exported file cannot reproduce it
+    clean = [f"observations.{name}.enable_corruption=false" for name, group in groups if group.enable_corruption]
+    if clean:
         resolved = configure(overrides=clean)
     torch.set_num_threads(1)
     seed_generators(derive(_SEED, "task"))
@@ -162,108 +166,111 @@ def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | N
     return ReferenceEnv(env, describe(env))
 
 
-def verify(reference: ReferenceEnv, checkpoint: Checkpoint, file: Path, format_: str, episodes: int) -> Verdict:
+def verify(
+    reference: ReferenceEnv, checkpoint: Checkpoint, file: Path, format_: str, episodes: int
+) -> ClosedLoopResult:
     """Evaluate the policy in its environment, then run the same episodes with the file in plain MuJoCo.
 
-    The model and the program that runs the file are written beside it.
+    The model and the program that runs the file are written to the folder of the file.
 
     Args:
         reference: the run's environment.
         checkpoint: the policy's checkpoint.
         file: the exported policy.
         format_: its format.
-        episodes: how many to run.
+        episodes: number of episodes.
 
     Raises:
-        CheckpointError: if the metadata makes no sense to the program.
-        MachineError: if the disk refuses.
+        CheckpointError: if the metadata does not fit the model.
+        MachineError: if a file cannot be written.
     """
     env = reference.env
     model = write_model(env.spec, env.engine.model, file.parent)
-    code = program(file, model, format_)
-    place = file.parent / PROGRAM
+    code = generate_program(file, model, format_)
+    program = file.parent / PROGRAM
     if not write_program(file.parent, code):
-        _log.warning(f"{place} is not what would be written, and stays as it is: remove it for a new one")
-    _log.info(f"{file.name} drives plain MuJoCo with {model.name} for {episodes} episodes")
+        _log.warning(f"{program} has other content than export writes and is not replaced; delete it to get a new one")
+    _log.info(f"{file.name} controls plain MuJoCo with {model.name} for {episodes} episodes")
     differing = deployment_differences(checkpoint, env.layout.record(), reference.deployment, _may_randomize(env))
     space: dict[str, Any] = {"__name__": "run_policy"}
-    exec(compile(code, "run_policy.py", "exec"), space)  # what has just been written, not what lies there
+    exec(compile(code, "run_policy.py", "exec"), space)  # the generated code, not the file: that may be the user's own
     controller, policy = space["Controller"](file), checkpoint.policy()
     initial = env.state_dict()
     seed_generators(derive(_SEED, "task"))
     evaluated = evaluate(env, trained_policy(env, policy), episodes)
 
-    def drive(synchronize: bool) -> tuple[_Driver, Evaluation]:
-        env.load_state_dict(initial)  # a curriculum, too, is where it was
+    def run_plain(synchronize: bool) -> tuple[_PlainMujocoRunner, Evaluation]:
+        env.load_state_dict(initial)  # also restores the curriculum
         seed_generators(derive(_SEED, "task"))
-        driver = _Driver(env, policy, controller, open_model(model), synchronize)
-        env.physics_override = driver.physics
+        runner = _PlainMujocoRunner(env, policy, controller, open_model(model), synchronize)
+        env.physics_override = runner.physics
         try:
-            return driver, evaluate(env, driver.act, episodes)
+            return runner, evaluate(env, runner.act, episodes)
         finally:
             env.physics_override = None
 
-    driver, driven = drive(synchronize=False)
-    verdict = Verdict(
+    runner, plain = run_plain(synchronize=False)
+    result = ClosedLoopResult(
         model,
-        place,
+        program,
         differing,
-        len(driven.returns),
-        driver.steps,
-        driver.differences,
+        len(plain.returns),
+        runner.steps,
+        runner.differences,
         evaluation_return=float(np.mean(evaluated.returns)),
-        plain_return=float(np.mean(driven.returns)),
+        plain_return=float(np.mean(plain.returns)),
         scale=float(np.mean(np.abs(evaluated.returns))),
-        by_metadata=driver.terms(closed=True),
-        by_task=driver.terms(closed=False),
+        by_metadata=runner.terms(closed=True),
+        by_task=runner.terms(closed=False),
     )
-    if not verdict.holds and all(holds for *_, holds in verdict.rows()[:-1]):
-        driver, driven = drive(synchronize=True)
-        verdict.synchronized_return = float(np.mean(driven.returns))
-        verdict.disagreeing_steps = driver.disagreeing_steps
-    return verdict
+    only_return_failed = not result.holds and all(passed for *_, passed in result.rows()[:-1])
+    if only_return_failed:
+        runner, plain = run_plain(synchronize=True)
+        result.synchronized_return = float(np.mean(plain.returns))
+        result.disagreeing_steps = runner.disagreeing_steps
+    return result
 
 
 def _may_randomize(env: VecEnv) -> bool:
-    """Whether a task may draw gains or the initial state at random: some event does more than reset."""
+    """Return whether the task may draw gains or the initial state at random: an event does more than reset."""
     events = [event for event in env.config.events.values() if event is not None]
     return isinstance(env, DirectEnv) or not all(event.func.startswith("reset_") for event in events)
 
 
-class _Driver:
-    """One plain simulation and one controller for each environment."""
+class _PlainMujocoRunner:
+    """One plain simulation (MjModel, MjData) and one controller for each environment."""
 
     def __init__(self, env: VecEnv, policy: Policy, controller: Any, model: mujoco.MjModel, synchronize: bool) -> None:
         engine = env.engine.replayable
         if engine is None:
-            raise UsageError("--verify compares with the CPU engine, and the task asks for another: sim.engine")
+            raise UsageError("--verify needs the CPU engine, and the task sets another one in sim.engine")
         self._env, self._engine, self._synchronize = env, engine, synchronize
         self.steps = 0
         self.disagreeing_steps = 0
-        """Steps in which a plain simulation and the engine did not arrive at one state."""
+        """Steps after which the states of plain MuJoCo and of the engine differed by more than rounding."""
         self.differences = {"action": 0.0, "observation": 0.0, "control": 0.0}
         """Largest difference of each."""
-        self._require_same_shape(model)
+        self._require_same_sizes(model)
         n = env.num_envs
-        self._expected: Callable[[Tensor], Tensor] = trained_policy(env, policy)
+        self._policy_action: Callable[[Tensor], Tensor] = trained_policy(env, policy)
         self._controllers = [copy.copy(controller) for _ in range(n)]
         self._models = [copy.deepcopy(model) if env.engine.expanded_fields() else model for _ in range(n)]
         self._datas = [mujoco.MjData(own) for own in self._models]
         self._rows: list[np.ndarray | None] = [None] * n
         self._ctrl = np.zeros((n, model.nu))
-        self._plan = controller.about["deployment"]
+        self._plan = controller.metadata["deployment"]
         closed = [c for control in self._plan["controls"] if control["closed"] for c in control["ctrl"]]
         self._closed = np.zeros(model.nu, dtype=bool)
         try:
             self._closed[closed] = True
-            self._ends = _ends(controller, model)
-        except (KeyError, IndexError, TypeError, ValueError) as error:
-            raise _misfit(error) from error
+            self._bounds = _control_bounds(controller, model)
+        except _BAD_METADATA as error:
+            raise _metadata_error(error) from error
         self._open_terms = [term for term in self._plan["observations"] if not term["closed"]]
-        self._decimation = controller.about["decimation"]
+        self._decimation = controller.metadata["decimation"]
 
     def act(self, obs: Tensor) -> Tensor:
-        """Return the file's actions for the plain simulations; `obs` are the observations of the environment."""
+        """Return the file's actions for the plain simulations; `obs` are the environment's observations."""
         is_first = (self._env.episode_length_buf == 0).tolist()
         for i, controller in enumerate(self._controllers):
             self._copy_state(i, is_first[i])
@@ -272,23 +279,24 @@ class _Driver:
             inputs = self._inputs(i, obs)
             try:
                 self._ctrl[i] = controller.act(self._datas[i], inputs)
-            except (KeyError, IndexError, TypeError, ValueError) as error:
-                raise _misfit(error) from error
+            except _BAD_METADATA as error:
+                raise _metadata_error(error) from error
         actions = torch.from_numpy(np.stack([controller.action for controller in self._controllers]))
         computed = torch.from_numpy(np.stack([controller.obs for controller in self._controllers])).float()
-        self._note("observation", computed, obs)
-        expected = self._expected(obs if self._synchronize else computed)
-        self._note("action", actions, expected)
+        self._record_difference("observation", computed, obs)
+        expected = self._policy_action(obs if self._synchronize else computed)
+        self._record_difference("action", actions, expected)
         if not self._synchronize:
             return actions
-        agree = _difference(actions, expected).amax(dim=1) <= ROUNDING
+        agree = relative_difference(actions, expected).amax(dim=1) <= ROUNDING
         return torch.where(agree[:, None], expected, actions)
 
     def physics(self) -> None:
-        """`decimation` times `mj_step`, in the place of the engine."""
+        """Call `mj_step` `decimation` times in every plain simulation; replaces the physics of the engine."""
         ctrl = self._engine.field("ctrl").numpy()
-        allowed = np.clip(ctrl, *self._ends)  # what MuJoCo would cut off, the file has cut off already
-        self._note("control", *(torch.from_numpy(values[:, self._closed]) for values in (self._ctrl, allowed)))
+        allowed = np.clip(ctrl, *self._bounds)  # the program clips its controls; MuJoCo clips those of the engine later
+        pairs = (torch.from_numpy(values[:, self._closed]) for values in (self._ctrl, allowed))
+        self._record_difference("control", *pairs)
         calls = self._env.calls_per_step
         for _ in range(calls):
             if calls > 1:
@@ -296,8 +304,7 @@ class _Driver:
             for i, data in enumerate(self._datas):
                 data.ctrl[:] = np.where(self._closed, self._ctrl[i], ctrl[i])
                 mujoco.mj_step(self._models[i], data, self._decimation // calls)
-                if self._plan["derived"] == "current":
-                    mujoco.mj_step1(self._models[i], data)  # what the state as it is looks like
+                self._update_derived(i)
             if self._synchronize:
                 self._engine.step(self._decimation // calls)
             else:
@@ -307,27 +314,32 @@ class _Driver:
         self._rows = [self._engine.state_row(i) for i in range(len(self._datas))]
         self.steps += len(self._datas)
 
+    def _update_derived(self, i: int) -> None:
+        # mj_step leaves positions and sensors of the state before it; mj_step1 computes those of the new state
+        if self._plan["derived"] == "current":
+            mujoco.mj_step1(self._models[i], self._datas[i])
+
     def _write_to_engine(self, env_ids: Iterable[int]) -> None:
         for i in env_ids:
             self._engine.copy_data(i, self._datas[i])
 
     def _synchronize_states(self) -> None:
-        """Where both sides arrived at one state but for rounding, go on from that of the engine."""
+        """Copy the engine's state to plain MuJoCo if both agree within rounding; else copy in the other direction."""
         disagreeing = []
         for i, data in enumerate(self._datas):
             fields = (self._engine.field(name)[i] for name in ("qpos", "qvel"))
             pairs = zip((data.qpos, data.qvel), fields, strict=True)
-            if all(bool((_difference(torch.from_numpy(own), theirs) <= ROUNDING).all()) for own, theirs in pairs):
-                self._put(i, self._engine.state_row(i))
-                if self._plan["derived"] == "current":
-                    mujoco.mj_step1(self._models[i], data)
+            differences = [relative_difference(torch.from_numpy(plain), engine) for plain, engine in pairs]
+            if all(bool((difference <= ROUNDING).all()) for difference in differences):
+                self._set_state(i, self._engine.state_row(i))
+                self._update_derived(i)
             else:
                 disagreeing.append(i)
         self._write_to_engine(disagreeing)
         self.disagreeing_steps += len(disagreeing)
 
     def terms(self, *, closed: bool) -> list[str]:
-        """Return the terms that plain code computes from the metadata, or those that it cannot."""
+        """Return the terms that plain code computes from the metadata, or those that it cannot compute."""
         kinds = {"observation": self._plan["observations"], "control": self._plan["controls"]}
         return [f"{kind} {t['name']}" for kind, terms in kinds.items() for t in terms if t["closed"] is closed]
 
@@ -342,19 +354,19 @@ class _Driver:
             target[...] = np.reshape(values, np.shape(target))
         if is_first:
             mujoco.mj_resetData(self._models[i], data)
-        self._put(i, row)
+        self._set_state(i, row)
         if self._plan["forces_after_reset"]:
             mujoco.mj_forward(self._models[i], data)
-            self._put(i, row)  # a forward pass leaves a warm start behind
+            self._set_state(i, row)  # mj_forward has overwritten the warm start, which is part of the state
         else:
             mujoco.mj_step1(self._models[i], data)
         self._rows[i] = row
 
-    def _put(self, i: int, row: np.ndarray) -> None:
+    def _set_state(self, i: int, row: np.ndarray) -> None:
         mujoco.mj_setState(self._models[i], self._datas[i], row, int(mujoco.mjtState.mjSTATE_INTEGRATION))
 
     def _inputs(self, i: int, obs: Tensor) -> dict[str, np.ndarray]:
-        """The inputs that plain code cannot compute: commands, and the terms that only the task's code knows."""
+        """Return what plain code cannot compute: commands, and observation terms without a formula."""
         commands = getattr(self._env, "command_manager", None)
         inputs = {
             f"command/{term.name}": term.instance.command[i].numpy()
@@ -362,51 +374,46 @@ class _Driver:
         }
         for term in self._open_terms:
             begin, end = term["columns"]
-            inputs[term["value"]["given"]] = obs[i, end - (end - begin) // term["history"] : end].numpy()
+            newest = end - (end - begin) // term["history"]
+            inputs[term["value"]["given"]] = obs[i, newest:end].numpy()
         return inputs
 
-    def _note(self, what: str, found: Tensor, expected: Tensor) -> None:
+    def _record_difference(self, name: str, found: Tensor, expected: Tensor) -> None:
         if found.numel():
-            largest = float(_difference(found, expected).max())
-            self.differences[what] = float(np.maximum(self.differences[what], largest))  # NaN stays
+            largest = float(relative_difference(found, expected).max())
+            self.differences[name] = float(np.maximum(self.differences[name], largest))  # np.maximum keeps NaN
 
-    def _require_same_shape(self, model: mujoco.MjModel) -> None:
+    def _require_same_sizes(self, model: mujoco.MjModel) -> None:
         own = self._engine.model
         for name in ("nq", "nv", "nu", "na", "nbody", "nsensordata"):
             if getattr(model, name) != getattr(own, name):
-                raise CheckpointError(f"the written model has another {name} than the run's")
+                raise CheckpointError(
+                    f"the written model has {name} = {getattr(model, name)}, the run's model has {getattr(own, name)}"
+                )
 
 
-def _misfit(error: Exception) -> CheckpointError:
+def _metadata_error(error: Exception) -> CheckpointError:
     return CheckpointError(f"the file's metadata does not fit the model: {type(error).__name__}: {error}")
 
 
-def _difference(found: Tensor, expected: Tensor) -> Tensor:
-    """Difference relative to max(1, |value|)."""
-    return (found - expected).abs() / expected.abs().clamp(min=1.0)
-
-
-def _ends(controller: Any, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest and largest effective controls: the range of controls, and the limits of `command`. (nu,) each"""
+def _control_bounds(controller: Any, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and largest effective controls: MuJoCo's ranges and the limits of `command`. (nu,) each"""
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = (np.where(limited, end, far) for end, far in zip(model.actuator_ctrlrange.T, _FREE, strict=True))
-    columns = [pair for term in controller.about["actions"] for pair in term["limits"] or [_FREE] * term["size"]]
+    columns = [pair for term in controller.metadata["actions"] for pair in term["limits"] or [_FREE] * term["size"]]
     limits = np.array([[far if end is None else end for end, far in zip(pair, _FREE, strict=True)] for pair in columns])
     for control in controller.plan["controls"]:
-        if control["closed"] and _reads_command(control["value"]):
+        if control["closed"] and _reads_only_command(control["value"]):
             ends = [controller.value(control["value"], None, {"command": end}) for end in limits.astype(np.float32).T]
             low[control["ctrl"]] = np.maximum(low[control["ctrl"]], np.minimum(*ends))
             high[control["ctrl"]] = np.minimum(high[control["ctrl"]], np.maximum(*ends))
     return low, high
 
 
-_FREE = (-np.inf, np.inf)
-
-
-def _reads_command(formula: Any) -> bool:
-    """Whether a formula reads the command alone."""
+def _reads_only_command(formula: Any) -> bool:
+    """Return whether the only input of a formula is the command."""
     if isinstance(formula, list):
         return True
     if "op" in formula:
-        return all(map(_reads_command, formula["of"]))
+        return all(map(_reads_only_command, formula["of"]))
     return bool(formula.get("given") == "command")

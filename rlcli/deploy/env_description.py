@@ -1,4 +1,4 @@
-"""What code without rlcli must know to be the environment of a policy: kept in checkpoints, written into exports."""
+"""Description of an environment for code without rlcli; it is stored in checkpoints and in exported files."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 import torch
+from pydantic_core import to_jsonable_python
 
 from rlcli.config.schema import ActionConfig, ObservationConfig
 from rlcli.config.term_signatures import params_model
@@ -20,17 +21,19 @@ if TYPE_CHECKING:
     from rlcli.envs.managed import ManagedEnv
     from rlcli.envs.vec_env import VecEnv
 
-_UNKNOWN = "observation/"
-"""What the caller must say where there is no formula."""
+_INPUT = "observation/"
+"""Prefix of the inputs for observation terms without a formula."""
 
 
 def describe(env: VecEnv) -> dict[str, Any]:
-    """Plain JSON: joints, actuators, start state, and a formula for every observation and control that has one.
+    """Return joints, actuators, start state, and the formulas of observations and controls, as plain JSON.
 
     Raises:
-        ConfigError: if a direct task describes itself in terms that do not fit it.
+        ConfigError: if the terms of a direct task's `in_terms` do not fit the task.
     """
-    observations, controls = _direct(env) if isinstance(env, DirectEnv) else _managed(env)  # type: ignore[arg-type]
+    observations, controls = (
+        _describe_direct(env) if isinstance(env, DirectEnv) else _describe_managed(env)  # type: ignore[arg-type]
+    )
     commands = getattr(env, "command_manager", None)
     return {
         "joints": _joints(env),
@@ -47,22 +50,24 @@ def describe(env: VecEnv) -> dict[str, Any]:
     }
 
 
-def _managed(env: ManagedEnv) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     groups = {}
     for group in env.config.observations:
-        edge, terms = 0, []
+        begin, terms = 0, []
         for pipeline in env.observation_manager.pipelines(group):
-            value = _prepared(env, pipeline.term, pipeline.width)
-            terms.append(_term_observation(pipeline.term, edge, pipeline.width, pipeline.history, value))
-            edge += pipeline.size
+            term, width = pipeline.term, pipeline.width
+            value = _processed_formula(env, term, width)
+            name, func, params = term.name, term.config.func, term.config.params
+            terms.append(_observation(name, func, params, begin, width, pipeline.history, value))
+            begin += pipeline.size
         groups[group] = terms
     return groups, _controls(env, env.action_manager.terms)
 
 
-def _direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    task, said = env.task, env.task.in_terms()
+def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    task, in_terms = env.task, env.task.in_terms()
     groups = {
-        group: [_observation(name, f"{type(task).__name__}.{hook}", {}, (0, width), 1, None)]
+        group: [_observation(name, f"{type(task).__name__}.{hook}", {}, 0, width)]
         for group, name, hook, width in (
             ("policy", "obs_buf", "get_observations", task.num_observations),
             ("critic", "states_buf", "get_states", task.num_states),
@@ -71,26 +76,29 @@ def _direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     }
     hook = f"{type(task).__name__}.pre_physics_step"
     unknown = {"name": "actions", "func": hook, "ctrl": [], "actuators": [], "closed": False, "value": None}
-    if said is None:
+    if in_terms is None:
         return groups, [unknown]
     bound = {
-        section: [_bound(env, section, number, entry) for number, entry in enumerate(said.get(section, []))]
+        section: [_bind(env, section, number, entry) for number, entry in enumerate(in_terms.get(section, []))]
         for section in ("observations", "actions")
     }
     env._binder.raise_problems()
-    edge, terms = 0, []
+    begin, terms = 0, []
     for term in bound["observations"]:
-        width = _width(env, term)
-        terms.append(_term_observation(term, edge, width, 1, _prepared(env, term, width, env.config.clip_observations)))
-        edge += width
-    if edge != task.num_observations:
-        message = f"{type(task).__name__}.in_terms() has {edge} columns of {task.num_observations}"
+        # `last_action` reads the action manager, which a direct task does not have
+        is_last_action = term.config.func == "last_action"
+        width = task.num_actions if is_last_action else int(term.call().shape[1])
+        value = _processed_formula(env, term, width, env.config.clip_observations)
+        terms.append(_observation(term.name, term.config.func, term.config.params, begin, width, value=value))
+        begin += width
+    if begin != task.num_observations:
+        message = f"{type(task).__name__}.in_terms() has {begin} columns, the task has {task.num_observations}"
         raise ConfigError([Problem("observations", "observations", message)])
     groups["policy"] = terms
     return groups, _controls(env, bound["actions"])
 
 
-def _bound(env: DirectEnv, section: str, number: int, entry: Mapping[str, Any]) -> BoundTerm:
+def _bind(env: DirectEnv, section: str, number: int, entry: Mapping[str, Any]) -> BoundTerm:
     path = (section, f"{entry['func']}_{number}")
     signature = env.resolved.vocabulary.find(section, entry["func"])
     if signature is None:
@@ -103,42 +111,32 @@ def _bound(env: DirectEnv, section: str, number: int, entry: Mapping[str, Any]) 
     return term
 
 
-def _width(env: DirectEnv, term: BoundTerm) -> int:
-    """Columns of a term; what the past decides has a width of its own."""
-    return env.task.num_actions if term.config.func == "last_action" else int(term.call().shape[1])
-
-
 def _observation(
-    name: str, func: str, params: Mapping[str, Any], columns: tuple[int, int], history: int, value: Formula | None
+    name: str, func: str, params: dict[str, Any], begin: int, width: int, history: int = 1, value: Formula | None = None
 ) -> dict[str, Any]:
     return {
         "name": name,
         "func": func,
-        "params": _plain(params),
-        "columns": list(columns),
+        "params": to_jsonable_python(params, fallback=str),
+        "columns": [begin, begin + width * history],
         "history": history,
         "closed": value is not None,
-        "value": given(_UNKNOWN + name) if value is None else value,
+        "value": given(_INPUT + name) if value is None else value,
     }
 
 
-def _term_observation(term: BoundTerm, edge: int, width: int, history: int, value: Formula | None) -> dict[str, Any]:
-    columns = edge, edge + width * history
-    return _observation(term.name, term.config.func, term.config.params, columns, history, value)
-
-
 def _controls(env: VecEnv, terms: Iterable[BoundTerm]) -> list[dict[str, Any]]:
-    """Return the description of each action term; their columns of the action lie side by side."""
-    controls, edge = [], 0
+    """Return the description of each action term. The terms take consecutive columns of the action."""
+    controls, begin = [], 0
     for term in terms:
-        controls.append(_control(env, term, (edge, edge + term.instance.size)))
-        edge += term.instance.size
+        controls.append(_control(env, term, (begin, begin + term.instance.size)))
+        begin += term.instance.size
     return controls
 
 
 def _control(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> dict[str, Any]:
     ctrl, value = control_formula(env, term, columns) or ([], None)
-    if value is not None and isinstance(env, DirectEnv):  # there `command` is the action, within its clip
+    if value is not None and isinstance(env, DirectEnv):  # its `command` is the clipped action: apply scale and offset
         action = term.instance
         effort = op("mul", given("command", range(*columns)), _row(action._scale, action.size))
         if bool(torch.as_tensor(action._offset).any()):
@@ -154,10 +152,11 @@ def _control(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> dict[str
     }
 
 
-def _prepared(env: VecEnv, term: BoundTerm, width: int, bound: float | None = None) -> Formula | None:
-    """A term's value with all that is done to it but noise, bias, delay and history."""
+def _processed_formula(env: VecEnv, term: BoundTerm, width: int, bound: float | None = None) -> Formula | None:
+    """Return a term's formula with its modifiers, clip and scale, but without noise, bias, delay and history."""
     value, config = observation_formula(env, term), term.config
     assert isinstance(config, ObservationConfig)
+    # a curriculum may change a tunable number, so it cannot be a constant of the formula
     if value is None or any((*term.path, key) in env._binder.tunable for key in ("scale", "clip")):
         return None
     for number, modifier in enumerate(config.modifiers):
@@ -169,6 +168,7 @@ def _prepared(env: VecEnv, term: BoundTerm, width: int, bound: float | None = No
         elif step["kind"] == "bias":
             value = op("add", value, _row(step["offset"], width))
         else:
+            # an integrator is the filter of the trapezoidal rule: y[n] = y[n-1] + dt / 2 (x[n] + x[n-1])
             half = 0.5 * env.step_dt
             b, a = (step["b"], step["a"]) if step["kind"] == "digital_filter" else ([half, half], [-1.0])
             key = ".".join(map(str, (*term.path, number)))
@@ -185,30 +185,22 @@ def _row(values: float | Sequence[float] | torch.Tensor, width: int) -> Formula:
     return list((row[0] if row.dim() == 2 else row).expand(width).tolist())
 
 
-def _plain(value: object) -> Any:
-    """As JSON."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value if value is None or isinstance(value, str | int | float | bool) else str(value)
-
-
 def _joints(env: VecEnv) -> list[dict[str, Any]]:
-    """All hinges and slides of all entities, and the gains of what drives them."""
+    """Return all hinge and slide joints of all entities with the stiffness and damping of their actuators."""
     model, rows = env.engine.model, []
     for name, entity in env.entities.items():
         gains: dict[int, tuple[float, float]] = {}
         for kind in ("motor", "position", "velocity"):
             for column, actuator in entity.actuators_of(kind):
-                held = kind == "position", kind != "motor"
-                parts = (model.actuator_gainprm[actuator, 0], -model.actuator_biasprm[actuator, 2])
-                gains[column] = tuple(float(v) + 0.0 if is_ else 0.0 for v, is_ in zip(parts, held, strict=True))  # type: ignore[assignment]
-        for drive in entity.actuators:
-            for i, column in enumerate(drive.joints):
-                gains[column] = float(drive.stiffness[0, i]), float(drive.damping[0, i])
+                # MuJoCo's position actuator: force = kp (ctrl - q) - kv q', with gainprm[0] = kp and biasprm[2] = -kv
+                stiffness = float(model.actuator_gainprm[actuator, 0]) if kind == "position" else 0.0
+                damping = 0.0 - float(model.actuator_biasprm[actuator, 2]) if kind != "motor" else 0.0  # never -0.0
+                gains[column] = stiffness, damping
+        for actuator_model in entity.actuators:
+            for i, column in enumerate(actuator_model.joints):
+                gains[column] = float(actuator_model.stiffness[0, i]), float(actuator_model.damping[0, i])
         for column, joint in enumerate(entity.joint_names):
-            stiffness, damping = gains.get(column, (None, None))
+            gain = gains.get(column, (None, None))
             rows.append(
                 {
                     "name": joint,
@@ -216,8 +208,8 @@ def _joints(env: VecEnv) -> list[dict[str, Any]]:
                     "qpos": int(entity.qpos_columns[column]),
                     "dof": int(entity.dof_columns[column]),
                     "default": float(entity.data.default_joint_pos[0, column]),
-                    "stiffness": stiffness,
-                    "damping": damping,
+                    "stiffness": gain[0],
+                    "damping": gain[1],
                 }
             )
     return rows

@@ -1,4 +1,4 @@
-"""The formats of exported policies: how each is written, and how it is read back to be checked."""
+"""Formats of exported policies: a writer for each, and a reader that checks the file."""
 
 from __future__ import annotations
 
@@ -14,44 +14,47 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.deploy.graph import Deployed
+from rlcli.deploy.graph import DeployedPolicy
 from rlcli.deploy.numpy_export import numpy_bytes, read_numpy
 from rlcli.errors import CheckpointError, DependencyError
 
 KEY = "rlcli"
-"""Where the metadata stands in a file: a property of the ONNX model, an extra file of the torch program."""
+"""Key of the metadata in a file: a property of the ONNX model, an extra file of the torch program."""
 FORMATS = {"onnx": ".onnx", "torch": ".pt2", "numpy": ".py"}
-"""Format -> how its files end."""
+"""Format -> suffix of its files."""
 _OPSET = 18
 
-Run = Callable[[dict[str, Tensor]], dict[str, Tensor]]
+PolicyFunction = Callable[[dict[str, Tensor]], dict[str, Tensor]]
 """Inputs by name -> outputs by name."""
 
 
-def write(format_: str, graph: Deployed, metadata: str, further: dict[str, str]) -> bytes:
-    """A file's content.
+def write(format_: str, graph: DeployedPolicy, metadata: str, extra_properties: dict[str, str]) -> bytes:
+    """Return the content of a file.
 
     Args:
         format_: one of `FORMATS`.
-        graph: what it computes.
+        graph: the module to export.
         metadata: JSON.
-        further: properties that an ONNX file has besides.
+        extra_properties: further metadata properties of an ONNX file.
     """
     if format_ == "onnx":
-        return _onnx_bytes(graph, {KEY: metadata, **further})
+        return _onnx_bytes(graph, {KEY: metadata, **extra_properties})
     return _torch_bytes(graph, metadata) if format_ == "torch" else numpy_bytes(graph, metadata)
 
 
-def read(format_: str, file: Path) -> tuple[Run, str]:
-    """What a file computes, and its metadata. A file of Python is run: only one that was written here is read."""
+def read(format_: str, file: Path) -> tuple[PolicyFunction, str]:
+    """Return the function in a file and its metadata as JSON.
+
+    A Python file is executed, so call this only with a file that this process has written.
+    """
     return {"onnx": _read_onnx, "torch": _read_torch, "numpy": read_numpy}[format_](file)
 
 
-def require(format_: str) -> None:
-    """What writes and checks a format must be there.
+def require_packages(format_: str) -> None:
+    """Check that the packages that write and check a format are installed.
 
     Raises:
-        DependencyError: if it is not installed.
+        DependencyError: if one of them is not.
     """
     if format_ != "onnx":
         return
@@ -65,34 +68,34 @@ def require(format_: str) -> None:
         ) from None
 
 
-def _example(graph: Deployed) -> tuple[Tensor, ...]:
-    rows = 2  # one row would be taken for a constant batch
-    return (torch.zeros(rows, graph.policy.spec.observation_size), *graph.start(rows).values())
+def _example_inputs(graph: DeployedPolicy) -> tuple[Tensor, ...]:
+    rows = 2  # torch.export treats a batch of one row as a constant
+    return (torch.zeros(rows, graph.policy.spec.observation_size), *graph.initial_state(rows).values())
 
 
-def _shapes(graph: Deployed) -> dict[str, dict[int, Any] | None]:
+def _dynamic_shapes(graph: DeployedPolicy) -> dict[str, dict[int, Any] | None]:
     batch = torch.export.Dim("batch")
     return {name: {0 if name == "obs" else 1: batch} for name in graph.inputs}
 
 
-def _onnx_bytes(graph: Deployed, properties: dict[str, str]) -> bytes:
+def _onnx_bytes(graph: DeployedPolicy, properties: dict[str, str]) -> bytes:
     import onnx
 
     with _quiet():
         program = torch.onnx.export(
-            graph.plain(),
-            _example(graph),
+            graph.for_onnx(),
+            _example_inputs(graph),
             dynamo=True,
             external_data=False,
             input_names=graph.inputs,
             output_names=graph.outputs,
-            dynamic_shapes=_shapes(graph),
+            dynamic_shapes=_dynamic_shapes(graph),
             opset_version=_OPSET,
             verbose=False,
         )
     assert program is not None
     for node in program.model.graph:
-        node.metadata_props.clear()  # stack traces, with paths of this machine
+        node.metadata_props.clear()  # they hold stack traces with paths of this machine
     program.model.producer_name = "rlcli"
     program.model.metadata_props.update(properties)
     model = program.model_proto
@@ -101,7 +104,7 @@ def _onnx_bytes(graph: Deployed, properties: dict[str, str]) -> bytes:
     return content
 
 
-def _read_onnx(file: Path) -> tuple[Run, str]:
+def _read_onnx(file: Path) -> tuple[PolicyFunction, str]:
     import onnxruntime
 
     data = file.read_bytes()
@@ -120,14 +123,14 @@ def _read_onnx(file: Path) -> tuple[Run, str]:
 
 
 def require_self_contained(data: bytes, file: Path) -> None:
-    """An ONNX file may name other files for its numbers, anywhere on the disk: such a one is not opened.
+    """Refuse an ONNX file that stores tensors in other files, whose paths may lead anywhere on the disk.
 
     Args:
-        data: its content.
-        file: its name, for the message.
+        data: the content of the file.
+        file: its path, for the message.
 
     Raises:
-        CheckpointError: if it is no ONNX file, or not the whole of it.
+        CheckpointError: if it is not an ONNX file, or stores a tensor in another file.
     """
     import onnx
     from google.protobuf.message import DecodeError
@@ -135,14 +138,14 @@ def require_self_contained(data: bytes, file: Path) -> None:
     try:
         model = onnx.load_from_string(data)
     except DecodeError:
-        raise CheckpointError(f"{file} is corrupt, or no ONNX file") from None
-    for value in _tensors_elsewhere(model):
+        raise CheckpointError(f"{file} is corrupt, or not an ONNX file") from None
+    for value in _external_tensors(model):
         where = next((entry.value for entry in value.external_data if entry.key == "location"), "?")
-        raise CheckpointError(f"{file} keeps '{value.name[:60]}' in another file, {where[:80]!r}; it is not opened")
+        raise CheckpointError(f"{file} stores '{value.name[:60]}' in another file, {where[:80]!r}; it is not opened")
 
 
-def _tensors_elsewhere(part: Any) -> Iterator[Any]:
-    """Tensors below a part of an ONNX model whose numbers are in another file."""
+def _external_tensors(part: Any) -> Iterator[Any]:
+    """Yield the tensors below a part of an ONNX model whose values are in another file."""
     from google.protobuf.message import Message
 
     if part.DESCRIPTOR.name == "TensorProto":
@@ -152,18 +155,18 @@ def _tensors_elsewhere(part: Any) -> Iterator[Any]:
     for _, value in part.ListFields():
         for inner in (value,) if isinstance(value, Message | str | bytes | int | float) else value:
             if isinstance(inner, Message):
-                yield from _tensors_elsewhere(inner)
+                yield from _external_tensors(inner)
 
 
-def _torch_bytes(graph: Deployed, metadata: str) -> bytes:
+def _torch_bytes(graph: DeployedPolicy, metadata: str) -> bytes:
     file = io.BytesIO()
     with _quiet():
-        program = torch.export.export(graph, _example(graph), dynamic_shapes=_shapes(graph))
+        program = torch.export.export(graph, _example_inputs(graph), dynamic_shapes=_dynamic_shapes(graph))
         torch.export.save(program, file, extra_files={KEY: metadata})
     return file.getvalue()
 
 
-def _read_torch(file: Path) -> tuple[Run, str]:
+def _read_torch(file: Path) -> tuple[PolicyFunction, str]:
     extra: dict[str, Any] = {KEY: ""}
     with _quiet():
         program = torch.export.load(file, extra_files=extra)
@@ -173,7 +176,7 @@ def _read_torch(file: Path) -> tuple[Run, str]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Exporters talk: about steps on stdout, about what they miss in the log."""
+    """Silence the exporters: they print progress on stdout, and log and warn about missing features."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

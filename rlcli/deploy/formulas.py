@@ -1,10 +1,14 @@
-"""Observation and action terms as formulas: plain data that says how code without rlcli computes them from MjData.
+"""Formulas of observation and action terms: plain data from which code without rlcli computes them from MjData.
 
-A formula is a list of numbers; `{"field": NAME, "at": [...]}`, elements of a field of MjData, flattened;
-`{"given": NAME, "at": [...]}`, what the caller knows: `last_action`, `steps` of the episode, `command/NAME`, or the
-policy's outputs `action` and `command`; or `{"op": NAME, "of": [formulas]}`. Every value is a row of float32.
+A formula is one of these. Every value is a row of float32.
 
-Of a term that has none only its own code can be asked.
+- A list of numbers.
+- `{"field": NAME, "at": [...]}`: elements of a flattened field of MjData.
+- `{"given": NAME, "at": [...]}`: elements of an input. Inputs are `last_action`, `steps` (of the episode),
+  `command/NAME`, and the policy's outputs `action` and `command`.
+- `{"op": NAME, "of": [formulas]}`: an operation; `deployed/run_policy.py` implements all of them.
+
+A term without a formula can only be computed by its own code.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,13 +33,13 @@ Formula = Any
 
 
 class NoFormula(Exception):
-    """Depends on what MjData does not hold."""
+    """Raised for a term that depends on something that MjData does not contain."""
 
 
 def observation_formula(env: VecEnv, term: BoundTerm) -> Formula | None:
-    """What the function of an observation term computes; None where plain code cannot."""
+    """Return the formula of an observation term's function; None if it has none."""
     function = getattr(term.call, "func", None)
-    make = _OBSERVATIONS.get(getattr(function, "__name__", "")) if _is_ours(function, observations) else None
+    make = _OBSERVATIONS.get(getattr(function, "__name__", "")) if _is_defined_in(observations, function) else None
     if make is None:
         return None
     try:
@@ -44,15 +49,15 @@ def observation_formula(env: VecEnv, term: BoundTerm) -> Formula | None:
 
 
 def control_formula(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> tuple[list[int], Formula] | None:
-    """Controls of the model, and what an action term writes to them; None where plain code cannot.
+    """Return the controls that an action term writes, by index, and the formula of their values; None if it has none.
 
     Args:
         env: the environment.
         term: the action term.
-        columns: of the policy's vector that it takes.
+        columns: begin and end of its columns in the policy's action.
     """
     action = term.instance
-    make = _ACTIONS.get(type(action).__name__) if _is_ours(type(action), actions) else None
+    make = _ACTIONS.get(type(action).__name__) if _is_defined_in(actions, type(action)) else None
     if make is None or None in action.actuators:
         return None
     value = make(action, list(range(*columns)))
@@ -62,149 +67,130 @@ def control_formula(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> t
 
 
 def field(name: str, at: Any) -> Formula:
-    """Elements of a field of MjData."""
+    """Return the formula of elements of a field of MjData."""
     return {"field": name, "at": [int(i) for i in at]}
 
 
 def given(name: str, at: Any = None) -> Formula:
-    """What the caller knows, or some elements of it."""
+    """Return the formula of an input, or of some elements of it."""
     return {"given": name} if at is None else {"given": name, "at": [int(i) for i in at]}
 
 
 def op(name: str, *of: Formula) -> Formula:
-    """An operation on formulas."""
+    """Return the formula of an operation on formulas."""
     return {"op": name, "of": list(of)}
 
 
 def numbers(values: Tensor) -> Formula:
-    """Constants."""
+    """Return a constant formula."""
     return [float(value) for value in values.detach().cpu().float().flatten().tolist()]
 
 
-def _is_ours(function: Any, module: Any) -> bool:
+def _is_defined_in(module: Any, function: Any) -> bool:
+    """Return whether a function or class is the library's own: a task may define another one with the same name."""
     return bool(getattr(function, "__module__", None) == module.__name__)
 
 
-# --- what terms are made of ---
+# --- parts of formulas ---
 
 
 def _shared(values: Tensor) -> Formula:
-    """A quantity that all environments have alike. (num_envs, k)"""
+    """Return a constant formula of a quantity (num_envs, k) that is equal in all environments."""
     if not bool((values == values[:1]).all()):
         raise NoFormula
     return numbers(values[0])
 
 
-def _joints(entity: Entity, joints: Columns) -> tuple[list[int], list[int]]:
-    """Addresses in qpos and in qvel."""
-    return entity.qpos_columns[joints].tolist(), entity.dof_columns[joints].tolist()
+def _joint_field(entity: Entity, name: str, joints: Columns) -> Formula:
+    """Return the joints' elements of qpos, or of a field with one element for each degree of freedom."""
+    return field(name, (entity.qpos_columns if name == "qpos" else entity.dof_columns)[joints].tolist())
 
 
-def _bodies(entity: Entity, bodies: Columns) -> list[int]:
-    return torch.from_numpy(entity.body_ids)[_host(bodies)].tolist()
+def _selected(ids: np.ndarray, columns: Columns) -> list[int]:
+    """Return the ids of the selected bodies, sites or sensors."""
+    return torch.from_numpy(ids)[columns if isinstance(columns, slice) else columns.cpu()].tolist()
 
 
-def _sites(entity: Entity, sites: Columns) -> list[int]:
-    return torch.from_numpy(entity.site_ids)[_host(sites)].tolist()
-
-
-def _host(columns: Columns) -> Columns:
-    return columns if isinstance(columns, slice) else columns.cpu()
-
-
-def _of(name: str, number: int, width: int, begin: int = 0, count: int | None = None) -> Formula:
+def _row_of(name: str, number: int, width: int, begin: int = 0, count: int | None = None) -> Formula:
+    """Return a row of a field of shape (n, width), or `count` of its elements from `begin` on."""
     start = number * width + begin
     return field(name, range(start, start + (width if count is None else count)))
 
 
-def _root(entity: Entity, name: str, address: int | None, start: int, stop: int, default: int) -> Formula:
-    """Elements `start` to `stop` of the root's part of qpos or qvel; a fixed root has those of the default state."""
+def _root(entity: Entity, name: str, start: int, stop: int, default: int) -> Formula:
+    """Return elements `start` to `stop` of the root's part of qpos or qvel.
+
+    A fixed root has constants instead: those of the default root state from index `default` on.
+    """
+    address = entity.root_qpos if name == "qpos" else entity.root_dof
     if address is None:
         return numbers(entity.data.default_root_state[0, default : default + stop - start])
     return field(name, range(address + start, address + stop))
 
 
 def _root_pos(entity: Entity) -> Formula:
-    is_mocap = entity.mocap >= 0
-    return _of("mocap_pos", entity.mocap, 3) if is_mocap else _root(entity, "qpos", entity.root_qpos, 0, 3, 0)
+    return _row_of("mocap_pos", entity.mocap, 3) if entity.mocap >= 0 else _root(entity, "qpos", 0, 3, 0)
 
 
 def _root_quat(entity: Entity) -> Formula:
-    is_mocap = entity.mocap >= 0
-    return _of("mocap_quat", entity.mocap, 4) if is_mocap else _root(entity, "qpos", entity.root_qpos, 3, 7, 3)
+    return _row_of("mocap_quat", entity.mocap, 4) if entity.mocap >= 0 else _root(entity, "qpos", 3, 7, 3)
 
 
 def _root_lin_vel_w(entity: Entity) -> Formula:
-    return _root(entity, "qvel", entity.root_dof, 0, 3, 7)
+    return _root(entity, "qvel", 0, 3, 7)
 
 
 def _root_ang_vel_b(entity: Entity) -> Formula:
-    return _root(entity, "qvel", entity.root_dof, 3, 6, 10)
+    return _root(entity, "qvel", 3, 6, 10)
 
 
 def _down(entity: Entity) -> Formula:
-    if entity.engine.expanded("opt.gravity") is not None:
+    """Return the unit vector of gravity in world frame."""
+    if entity.engine.expanded("opt.gravity") is not None:  # gravity differs between environments
         raise NoFormula
     return _shared(entity.data.down_w)
 
 
-def _at_home(env: VecEnv) -> None:
-    """Positions count from the environment's origin, which is the world's where there is no terrain."""
+def _require_no_terrain(env: VecEnv) -> None:
+    """Refuse terrain: positions are relative to the environment's origin, which is the world's only without terrain."""
     if env.terrain is not None:
         raise NoFormula
 
 
 def _velocity_at(entity: Entity, body: int, point: Formula) -> Formula:
-    """Velocity of a point of a body: MjData has that at the centre of mass of the body's tree."""
+    """Return the velocity of a point of a body in world frame.
+
+    MjData's `cvel` is [angular, linear] velocity at the centre of mass of the body's kinematic tree.
+    """
     root = int(entity.engine.model.body_rootid[body])
-    arm = op("sub", point, _of("subtree_com", root, 3))
-    return op("add", _of("cvel", body, 6, 3, 3), op("cross", _of("cvel", body, 6, 0, 3), arm))
+    arm = op("sub", point, _row_of("subtree_com", root, 3))
+    return op("add", _row_of("cvel", body, 6, 3, 3), op("cross", _row_of("cvel", body, 6, 0, 3), arm))
 
 
-def _site_quat(entity: Entity, site: int) -> Formula:
-    model = entity.engine.model
-    turn = numbers(torch.tensor(model.site_quat[site]))
-    return op("product", _of("xquat", int(model.site_bodyid[site]), 4), turn)
-
-
-def _parts(*formulas: Formula) -> Formula:
+def _concatenated(*formulas: Formula) -> Formula:
     return formulas[0] if len(formulas) == 1 else op("cat", *formulas)
 
 
 # --- observation terms, by the names of their functions ---
 
 
-def _joint_pos_rel(env: VecEnv, entity: Entity, joints: Columns) -> Formula:
-    default = _shared(entity.data.default_joint_pos[:, joints])
-    return op("sub", field("qpos", _joints(entity, joints)[0]), default)
-
-
-def _joint_vel_rel(env: VecEnv, entity: Entity, joints: Columns) -> Formula:
-    default = _shared(entity.data.default_joint_vel[:, joints])
-    return op("sub", field("qvel", _joints(entity, joints)[1]), default)
-
-
 def _joint_angle_sum(env: VecEnv, entity: Entity, joints: Columns) -> Formula:
-    qpos = field("qpos", _joints(entity, joints)[0])
-    return op("wrap", op("dot", qpos, [1.0] * len(_joints(entity, joints)[0])))
+    qpos = _joint_field(entity, "qpos", joints)
+    return op("wrap", op("dot", qpos, [1.0] * len(qpos["at"])))
 
 
 def _joint_pos_limit_normalized(env: VecEnv, entity: Entity, joints: Columns) -> Formula:
     low, high = entity.data.soft_joint_pos_limits[joints].unbind(dim=1)
     limited = high - low < torch.inf
     low, high = torch.where(limited, low, 0.0), torch.where(limited, high, 1.0)
-    twice = op("mul", [2.0], field("qpos", _joints(entity, joints)[0]))
+    twice = op("mul", [2.0], _joint_field(entity, "qpos", joints))
+    # (2 q - low - high) / (high - low) in the order of the term's own code, so that both round alike
     scaled = op("div", op("sub", op("sub", twice, numbers(low)), numbers(high)), numbers(high - low))
     return scaled if bool(limited.all()) else op("mul", scaled, numbers(limited))
 
 
-def _base_pos_z(env: VecEnv, entity: Entity) -> Formula:
-    _at_home(env)
-    return op("take", _root_pos(entity), [2.0])
-
-
 def _root_pos_w(env: VecEnv, entity: Entity) -> Formula:
-    _at_home(env)
+    _require_no_terrain(env)
     return _root_pos(entity)
 
 
@@ -225,71 +211,69 @@ def _yaw(entity: Entity) -> Formula:
     return op("angle", op("rotate", _root_quat(entity), [1.0, 0.0, 0.0]))
 
 
-def _way(env: VecEnv, entity: Entity, target: Iterable[float]) -> tuple[Formula, Formula]:
-    """Horizontally: the root's forward axis, and the way from it to a point."""
-    _at_home(env)
+def _heading_and_path(env: VecEnv, entity: Entity, target: Iterable[float]) -> tuple[Formula, Formula]:
+    """Return the root's forward axis and the vector from the root to a point, both horizontal (x, y)."""
+    _require_no_terrain(env)
     point = [float(value) for value in target][:2]
-    way = op("sub", point, op("take", _root_pos(entity), [0.0, 1.0]))
-    return op("take", op("rotate", _root_quat(entity), [1.0, 0.0, 0.0]), [0.0, 1.0]), way
+    path = op("sub", point, op("take", _root_pos(entity), [0.0, 1.0]))
+    return op("take", op("rotate", _root_quat(entity), [1.0, 0.0, 0.0]), [0.0, 1.0]), path
 
 
 def _base_heading_proj(env: VecEnv, entity: Entity, target: Iterable[float]) -> Formula:
-    ahead, way = _way(env, entity, target)
-    return op("div", op("dot", ahead, way), op("sqrt", op("dot", way, way)))
+    heading, path = _heading_and_path(env, entity, target)
+    return op("div", op("dot", heading, path), op("sqrt", op("dot", path, path)))
 
 
 def _base_angle_to_target(env: VecEnv, entity: Entity, target: Iterable[float]) -> Formula:
-    ahead, way = _way(env, entity, target)
-    return op("wrap", op("sub", op("angle", way), op("angle", ahead)))
+    heading, path = _heading_and_path(env, entity, target)
+    return op("wrap", op("sub", op("angle", path), op("angle", heading)))
 
 
 def _body_pose_w(env: VecEnv, entity: Entity, bodies: Columns) -> Formula:
-    _at_home(env)
-    return _parts(
-        *(part for b in _bodies(entity, bodies) for part in (_of("xpos", b, 3), _of("xquat", b, 4))),
-    )
+    _require_no_terrain(env)
+    poses = ((_row_of("xpos", b, 3), _row_of("xquat", b, 4)) for b in _selected(entity.body_ids, bodies))
+    return _concatenated(*(part for pose in poses for part in pose))
 
 
 def _body_projected_gravity_b(env: VecEnv, entity: Entity, bodies: Columns) -> Formula:
-    down = _down(entity)
-    return _parts(*(op("unrotate", _of("xquat", b, 4), down) for b in _bodies(entity, bodies)))
+    down, ids = _down(entity), _selected(entity.body_ids, bodies)
+    return _concatenated(*(op("unrotate", _row_of("xquat", b, 4), down) for b in ids))
 
 
 def _body_state_b(env: VecEnv, entity: Entity, bodies: Columns) -> Formula:
     root, parts = _root_quat(entity), []
-    for b in _bodies(entity, bodies):
+    for b in _selected(entity.body_ids, bodies):
         parts += [
-            op("unrotate", root, op("sub", _of("xpos", b, 3), _root_pos(entity))),
-            op("product", op("inverse", root), _of("xquat", b, 4)),
-            op("unrotate", root, _velocity_at(entity, b, _of("xpos", b, 3))),
-            op("unrotate", root, _of("cvel", b, 6, 0, 3)),
+            op("unrotate", root, op("sub", _row_of("xpos", b, 3), _root_pos(entity))),
+            op("product", op("inverse", root), _row_of("xquat", b, 4)),
+            op("unrotate", root, _velocity_at(entity, b, _row_of("xpos", b, 3))),
+            op("unrotate", root, _row_of("cvel", b, 6, 0, 3)),
         ]
     return op("cat", *parts)
 
 
 def _sensor(env: VecEnv, entity: Entity, sensors: Columns) -> Formula:
-    return field("sensordata", torch.arange(entity.engine.model.nsensordata)[_host(sensors)].tolist())
+    return field("sensordata", _selected(np.arange(entity.engine.model.nsensordata), sensors))
 
 
-def _foot_height(env: VecEnv, entity: Entity, sites: Columns) -> Formula:
-    _at_home(env)
-    return field("site_xpos", [3 * s + 2 for s in _sites(entity, sites)])
-
-
-def _ee_pos(env: VecEnv, entity: Entity, sites: Columns) -> Formula:
-    _at_home(env)
-    return field("site_xpos", [3 * s + i for s in _sites(entity, sites) for i in range(3)])
+def _site_pos(env: VecEnv, entity: Entity, sites: Columns, axes: Iterable[int] = (0, 1, 2)) -> Formula:
+    _require_no_terrain(env)
+    return field("site_xpos", [3 * s + axis for s in _selected(entity.site_ids, sites) for axis in axes])
 
 
 def _ee_quat(env: VecEnv, entity: Entity, sites: Columns, make_quat_unique: bool = True) -> Formula:
-    quats = [_site_quat(entity, s) for s in _sites(entity, sites)]
-    return _parts(*(op("unique", q) if make_quat_unique else q for q in quats))
+    model, quats = entity.engine.model, []
+    for site in _selected(entity.site_ids, sites):
+        # MjData has the orientation of a site as a matrix only, so the body's quaternion is turned by the site's
+        body_quat = _row_of("xquat", int(model.site_bodyid[site]), 4)
+        quats.append(op("product", body_quat, numbers(torch.tensor(model.site_quat[site]))))
+    return _concatenated(*(op("unique", q) if make_quat_unique else q for q in quats))
 
 
 def _ee_velocity(env: VecEnv, entity: Entity, sites: Columns) -> Formula:
-    body = entity.engine.model.site_bodyid
-    velocities = [_velocity_at(entity, int(body[s]), _of("site_xpos", s, 3)) for s in _sites(entity, sites)]
-    return _parts(*(op("unrotate", _root_quat(entity), velocity) for velocity in velocities))
+    body, ids = entity.engine.model.site_bodyid, _selected(entity.site_ids, sites)
+    velocities = [_velocity_at(entity, int(body[s]), _row_of("site_xpos", s, 3)) for s in ids]
+    return _concatenated(*(op("unrotate", _root_quat(entity), velocity) for velocity in velocities))
 
 
 def _object_position(env: VecEnv, entity: Entity, object: Entity) -> Formula:
@@ -301,8 +285,8 @@ def _object_quat(env: VecEnv, entity: Entity, object: Entity) -> Formula:
 
 
 def _ee_to_object(env: VecEnv, entity: Entity, sites: Columns, object: Entity) -> Formula:
-    (site,) = _sites(entity, sites)
-    return op("sub", _root_pos(object), _of("site_xpos", site, 3))
+    (site,) = _selected(entity.site_ids, sites)
+    return op("sub", _root_pos(object), _row_of("site_xpos", site, 3))
 
 
 def _generated_commands(env: VecEnv, command: CommandTerm) -> Formula:
@@ -311,15 +295,19 @@ def _generated_commands(env: VecEnv, command: CommandTerm) -> Formula:
 
 
 _OBSERVATIONS: Mapping[str, Callable[..., Formula]] = {
-    "joint_pos": lambda env, entity, joints: field("qpos", _joints(entity, joints)[0]),
-    "joint_vel": lambda env, entity, joints: field("qvel", _joints(entity, joints)[1]),
-    "joint_pos_rel": _joint_pos_rel,
-    "joint_vel_rel": _joint_vel_rel,
-    "joint_angle": lambda env, entity, joints: op("wrap", field("qpos", _joints(entity, joints)[0])),
+    "joint_pos": lambda env, entity, joints: _joint_field(entity, "qpos", joints),
+    "joint_vel": lambda env, entity, joints: _joint_field(entity, "qvel", joints),
+    "joint_pos_rel": lambda env, entity, joints: op(
+        "sub", _joint_field(entity, "qpos", joints), _shared(entity.data.default_joint_pos[:, joints])
+    ),
+    "joint_vel_rel": lambda env, entity, joints: op(
+        "sub", _joint_field(entity, "qvel", joints), _shared(entity.data.default_joint_vel[:, joints])
+    ),
+    "joint_angle": lambda env, entity, joints: op("wrap", _joint_field(entity, "qpos", joints)),
     "joint_angle_sum": _joint_angle_sum,
     "joint_pos_limit_normalized": _joint_pos_limit_normalized,
-    "joint_effort": lambda env, entity, joints: field("qfrc_actuator", _joints(entity, joints)[1]),
-    "base_pos_z": _base_pos_z,
+    "joint_effort": lambda env, entity, joints: _joint_field(entity, "qfrc_actuator", joints),
+    "base_pos_z": lambda env, entity: op("take", _root_pos_w(env, entity), [2.0]),
     "base_lin_vel": lambda env, entity: op("unrotate", _root_quat(entity), _root_lin_vel_w(entity)),
     "base_ang_vel": lambda env, entity: _root_ang_vel_b(entity),
     "projected_gravity": lambda env, entity: op("unrotate", _root_quat(entity), _down(entity)),
@@ -343,14 +331,11 @@ _OBSERVATIONS: Mapping[str, Callable[..., Formula]] = {
     "remaining_time_s": lambda env: op(
         "mul", op("sub", [float(env.max_episode_length)], given("steps")), [env.step_dt]
     ),
-    "sensor_data": _sensor,
-    "imu_orientation": _sensor,
+    **dict.fromkeys(("sensor_data", "imu_orientation", "imu_ang_vel", "imu_lin_acc"), _sensor),
     "imu_projected_gravity": lambda env, entity, sensors: op("unrotate", _sensor(env, entity, sensors), _down(entity)),
-    "imu_ang_vel": _sensor,
-    "imu_lin_acc": _sensor,
-    "foot_height": _foot_height,
-    "ee_pos": _ee_pos,
-    "ee_frame_pos": _ee_pos,
+    "foot_height": lambda env, entity, sites: _site_pos(env, entity, sites, [2]),
+    "ee_pos": _site_pos,
+    "ee_frame_pos": _site_pos,
     "ee_quat": _ee_quat,
     "ee_velocity": _ee_velocity,
     "object_position_in_robot_root_frame": _object_position,
@@ -378,7 +363,7 @@ def _clipped(action: Any, value: Formula) -> Formula:
 
 
 def _relative(action: Any, columns: list[int]) -> Formula:
-    positions = field("qpos", _joints(action.entity, action.joints)[0])
+    positions = _joint_field(action.entity, "qpos", action.joints)
     return _clipped(action, op("add", positions, _scaled(action, columns)))
 
 
@@ -399,14 +384,11 @@ def _binary(action: Any, columns: list[int]) -> Formula:
     )
 
 
-def _affine(action: Any, columns: list[int]) -> Formula:
-    return given("command", columns)
-
-
 _ACTIONS: Mapping[str, Callable[[Any, list[int]], Formula]] = {
-    "JointEffort": _affine,
-    "JointPosition": _affine,
-    "JointVelocity": _affine,
+    # the policy's output `command` has their scale, offset and limits already
+    **dict.fromkeys(
+        ("JointEffort", "JointPosition", "JointVelocity"), lambda action, columns: given("command", columns)
+    ),
     "RelativeJointPosition": _relative,
     "JointPositionToLimits": _to_limits,
     "BinaryJointPosition": _binary,

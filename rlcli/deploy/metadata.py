@@ -1,11 +1,11 @@
-"""What an exported file says of itself: everything that whoever runs it must know, and the same in mjlab's words."""
+"""Metadata of an exported file: everything that a program needs to run the policy, also in mjlab's format."""
 
 from __future__ import annotations
 
 import itertools
 from typing import Any
 
-from rlcli.deploy.graph import Deployed
+from rlcli.deploy.graph import DeployedPolicy
 from rlcli.runs.checkpoint import Checkpoint
 from rlcli.runs.checkpoint_manifest import DeploymentRecord, LayoutRecord
 from rlcli.runs.run import RECORD
@@ -15,37 +15,35 @@ SCHEMA = 2
 
 
 def metadata_of(
-    checkpoint: Checkpoint, graph: Deployed, layout: LayoutRecord, deployment: DeploymentRecord | None
+    checkpoint: Checkpoint, graph: DeployedPolicy, layout: LayoutRecord, deployment: DeploymentRecord | None
 ) -> dict[str, Any]:
-    """The metadata of a checkpoint's policy."""
+    """Return the metadata of a checkpoint's policy."""
     manifest, spec = checkpoint.manifest, graph.policy.spec
     task, run = manifest.get("task") or {}, checkpoint.folder.resolve().parent.parent
     normalized = graph.policy.normalizer is not None
     terms = layout.observations[spec.group]
+
+    def output(meaning: str) -> dict[str, Any]:
+        return {"shape": ["batch", spec.action_size], "dtype": "float32", "meaning": meaning}
+
     return {
         "schema": SCHEMA,
         "input": {
             "name": "obs",
             "shape": ["batch", spec.observation_size],
             "dtype": "float32",
-            "meaning": f"the environment's observation group '{spec.group}': each term's value after its `modifiers`,"
-            " clipped to `clip`, then times `scale`; its last `history` steps, the oldest first, an episode's first"
-            " value in all of them when it begins; side by side in the order of `observations`; nothing else is done"
-            " to it outside",
+            "meaning": f"the observation group '{spec.group}' of the environment: the terms of `observations`"
+            " concatenated in order. The value of a term passes its `modifiers`, is clipped to `clip` and multiplied by"
+            " `scale`. A term has its last `history` steps, oldest first; the first value of an episode fills all of"
+            " them. Nothing else is done before the input",
         },
         "outputs": {
-            "action": {
-                "shape": ["batch", spec.action_size],
-                "dtype": "float32",
-                "meaning": "exactly what env.step takes: the deterministic action, within +-`action_bound`",
-            },
-            "command": {
-                "shape": ["batch", spec.action_size],
-                "dtype": "float32",
-                "meaning": "what reaches the actuators, in the `unit` of each term of `actions`: action x `scale` +"
-                " `offset`, then within `clip`, then within `limits`. Where `command` of a term is 'task', the task's"
-                " own code makes the actuators' command of it, and it is the action within `clip`",
-            },
+            "action": output("the argument of env.step: the deterministic action, within +-`action_bound`"),
+            "command": output(
+                "what reaches the actuators, in the `unit` of each term of `actions`: action x `scale` + `offset`,"
+                " clipped to `clip`, then to `limits`. If `command` of a term is 'task', this is the action clipped to"
+                " `clip`, and the task's own code computes the actuators' command from it"
+            ),
         },
         "memory": [
             {
@@ -54,9 +52,10 @@ def metadata_of(
                 "shape": [len(spec.memory), "batch", spec.memory[0]],
                 "single": [len(spec.memory), 1, spec.memory[0]],
                 "dtype": "float32",
-                "meaning": f"{what} of the memory's layers: zeros when an episode begins, then what the last step gave",
+                "meaning": f"{state} of the recurrent layers: zeros in the first step of an episode, then the output"
+                f" {part}_out of the last step",
             }
-            for part, what in (("h", "outputs"), ("c", "cell states"))
+            for part, state in (("h", "hidden states"), ("c", "cell states"))
             if spec.memory
         ],
         "observations": [
@@ -76,7 +75,7 @@ def metadata_of(
             "inside": [*(["normalizer"] if normalized else []), "action_bound"],
             "between_action_and_command": ["actions.scale", "actions.offset", "actions.clip", "actions.limits"],
         },
-        "deployment": _deployed(deployment, spec.group),
+        "deployment": _deployment(deployment, spec.group),
         "normalizer": normalized,
         "action_bound": spec.action_bound,
         "step_dt": layout.step_dt,
@@ -93,7 +92,7 @@ def metadata_of(
     }
 
 
-def _deployed(deployment: DeploymentRecord | None, group: str) -> dict[str, Any] | None:
+def _deployment(deployment: DeploymentRecord | None, group: str) -> dict[str, Any] | None:
     if deployment is None:
         return None
     record = deployment.model_dump(mode="json")
@@ -101,9 +100,10 @@ def _deployed(deployment: DeploymentRecord | None, group: str) -> dict[str, Any]
 
 
 def mjlab_properties(metadata: dict[str, Any], entity: str = "robot") -> dict[str, str]:
-    """The properties that mjlab 1.6 gives its ONNX files, as it writes them: what reads those reads these.
+    """Return the metadata properties of mjlab 1.6's ONNX files, so that programs for those can read these.
 
-    Lists are separated by commas, lists in lists by semicolons. What the checkpoint does not know is left out.
+    Items of a list are separated by commas, items of an inner list by semicolons. Properties that the checkpoint does
+    not have are left out, and lists of names if a name contains a separator.
     """
     terms, actions = metadata["observations"], metadata["actions"]
     widths = [term["size"] // term["history"] for term in terms]
@@ -130,19 +130,17 @@ def mjlab_properties(metadata: dict[str, Any], entity: str = "robot") -> dict[st
             "default_joint_pos": [joint["default"] for joint in joints],
             "command_names": [command["name"] for command in deployment["commands"]],
         }
-    found = {name: ",".join(map(_entry, values)) for name, values in lists.items() if not _ambiguous(values)}
-    return {"run_path": str(metadata["run"] or ""), **found}
+    properties = {"run_path": str(metadata["run"] or "")}
+    for name, values in lists.items():
+        if not any(isinstance(value, str) and ("," in value or ";" in value) for value in values):
+            properties[name] = ",".join(map(_entry, values))
+    return properties
 
 
 def _entry(value: object) -> str:
     if isinstance(value, list):
         return ";".join(map(_entry, value))
     return f"{value:.9g}" if isinstance(value, float) else str(value)
-
-
-def _ambiguous(values: list[Any]) -> bool:
-    """Whether a name holds a separator."""
-    return any(isinstance(value, str) and ("," in value or ";" in value) for value in values)
 
 
 def _columns(terms: list[Any]) -> list[list[int]]:

@@ -1,11 +1,10 @@
-"""A policy as one Python file that needs numpy alone: `deployed/policy.py` with the numbers filled in."""
+"""Export of a policy to one Python file that needs only numpy: the template `deployed/policy.py` with the weights."""
 
 from __future__ import annotations
 
 import base64
 import io
 import json
-import math
 import pprint
 import textwrap
 from pathlib import Path
@@ -16,27 +15,27 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from rlcli.deploy.graph import Deployed
+    from rlcli.deploy.graph import DeployedPolicy
 
 _TEMPLATE = Path(__file__).parent / "deployed" / "policy.py"
 
 
-def numpy_bytes(graph: Deployed, metadata: str) -> bytes:
-    """The file: code that one reads, and at its end the weights as base64 of an npz."""
+def numpy_bytes(graph: DeployedPolicy, metadata: str) -> bytes:
+    """Return the file: readable code, and at its end the weights as an npz file in base64."""
     weights = io.BytesIO()
     np.savez(weights, **_weights(graph))  # type: ignore[arg-type]
     text = _TEMPLATE.read_text(encoding="utf-8")
     code, _, tail = text.partition("_W = {}\n")
     lines = textwrap.wrap(base64.b64encode(weights.getvalue()).decode(), 110)
     packed = "WEIGHTS = (\n" + "\n".join(f'    "{line}"' for line in lines) + "\n)\n"
-    # what a checkpoint says becomes a literal and nothing else, whatever characters it holds
+    # values of an untrusted checkpoint become literals, so that none of them can be executed as code
     code = code.replace("METADATA: dict = {}", f"METADATA = {literal(json.loads(metadata))}")
     code = code.replace("NETWORK: dict = {}", f"NETWORK = {literal(_network(graph))}").replace('WEIGHTS = ""\n', "")
     return (code + packed + "_W = {}\n" + tail).encode("ascii")
 
 
 def read_numpy(file: Path) -> tuple[Any, str]:
-    """Run a file that has just been written here: its function, and its metadata as JSON."""
+    """Execute a file that this process has written; return its function, and its metadata as JSON."""
     space: dict[str, Any] = {"__name__": "policy"}
     exec(compile(file.read_text(encoding="utf-8"), str(file), "exec"), space)
 
@@ -48,14 +47,14 @@ def read_numpy(file: Path) -> tuple[Any, str]:
 
 
 def literal(value: object) -> str:
-    """Plain data as Python's source, in ASCII."""
+    """Return plain data as Python source in ASCII."""
     return pprint.pformat(value, width=110, sort_dicts=False).encode("ascii", "backslashreplace").decode()
 
 
-def _network(graph: Deployed) -> dict[str, Any]:
+def _network(graph: DeployedPolicy) -> dict[str, Any]:
     spec = graph.policy.spec
     normalizer = graph.policy.normalizer
-    bounds = [values.tolist() for values in (graph.clip, graph.limits) if values is not None]
+    bounds = [values.double() for values in (graph.clip, graph.limits) if values is not None]
     return {
         "kind": spec.kind,
         "normalize": normalizer is not None,
@@ -69,16 +68,12 @@ def _network(graph: Deployed) -> dict[str, Any]:
         "squashed": not spec.kind.startswith("gaussian-"),
         "bound": spec.action_bound,
         "scaled": graph.scaled,
-        "bounds": [[[_finite(x) for x in ends] for ends in pair] for pair in bounds],
+        # Python has no literal for infinity; 3.4e38 is nearly the largest float32
+        "bounds": [values.nan_to_num(posinf=3.4e38, neginf=-3.4e38).tolist() for values in bounds],
     }
 
 
-def _finite(value: float) -> float:
-    """Infinity has no literal."""
-    return math.copysign(3.4e38, value) if math.isinf(value) else value
-
-
-def _weights(graph: Deployed) -> dict[str, np.ndarray]:
+def _weights(graph: DeployedPolicy) -> dict[str, np.ndarray]:
     policy, arrays = graph.policy, {}
     if policy.normalizer is not None:
         arrays["mean"] = policy.normalizer.mean.float()

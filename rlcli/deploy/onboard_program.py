@@ -1,4 +1,4 @@
-"""What `export --verify` leaves beside a policy: the model that it was trained on, and a program that runs it there."""
+"""Files that `export --verify` writes beside a policy: the trained model, and a program that runs the policy on it."""
 
 from __future__ import annotations
 
@@ -17,71 +17,74 @@ from rlcli.runs.atomic_io import disk_error, write_atomic
 PROGRAM = "run_policy.py"
 MODEL = "model.xml"
 _MARK = "<!-- written by rlcli export -->\n"
-"""The first line of a model, by which it is known as one that may be replaced."""
+"""First line of an exported model. A model file with this line may be overwritten."""
 _TEMPLATE = Path(__file__).parent / "deployed" / PROGRAM
-_OPEN_ONNX = """        session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
-        self.about = json.loads(session.get_modelmeta().custom_metadata_map["rlcli"])
-        self.policy = lambda x: dict(zip([o.name for o in session.get_outputs()], session.run(None, x), strict=True))
-"""
 _OPEN = {
-    "onnx": _OPEN_ONNX,
+    "onnx": """        session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+        self.metadata = json.loads(session.get_modelmeta().custom_metadata_map["rlcli"])
+        self.policy = lambda x: dict(zip([o.name for o in session.get_outputs()], session.run(None, x), strict=True))
+""",
     "numpy": """        space = runpy.run_path(str(file))
-        self.about, self.policy = space["METADATA"], space["run"]
+        self.metadata, self.policy = space["METADATA"], space["run"]
 """,
     "torch": """        program = torch.export.load(str(file), extra_files=(extra := {"rlcli": ""})).module()
-        names, self.about = ("obs", "h_in", "c_in"), json.loads(extra["rlcli"])
+        names, self.metadata = ("obs", "h_in", "c_in"), json.loads(extra["rlcli"])
         tensors = lambda x: [torch.from_numpy(x[name]) for name in names if name in x]  # noqa: E731
         self.policy = lambda x: {name: value.detach().numpy() for name, value in program(*tensors(x)).items()}
 """,
 }
-_USUAL = "import json\nimport sys\nfrom pathlib import Path\n\nimport mujoco\nimport numpy as np\n"
+_STANDARD = "import json\nimport sys\nfrom pathlib import Path\n\nimport mujoco\nimport numpy as np\n"
 _IMPORTS = {
-    "onnx": f"{_USUAL}import onnxruntime\n",
-    "numpy": _USUAL.replace("json", "runpy"),
-    "torch": f"{_USUAL}import torch\n",
+    "onnx": f"{_STANDARD}import onnxruntime\n",
+    "numpy": _STANDARD.replace("json", "runpy"),
+    "torch": f"{_STANDARD}import torch\n",
 }
-_NEEDS = {"onnx": "numpy, mujoco, onnxruntime", "numpy": "numpy and mujoco", "torch": "numpy, mujoco and torch"}
-_ALIKE = {"rtol": 1e-4, "atol": 1e-5}
-"""How far a model may be from one that was read from its text, which may have six digits."""
+_PACKAGES = {"onnx": "numpy, mujoco, onnxruntime", "numpy": "numpy and mujoco", "torch": "numpy, mujoco and torch"}
+_TOLERANCE = {"rtol": 1e-4, "atol": 1e-5}
+"""Largest accepted difference of a model that was read from XML, which may have only six digits."""
 
 
-def program(policy: Path, model: Path, format_: str) -> str:
-    """The program that runs a policy file on a model file, both beside it."""
+def generate_program(policy: Path, model: Path, format_: str) -> str:
+    """Return the program that runs a policy file on a model file; all three are in one folder."""
     text = _TEMPLATE.read_text(encoding="utf-8")
-    text = text.replace(_NEEDS["onnx"], _NEEDS[format_]).replace(_IMPORTS["onnx"], _IMPORTS[format_])
-    text = text.replace(_OPEN["onnx"], _OPEN[format_]).replace('"policy.onnx"', literal(policy.name))
-    text = text.replace('"model.xml"', literal(model.name))
+    for parts in (_PACKAGES, _IMPORTS, _OPEN):
+        text = text.replace(parts["onnx"], parts[format_])
+    text = text.replace('"policy.onnx"', literal(policy.name)).replace('"model.xml"', literal(model.name))
     return text if model.suffix == ".xml" else text.replace("from_xml_path", "from_binary_path")
 
 
-def require_room(policy: Path) -> None:
-    """What is written beside a policy file takes no other file's place.
+def check_overwrites(policy: Path) -> None:
+    """Check that --verify would overwrite neither the policy nor a model that the user has written.
 
     Raises:
-        UsageError: if the policy has the program's name, or a model stands there that is somebody's own.
+        UsageError: if the policy has the program's name, or the folder has a model that export did not write.
     """
     if policy.name == PROGRAM:
-        raise UsageError(f"{PROGRAM} is the program that --verify writes beside the policy", hint="another --output")
-    own = policy.with_name(MODEL)
+        raise UsageError(
+            f"--verify writes its program to {PROGRAM}, so the policy needs another name", hint="--output FILE"
+        )
+    model = policy.with_name(MODEL)
     try:
-        with own.open("rb") as file:
-            ours = file.read(len(_MARK)) == _MARK.encode()
+        with model.open("rb") as file:
+            is_exported = file.read(len(_MARK)) == _MARK.encode()
     except FileNotFoundError:
         return
-    except OSError:  # a folder, or not to be read
-        ours = False
-    if not ours:
+    except OSError:  # a folder, or no permission
+        is_exported = False
+    if not is_exported:
         raise UsageError(
-            f"{own} stands where --verify writes the model, and is not one that export has written",
-            hint="an --output in a folder of its own",
+            f"--verify would overwrite {model}, which export has not written",
+            hint="give an --output in an empty folder",
         )
 
 
 def write_program(folder: Path, text: str) -> bool:
-    """Write the program, unless another stands there, which may be somebody's work; whether it is there now.
+    """Write the program if there is no file of its name; return whether the file now has this text.
+
+    An existing file is never replaced: the user may have edited it.
 
     Raises:
-        MachineError: if the disk refuses.
+        MachineError: if the file cannot be written.
     """
     file = folder / PROGRAM
     try:
@@ -94,50 +97,51 @@ def write_program(folder: Path, text: str) -> bool:
 
 
 def write_model(spec: mujoco.MjSpec, model: mujoco.MjModel, folder: Path) -> Path:
-    """Write a model as text where the text says all of it, else compiled, for this version of MuJoCo.
+    """Write a model as XML if the XML describes all of it; else as a binary file for this version of MuJoCo.
 
     Raises:
-        MachineError: if the disk refuses.
+        MachineError: if the file cannot be written.
     """
-    text = _as_text(spec, model)
+    text = _model_xml(spec, model)
     file = folder / (MODEL if text is not None else "model.mjb")
-    write_atomic(file, _MARK + text if text is not None else _as_bytes(model))
+    write_atomic(file, _MARK + text if text is not None else _model_bytes(model))
     return file
 
 
 def open_model(file: Path) -> mujoco.MjModel:
-    """A model that was written here."""
+    """Return the model in a file of `write_model`."""
     read = mujoco.MjModel.from_xml_path if file.suffix == ".xml" else mujoco.MjModel.from_binary_path
     return read(str(file))
 
 
-def _as_bytes(model: mujoco.MjModel) -> bytes:
-    """A compiled model as MuJoCo reads it from a file."""
+def _model_bytes(model: mujoco.MjModel) -> bytes:
+    """Return the content of a binary model file (.mjb)."""
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()
 
 
-def _as_text(spec: mujoco.MjSpec, model: mujoco.MjModel) -> str | None:
+def _model_xml(spec: mujoco.MjSpec, model: mujoco.MjModel) -> str | None:
+    """Return a model as XML; None if the XML would need other files or compiles to another model."""
     assets = [*spec.meshes, *spec.hfields, *spec.textures, *spec.skins]
     if any(getattr(asset, "file", "") or any(getattr(asset, "cubefiles", [])) for asset in assets):
         return None
     try:
-        with _all_digits():
+        with _full_xml_precision():
             text = str(spec.to_xml())
-        return text if _alike(mujoco.MjModel.from_xml_string(text), model) else None
-    except (ValueError, RuntimeError):  # something that has no text
+        return text if _models_close(mujoco.MjModel.from_xml_string(text), model) else None
+    except (ValueError, RuntimeError):  # an element that XML cannot express
         return None
 
 
 @contextlib.contextmanager
-def _all_digits() -> Iterator[None]:
-    """MuJoCo writes six digits of a number unless told otherwise, by a function that has no name in Python."""
+def _full_xml_precision() -> Iterator[None]:
+    """Make MuJoCo write numbers with 17 digits instead of six; its Python package has no function for that."""
     try:
         found = next(Path(mujoco.__file__).parent.glob("*mujoco*.[sd][oly]*"))
         library = ctypes.CDLL(str(found))
         get, put = library._mjPRIVATE__get_xml_precision, library._mjPRIVATE__set_xml_precision
-    except (StopIteration, OSError, AttributeError):  # six have to do
+    except (StopIteration, OSError, AttributeError):  # fall back to six digits
         yield
         return
     before = get()
@@ -148,13 +152,13 @@ def _all_digits() -> Iterator[None]:
         put(before)
 
 
-def _alike(read: mujoco.MjModel, model: mujoco.MjModel) -> bool:
-    """Whether two models are the same but for the digits of their numbers."""
+def _models_close(read: mujoco.MjModel, model: mujoco.MjModel) -> bool:
+    """Return whether two models are equal within the precision of XML."""
     for one, other in ((read, model), (read.opt, model.opt)):
         for name in dir(model if other is model else model.opt):
             value = getattr(other, name, None) if not name.startswith("_") else None
             if isinstance(value, float | int | np.ndarray) and np.asarray(value).dtype.kind in "fiub":
                 found = getattr(one, name)
-                if np.shape(found) != np.shape(value) or not np.allclose(found, value, **_ALIKE, equal_nan=True):
+                if np.shape(found) != np.shape(value) or not np.allclose(found, value, **_TOLERANCE, equal_nan=True):
                     return False
     return True

@@ -1,4 +1,4 @@
-"""Values of a configuration as a card shows them: short, and as people write them."""
+"""Short texts for the values of a configuration in a task card."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from rlcli.config.schema import ConstantNoiseConfig, EventConfig, GaussianNoiseC
 
 
 def number(value: float) -> str:
-    """A number as people write it."""
+    """Return a number with up to six digits."""
     return f"{value:.6g}"
 
 
 def columns_text(count: int) -> str:
-    """How many numbers an observation or an action has."""
+    """Return the size of an observation or an action as text."""
     return f"{count} number{'s' * (count != 1)}"
 
 
 def text_of(value: object) -> str:
-    """A value of a configuration, short."""
+    """Return a value of a configuration as text."""
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "-"}[value]
     if isinstance(value, int | float):
@@ -36,7 +36,7 @@ def text_of(value: object) -> str:
 
 
 def noise_text(config: UniformNoiseConfig | GaussianNoiseConfig | ConstantNoiseConfig | None) -> str:
-    """What is drawn, and what is done with it."""
+    """Return the operation and the distribution of a noise model as text."""
     if config is None:
         return ""
     verb = {"add": "+", "scale": "x", "set": "="}[config.operation]
@@ -48,13 +48,13 @@ def noise_text(config: UniformNoiseConfig | GaussianNoiseConfig | ConstantNoiseC
 
 
 def modifier_text(settings: Mapping[str, Any]) -> str:
-    """A modifier of an observation: its kind and its numbers."""
+    """Return the kind and the settings of an observation modifier as text."""
     rest = {key: value for key, value in settings.items() if key != "kind"}
     return f"{settings['kind'].replace('_', ' ')} {text_of(rest)}".strip()
 
 
 def when_text(config: EventConfig) -> str:
-    """When an event happens."""
+    """Return the time at which an event happens as text."""
     if config.mode == "interval" and config.interval_range_s is not None:
         timer = ", all together" if config.global_time else ""
         return f"every {span(config.interval_range_s)} s{timer}"
@@ -64,6 +64,6 @@ def when_text(config: EventConfig) -> str:
 
 
 def span(pair: tuple[float, float]) -> str:
-    """A range in words."""
+    """Return a range as text."""
     low, high = number(pair[0]), number(pair[1])
     return low if low == high else f"{low} to {high}"

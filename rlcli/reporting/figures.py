@@ -1,4 +1,4 @@
-"""Learning curves as pictures, drawn with matplotlib: without a window, and the same bytes for the same curves."""
+"""Pictures of learning curves, drawn with matplotlib: without a window, and with the same bytes for the same curves."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from rlcli.safe_text import UNSAFE, shorten
 FORMATS = (".png", ".svg", ".pdf")
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31", "#777777")
-"""Told apart by most eyes that see colours otherwise: those of Okabe and Ito, and two more."""
+"""The colour-blind safe palette of Okabe and Ito, and two more."""
 _STYLES = ("-", "--", ":", "-.")
-"""Of the lines where the colours begin anew."""
+"""Line styles; the next one is used each time the colours are used up."""
 
 INK, FAINT, PAPER = "#1b1f24", "#d0d7de", "#fefefe"
-"""Of text, rules and what lies behind a legend, as in `curves.mplstyle`; a page has its own."""
+"""Colours of text, rules and the background of a legend, as in `curves.mplstyle`; an HTML page replaces them."""
 _WIDTH, _HEIGHT = 5.2, 3.2
-"""Of a panel [inches]."""
-_ON_A_PAGE = (4.1, 2.7)
-"""The same of one on a page, where it is as wide as its place: smaller, so that its text is larger."""
-_FEW = 8
-"""Lines whose legend has one column."""
-_LONGEST = 64
-"""Characters of a label."""
+"""Size of a panel [inches]."""
+_PAGE_SIZE = (4.1, 2.7)
+"""Size of a panel on an HTML page [inches]. The page scales it up, so its text becomes larger."""
+_ONE_COLUMN = 8
+"""Most lines of a legend with one column."""
+_MAX_LABEL = 64
+"""Most characters of a label."""
 _NOT_DRAWN = re.compile(f"{UNSAFE.pattern}|[\t\n\ufffe\uffff]")
-"""Characters that a picture cannot show, and those that turn the direction of text."""
+"""Characters that a picture cannot show, and characters that change the direction of text."""
 
 _STYLE = Path(__file__).resolve().parent.parent / "templates" / "report" / "curves.mplstyle"
 
 
 def check_drawing() -> None:
-    """Refuse where nothing can be drawn.
+    """Check that pictures can be drawn.
 
     Raises:
         DependencyError: if matplotlib is not installed.
@@ -53,14 +53,14 @@ def check_drawing() -> None:
 
 
 def picture(panels: Sequence[Panel], x_label: str, kind: str, *, title: str = "", note: str = "") -> bytes:
-    """All panels in one file.
+    """Return a picture of all panels as the content of a file.
 
     Args:
-        panels: what to draw.
-        x_label: of their x axis.
+        panels: the panels.
+        x_label: label of their x axes.
         kind: one of `FORMATS`.
-        title: stands above.
-        note: stands below.
+        title: text above the panels.
+        note: text below the panels.
     """
     columns = 1 if len(panels) == 1 else 2 if len(panels) <= 4 else 3
     rows = math.ceil(len(panels) / columns)
@@ -82,55 +82,56 @@ def picture(panels: Sequence[Panel], x_label: str, kind: str, *, title: str = ""
 def scatter(
     columns: Sequence[tuple[str, Sequence[Any], bool]], values: Sequence[float], label: str, *, title: str
 ) -> bytes:
-    """What trials reached over each thing that they varied in, as SVG.
+    """Return scatter plots of the trials' results over each of their settings, as SVG.
 
     Args:
-        columns: name, value of each trial, and whether the axis is logarithmic; what is no number has a place each.
-        values: what the trials reached.
-        label: of it.
-        title: of the picture.
+        columns: (name, value of each trial, whether the axis is logarithmic) of each setting; values that are not
+            numbers are drawn at equal distances.
+        values: the result of each trial.
+        label: name of the result.
+        title: title of the picture.
     """
-    wide = min(3, len(columns))
-    rows = -(-len(columns) // wide)
+    width = min(3, len(columns))
+    rows = math.ceil(len(columns) / width)
     with _drawing({}):
-        figure = _figure((_WIDTH * wide * 0.75, _HEIGHT * rows * 0.85))
-        for place, (name, given, log) in enumerate(columns):
-            axes = figure.add_subplot(rows, wide, place + 1)
-            numbers = all(type(value) in (int, float) for value in given)
-            words = sorted({str(value) for value in given})
-            x = given if numbers else [words.index(str(value)) for value in given]
+        figure = _figure((_WIDTH * width * 0.75, _HEIGHT * rows * 0.85))
+        for position, (name, settings, log) in enumerate(columns):
+            axes = figure.add_subplot(rows, width, position + 1)
+            is_numeric = all(type(value) in (int, float) for value in settings)
+            words = sorted({str(value) for value in settings})
+            x = settings if is_numeric else [words.index(str(value)) for value in settings]
             axes.scatter(x, values, s=18.0, color=COLORS[0], alpha=0.8, linewidths=0.0)
             if log:
                 axes.set_xscale("log")
-            if not numbers:
+            if not is_numeric:
                 axes.set_xticks(range(len(words)), [_text(word, 16) for word in words])
             axes.set_xlabel(_text(name))
-            if place % wide == 0:
+            if position % width == 0:
                 axes.set_ylabel(_text(label))
         figure.suptitle(_text(title))
         return _bytes(figure, ".svg")
 
 
 def panel_svg(panel: Panel, x_label: str, name: str) -> str:
-    """One panel as an SVG element for a page, whose text and rules take the page's colours; without a legend.
+    """Return a panel without a legend as an SVG element for an HTML page, in the page's colours.
 
     Args:
-        panel: what to draw.
-        x_label: of its x axis.
-        name: what its ids begin with, its own in the page.
+        panel: the panel.
+        x_label: label of its x axis.
+        name: prefix of its ids, unique in the page.
     """
     with _drawing({"svg.fonttype": "none"}):
-        figure = _figure(_ON_A_PAGE)
+        figure = _figure(_PAGE_SIZE)
         _draw(figure.add_subplot(), panel, x_label, legend=False, title=False)
         svg = _bytes(figure, ".svg", transparent=True).decode()
     return _for_page(svg, name, f"{panel.title}, {panel.unit}")
 
 
 def legend_of(panel: Panel) -> list[tuple[str, int, int]]:
-    """What a page puts beside a panel: (label, number of the colour, number of the line's style) each."""
+    """Return the legend of a panel for an HTML page: (label, index of the colour, index of the line style)."""
     if panel.by_curve and len(panel.items) == 1:
         return []
-    return [(item.label, item.index % len(COLORS), item.index // len(COLORS) % len(_STYLES)) for item in panel.items]
+    return [(item.label, *_look(item)) for item in panel.items]
 
 
 @contextmanager
@@ -139,8 +140,8 @@ def _drawing(settings: dict[str, Any]) -> Iterator[None]:
     import matplotlib as mpl
 
     with mpl.rc_context(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a letter that the font lacks is drawn as a box
-        mpl.rcdefaults()  # not what the user's matplotlibrc says: the same picture everywhere
+        warnings.simplefilter("ignore")  # matplotlib draws a box for a letter that the font lacks
+        mpl.rcdefaults()  # without the user's matplotlibrc, so that the picture is the same everywhere
         mpl.rc_file(_STYLE, use_default_template=False)
         mpl.rcParams.update(settings)
         yield
@@ -167,22 +168,22 @@ def _draw(axes: Any, panel: Panel, x_label: str, *, legend: bool, title: bool = 
     if title:
         axes.set_title("\n".join(_text(line, 54) for line in (panel.title, panel.subtitle) if line))
     if legend and panel.items and not (panel.by_curve and len(panel.items) == 1):
-        many = len(panel.items) > _FEW
+        many = len(panel.items) > _ONE_COLUMN
         settings = {"loc": "upper left" if panel.stacked else "best", "fontsize": 6 if many else 8, "ncols": 1 + many}
         _legend(axes, panel.items, bands=panel.stacked, **settings)
 
 
 def _lines(axes: Any, items: Sequence[Item]) -> None:
     for item in items:
-        line = item.line
+        line, color = item.line, _color(item)
         marker = "o" if len(line.x) == 1 else ""
-        axes.plot(line.x, line.middle, color=_color(item), linestyle=_style(item), marker=marker, markersize=4)
+        axes.plot(line.x, line.middle, color=color, linestyle=_style(item), marker=marker, markersize=4)
         if line.low is not None and line.high is not None:
-            axes.fill_between(line.x, line.low, line.high, color=_color(item), alpha=0.2, linewidth=0)
+            axes.fill_between(line.x, line.low, line.high, color=color, alpha=0.2, linewidth=0)
 
 
 def _stack(axes: Any, items: Sequence[Item]) -> None:
-    """Shares on top of each other; where several causes ended an episode at once they share it."""
+    """Draw shares as stacked bands; they are scaled down if several causes of one episode sum to more than 1."""
     if not items:
         return
     grid = max((item.line.x for item in items), key=len)
@@ -191,7 +192,7 @@ def _stack(axes: Any, items: Sequence[Item]) -> None:
     axes.stackplot(grid, shares, colors=[_color(item) for item in items], alpha=0.75, linewidth=0)
 
 
-def _legend(place: Any, items: Sequence[Item], *, bands: bool = False, **settings: Any) -> None:
+def _legend(owner: Any, items: Sequence[Item], *, bands: bool = False, **settings: Any) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -199,51 +200,56 @@ def _legend(place: Any, items: Sequence[Item], *, bands: bool = False, **setting
         Patch(color=_color(item), alpha=0.75) if bands else Line2D([], [], color=_color(item), linestyle=_style(item))
         for item in items
     ]
-    # a label that begins with an underscore would be left out
+    # matplotlib leaves out labels that begin with an underscore
     labels = [f" {text}" if (text := _text(item.label)).startswith("_") else text for item in items]
-    place.legend(handles, labels, **settings)
+    owner.legend(handles, labels, **settings)
 
 
 def _bytes(figure: Any, kind: str, *, transparent: bool = False) -> bytes:
-    nothing = {
+    omitted = {  # dates and versions would change the bytes
         ".svg": {"Date": None, "Creator": None, "Format": None, "Type": None},
         ".png": {"Software": None},
         ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
     }
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind[1:], metadata=nothing[kind], transparent=transparent, dpi=130)
+    figure.savefig(buffer, format=kind[1:], metadata=omitted[kind], transparent=transparent, dpi=130)
     return buffer.getvalue()
 
 
 def _compact(value: float, _: int | None = None) -> str:
-    """1500000 -> 1.5M."""
+    """Format a tick label: 1500000 -> 1.5M."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
             return f"{value / size:g}{letter}"
     return f"{value:g}"
 
 
+def _look(item: Item) -> tuple[int, int]:
+    """Return the indices of an item's colour and line style."""
+    return item.index % len(COLORS), item.index // len(COLORS) % len(_STYLES)
+
+
 def _color(item: Item) -> str:
-    return COLORS[item.index % len(COLORS)]
+    return COLORS[_look(item)[0]]
 
 
 def _style(item: Item) -> str:
-    return _STYLES[item.index // len(COLORS) % len(_STYLES)]
+    return _STYLES[_look(item)[1]]
 
 
-def _text(text: str, limit: int = _LONGEST) -> str:
+def _text(text: str, limit: int = _MAX_LABEL) -> str:
     return shorten(_NOT_DRAWN.sub("?", text), limit, "…")
 
 
 def _for_page(svg: str, name: str, label: str) -> str:
-    """The element alone, as wide as its place, its own ids, text and rules in the page's colours."""
+    """Return the SVG element without a fixed size, with ids that begin with `name`, in the page's colours."""
     head, _, rest = svg[svg.index("<svg") :].partition(">")
-    box = re.search(r'viewBox="[\d. ]+"', head)
-    assert box is not None
+    view_box = re.search(r'viewBox="[\d. ]+"', head)
+    assert view_box is not None
     rest = re.sub(r"<metadata>.*?</metadata>|<defs>\s*<style.*?</style>\s*</defs>", "", rest, flags=re.DOTALL)
     rest = re.sub(r'(?<= id=")|(?<=url\(#)|(?<=xlink:href="#)', f"{name}-", rest)
     variables = {INK: "currentColor", FAINT: "var(--rule)", PAPER: "var(--paper)"}
     for color, variable in {**variables, **{color: f"var(--c{i})" for i, color in enumerate(COLORS)}}.items():
         rest = rest.replace(color, variable)
     rest = rest.replace("'DejaVu Sans'", "inherit")
-    return f'<svg {box[0]} role="img" aria-label="{escape(label)}">{rest}'.strip()
+    return f'<svg {view_box[0]} role="img" aria-label="{escape(label)}">{rest}'.strip()

@@ -1,4 +1,4 @@
-"""A run's page as HTML: one file, nothing loaded from elsewhere, nothing that runs, all text escaped."""
+"""HTML of a run's page: one file without scripts and external resources, with all text escaped."""
 
 from __future__ import annotations
 
@@ -19,31 +19,23 @@ from rlcli.safe_text import UNSAFE, shorten
 POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:; base-uri 'none'; form-action 'none'"
 )
-"""The page's content security policy: no script, no frame, no font, nothing from any host."""
+"""Content security policy of the page: no scripts, frames or fonts, and nothing from any host."""
 
 _TEMPLATES = Path(__file__).resolve().parent.parent / "templates" / "report"
-_MOST = 2000
+_MAX_CHARACTERS = 2000
 _NOT_SHOWN = re.compile(f"{UNSAFE.pattern}|[\ufffe\uffff]")
-"""Characters that no page may hold, and those that turn the direction of text."""
+"""Characters that HTML forbids, and characters that change the direction of text."""
 
 
 def render(page: Page) -> str:
-    """The whole page."""
+    """Return the page as HTML."""
     video = None if page.video is None else f"data:video/mp4;base64,{base64.b64encode(page.video).decode()}"
-    return (
-        _templates()
-        .get_template("page.html.jinja")
-        .render(
-            page=page,
-            policy=POLICY,
-            video=video,
-            version=__version__,
-        )
-    )
+    template = _templates().get_template("page.html.jinja")
+    return template.render(page=page, policy=POLICY, video=video, version=__version__)
 
 
 def card_html(card: Card, level: int = 2) -> str:
-    """A task's card alone, whose headings begin at a level."""
+    """Return only a task card as HTML; `level` is the level of its first heading."""
     module: Any = _templates().get_template("card.html.jinja").module
     return str(module.card(card, level))
 
@@ -63,16 +55,14 @@ def _templates() -> jinja2.Environment:
 
 
 def _clean(value: object) -> Any:
-    """Text of a run as a page can show it; not too much of it."""
-    if not isinstance(value, str) or isinstance(value, Markup):
+    """Replace forbidden characters of a text and shorten it; other values, markup and the video stay as they are."""
+    if not isinstance(value, str) or isinstance(value, Markup) or value.startswith("data:video/mp4;base64,"):
         return value
-    if value.startswith("data:video/mp4;base64,"):
-        return value
-    return shorten(_NOT_SHOWN.sub("\ufffd", value), _MOST, "…")
+    return shorten(_NOT_SHOWN.sub("\ufffd", value), _MAX_CHARACTERS, "…")
 
 
 def _coded(text: str) -> Markup:
-    """Escaped text in which `names` between backticks are code."""
+    """Return escaped text in which `names` between backticks are code elements."""
     parts = _clean(text).split("`")
     if len(parts) % 2 == 0:
         return escape(_clean(text))

@@ -1,4 +1,4 @@
-"""Evaluation and video of a run's page: those that the run holds, else new ones."""
+"""Evaluation and video for a run's page: taken from the run's folder, or made if they are missing."""
 
 from __future__ import annotations
 
@@ -23,20 +23,19 @@ from rlcli.runs.safe_io import read_file, require_inside
 _log = logging.getLogger(__name__)
 
 _EPISODES = 200
-_LONGEST_S = 20.0
-"""Length of a video for the page, at most [s]."""
-_LARGEST = 24 * 2**20
-"""Size of a video in the page, at most [bytes]."""
+_MAX_VIDEO_S = 20.0
+"""Longest video that is made for a page [s]."""
+_MAX_VIDEO_BYTES = 24 * 2**20
 
 
 class PageMedia:
-    """Evaluation and video of one checkpoint; the environment is built when it is first needed.
+    """Evaluation and video of one checkpoint. The environment is built when it is first needed.
 
     Args:
-        page: the page that gets them.
+        page: the page to which they are added.
         run: the run.
         checkpoint: the checkpoint's folder.
-        schema: version of the documents that the command line writes.
+        schema: schema version of the command line's JSON documents.
     """
 
     def __init__(self, page: Page, run: Run, checkpoint: Path, schema: int) -> None:
@@ -44,7 +43,7 @@ class PageMedia:
         self._name = checkpoint.resolve().name
 
     def add_evaluation(self, *, may_evaluate: bool) -> str:
-        """Put the evaluation on the page; return where it is from: `stored`, `made` or nothing."""
+        """Add the evaluation to the page; return its origin: `stored`, `made`, or an empty text if there is none."""
         page = self._page
         try:
             page.evaluation = read_evaluation(self._run, self._name)
@@ -52,7 +51,7 @@ class PageMedia:
                 return "stored"
             if not may_evaluate:
                 command = f"rlcli eval --checkpoint {self._run.folder}"
-                page.missing["evaluation"] = f"There is no evaluation: `{command}` makes one."
+                page.missing["evaluation"] = f"There is no evaluation. Run `{command}` to make one."
                 return ""
             _log.info(f"evaluating {_EPISODES} episodes")
             summary, _ = run_episodes(self._session, _EPISODES)
@@ -64,14 +63,14 @@ class PageMedia:
         return "made"
 
     def add_video(self) -> str:
-        """Put a video on the page; return where it is from: `stored`, `made`, `older` (checkpoint) or nothing."""
+        """Add a video to the page; return its origin: `stored`, `made`, `older` (checkpoint), or an empty text."""
         page, file = self._page, self._run.folder / "videos" / f"{self._name}.mp4"
         try:
-            page.video = self._read(file)
+            page.video = self._read_video(file)
             if page.video is not None:
                 page.video_of = f"Checkpoint {self._name}."
                 return "stored"
-            page.video = self._film(file)
+            page.video = self._record_video(file)
             page.video_of = f"Checkpoint {self._name}, environment 0, deterministic policy."
         except RlcliError as error:
             return self._add_older_video(reason_of(error))
@@ -81,44 +80,44 @@ class PageMedia:
     def _session(self) -> Session:
         return open_session(PolicyRequest(None, checkpoint=str(self._checkpoint)))
 
-    def _film(self, file: Path) -> bytes | None:
+    def _record_video(self, file: Path) -> bytes | None:
         from rlcli.viewer.video_writer import check_video
 
         check_video(file)
         require_own(self._run, "videos")
-        session = self._session
+        session = self._session  # imports torch and MuJoCo: after the checks above
 
         from rlcli.viewer.record_video import record_episode
 
-        frames, fps, backend = record_episode(session.env, session.act, file, longest_s=_LONGEST_S)
+        frames, fps, backend = record_episode(session.env, session.act, file, longest_s=_MAX_VIDEO_S)
         _log.info(f"{file}: {frames} frames, {fps:g} a second, drawn with {backend}")
-        return self._read(file)
+        return self._read_video(file)
 
     def _add_older_video(self, why: str) -> str:
         folder = self._run.folder / "videos"
         for file in sorted(folder.glob("*.mp4"), reverse=True) if folder.is_dir() else []:
             try:
-                self._page.video = self._read(file)
+                self._page.video = self._read_video(file)
             except RlcliError:
                 continue
-            self._page.video_of = f"{file.stem}; of the newest checkpoint there is none: {why}"
+            self._page.video_of = f"Checkpoint {file.stem}. The newest checkpoint has no video: {why}"
             return "older"
         self._page.missing["video"] = f"There is no video: {why}"
         return ""
 
-    def _read(self, file: Path) -> bytes | None:
-        """A video of the run; None if it is not there.
+    def _read_video(self, file: Path) -> bytes | None:
+        """Return a video of the run; None if the file does not exist.
 
         Raises:
-            CheckpointError: if it is no video, not the run's own, or too large for a page.
+            CheckpointError: if it is not an MP4, is outside the run's folder, or is too large for a page.
         """
         try:
             require_inside(self._run.folder, file)
-            data = read_file(file, _LARGEST)
+            data = read_file(file, _MAX_VIDEO_BYTES)
         except FileNotFoundError:
             return None
         except OSError as error:
             raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
         if data[4:8] != b"ftyp":
-            raise CheckpointError(f"{file} is no MP4")
+            raise CheckpointError(f"{file} is not an MP4")
         return data

@@ -1,23 +1,19 @@
-"""What a picture of learning curves shows: one panel a metric, all terminations in one."""
+"""Panels of a picture of learning curves: one for each metric, and one for all terminations."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from rlcli.errors import UsageError, did_you_mean, listing
 from rlcli.reporting.curves import Curve, Line
 
 REWARDS, TERMINATIONS = "Episode_Reward/", "Episode_Termination/"
-METRICS = {
-    "return": "Train/mean_reward",
-    "success": "Train/success_rate",
-    "length": "Train/mean_episode_length",
-}
+METRICS = {"return": "Train/mean_reward", "success": "Train/success_rate", "length": "Train/mean_episode_length"}
 """Short name -> metric."""
 GROUPS = {"rewards": REWARDS, "terminations": TERMINATIONS}
-"""Short name -> what the names of its metrics begin with."""
+"""Short name -> prefix of its metrics."""
 DEFAULT = (*METRICS, *GROUPS)
 
 _TITLES = {
@@ -32,7 +28,7 @@ _SHARES = ("success_rate",)
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One line or band of a panel; `index` chooses its colour."""
+    """Line or band of a panel; `index` selects its colour."""
 
     label: str
     line: Line
@@ -41,31 +37,31 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One coordinate system."""
+    """Coordinate system with lines or bands."""
 
     title: str
     unit: str
     items: list[Item]
     stacked: bool = False
-    """Bands on top of each other, from 0 to 1."""
+    """Whether the items are bands stacked from 0 to 1."""
     share: bool = False
-    """From 0 to 1."""
+    """Whether the y axis is a share from 0 to 1."""
     by_curve: bool = False
-    """Its lines are the picture's curves: one legend serves all such panels."""
+    """Whether its lines are the picture's curves. All such panels have one common legend."""
     subtitle: str = ""
 
 
 def choose(curves: Sequence[Curve], names: Sequence[str] | None = None, axis: str = "steps") -> list[Panel]:
-    """The panels of a picture.
+    """Return the panels of a picture.
 
     Args:
-        curves: what is drawn.
-        names: metrics, short names of them, or what stands before the slash of some; None: the usual ones, as far as
-            the runs have them.
+        curves: the curves.
+        names: metrics, short names, or groups of metrics (the part before the slash); None: the default ones that the
+            runs have.
         axis: the x axis, a key of `AXES`.
 
     Raises:
-        UsageError: for a name that none of the runs knows, with those that they do.
+        UsageError: for a name that no run has, with the list of valid names.
     """
     known = list(dict.fromkeys(name for curve in curves for name in curve.names()))
     panels: list[Panel] = []
@@ -78,16 +74,11 @@ def choose(curves: Sequence[Curve], names: Sequence[str] | None = None, axis: st
         if name == "terminations":
             panels += _stacks(curves, metrics, axis)
         elif name == "rewards" and len(curves) == 1:
-            panels.append(_terms(curves[0], metrics, axis))
+            items = _items((metric.removeprefix(REWARDS), curves[0].line(metric, axis)) for metric in metrics)
+            panels.append(Panel("Reward terms", _REWARD_UNIT, items))
         else:
             panels += [_panel(curves, metric, axis) for metric in metrics]
     return [panel for panel in panels if panel.items]
-
-
-def available(known: Sequence[str]) -> list[str]:
-    """Every name that `choose` takes of runs with these metrics."""
-    short = [name for name in DEFAULT if _metrics(name, known)]
-    return [*short, *known]
 
 
 def _metrics(name: str, known: Sequence[str]) -> list[str]:
@@ -98,7 +89,7 @@ def _metrics(name: str, known: Sequence[str]) -> list[str]:
 
 
 def _unknown(name: str, known: Sequence[str]) -> UsageError:
-    names = available(known)
+    names = [*(short for short in DEFAULT if _metrics(short, known)), *known]
     tails = {each.rpartition("/")[2]: each for each in reversed(names)}
     tail = next(iter(difflib.get_close_matches(name, list(tails), n=1)), None)
     near = did_you_mean(name, names) or (f"did you mean '{tails[tail]}'?" if tail else None)
@@ -111,34 +102,21 @@ def _panel(curves: Sequence[Curve], metric: str, axis: str) -> Panel:
         title, unit = f"Reward: {metric.removeprefix(REWARDS)}", _REWARD_UNIT
     elif metric.startswith(TERMINATIONS):
         title, unit = f"Ended by {metric.removeprefix(TERMINATIONS)}", _ENDS_UNIT
-    items = [
-        Item(curve.label, line, index)
-        for index, curve in enumerate(curves)
-        if metric in curve.names() and (line := curve.line(metric, axis)) is not None
-    ]
+    items = _items((curve.label, curve.line(metric, axis)) for curve in curves)
     share = metric.rpartition("/")[2] in _SHARES or metric.startswith(TERMINATIONS)
     return Panel(title, unit, items, share=share, by_curve=True)
 
 
-def _terms(curve: Curve, metrics: Sequence[str], axis: str) -> Panel:
-    """All reward terms of one curve."""
-    items = [
-        Item(metric.removeprefix(REWARDS), line, index)
-        for index, metric in enumerate(metrics)
-        if metric in curve.names() and (line := curve.line(metric, axis)) is not None
-    ]
-    return Panel("Reward terms", _REWARD_UNIT, items)
-
-
 def _stacks(curves: Sequence[Curve], metrics: Sequence[str], axis: str) -> list[Panel]:
-    """Terminations, a panel a curve: means over seeds, which add up."""
+    """Return a panel of the terminations for each curve; means over seeds, because their shares add up to 1."""
     panels = []
     for curve in curves:
-        items = [
-            Item(metric.removeprefix(TERMINATIONS), line, index)
-            for index, metric in enumerate(metrics)
-            if metric in curve.names() and (line := curve.mean(metric, axis)) is not None
-        ]
+        items = _items((metric.removeprefix(TERMINATIONS), curve.mean(metric, axis)) for metric in metrics)
         subtitle = curve.label if len(curves) > 1 else ""
         panels.append(Panel("Why episodes ended", _ENDS_UNIT, items, stacked=True, share=True, subtitle=subtitle))
     return panels
+
+
+def _items(lines: Iterable[tuple[str, Line | None]]) -> list[Item]:
+    """Return the existing lines; a missing one leaves out its colour, so that others keep theirs in all panels."""
+    return [Item(label, line, index) for index, (label, line) in enumerate(lines) if line is not None]

@@ -1,4 +1,4 @@
-"""Content of a run's page, gathered from its files. Each part is gathered on its own: one may be missing."""
+"""Content of a run's page, read from the run's files. If a part cannot be read, the others are still shown."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from rlcli.runs.config_diff import as_text
 from rlcli.runs.restore import recorded_task, resolve_run
 from rlcli.runs.run import Run
 
-_MOST_CHARACTERS = 2000
-"""Of a text that the page shows."""
+_MAX_CHARACTERS = 2000
+"""Most characters of a text on the page."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A value of the configuration and where it was written."""
+    """Value of the configuration and the file, flag or override that it comes from."""
 
     key: str
     value: str
@@ -45,7 +45,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """A panel of learning curves: an SVG element, and beside it (label, colour, style of the line) of what is in it."""
+    """Panel of learning curves: an SVG element, and its legend of (label, index of colour, index of line style)."""
 
     title: str
     svg: str
@@ -70,17 +70,17 @@ class Page:
     """Section -> its values."""
     machine: list[tuple[str, str]] = field(default_factory=list)
     commands: list[tuple[str, str]] = field(default_factory=list)
-    """(what it does, command) each."""
+    """(description, command) of each command."""
     missing: dict[str, str] = field(default_factory=dict)
-    """Part -> one sentence why it is not there."""
+    """Part -> one sentence why it is missing."""
 
 
 def gather_page(run: Run, checkpoint: Path | None) -> Page:
-    """Gather everything but evaluation and video, which may have to be made.
+    """Read everything except evaluation and video, which `PageMedia` adds.
 
     Args:
         run: the run.
-        checkpoint: the folder of the checkpoint that the page is about; None: it has none.
+        checkpoint: the folder of the checkpoint that is described; None: the run has none.
     """
     record = run.record
     page = Page(str(record["task"]["name"]), run.folder.resolve().name, "", [])
@@ -111,14 +111,14 @@ def gather_page(run: Run, checkpoint: Path | None) -> Page:
 
 
 def _card(run: Run, document: strict_yaml.Document | None, checkpoint: Path | None) -> Card:
-    """The card of the task as the run has it; of a stranger's task without what its own code says."""
+    """Return the card of the run's task. If the task's code is not trusted or not installed, its terms are left out."""
     layout = _layout(checkpoint)
     try:
         return task_card(resolve_run(run, play=False), layout)
     except RlcliError:
         if document is None:
             raise
-    # pydantic is strict about lists and tuples but where it reads JSON
+    # in strict mode pydantic accepts a list for a tuple only when it reads JSON
     task = TaskConfig.model_validate_json(json.dumps(move_foreign_keys(document.data)), context={"open_scene": True})
     return card(task, Vocabulary(), name=str(run.record["task"]["name"]), layout=layout)
 
@@ -166,33 +166,34 @@ def _facts(run: Run, curve: Curve | None) -> Iterator[tuple[str, str]]:
         yield "Resumed", f"{len(record['resumed'])} times"
 
 
-# --- configuration and where it was written ---
+# --- configuration and its origins ---
 
 
 def _settings(run: Run, document: strict_yaml.Document) -> list[Setting]:
-    """Every value of a run and its origin.
+    """Return every value of a run's configuration and its origin.
 
-    What the command line or a `--config` file gave is recorded in the run. For the others the task is looked at as it
-    is installed now: where it has the same value, that is the place; where not, it is a line of the run's own file.
+    The run records values of the command line and of `--config` files. Other values are compared with the installed
+    task: if they are equal, the origin is the line of the installed task; else it is the line of the run's own file.
     """
-    given = run.record.get("given", {})
-    now, places = _installed(run)
+    recorded = run.record.get("given", {})
+    installed, lines = _installed(run)
     rows = []
     for path, value in leaves(document.data):
         key = dotted(path)
-        if key in given:
-            origin = str(given[key])
-        elif key in places and as_text(now.get(key)) == as_text(value):
-            origin = places[key]
+        if key in recorded:
+            origin = str(recorded[key])
+        elif key in lines and as_text(installed.get(key)) == as_text(value):
+            origin = lines[key]
         else:
             line, column = document.marks.get(path, (0, 0))
-            origin = f"{run.config.name}:{line}:{column}" + (" (the installed task differs)" if key in places else "")
-        rows.append(Setting(key, _value(value), origin))
+            origin = f"{run.config.name}:{line}:{column}" + (" (the installed task differs)" if key in lines else "")
+        text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+        rows.append(Setting(key, text, origin))
     return rows
 
 
 def _installed(run: Run) -> tuple[dict[str, Any], dict[str, str]]:
-    """The task of a run as it is installed: key -> value, key -> origin; nothing where it cannot be had."""
+    """Return key -> value and key -> origin of the installed task; both are empty if it cannot be loaded."""
     from rlcli.config.dump import to_data
 
     device = "cuda" if str(run.record.get("device", "")).startswith("cuda") else "cpu"
@@ -202,42 +203,35 @@ def _installed(run: Run) -> tuple[dict[str, Any], dict[str, str]]:
     except RlcliError:
         return {}, {}
     values = {dotted(path): value for path, value in leaves(to_data(resolved))}
-    # of a file of the task its name is enough; the page may be read on another machine
-    return values, {key: place.replace(source.label, source.config.name) for key, place in origins(resolved).items()}
+    # without the folder of the task's files: the page may be read on another machine
+    return values, {key: line.replace(source.label, source.config.name) for key, line in origins(resolved).items()}
 
 
 def _sections(settings: list[Setting]) -> list[tuple[str, list[Setting]]]:
     sections: dict[str, list[Setting]] = {}
     for setting in settings:
-        head = setting.key.partition(".")[0]
-        sections.setdefault(head if head != setting.key else "general", []).append(setting)
+        section, dot, _ = setting.key.partition(".")
+        sections.setdefault(section if dot else "general", []).append(setting)
     return sorted(sections.items(), key=lambda item: item[0] != "general")
-
-
-def _value(value: object) -> str:
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
 
 
 # --- versions, machine, commands ---
 
 
 def _machine(record: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    task, versions, cpu = record["task"], record.get("versions", {}), record.get("cpu", {})
-    owner = (
-        f"{task.get('distribution')} {task.get('version') or ''}" if task.get("distribution") else task.get("folder")
-    )
-    yield "Task from", str(owner).strip()
+    task, versions, torch = record["task"], record.get("versions", {}), record.get("torch", {})
+    distribution = f"{task.get('distribution')} {task.get('version') or ''}".strip()
+    yield "Task from", distribution if task.get("distribution") else str(task.get("folder")).strip()
     yield "rlcli", str(record.get("rlcli", "unknown"))
     yield "Python", str(record.get("python", "unknown"))
-    yield from ((str(name), str(version)) for name, version in versions.items() if version)
-    for key, title in (("platform", "Platform"), ("libc", "C library")):
-        if record.get(key):
-            yield title, str(record[key])
-    if cpu.get("model"):
-        yield "Processor", str(cpu["model"])
-    torch = record.get("torch", {})
-    if torch.get("gpu"):
-        yield "GPU", f"{torch['gpu']}, CUDA {torch.get('cuda')}"
+    optional = {
+        **versions,
+        "Platform": record.get("platform"),
+        "C library": record.get("libc"),
+        "Processor": record.get("cpu", {}).get("model"),
+        "GPU": f"{torch['gpu']}, CUDA {torch.get('cuda')}" if torch.get("gpu") else None,
+    }
+    yield from ((str(name), str(value)) for name, value in optional.items() if value)
     yield "Threads", f"engine {record.get('engine_threads', '?')}, torch {record.get('torch_threads', '?')}"
     for name, digest in record.get("sources", {}).items():
         yield f"sha256 of {'the sources of rlcli' if name == 'rlcli' else name}", str(digest)[:64]
@@ -261,7 +255,7 @@ def _commands(run: Run, checkpoint: Path | None) -> Iterator[tuple[str, str]]:
 
 
 def reason_of(error: Exception) -> str:
-    """Return an error as one sentence for the page."""
+    """Return the message of an error as one sentence for the page."""
     if isinstance(error, RlcliError):
         text = error.message + (f" ({error.hint})" if error.hint else "")
     elif isinstance(error, ValidationError):
@@ -270,7 +264,7 @@ def reason_of(error: Exception) -> str:
     else:
         text = str(error)
     text = " ".join(text.split())
-    return text[:_MOST_CHARACTERS] + ("" if text.endswith((".", ")")) else ".")
+    return text[:_MAX_CHARACTERS] + ("" if text.endswith((".", ")")) else ".")
 
 
 def _date(text: object) -> str:

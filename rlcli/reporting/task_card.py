@@ -1,6 +1,6 @@
-"""The card of a task: what its Markov decision process is, in tables, from its configuration and docstrings.
+"""Task card: tables that describe the task's Markov decision process, from its configuration and docstrings.
 
-Nothing is built or imported. What only the compiled model knows, the size of a term and the joints behind it, is in a
+Nothing is built or imported. Sizes of terms and names of joints come from the compiled model, so they are read from a
 layout: the `layout` of a checkpoint's manifest, or the `task.layout.json` that a task ships.
 """
 
@@ -9,13 +9,16 @@ from __future__ import annotations
 import ast
 import contextlib
 import html
+import itertools
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rlcli.config.layers import leaves
 from rlcli.config.load import Resolved
+from rlcli.config.messages import dotted
 from rlcli.config.schema import ObservationConfig, ObservationGroupConfig, TaskConfig, TermConfig
 from rlcli.config.source_classes import lineage
 from rlcli.config.term_signatures import SECTIONS, SELECTORS, SignatureError, Vocabulary, first_paragraph, read_params
@@ -28,7 +31,7 @@ CODE, NUMBER, TEXT = "code", "number", "text"
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of a table: its title, and whether it holds names, numbers or sentences."""
+    """Column of a table: its title, and whether it contains names, numbers or sentences."""
 
     title: str
     kind: str = TEXT
@@ -36,7 +39,7 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of plain text; what stands between backticks is a name."""
+    """Table of plain text; text between backticks is a name."""
 
     title: str
     note: str
@@ -46,7 +49,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """What a task is."""
+    """Description of a task."""
 
     name: str
     summary: str
@@ -55,7 +58,7 @@ class Card:
 
 
 def task_card(resolved: Resolved, layout: Mapping[str, Any] | None = None) -> Card:
-    """The card of a resolved task; `layout` as `rlcli.envs.vec_env.Layout.record` gives it."""
+    """Return the card of a resolved task; `layout` is the result of `rlcli.envs.vec_env.Layout.record`."""
     source = resolved.source
     return card(resolved.task, resolved.vocabulary, name=source.name, source=source, layout=layout)
 
@@ -68,14 +71,14 @@ def card(
     source: TaskSource | None = None,
     layout: Mapping[str, Any] | None = None,
 ) -> Card:
-    """The card of a configuration.
+    """Return the card of a configuration.
 
     Args:
         task: the configuration.
-        vocabulary: where its terms are looked up.
-        name: of the task.
-        source: its files; None where they are not at hand: then a direct task's docstrings are left out.
-        layout: sizes, units and elements as compiled; None leaves them out.
+        vocabulary: the signatures of its terms.
+        name: the task's name.
+        source: its files; without them (None) the docstrings of a direct task are left out.
+        layout: sizes, units and elements of the compiled terms; None leaves them out.
     """
     layout = layout or {}
     tables = [
@@ -83,20 +86,15 @@ def card(
         _actions(task, vocabulary, layout),
         _actuators(task),
         *_direct(task, source),
-        _rewards(task, vocabulary),
-        _terminations(task, vocabulary),
-        _success(task, vocabulary),
-        _commands(task, vocabulary),
-        _events(task, vocabulary),
-        _curriculum(task, vocabulary),
+        *_term_tables(task, vocabulary),
         _sensors(task),
     ]
-    shown = (_without_empty_columns(table) for table in tables if table is not None and table.rows)
+    shown = (_without_empty_columns(table) for table in tables if table.rows)
     return Card(name, task.summary, tuple(_facts(task, layout)), tuple(shown))
 
 
 def markdown(content: Card, level: int = 1) -> str:
-    """A card as Markdown, whose headings begin at a level."""
+    """Return a card as Markdown; `level` is the level of its first heading."""
     lines = [f"{'#' * level} {_cell(content.name)}", "", _cell(content.summary), ""]
     lines += ["| | |", "| --- | --- |", *(f"| {_cell(key)} | {_cell(value)} |" for key, value in content.facts), ""]
     for table in content.tables:
@@ -137,12 +135,9 @@ def _facts(task: TaskConfig, layout: Mapping[str, Any]) -> Iterable[tuple[str, s
         terms = terms.get("policy", []) if isinstance(terms, Mapping) else terms
         if terms:
             yield title, columns_text(sum(term["size"] for term in terms))
-    for clip, title in (
-        (task.clip_observations, "Observations are clipped to"),
-        (task.clip_actions, "Actions are clipped to"),
-    ):
+    for kind, clip in (("Observations", task.clip_observations), ("Actions", task.clip_actions)):
         if clip is not None:
-            yield title, f"±{number(clip)}"
+            yield f"{kind} are clipped to", f"±{number(clip)}"
     yield "Environments", f"{task.scene.num_envs:,}"
     for name, entity in task.scene.entities.items():
         shape = f"{entity.shape} {text_of(entity.size)}" if entity.shape else str(entity.model)
@@ -152,25 +147,27 @@ def _facts(task: TaskConfig, layout: Mapping[str, Any]) -> Iterable[tuple[str, s
     yield "Gravity", f"{text_of(task.sim.gravity)} m/s²"
 
 
-def _observations(task: TaskConfig, vocabulary: Vocabulary, layout: Mapping[str, Any]) -> Iterable[Table | None]:
+def _observations(task: TaskConfig, vocabulary: Vocabulary, layout: Mapping[str, Any]) -> Iterable[Table]:
     compiled = layout.get("observations", {})
-    if not task.observations:
-        yield from (_compiled_observations(f"Observations: {group}", terms) for group, terms in compiled.items())
+    if not task.observations:  # a direct task, whose observations are in the layout only
+        for group, terms in compiled.items():
+            rows = [(t["name"], t.get("unit", ""), str(t["size"]), text_of(t.get("clip") or "")) for t in terms]
+            note = f"{columns_text(sum(term['size'] for term in terms))}."
+            yield Table(f"Observations: {group}", note, _columns("Name", "Unit", "Size", "Clip"), tuple(rows))
         return
     titles = ("Term", "What", "Unit", "Size", "Of", "Parameters", "Modifiers", "Noise", "Bias", "Clip", "Scale")
     columns = _columns(*titles, "Delay", "History")
     for name, group in task.observations.items():
-        known = {term["name"]: term for term in compiled.get(name, [])}
-        rows = [
-            _observation(term, config, group, vocabulary, known.get(term, {}))
+        layouts = {term["name"]: term for term in compiled.get(name, [])}
+        cells = [
+            _observation(term, config, group, vocabulary, layouts.get(term, {}))
             for term, config in group.terms.items()
             if config is not None
         ]
         note = "" if group.enable_corruption else "Without noise, bias and delay."
-        size = sum(term["size"] for term in known.values())
-        yield Table(
-            f"Observations: {name}", f"{columns_text(size)}. {note}".strip() if size else note, columns, tuple(rows)
-        )
+        size = sum(term["size"] for term in layouts.values())
+        note = f"{columns_text(size)}. {note}".strip() if size else note
+        yield Table(f"Observations: {name}", note, columns, tuple(cells))
 
 
 def _observation(
@@ -178,18 +175,18 @@ def _observation(
     config: ObservationConfig,
     group: ObservationGroupConfig,
     vocabulary: Vocabulary,
-    known: Mapping[str, Any],
+    layout: Mapping[str, Any],
 ) -> tuple[str, ...]:
-    what, unit = _meaning("observations", config, vocabulary)
+    meaning, unit = _meaning("observations", config, vocabulary)
     noisy = group.enable_corruption
     delay = config.delay if noisy else None
     history = group.history or config.history or 1
     return (
         name,
-        what,
-        known.get("unit") or unit,
-        str(known.get("size", "")),
-        ", ".join(known.get("elements", [])),
+        meaning,
+        layout.get("unit") or unit,
+        str(layout.get("size", "")),
+        ", ".join(layout.get("elements", [])),
         _parameters("observations", config, vocabulary),
         "; ".join(modifier_text(modifier.model_dump()) for modifier in config.modifiers),
         noise_text(config.noise) if noisy else "",
@@ -201,28 +198,18 @@ def _observation(
     )
 
 
-def _compiled_observations(title: str, terms: Sequence[Mapping[str, Any]]) -> Table:
-    """Return the observations of a direct task, which only the layout has."""
-    rows = [
-        (term["name"], term.get("unit", ""), str(term["size"]), text_of(term["clip"]) if term.get("clip") else "")
-        for term in terms
-    ]
-    note = f"{columns_text(sum(term['size'] for term in terms))}."
-    return Table(title, note, _columns("Name", "Unit", "Size", "Clip"), tuple(rows))
-
-
 def _actions(task: TaskConfig, vocabulary: Vocabulary, layout: Mapping[str, Any]) -> Table:
-    known = {term["name"]: term for term in layout.get("actions", [])}
+    layouts = {term["name"]: term for term in layout.get("actions", [])}
     rows = []
     for name, config in task.actions.items():
         if config is None:
             continue
-        what, unit = _meaning("actions", config, vocabulary)
-        term = known.pop(name, {})
+        meaning, unit = _meaning("actions", config, vocabulary)
+        term = layouts.get(name, {})
         parameters = _parameters("actions", config, vocabulary)
-        rows.append((name, what, term.get("unit") or unit, parameters, *_compiled_action(term)))
+        rows.append((name, meaning, term.get("unit") or unit, parameters, *_compiled_action(term)))
     if not task.actions:
-        rows = [(name, "", term.get("unit", ""), "", *_compiled_action(term)) for name, term in known.items()]
+        rows = [(name, "", term.get("unit", ""), "", *_compiled_action(term)) for name, term in layouts.items()]
     columns = _columns("Term", "What", "Unit", "Parameters", "Size", "Drives", "Limits")
     return Table("Actions", "", columns, tuple(rows))
 
@@ -236,65 +223,42 @@ def _compiled_action(term: Mapping[str, Any]) -> tuple[str, str, str]:
     return str(term.get("size", "")), ", ".join(term.get("elements", [])), limits
 
 
-def _terms(
-    section: str,
-    terms: Mapping[str, TermConfig | None],
-    vocabulary: Vocabulary,
-    cells: Callable[[Any, str, str], tuple[str, ...]],
-) -> tuple[tuple[str, ...], ...]:
-    """Return a row for each term: its name, what `cells` makes of its settings, meaning and unit, and parameters."""
-    return tuple(
-        (name, *cells(config, *_meaning(section, config, vocabulary)), _parameters(section, config, vocabulary))
-        for name, config in terms.items()
-        if config is not None
-    )
+def _term_tables(task: TaskConfig, vocabulary: Vocabulary) -> Iterable[Table]:
+    """Yield the tables of the sections that have one row for each term."""
 
+    def table(
+        section: str, note: str, titles: tuple[str, ...], cells: Callable[[Any, str, str], tuple[str, ...]]
+    ) -> Table:
+        """Return a table; `cells` makes the cells between name and parameters of (config, meaning, unit)."""
+        terms = getattr(task, section)
+        if section == "success":
+            terms = {terms.func: terms} if terms else {}
+        rows = [
+            (name, *cells(config, *_meaning(section, config, vocabulary)), _parameters(section, config, vocabulary))
+            for name, config in terms.items()
+            if config is not None
+        ]
+        title = "Events and randomisation" if section == "events" else section.capitalize()
+        return Table(title, note, _columns(*titles), tuple(rows))
 
-def _rewards(task: TaskConfig, vocabulary: Vocabulary) -> Table:
-    rows = _terms("rewards", task.rewards, vocabulary, lambda term, what, unit: (number(term.weight), what))
     scaled = f" x {number(task.step_dt)} s" if task.reward_dt_scaling else ""
     note = f"The reward of a step is the sum of weight x value{scaled} over the terms."
-    return Table("Rewards", note, _columns("Term", "Weight", "Value", "Parameters"), rows)
-
-
-def _terminations(task: TaskConfig, vocabulary: Vocabulary) -> Table:
-    rows = _terms(
-        "terminations",
-        task.terminations,
-        vocabulary,
-        lambda term, what, unit: ("truncates" if term.time_out else "terminates", what),
-    )
-    note = "An episode that is truncated ran out of time: its last state has a future, which is bootstrapped."
-    return Table("Terminations", note, _columns("Term", "What it does", "When", "Parameters"), rows)
-
-
-def _success(task: TaskConfig, vocabulary: Vocabulary) -> Table:
-    terms = {task.success.func: task.success} if task.success else {}
-    rows = _terms("success", terms, vocabulary, lambda term, what, unit: (what,))
+    titles: tuple[str, ...] = ("Term", "Weight", "Value", "Parameters")
+    yield table("rewards", note, titles, lambda term, meaning, unit: (number(term.weight), meaning))
+    note = "A truncated episode ran out of time: the value of its last state is bootstrapped."
+    titles = ("Term", "What it does", "When", "Parameters")
+    ends = {True: "truncates", False: "terminates"}
+    yield table("terminations", note, titles, lambda term, meaning, unit: (ends[term.time_out], meaning))
     hold = number(task.success.hold_s) if task.success else ""
-    note = f"An episode succeeds if time ended it and this held during its last {hold} s."
-    return Table("Success", note, _columns("Condition", "When", "Parameters"), rows)
-
-
-def _commands(task: TaskConfig, vocabulary: Vocabulary) -> Table:
-    rows = _terms(
-        "commands",
-        task.commands,
-        vocabulary,
-        lambda term, what, unit: (what, unit, f"every {span(term.resampling_time_s)} s"),
+    note = f"An episode succeeds if it ends by time-out and the condition held during its last {hold} s."
+    yield table("success", note, ("Condition", "When", "Parameters"), lambda term, meaning, unit: (meaning,))
+    titles = ("Term", "What", "Unit", "Resampled", "Ranges")
+    yield table(
+        "commands", "", titles, lambda term, meaning, unit: (meaning, unit, f"every {span(term.resampling_time_s)} s")
     )
-    return Table("Commands", "", _columns("Term", "What", "Unit", "Drawn anew", "Ranges"), rows)
-
-
-def _events(task: TaskConfig, vocabulary: Vocabulary) -> Table:
-    rows = _terms("events", task.events, vocabulary, lambda term, what, unit: (when_text(term), what))
-    columns = _columns("Term", "When", "What", "Ranges and parameters")
-    return Table("Events and randomisation", "", columns, rows)
-
-
-def _curriculum(task: TaskConfig, vocabulary: Vocabulary) -> Table:
-    rows = _terms("curriculum", task.curriculum, vocabulary, lambda term, what, unit: (what,))
-    return Table("Curriculum", "", _columns("Term", "What", "Parameters"), rows)
+    titles = ("Term", "When", "What", "Ranges and parameters")
+    yield table("events", "", titles, lambda term, meaning, unit: (when_text(term), meaning))
+    yield table("curriculum", "", ("Term", "What", "Parameters"), lambda term, meaning, unit: (meaning,))
 
 
 def _sensors(task: TaskConfig) -> Table:
@@ -306,7 +270,7 @@ def _sensors(task: TaskConfig) -> Table:
 
 
 def _actuators(task: TaskConfig) -> Table:
-    """The models of what drives joints; of MuJoCo's own actuators the MJCF tells."""
+    """Return the table of actuator models; MuJoCo's own actuators are in the MJCF and are left out."""
     rows = [
         (
             name,
@@ -333,12 +297,13 @@ _HOOKS = {
     "calculate_metrics": "Reward",
     "is_done": "Termination",
 }
-"""Hook -> what it decides."""
+"""Hook of a direct task -> the part of the task that it decides."""
 
 
 def _direct(task: TaskConfig, source: TaskSource | None) -> Iterable[Table]:
-    """Parameters and docstrings of a direct task's class, read from its source."""
-    values = task.params | {key: value for block in task.foreign.values() for key, value in _flat(block).items()}
+    """Yield the parameters and the docstrings of a direct task's class, read from its source."""
+    foreign = (leaf for block in task.foreign.values() if block for leaf in leaves(block))
+    values = task.params | {dotted(path): value for path, value in foreign}
     described: dict[str, tuple[str, str]] = {}
     hooks: list[tuple[str, str, str]] = []
     if source is not None and source.task and source.task_file is not None:
@@ -353,32 +318,19 @@ def _direct(task: TaskConfig, source: TaskSource | None) -> Iterable[Table]:
     rows = [(key, text_of(value), *described.get(key, ("", ""))) for key, value in values.items()]
     columns = (Column("Parameter", CODE), Column("Value", NUMBER), Column("What"), Column("Default", NUMBER))
     yield Table("Parameters", "", columns, tuple(rows))
-    note = "What the docstrings of the task's class say; its code is the definition."
-    yield Table("In the task's words", note, _columns("Decides", "Hook", "What"), tuple(hooks))
+    note = "The docstrings of the task's class. Its code is the definition."
+    yield Table("Docstrings of the task", note, _columns("Decides", "Hook", "What"), tuple(hooks))
 
 
 def _hooks(file: Path, class_name: str) -> list[tuple[str, str, str]]:
-    docstrings = _docstrings(file, class_name)
-    found = [("Task", class_name, docstrings.get("", ""))]
-    found += [(decides, name, docstrings.get(name, "")) for name, decides in _HOOKS.items()]
-    return [(decides, name, first_paragraph(text)) for decides, name, text in found if text]
-
-
-def _docstrings(file: Path, class_name: str) -> dict[str, str]:
-    """Method -> docstring, of a class and of the bases that a task has in files of its own; "" is the class itself."""
-    found: dict[str, str] = {}
-    for source in reversed(lineage(file, class_name)):
+    """Return (what it decides, name, first paragraph of the docstring) for a class and its hooks, bases included."""
+    docstrings: dict[str, str] = {}
+    for source in reversed(lineage(file, class_name)):  # bases first, so that a class overrides them
         functions = [inner for inner in source.node.body if isinstance(inner, ast.FunctionDef)]
-        found |= {inner.name: text for inner in functions if (text := ast.get_docstring(inner))}
-        found[""] = ast.get_docstring(source.node) or ""
-    return found
-
-
-def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, item in value.items():
-        flat |= _flat(item, f"{prefix}{key}.") if isinstance(item, Mapping) and item else {f"{prefix}{key}": item}
-    return flat
+        docstrings |= {inner.name: text for inner in functions if (text := ast.get_docstring(inner))}
+        docstrings[class_name] = ast.get_docstring(source.node) or ""
+    decisions = {class_name: "Task", **_HOOKS}
+    return [(decides, n, first_paragraph(docstrings[n])) for n, decides in decisions.items() if docstrings.get(n)]
 
 
 # --- cells ---
@@ -388,25 +340,26 @@ _UNIT = re.compile(r"\[([^\]]+)\]")
 
 
 def _meaning(section: str, config: TermConfig, vocabulary: Vocabulary) -> tuple[str, str]:
-    """What a term's docstring says, without shapes, and its unit."""
+    """Return a term's docstring without shapes, and its unit."""
     signature = vocabulary.find(section, config.func)
     if signature is None or not signature.description:
         return f"`{config.func}`", ""
-    said = _SHAPE.sub("", signature.description).strip()
+    description = _SHAPE.sub("", signature.description).strip()
     unit = _UNIT.search(signature.summary)
-    return said, unit[1] if unit else ""
+    return description, unit[1] if unit else ""
 
 
 def _parameters(section: str, config: TermConfig, vocabulary: Vocabulary) -> str:
-    """The parameters of a term; the entity only where it is not the usual one, selectors where they select."""
+    """Return the parameters of a term without default entities and without selectors of all elements."""
     signature = vocabulary.find(section, config.func)
-    known = {p.name: p for p in signature.parameters} if signature else {}
-    given = {key: value for key, value in config.params.items() if key not in SECTIONS[section].model_fields}
+    parameters = {p.name: p for p in signature.parameters} if signature else {}
     parts = []
-    for key, value in given.items():
-        parameter = known.get(key)
-        quiet = parameter is not None and parameter.alias is not None and value == parameter.default
-        if value is None or (quiet and (parameter is None or parameter.alias not in SELECTORS or value == ".*")):
+    for key, value in config.params.items():
+        if value is None or key in SECTIONS[section].model_fields:
+            continue
+        parameter = parameters.get(key)
+        is_default = parameter is not None and parameter.alias is not None and value == parameter.default
+        if parameter is not None and is_default and (parameter.alias not in SELECTORS or value == ".*"):
             continue
         parts.append(f"`{key}` = {text_of(value)}")
     return ", ".join(parts)
@@ -419,10 +372,8 @@ def _without_empty_columns(table: Table) -> Table:
 
 
 def _cell(text: str) -> str:
-    """Text in Markdown, where only what stands between backticks is more than text."""
+    """Return text as Markdown with all markup escaped, except code between backticks."""
     parts = " ".join(text.split()).split("`")
     plain = [re.sub(r"([\\*_\[\]#])", r"\\\1", html.escape(part, quote=False)) for part in parts[::2]]
     codes = [f"`{part}`" for part in parts[1::2]]
-    if len(parts) % 2 == 0:  # one without its twin
-        return "".join(plain[i] + (codes[i] if i < len(codes) else "") for i in range(len(plain)))
-    return "".join(a + b for a, b in zip(plain, [*codes, ""], strict=True))
+    return "".join(a + b for a, b in itertools.zip_longest(plain, codes, fillvalue=""))

@@ -1,6 +1,7 @@
-"""The contract kit, what every task must keep, and the linter, what a policy learns well from: both by running it.
+"""Contract checks and linter for tasks: both run the task.
 
-For task authors, `rlcli check`, `rlcli lint` and pytest.
+The checks test the contract that every task must keep. The linter looks for defects that make learning hard. Both are
+for authors of tasks; `rlcli check`, `rlcli lint` and the pytest plugin use them.
 
 ```python
 from rlcli.testing import check_task

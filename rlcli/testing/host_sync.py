@@ -1,4 +1,4 @@
-"""Detection of host syncs: operations whose result the host must read before it goes on."""
+"""Detection of host syncs: operations whose result the host must read before it continues."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 SYNC_OPS = {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "item", "unique", "_unique2"}
-"""Operations whose result the host must have before it goes on."""
+"""Operations whose result the host must read before it continues."""
 COPY_OPS = {"lift_fresh", "lift", "from_file"}
-"""Operations that make a tensor of what the host has; none of them can be recorded."""
+"""Operations that make a tensor from data of the host; a CUDA graph cannot record them."""
 _MASKED = ("index", "index_put", "index_put_")
 
 
@@ -26,12 +26,12 @@ class HostSyncGuard(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torc
     def __torch_dispatch__(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
     ) -> Any:
-        """Let everything else through."""
+        """Raise for operations that force a host sync, and execute all others."""
         name = func.overloadpacket.__name__
         if name in SYNC_OPS:
             raise HostSyncError(f"'{name}' waits for the device")
         if name in COPY_OPS:
-            raise HostSyncError(f"'{name}' makes a tensor of numbers of the host, which waits for the device")
+            raise HostSyncError(f"'{name}' makes a tensor from numbers of the host and waits for the device")
         if name in _MASKED and any(isinstance(i, Tensor) and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
-            raise HostSyncError(f"'{name}' with a mask is a search, which waits for the device")
+            raise HostSyncError(f"'{name}' with a mask searches its true elements and waits for the device")
         return func(*args, **(kwargs or {}))

@@ -1,22 +1,15 @@
-"""Runs the checks one after the other; one that raises is a finding of its own, and the others still run."""
+"""Runner of the contract checks. A check that raises an error gives a finding, and the others still run."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from rlcli.errors import (
-    ConfigError,
-    DependencyError,
-    DeviceError,
-    MachineError,
-    ShapeError,
-    TaskError,
-    require_known,
-)
+from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError, ShapeError, TaskError, require_known
 from rlcli.testing import episode_checks, portability_checks, value_checks
 from rlcli.testing.task_under_test import Finding, NotRunError, TaskUnderTest, error_text, open_task
 
@@ -52,7 +45,7 @@ CHECKS: dict[str, Check] = {
     "engines": portability_checks.engines,
     "captured": portability_checks.captured,
 }
-"""Name -> check, in the order in which they run. The first line of a check's docstring says what it demands."""
+"""Name -> check, in the order in which they run. The first line of a check's docstring is the clause."""
 
 _DIRECT_ONLY = ("observation-after-reset",)
 
@@ -70,34 +63,32 @@ def check_task(
 
     Args:
         task: a name from `list-tasks`, or a folder with a `task.yaml`.
-        agent: whose patch of the task and action bound hold; None takes the default agent.
+        agent: the agent whose changes to the task and action bound are used; None: the default agent.
         overrides: `key.path=value`, as on the command line.
         only: names of checks to run; all if empty.
         on_check: called after each check with its name and findings; with None for a check that was not run.
-        on_note: called after a check with its name and what else it has to say: why it was not run, what it measured.
+        on_note: called after a check with its name and a note: why it was not run, or what it measured.
 
     Returns:
-        What the task does not keep; empty for a task that is in order.
+        Violations of the contract; empty if there are none.
 
     Raises:
         UsageError: for a check that does not exist.
-        ConfigError: if the files are not valid; `rlcli validate` says the same.
+        ConfigError: if the files are not valid; `rlcli validate` prints the same errors.
         TaskError: if there is no such task, or it cannot be imported.
     """
     for name in only:
         require_known(name, list(CHECKS), "check", "checks")
     subject = open_task(task, agent, overrides)
-    chosen = [name for name in CHECKS if (not only or name in only) and (subject.is_direct or name not in _DIRECT_ONLY)]
+    selected = [n for n in CHECKS if (not only or n in only) and (subject.is_direct or n not in _DIRECT_ONLY)]
     found: list[Finding] = []
     with torch.random.fork_rng(devices=[]):
         broken = list(_build(subject))
         if broken:
-            found += broken
-            for name in dict.fromkeys((*(f.check for f in broken), *chosen)):
-                mine = [f for f in broken if f.check == name]
-                on_check(name, mine or None)
-            return found
-        for name in chosen:
+            for name in dict.fromkeys((*(f.check for f in broken), *selected)):
+                on_check(name, [f for f in broken if f.check == name] or None)
+            return broken
+        for name in selected:
             try:
                 findings = list(_run(name, subject, found))
             except NotRunError as reason:
@@ -112,7 +103,7 @@ def check_task(
 
 
 def record_layout(task: str | Path, *, agent: str | None = None, overrides: Sequence[str] = ()) -> Path:
-    """Write down the columns of a task's observations and actions, beside its configuration; `layout` compares later.
+    """Record the columns of a task's observations and actions beside its configuration, for the check `layout`.
 
     Returns:
         The file.
@@ -121,21 +112,24 @@ def record_layout(task: str | Path, *, agent: str | None = None, overrides: Sequ
         ConfigError: if the task is not valid.
         TaskError: if there is no such task, or it cannot be imported.
     """
-    return portability_checks.record_layout(open_task(task, agent, overrides))
+    subject = open_task(task, agent, overrides)
+    record, file = subject.env().layout.record(), portability_checks.layout_file(subject)
+    columns = {part: record[part] for part in ("observations", "actions")}
+    file.write_text(json.dumps(columns, indent=1) + "\n", encoding="utf-8")
+    return file
 
 
 def _build(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Nothing can be checked of a task that cannot be built."""
+    """Build the environment; yield the findings if that fails, since no check can run then."""
     try:
         subject.env()
     except ConfigError as error:
         for problem in error.problems:
-            # a term's first value is looked at when the environment is built
+            # the environment checks the shape of a term's first value while it is built
             check = "shapes" if isinstance(error, ShapeError) else "names"
             where = f"{problem.where}: {problem.path}" if problem.path else problem.where
-            yield Finding(
-                check, "error", where, problem.message, problem.hint or "mend it; `rlcli validate --deep` agrees"
-            )
+            hint = problem.hint or "correct it; `rlcli validate --deep` reports it too"
+            yield Finding(check, "error", where, problem.message, hint)
     except (TaskError, DependencyError, DeviceError, MachineError):
         raise
     except Exception as error:
@@ -155,5 +149,5 @@ def _run(name: str, subject: TaskUnderTest, before: list[Finding]) -> Iterator[F
 def _stopped(name: str, subject: TaskUnderTest, error: Exception, before: list[Finding]) -> Finding:
     message = f"the check was stopped by {error_text(error)}"
     earlier = next((f.check for f in before if f.message == message), None)
-    hint = "mend what raises it, then check again" if earlier is None else f"see {earlier}"
-    return Finding(name, "error", subject.place(error), message, hint)
+    hint = "correct the code that raises it, then check again" if earlier is None else f"see {earlier}"
+    return Finding(name, "error", subject.location(error), message, hint)

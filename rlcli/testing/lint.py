@@ -1,4 +1,4 @@
-"""The linter: whether a task, that may keep its contract to the letter, is one that a policy can learn well.
+"""Linter of tasks: it finds what makes a task hard to learn, also in tasks that keep the contract.
 
 ```python
 from rlcli.testing import lint_task
@@ -33,29 +33,29 @@ def lint_task(
     ignore: Sequence[str] = (),
     on_rule: Callable[[str, list[Remark]], None] = lambda name, remarks: None,
 ) -> list[Remark]:
-    """Look at what a task does under agents that know nothing.
+    """Run a task with scripted, untrained agents and apply the rules to their rollouts.
 
     Args:
         task: a name from `list-tasks`, or a folder with a `task.yaml`.
-        agent: whose patch of the task, action bound and discount hold; None takes the default agent.
+        agent: the agent whose changes to the task, action bound and discount are used; None: the default agent.
         overrides: `key.path=value`, as on the command line.
-        seconds: simulated time that each agent acts for [s]; None: an episode, but no more than 1000 steps.
+        seconds: simulated time of each rollout [s]; None: one episode, but at most 1000 steps.
         only: names of rules; all if empty.
         ignore: names of rules that are left out.
         on_rule: called after each rule with its name and remarks.
 
     Returns:
-        What will get in the way of learning; empty for a task that is in order.
+        Obstacles to learning; empty if there are none.
 
     Raises:
         UsageError: for a rule that does not exist.
-        ConfigError: if the task is not valid; `rlcli validate --deep` says the same.
+        ConfigError: if the task is not valid; `rlcli validate --deep` prints the same errors.
         TaskError: if there is no such task, or it cannot be imported.
     """
     for name in (*only, *ignore):
         require_known(name, list(RULES), "rule", "rules")
     if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
-        raise UsageError(f"--seconds {seconds:g} is not a time", hint="simulated seconds, above 0")
+        raise UsageError(f"--seconds {seconds:g} is not a duration", hint="simulated seconds, above 0")
     evidence = RolloutEvidence(open_task(task, agent, overrides), seconds)
     found: list[Remark] = []
     with torch.random.fork_rng(devices=[]):
@@ -63,7 +63,7 @@ def lint_task(
             if (only and name not in only) or name in ignore:
                 continue
             remarks = list(_apply_rule(name, evidence))
-            if evidence.stopped:  # what little there was of the lives says nothing
+            if evidence.stopped:  # the rollouts are incomplete, so no other rule applies
                 remarks = list(_apply_rule("stops", evidence))
             found += remarks
             on_rule(name, remarks)
@@ -80,4 +80,5 @@ def _apply_rule(name: str, evidence: RolloutEvidence) -> Iterator[Remark]:
         raise
     except Exception as error:
         message = f"the rule was stopped by {error_text(error)}"
-        yield Remark(name, "error", evidence.subject.place(error), message, "mend what raises it, then lint again")
+        hint = "correct the code that raises it, then lint again"
+        yield Remark(name, "error", evidence.subject.location(error), message, hint)

@@ -1,4 +1,4 @@
-"""Scripted agents (zero, random, bang-bang, sine), and the recorded rollouts that the linter checks."""
+"""Scripted agents (zero, random, bang-bang, sine) and their recorded rollouts, which the linter checks."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from torch import Tensor
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.vec_env import VecEnv
-from rlcli.testing.task_under_test import TaskUnderTest
+from rlcli.testing.task_under_test import TaskUnderTest, element_names, ended_episodes
 
 NUM_ENVS = 16
 MAX_STEPS = 1000
-"""Longest rollout [steps], where no other time is given."""
+"""Longest rollout if no duration is given [steps]."""
 ScriptedAgent = Callable[[int], Tensor]
 """Step -> action (num_envs, a)."""
 
 SWITCH_S = 0.25
-"""How long a bang-bang agent holds a sign, on average [s]."""
+"""Mean time between sign changes of the bang-bang agent [s]."""
 SINE_HZ = (0.25, 2.0)
 """Frequencies of the sine agent [Hz]."""
 
@@ -74,13 +74,14 @@ SCRIPTED_AGENTS: dict[str, Callable[[VecEnv, float], ScriptedAgent]] = {
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """An episode, possibly cut off by the end of the rollout."""
+    """Episode of a rollout; the end of the rollout may have cut it off."""
 
     steps: int
     total: float
     """Undiscounted sum of rewards."""
     terminated: bool
     ended: bool
+    """Whether it ended before the rollout did."""
     causes: tuple[str, ...] = ()
 
 
@@ -95,12 +96,12 @@ class Rollout:
     """Whether the episode ended with this step. bool"""
     terminated: Tensor
     terms: dict[str, Tensor]
-    """Reward term -> what it paid, weight included; empty for a direct task."""
+    """Reward term -> its reward, weight included; empty for a direct task."""
     obs: dict[str, Tensor]
-    """Group -> observations, start states first, divergent ones left out."""
+    """Group -> observations, beginning with those of the reset."""
     episodes: list[Episode]
     limited: dict[str, float]
-    """Name of a limited quantity -> share of the steps in which it was at its limit, under random actions only."""
+    """Name of a limited quantity -> share of the steps in which it was at its limit; only under random actions."""
     speed: Tensor
     """Root mean square of each velocity. (nv,)"""
     diverged: int
@@ -129,15 +130,12 @@ def record_rollout(env: VecEnv, agent: str, bound: float, steps: int) -> Rollout
                     physics.add_clipped_columns(action)
                 _append(obs, result.obs)
                 totals += result.reward
-                if result.episodes is not None:
-                    ended = result.episodes.ended()
-                    for row, number in enumerate(ended.ids.tolist()):
-                        causes = tuple(name for name, mask in ended.causes.items() if bool(mask[row]))
-                        length, out = int(ended.lengths[row]), bool(result.terminated[number])
-                        episodes.append(Episode(length, float(totals[number]), out, True, causes))
-                        totals[number] = 0.0
-        except Exception as stopped:
-            error = stopped
+                for end in ended_episodes(result):
+                    total = float(totals[end.env_id])
+                    episodes.append(Episode(end.length, total, end.terminated, True, end.causes))
+                    totals[end.env_id] = 0.0
+        except Exception as raised:
+            error = raised
     running = zip(env.episode_length_buf.tolist(), totals.tolist(), strict=True)
     episodes += [Episode(length, total, False, False) for length, total in running if length]
     count = max(1, physics.steps)
@@ -202,16 +200,15 @@ class _PhysicsObserver(StepObserver):
         """Record which columns of the action are clipped before they become commands."""
         column = 0
         for term in self._env.layout.actions:
-            for place in range(term.size):
-                clip = None if term.clip is None else term.clip[place]
+            for index, name in enumerate(element_names(term.elements, term.size)):
+                clip = None if term.clip is None else term.clip[index]
                 if isinstance(clip, tuple):
-                    scale = 1.0 if term.scale is None else term.scale[place]
-                    offset = 0.0 if term.offset is None else term.offset[place]
-                    command = action[:, column + place] * scale + offset
-                    name = term.elements[place] if len(term.elements) == term.size else str(place)
+                    scale = 1.0 if term.scale is None else term.scale[index]
+                    offset = 0.0 if term.offset is None else term.offset[index]
+                    command = action[:, column] * scale + offset
                     share = float(((command < clip[0]) | (command > clip[1])).float().mean())
-                    self.shares[f"column {column + place} of the action ({name})"] += share
-            column += term.size
+                    self.shares[f"column {column} of the action ({name})"] += share
+                column += 1
 
 
 class RolloutEvidence:
@@ -238,7 +235,7 @@ class RolloutEvidence:
         return any(rollout.error is not None for rollout in self._rollouts or ())
 
     def env(self, num_envs: int = NUM_ENVS, **settings: Any) -> VecEnv:
-        """Return a new environment with further settings."""
+        """Return a new environment with further settings; in their names `__` stands for a dot."""
         flags = {key.replace("__", "."): value for key, value in settings.items()}
-        # all cores: what a world does is the same at any number of threads
+        # all cores: the number of engine threads does not change the results
         return self.subject.env(flags={"scene.num_envs": num_envs, "sim.engine_threads": None, **flags})

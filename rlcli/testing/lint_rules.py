@@ -1,4 +1,4 @@
-"""The rules of the linter: each looks at recorded rollouts of scripted agents for what gets in the way of learning."""
+"""Rules of the linter: each finds one obstacle to learning in the recorded rollouts of scripted agents."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from itertools import product
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from rlcli.config.layers import leaves
 from rlcli.config.schema import AgentConfig
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
@@ -22,39 +24,35 @@ from rlcli.testing.timestep_checks import energy_drift
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """Something in a task that will get in the way of learning."""
+    """Obstacle to learning in a task."""
 
     rule: str
     severity: Literal["error", "warning"]
     where: str
-    """The term, the column, or the setting."""
+    """Term, column or setting."""
     message: str
     hint: str
     numbers: dict[str, float] = field(default_factory=dict)
-    """What was measured, by name."""
+    """Measured values by name."""
 
     def __str__(self) -> str:
-        """One line."""
+        """Return the remark as one line."""
         return f"{self.severity}: {self.rule}: {self.where}: {self.message}; {self.hint}"
 
     def record(self) -> dict[str, Any]:
-        """As plain JSON, which has no infinity."""
+        """Return the remark as JSON, which has no infinity: such numbers become null."""
         numbers = {name: value if math.isfinite(value) else None for name, value in self.numbers.items()}
         return {**asdict(self), "numbers": numbers}
 
 
-def error_at(where: str, message: str, hint: str, numbers: dict[str, float]) -> Remark:
-    """Return an error of the rule that is running; the linter adds the name of the rule."""
-    return Remark("", "error", where, message, hint, numbers)
-
-
-def warning_at(where: str, message: str, hint: str, numbers: dict[str, float]) -> Remark:
-    """Return a warning of the rule that is running, likewise."""
-    return Remark("", "warning", where, message, hint, numbers)
+error_at = partial(Remark, "", "error")
+"""(where, message, hint, numbers) -> error of the running rule; the linter adds the name of the rule."""
+warning_at = partial(Remark, "", "warning")
+"""(where, message, hint, numbers) -> warning of the running rule; the linter adds the name of the rule."""
 
 
 def runs_without_error(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """The task runs: no agent makes it raise an error."""
+    """Check that the task raises no error under any agent."""
     seen = set()
     for rollout in evidence.rollouts:
         if rollout.error is None:
@@ -64,55 +62,55 @@ def runs_without_error(evidence: RolloutEvidence) -> Iterator[Remark]:
             seen.add(text)
             step = len(rollout.reward)
             message = f"the {rollout.agent} agent was stopped after {step} steps by {text}"
-            hint = "mend what raises it; `rlcli check` looks closer"
-            yield error_at(evidence.subject.place(rollout.error), message, hint, {"step": step})
+            hint = "correct the code that raises it; `rlcli check` finds more details"
+            yield error_at(evidence.subject.location(rollout.error), message, hint, {"step": step})
 
 
-AT_ONCE = 5
-"""Steps within which an end is one at once."""
+EARLY = 5
+"""Episodes of at most so many steps end early."""
 
 
 def early_resets(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Episodes do not end as soon as they have begun, whatever the agent does."""
+    """Check that few episodes end in their first steps, at least under one agent."""
     shares = {}
     for rollout in evidence.rollouts:
-        begun = [e for e in rollout.episodes if e.ended or e.steps > AT_ONCE]
-        early = [e for e in begun if e.steps <= AT_ONCE < rollout.env.max_episode_length]
-        shares[rollout.agent] = (len(early) / len(begun) if begun else 0.0, early)
+        complete = [e for e in rollout.episodes if e.ended or e.steps > EARLY]
+        early = [e for e in complete if e.steps <= EARLY < rollout.env.max_episode_length]
+        shares[rollout.agent] = (len(early) / len(complete) if complete else 0.0, early)
     share, early = min(shares.values(), key=lambda found: found[0])
     if share >= 0.1:
         causes = Counter(cause for episode in early for cause in episode.causes)
         names = ", ".join(name for name, _ in causes.most_common(2)) or "a reset"
         yield error_at(
             f"terminations: {names}",
-            f"{share:.0%} of the episodes end within {AT_ONCE} steps, under every agent",
-            "start where the termination does not hold (narrower reset ranges), or let it allow more",
-            {"share": share, "steps": AT_ONCE},
+            f"{share:.0%} of the episodes end within {EARLY} steps, under every agent",
+            "choose start states that the termination allows (narrower reset ranges), or widen its limits",
+            {"share": share, "steps": EARLY},
         )
 
 
-def _active(evidence: RolloutEvidence) -> list[str]:
-    """Reward terms that have a weight."""
+def _weighted_terms(evidence: RolloutEvidence) -> list[str]:
+    """Return the reward terms with a weight other than 0."""
     rewards = evidence.subject.resolved.task.rewards
     env = evidence.rollouts[0].env
     if not isinstance(env, ManagedEnv):
         return []
-    # a weight that a curriculum moves may well begin at 0, and no dummy agent lives to see it change
+    # a curriculum may raise a weight from 0, but a rollout is too short for that
     return [name for name, config in rewards.items() if config is not None and config.weight != 0.0]
 
 
 def silent_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Every reward term with a weight pays something, at some time, to some agent."""
+    """Check that every reward term with a weight is not always 0 under all agents."""
     if evidence.steps < min(evidence.subject.resolved.task.max_episode_length, MAX_STEPS):
-        return  # a look that is shorter than an episode has not seen what comes at its end
+        return  # a term may be other than 0 only at the end of an episode, which a shorter rollout does not reach
     steps = sum(rollout.reward.numel() for rollout in evidence.rollouts)
-    for name in _active(evidence):
+    for name in _weighted_terms(evidence):
         values = [rollout.terms[name] for rollout in evidence.rollouts if name in rollout.terms]
         if values and not any(bool(v.any()) for v in values):
             yield warning_at(
                 f"rewards.{name}",
                 f"is 0 in all {steps} steps of {len(evidence.rollouts)} agents",
-                "see that its thresholds, joints and sensors are the meant ones, give it a softer slope, or drop it",
+                "check its thresholds, joints and sensors, give it a softer slope, or remove it",
                 {"steps": steps},
             )
 
@@ -121,8 +119,8 @@ DOMINANT = 0.99
 
 
 def dominant_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """No reward term is so large, under every agent, that the others cannot be told."""
-    active = _active(evidence)
+    """Check that no reward term is so large under every agent that the others have no effect."""
+    active = _weighted_terms(evidence)
     shares: dict[str, list[float]] = {name: [] for name in active}
     for rollout in evidence.rollouts:
         sizes = {name: float(rollout.terms[name].double().abs().mean()) for name in active if name in rollout.terms}
@@ -135,17 +133,17 @@ def dominant_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
             others = ", ".join(other for other in active if other != name)
             yield warning_at(
                 f"rewards.{name}",
-                f"makes {min(found):.1%} or more of the reward's size under every agent: {others} cannot be told",
-                "lower its weight, or raise those of the others, until each can be told",
+                f"is {min(found):.1%} or more of the reward's size under every agent: {others} have almost no effect",
+                "lower its weight, or raise the weights of the others",
                 {"share": min(found)},
             )
 
 
 def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """The reward depends on what the agent does."""
+    """Check that the reward depends on the agent's actions."""
     rewards = torch.cat([rollout.reward.flatten() for rollout in evidence.rollouts])
     if any(bool(rollout.terminated.any()) for rollout in evidence.rollouts) or not rewards.numel():
-        return  # living on is then what is paid for
+        return  # with terminations a constant reward still rewards long episodes
     if bool((rewards == rewards[0]).all()):
         value = float(rewards[0])
         yield error_at(
@@ -157,63 +155,59 @@ def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """To end an episode early does not pay more than to live on well."""
-    alive, final = [], []
+    """Check that an early termination does not give more reward than good steps until the agent's horizon."""
+    running_steps, terminal_steps = [], []
     for rollout in evidence.rollouts:
-        ended = rollout.terminated.bool()
-        alive.append(rollout.reward[~ended & ~rollout.over.bool()])
-        final.append(rollout.reward[ended])
-    living, dying = torch.cat(alive), torch.cat(final)
-    if len(dying) < 10 or not len(living):
+        terminated = rollout.terminated.bool()
+        running_steps.append(rollout.reward[~terminated & ~rollout.over.bool()])
+        terminal_steps.append(rollout.reward[terminated])
+    running, terminal = torch.cat(running_steps), torch.cat(terminal_steps)
+    if len(terminal) < 10 or not len(running):
         return
     task = evidence.subject.resolved.task
     gamma = discount_of(evidence.subject.resolved.agent)
     gamma = 0.99 if gamma is None else gamma
     horizon = min(1.0 / max(1.0 - gamma, 1e-6), float(task.max_episode_length))
-    rate = _quantile(living, 0.9)  # a good step: what a policy can hope for that does better than these agents
-    last = float(dying.median())
-    if rate * horizon >= last:
+    good = _quantile(running, 0.9)  # a trained policy should reach what scripted agents reach in 10 % of their steps
+    last = float(terminal.median())
+    if good * horizon >= last:
         return
     finished = [e for rollout in evidence.rollouts for e in rollout.episodes if e.ended]
-    survived = [e.total for e in finished if not e.terminated]
-    terminated = [e.total for e in finished if e.terminated]
-    numbers = {"good_step": rate, "last_step": last, "horizon": horizon, "return_terminated": _mean(terminated)}
-    message = (
-        f"a good step pays {rate:.3g}, {rate * horizon:.3g} over the {horizon:.0f} steps that an agent sees ahead,"
-    )
-    message += f" and a terminal step {last:.3g}"
-    if survived:
-        if _mean(terminated) <= _mean(survived):
+    timed_out = [e.total for e in finished if not e.terminated]
+    return_terminated = _mean([e.total for e in finished if e.terminated])
+    numbers = {"good_step": good, "last_step": last, "horizon": horizon, "return_terminated": return_terminated}
+    message = f"the reward of a good step is {good:.3g}, {good * horizon:.3g} over the agent's horizon of {horizon:.0f}"
+    message += f" steps, and that of a terminal step is {last:.3g}"
+    if timed_out:
+        if return_terminated <= _mean(timed_out):
             return
-        numbers["return_survived"] = _mean(survived)
-        message += (
-            f"; episodes that were terminated return {_mean(terminated):.3g}, those that lived on {_mean(survived):.3g}"
-        )
-    if rate > 0.0:
-        hint = "pay less for the end; if it is the goal, this is as it should be (--ignore dying-pays)"
+        numbers["return_survived"] = _mean(timed_out)
+        message += f"; the mean return of terminated episodes is {return_terminated:.3g}"
+        message += f", that of the others {_mean(timed_out):.3g}"
+    if good > 0.0:
+        hint = "lower the reward of the end; if the end is the goal, this is correct (--ignore dying-pays)"
         yield warning_at("rewards", message, hint, numbers)
         return
-    hint = "pay for being alive (is_alive), make terms positive, or let a termination cost more (is_terminated)"
+    hint = "reward every step (is_alive), make terms positive, or penalise terminations more (is_terminated)"
     yield error_at("rewards", message, hint, numbers)
 
 
 LARGE, SMALL = 100.0, 0.01
-"""`cart-double-pendulum` learns as it is from a column that is larger than 75 in 1 % of the steps."""
+"""Limits of the usual size. `cart-double-pendulum` has a column above 75 in 1 % of the steps, and learns well."""
 
 
 def constant_observations(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """No observation column keeps one value, whatever the agent does; of a picture, some pixel does not."""
+    """Check that every observation column varies under the agents; of a picture, at least one pixel."""
     for where, values in _columns(evidence):
         if bool((values == values[:, :1]).all()):
             low = float(values.min())
-            what = f"is {low:g}" if len(values) == 1 else "is the same"
-            message = f"{what} in every step of every agent"
-            hint = "leave it out, or compute it from what changes"
-            yield error_at(where, message, hint, {"value": low})
+            value = f"is {low:g}" if len(values) == 1 else "is the same"
+            hint = "leave it out, or compute it from something that changes"
+            yield error_at(where, f"{value} in every step of every agent", hint, {"value": low})
 
 
 def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Observations are not far from 1 in size, unless the agent normalises them."""
+    """Check that observations have a size near 1, unless the agent normalises them."""
     if getattr(evidence.subject.resolved.agent, "normalize_observations", False):
         return
     for where, values in _columns(evidence):
@@ -221,36 +215,36 @@ def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
         usual, largest = _quantile(sizes, 0.99), float(sizes.max())
         if bool((values == values[:, :1]).all()) or (largest >= SMALL and usual <= LARGE):
             continue
-        message = f"is never larger than {largest:.3g}; below {SMALL:g} it drowns among the others"
+        message = f"is never larger than {largest:.3g}; below {SMALL:g} its effect is lost among the others"
         if usual > LARGE:
-            message = f"is larger than {usual:.3g} in 1 % of the steps; sizes up to {LARGE:g} are learnt well"
+            message = f"is larger than {usual:.3g} in 1 % of the steps; policies learn well from sizes up to {LARGE:g}"
         factor = 10.0 ** round(math.log10(1.0 / (usual if usual > LARGE else largest)))
         hint = f"scale: {factor:g}, or let the agent normalise (normalize_observations: true)"
         yield warning_at(where, message, hint, {"usual": usual, "largest": largest})
 
 
 def _columns(evidence: RolloutEvidence) -> Iterator[tuple[str, Tensor]]:
-    """Each observation column, or picture, and its values in all lives. (columns, steps)"""
+    """Yield each observation column or picture, and its values in all rollouts. (columns, steps)"""
     env = evidence.rollouts[0].env
     for group in env.layout.observations:
         rollouts = [rollout.obs[group] for rollout in evidence.rollouts if group in rollout.obs]
-        seen = torch.cat([obs.flatten(0, 1) for obs in rollouts]).t()
+        values = torch.cat([obs.flatten(0, 1) for obs in rollouts]).t()
         for where, columns in observation_parts(env, group):
-            yield where, seen[columns].contiguous()
+            yield where, values[columns].contiguous()
 
 
 SATURATED = 0.8
 
 
 def saturated_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Random actions within the bound mostly stay within what actuators can take."""
+    """Check that random actions within the bound mostly stay within the limits of the actuators."""
     (rollout,) = [rollout for rollout in evidence.rollouts if rollout.agent == "random"]
     for name, share in rollout.limited.items():
         if share >= SATURATED:
             yield warning_at(
                 name,
                 f"is at its limit in {share:.0%} of the steps under random actions within +-{evidence.subject.bound:g}",
-                "lower the action's scale (or the gain), or raise the limit: beyond it, actions differ in nothing",
+                "lower the action's scale (or the gain), or raise the limit: actions beyond it have the same effect",
                 {"share": share},
             )
 
@@ -259,36 +253,36 @@ DEAD = 1e-6
 
 
 def dead_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Every column of the action moves something."""
+    """Check that every column of the action changes the state."""
     env = evidence.env(8)
     env.reset(seed=0)
     start = env.state_dict()
     steps = max(5, math.ceil(0.1 / env.step_dt))
     bound = evidence.subject.bound
-    # a column may multiply others, so that it moves nothing while they are 0
-    others = [torch.full((8, env.layout.action_size), level * bound) for level in (0.0, 0.5)]
-    without = [(action, _state_after(env, start, action, steps)) for action in others]
+    # a column may be a factor of others, and has no effect while they are 0
+    bases = [torch.full((8, env.layout.action_size), level * bound) for level in (0.0, 0.5)]
+    references = [(action, _state_after(env, start, action, steps)) for action in bases]
     names = [n for t in env.layout.actions for n in (t.elements if len(t.elements) == t.size else [t.name] * t.size)]
     for column, name in enumerate(names):
         moved = 0.0
-        for (base, rest), sign in product(without, (1.0, -1.0)):
+        for (base, reference), sign in product(references, (1.0, -1.0)):
             action = base.clone()
             action[:, column] = sign * bound
-            moved = max(moved, float((_state_after(env, start, action, steps) - rest).abs().max()))
+            moved = max(moved, float((_state_after(env, start, action, steps) - reference).abs().max()))
             if moved > DEAD:
                 break
         if moved <= DEAD:
             yield error_at(
                 f"actions, column {column} ({name})",
                 f"moves nothing: after {steps} steps at +-{bound:g} the state differs by {moved:.1g}"
-                " from that without action",
-                "see that it drives the meant actuator, with a scale, a gear and a limit that are not 0",
+                " from the state without this action",
+                "check its actuator, and that scale, gear and limit are not 0",
                 {"moved": moved, "steps": steps},
             )
 
 
 def _state_after(env: VecEnv, start: dict[str, Tensor], action: Tensor, steps: int) -> Tensor:
-    """Positions and velocities after some steps of one action. (num_envs, nq + nv)"""
+    """Return positions and velocities after some steps with a constant action. (num_envs, nq + nv)"""
     env.load_state_dict(start)
     for _ in range(steps):
         env.step(action.clone())
@@ -299,7 +293,7 @@ DRIFT, RATIO = 0.2, 1.5
 
 
 def timestep(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """The physics time step is short enough: half of it shows the same energy and speeds, twice of it is stable."""
+    """Check that energy and speeds are the same with half the physics time step, and stable with twice the step."""
     dt = evidence.subject.resolved.task.sim.dt
     where = f"sim.dt = {dt:g} s"
     hint = "take a smaller sim.dt (and more decimation), more damping or armature, or lower gains and stiffnesses"
@@ -315,10 +309,8 @@ def timestep(evidence: RolloutEvidence) -> Iterator[Remark]:
         env.step(SCRIPTED_AGENTS["random"](env, evidence.subject.bound)(step))
     drift = energy_drift(env)
     if drift.relative > DRIFT:
-        message = (
-            f"left to itself for {drift.seconds:.2g} s, the model's energy differs by {drift.relative:.0%} of what"
-        )
-        message += f" moves to and fro from that with steps of {dt / 2:g} s; up to {DRIFT:.0%} is usual"
+        message = f"after {drift.seconds:.2g} s without actuators the model's energy differs from that with steps of"
+        message += f" {dt / 2:g} s by {drift.relative:.0%} of the exchanged energy; up to {DRIFT:.0%} is usual"
         yield warning_at(where, message, hint, {"energy_drift": drift.relative})
         return
     yield from _compare_half_and_double_step(evidence, dt, where, hint)
@@ -328,15 +320,15 @@ def _compare_half_and_double_step(evidence: RolloutEvidence, dt: float, where: s
     task = evidence.subject.resolved.task
     steps = max(10, min(evidence.steps, math.ceil(1.0 / task.step_dt)))
     bound = evidence.subject.bound
-    as_is = record_rollout(evidence.env(16), "random", bound, steps)
+    full = record_rollout(evidence.env(16), "random", bound, steps)
     half = record_rollout(evidence.env(16, sim__dt=dt / 2, decimation=2 * task.decimation), "random", bound, steps)
-    if as_is.error is None and half.error is None:
-        a, b = as_is.speed, half.speed
-        of_note = torch.maximum(a, b) > 0.05 * torch.maximum(a, b).max()
-        ratio = torch.where(of_note & (torch.minimum(a, b) > 0.0), torch.maximum(a / b, b / a), 1.0)
+    if full.error is None and half.error is None:
+        a, b = full.speed, half.speed
+        is_fast = torch.maximum(a, b) > 0.05 * torch.maximum(a, b).max()
+        ratio = torch.where(is_fast & (torch.minimum(a, b) > 0.0), torch.maximum(a / b, b / a), 1.0)
         worst = int(ratio.argmax()) if len(ratio) else 0
         if len(ratio) and float(ratio[worst]) > RATIO:
-            model = as_is.env.engine.model
+            model = full.env.engine.model
             name = f"joint '{model.joint(int(model.dof_jntid[worst])).name}'"
             message = f"under random actions {name} moves at {float(a[worst]):.3g} (root mean square), and at"
             message += f" {float(b[worst]):.3g} with steps of {dt / 2:g} s; a factor of up to {RATIO:g} is usual"
@@ -344,12 +336,10 @@ def _compare_half_and_double_step(evidence: RolloutEvidence, dt: float, where: s
             return
     if 2 * dt > 0.1:
         return
-    parts = task.decimation // 2 if task.decimation % 2 == 0 else task.decimation
-    twice = record_rollout(evidence.env(16, sim__dt=2 * dt, decimation=parts), "random", bound, steps)
+    decimation = task.decimation // 2 if task.decimation % 2 == 0 else task.decimation
+    twice = record_rollout(evidence.env(16, sim__dt=2 * dt, decimation=decimation), "random", bound, steps)
     if twice.diverged:
-        message = (
-            f"at twice the step the simulation diverges, {twice.diverged} times in {steps} steps: there is no room"
-        )
+        message = f"with twice the step the simulation diverges, {twice.diverged} times in {steps} steps: no margin"
         yield warning_at(where, message, hint, {"diverged_at_twice": twice.diverged})
 
 
@@ -357,37 +347,32 @@ NEAREST, FARTHEST = 0.05, 10.0
 
 
 def horizon(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """What an agent looks ahead, 1 / (1 - gamma) steps, is of the length of an episode."""
+    """Check that the agent's horizon, 1 / (1 - gamma) steps, is comparable to the length of an episode."""
     for name, resolved in evidence.subject.agents().items():
         gamma = discount_of(resolved.agent)
         if gamma is None:
             continue
         steps = resolved.task.max_episode_length
         ahead = math.inf if gamma >= 1.0 else 1.0 / (1.0 - gamma)
-        if NEAREST <= round(ahead / steps, 9) <= FARTHEST:  # 1 / (1 - 0.99) is a little less than 100
+        if NEAREST <= round(ahead / steps, 9) <= FARTHEST:  # rounded: 1 / (1 - 0.99) is a little less than 100
             continue
         fitting = 1.0 - 1.0 / max(2.0, 0.25 * steps)
         yield warning_at(
             f"agents.{name}.gamma = {gamma:g}",
-            f"looks {ahead:.3g} steps ({ahead * resolved.task.step_dt:.2g} s) ahead, and an episode has {steps}"
+            f"gives a horizon of {ahead:.3g} steps ({ahead * resolved.task.step_dt:.2g} s), and an episode has {steps}"
             f" ({resolved.task.episode_length_s:g} s)",
-            f"about {fitting:.3g} looks over a quarter of the episode",
+            f"{fitting:.3g} gives a horizon of a quarter of the episode",
             {"gamma": gamma, "horizon": ahead, "episode": steps},
         )
 
 
 def discount_of(agent: AgentConfig | None) -> float | None:
-    """The discount factor of an agent, wherever its trainer keeps it; None if it has none."""
-    return None if agent is None else _find_gamma(agent.model_dump())
-
-
-def _find_gamma(data: object) -> float | None:
-    if not isinstance(data, dict):
+    """Return the discount factor in an agent's settings, also in nested ones; None if there is none."""
+    if agent is None:
         return None
-    for key in ("gamma", "discount", "discount_factor"):
-        if isinstance(data.get(key), int | float):
-            return float(data[key])
-    return next((found for value in data.values() if (found := _find_gamma(value)) is not None), None)
+    settings = sorted(leaves(agent.model_dump()), key=lambda leaf: len(leaf[0]))  # the least nested one first
+    discounts = (v for path, v in settings if path and path[-1] in ("gamma", "discount", "discount_factor"))
+    return next((float(value) for value in discounts if isinstance(value, int | float)), None)
 
 
 RULES: dict[str, Callable[[RolloutEvidence], Iterable[Remark]]] = {
@@ -404,13 +389,13 @@ RULES: dict[str, Callable[[RolloutEvidence], Iterable[Remark]]] = {
     "timestep": timestep,
     "horizon": horizon,
 }
-"""Name -> rule, in the order in which they run. The first line of a rule's docstring says what it wants."""
+"""Name -> rule, in the order in which they run. The first line of a rule's docstring is the rule."""
 
 
 def _quantile(values: Tensor, share: float) -> float:
-    """A quantile, of at most 100,000 of the values, evenly picked."""
-    picked = values.flatten()[:: max(1, values.numel() // 100_000)]
-    return float(picked.double().quantile(share))
+    """Return a quantile, of at most about 100,000 evenly spaced values."""
+    sample = values.flatten()[:: max(1, values.numel() // 100_000)]  # torch's quantile limits the number of values
+    return float(sample.double().quantile(share))
 
 
 def _mean(values: Sequence[float]) -> float:

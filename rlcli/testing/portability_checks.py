@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import random
 import sys
 import time
 from collections import Counter
@@ -13,7 +12,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,15 +21,18 @@ from rlcli.envs.make import make_env
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DeviceError, RlcliError
+from rlcli.rl.rng import rng_state
 from rlcli.runs.bundle import open_bundle
 from rlcli.runs.restore import require_fit
-from rlcli.testing.episode_checks import first_difference
+from rlcli.testing.episode_checks import compare_trajectories
 from rlcli.testing.host_sync import HostSyncError, HostSyncGuard
 from rlcli.testing.task_under_test import (
     NUM_ENVS,
     Finding,
     NotRunError,
     TaskUnderTest,
+    bitwise_equal,
+    element_names,
     error_at,
     random_actions,
     record_trajectory,
@@ -42,96 +43,75 @@ from rlcli.testing.task_under_test import (
 
 STEPS = 16
 EPISODE = 12
-"""Steps of an episode, so that some end on the way."""
+"""Steps of an episode, so that episodes end within the `STEPS`."""
 
 
 def threads(subject: TaskUnderTest) -> Iterator[Finding]:
-    """The engine's threads change nothing, bit for bit."""
+    """Check that trajectories are bit-identical with any number of engine threads."""
     trajectories = []
     for count in (1, 3):
         env = subject.env(episode_steps=EPISODE, flags={"sim.engine_threads": count})
         torch.manual_seed(0)
         trajectories.append(record_trajectory(env, random_actions(env, subject.bound, STEPS)))
-    difference = first_difference(env, *trajectories)
-    if difference is not None:
-        where, message = difference
-        hint = "let nothing depend on engine_threads or on the number of cores"
-        yield error_at(where, f"differs between 1 and 3 engine threads: {message}", hint)
+    hint = "let nothing depend on engine_threads or on the number of cores"
+    yield from compare_trajectories(env, trajectories, "differs between 1 and 3 engine threads", hint)
 
 
 FEW = 3
 
 
 def num_envs(subject: TaskUnderTest) -> Iterator[Finding]:
-    """An environment lives the same life however many others there are, bit for bit."""
+    """Check that the trajectory of an environment is bit-identical with any number of environments."""
     many = subject.env(episode_steps=EPISODE)
     few = subject.env(episode_steps=EPISODE, flags={"scene.num_envs": FEW})
     actions = list(random_actions(many, subject.bound, STEPS))
     torch.manual_seed(0)
-    seeded = _random_states()
-    trajectories = [record_trajectory(many, (a.clone() for a in actions))]
-    drew = _random_states() != seeded
+    before = rng_state()
+    of_many = [{n: v[:FEW] for n, v in step.items()} for step in record_trajectory(many, (a.clone() for a in actions))]
+    draws_globally = any(not bitwise_equal(state, before[name]) for name, state in rng_state().items())
     torch.manual_seed(0)
-    trajectories.append(record_trajectory(few, (a[:FEW].clone() for a in actions)))
-    difference = first_difference(
-        many, [{n: v[:FEW] for n, v in step.items()} for step in trajectories[0]], trajectories[1]
-    )
-    if difference is None:
-        return
-    where, message = difference
-    message = f"differs between {NUM_ENVS} and {FEW} environments: {message}"
-    if drew:
-        message += "; the task draws from torch, numpy or random, which know nothing of environments"
-        hint = "with the selection's draws, or self.draws(env_ids), it would not; without, runs of other sizes differ"
+    of_few = record_trajectory(few, (a[:FEW].clone() for a in actions))
+    make, reason = warning_at, ""
+    if draws_globally:
+        reason = "; the task draws from torch, numpy or random, whose numbers depend on the number of environments"
+        hint = "use the selection's draws, or self.draws(env_ids); else runs with other numbers of environments differ"
     elif subject.resolved.task.curriculum:
-        message += "; a curriculum that averages over episodes may mean it so"
-        hint = "let a schedule go by steps, if it should not depend on the number of environments"
+        reason = "; this may be intended for a curriculum that averages over episodes"
+        hint = "use a schedule over steps, if the curriculum should not depend on the number of environments"
     else:
-        hint = (
-            "compute each row from its own environment alone; torch's sum over dim 0, atan2 and pow round differently"
-        )
-        hint += " for other sizes (rlcli.sim.rotations has an atan2 that does not)"
-        yield error_at(where, message, hint)
-        return
-    yield warning_at(where, message, hint)
+        make = error_at
+        hint = "compute each row only from its environment; torch's sum over dim 0, atan2 and pow round differently for"
+        hint += " other sizes (rlcli.sim.rotations has an atan2 that does not)"
+    message = f"differs between {NUM_ENVS} and {FEW} environments{reason}"
+    yield from compare_trajectories(many, (of_many, of_few), message, hint, make)
 
 
-def _random_states() -> tuple[Any, ...]:
-    """Where the generators stand that are not rlcli's."""
-    numpy: Any = np.random.get_state()
-    return torch.get_rng_state().numpy().tobytes(), numpy[1].tobytes(), numpy[2:], random.getstate()
-
-
-# --- stopped and resumed, in versions ---
+# --- checkpoints and versions ---
 
 
 def checkpoint(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Saved in mid-run and restored elsewhere, a life goes on bit for bit: terms, commands and curriculum included."""
+    """Check that a restored environment continues bit-identically: terms, commands and curriculum included."""
     env, other = subject.env(episode_steps=EPISODE), subject.env(episode_steps=EPISODE, seed=1)
     actions = list(random_actions(env, subject.bound, 7 + STEPS))
     other.reset(seed=1)
     for action in actions[-3:]:
-        other.step(action.clone())
+        other.step(action.clone())  # so that its state differs before it is restored
     env.reset(seed=0)
-    result = None
     for action in actions[:7]:
         result = env.step(action.clone())
-    assert result is not None
     saved = env.state_dict()
     last = {f"observation '{group}'": values.clone() for group, values in result.obs.items()}
     again = {f"observation '{group}'": values.clone() for group, values in other.load_state_dict(saved).items()}
     trajectories = [[last, *_continue(env, actions[7:])], [again, *_continue(other, actions[7:])]]
-    difference = first_difference(env, *trajectories)
-    if difference is not None:
-        where, message = difference
-        kept = "keep what is carried on in tensors, numbers, containers or random generators, as attributes"
-        hint = f"{kept}; a term may have state_dict() and load_state_dict(state) of its own"
-        if not isinstance(env, ManagedEnv):
-            hint = f"{kept} of the task"
-        if unsaved := env.unsaved_state():
-            hint = f"no checkpoint can hold {', '.join(unsaved)}; {hint}"
-        message = f"goes on differently after saving and restoring: {message}"
-        yield error_at(where, message, f"{hint}; else a resumed run is another run")
+    hint = "store state in tensors, numbers, containers or random generators, as attributes"
+    if isinstance(env, ManagedEnv):
+        hint += "; a term may define state_dict() and load_state_dict(state)"
+    else:
+        hint += " of the task"
+    if unsaved := env.unsaved_state():
+        hint = f"no checkpoint can hold {', '.join(unsaved)}; {hint}"
+    hint += "; else a resumed run differs from an uninterrupted one"
+    yield from compare_trajectories(env, trajectories, "differs after saving and restoring", hint)
 
 
 def _continue(env: VecEnv, actions: list[Tensor]) -> list[dict[str, Tensor]]:
@@ -140,10 +120,10 @@ def _continue(env: VecEnv, actions: list[Tensor]) -> list[dict[str, Tensor]]:
 
 
 def policy(subject: TaskUnderTest) -> Iterator[Finding]:
-    """The policy that is shipped with the task can be read, and fits the task as it is."""
+    """Check that the policy that the task ships can be read, and fits the task."""
     folder = subject.source.policy
     if folder is None:
-        raise NotRunError("the task ships none; rlcli export --format bundle writes one")
+        raise NotRunError("the task ships no policy; rlcli export --format bundle writes one")
     try:
         bundle = open_bundle(folder)
         bundle.policy()
@@ -158,55 +138,46 @@ def policy(subject: TaskUnderTest) -> Iterator[Finding]:
     name = bundle.manifest["task"]["name"]
     if name != subject.source.name:
         message = f"is a policy for '{name}'"
-        yield error_at(str(folder), message, f"export one of {subject.source.name}")
+        yield error_at(str(folder), message, f"export a policy for {subject.source.name}")
 
 
 def layout_file(subject: TaskUnderTest) -> Path:
-    """Where the layout of a task is recorded: beside its configuration."""
+    """Return the file in which the layout of a task is recorded, beside its configuration."""
     config = subject.source.config
     return config.with_name(f"{config.stem}.layout.json")
 
 
-def record_layout(subject: TaskUnderTest) -> Path:
-    """Write down which columns the task's observations and actions have now."""
-    record = subject.env().layout.record()
-    file = layout_file(subject)
-    kept = {part: record[part] for part in ("observations", "actions")}
-    file.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
-    return file
-
-
 def layout(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Observations and actions are those that were recorded, in the same order, where that was done."""
+    """Check that observations and actions have the recorded columns in the recorded order, if they were recorded."""
     file = layout_file(subject)
     if not file.is_file():
         raise NotRunError(f"there is no {file.name}; `rlcli check TASK --record-layout` writes it")
-    hint = (
-        f"put it back, or take it for good with --record-layout: what was trained before no longer fits ({file.name})"
-    )
+    hint = f"undo the change, or accept it with --record-layout: policies trained before no longer fit ({file.name})"
     try:
-        before = json.loads(file.read_text(encoding="utf-8"))
-        then = {**{f"observations.{g}": t for g, t in before["observations"].items()}, "actions": before["actions"]}
+        recorded = _groups(json.loads(file.read_text(encoding="utf-8")))
     except (ValueError, KeyError, AttributeError, TypeError) as error:
-        yield error_at(file.name, f"is no recorded layout: {error!r}", "write it anew: --record-layout")
+        yield error_at(file.name, f"is not a recorded layout: {error!r}", "write it again: --record-layout")
         return
-    record = json.loads(json.dumps(subject.env().layout.record()))
-    now = {**{f"observations.{g}": t for g, t in record["observations"].items()}, "actions": record["actions"]}
-    for where in {**then, **now}:
-        difference = _changed(then.get(where), now.get(where))
+    current = _groups(json.loads(json.dumps(subject.env().layout.record())))
+    for where in {**recorded, **current}:
+        difference = _changed(recorded.get(where), current.get(where))
         if difference is not None:
             yield error_at(where, difference, hint)
 
 
+def _groups(record: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    return {**{f"observations.{g}": terms for g, terms in record["observations"].items()}, "actions": record["actions"]}
+
+
 def _changed(then: list[dict[str, Any]] | None, now: list[dict[str, Any]] | None) -> str | None:
-    """The first difference between two lists of terms."""
+    """Return the first difference between two lists of terms as text."""
     if then is None or now is None:
         return "is new" if then is None else "is gone"
-    before, after = list(_columns(then)), list(_columns(now))
+    before, after = _columns(then), _columns(now)
     first = next((n for n, (old, new) in enumerate(zip(before, after, strict=False)) if old != new), None)
     if len(before) != len(after):
         at = min(len(before), len(after)) if first is None else first
-        return f"had {len(before)} columns and has {len(after)}, other ones from column {at} on"
+        return f"had {len(before)} columns and has {len(after)}; the first difference is column {at}"
     if first is not None:
         return f"column {first} was '{before[first]}' and is '{after[first]}'"
     for old_term, new_term in zip(then, now, strict=True):
@@ -216,36 +187,33 @@ def _changed(then: list[dict[str, Any]] | None, now: list[dict[str, Any]] | None
     return None
 
 
-def _columns(terms: list[dict[str, Any]]) -> Iterator[str]:
-    for term in terms:
-        elements = term["elements"] if len(term["elements"]) == term["size"] else range(term["size"])
-        for element in elements:
-            yield f"{term['name']}[{element}]"
+def _columns(terms: list[dict[str, Any]]) -> list[str]:
+    return [f"{term['name']}[{e}]" for term in terms for e in element_names(term["elements"], term["size"])]
 
 
-# --- how fast ---
+# --- speed ---
 
 SMALL, LARGE = 16, 256
 
 
 def speed(subject: TaskUnderTest) -> Iterator[Finding]:
-    """No Python loop runs over environments: how many lines a step and a reset run does not grow with them."""
+    """Check that no Python loop runs over environments: more environments must not execute more lines of code."""
     lines, seconds = [], []
     for count in (SMALL, LARGE):
         env = subject.env(flags={"scene.num_envs": count})
         action = torch.zeros(count, env.layout.action_size)
         env.reset(seed=0)
         env.step(action.clone())
-        env.step(action.clone())  # by then what is made late is made
+        env.step(action.clone())  # two steps for everything that is created lazily
         start = time.perf_counter()
         for _ in range(10):
             env.step(action.clone())
         seconds.append((time.perf_counter() - start) / 10)
-        lines.append(_lines(env, action))
+        lines.append(_count_lines(env, action))
     rate = LARGE / seconds[1]
     subject.notes["speed"] = f"{rate:,.0f} steps/s with {LARGE} environments on one engine thread"
     grown = lines[1] - lines[0]
-    loops = {place: count for place, count in grown.items() if count >= (LARGE - SMALL) // 2}
+    loops = {line: count for line, count in grown.items() if count >= (LARGE - SMALL) // 2}
     if not loops:
         return
     own = {p: c for p, c in loops.items() if Path(p[0]).is_relative_to(subject.source.root)}
@@ -259,8 +227,8 @@ def speed(subject: TaskUnderTest) -> Iterator[Finding]:
     )
 
 
-def _lines(env: VecEnv, action: Tensor) -> Counter[tuple[str, int]]:
-    """How often each line of Python runs in a step and a reset. Times would depend on who else uses the machine."""
+def _count_lines(env: VecEnv, action: Tensor) -> Counter[tuple[str, int]]:
+    """Count how often each line of Python runs in a step and a reset. Unlike times, counts are reproducible."""
     counts: Counter[tuple[str, int]] = Counter()
 
     def count(frame: FrameType, event: str, value: object) -> Any:
@@ -277,53 +245,48 @@ def _lines(env: VecEnv, action: Tensor) -> Counter[tuple[str, int]]:
     return counts
 
 
-# --- the other engine ---
+# --- the GPU engine ---
 
 FEW_WORLDS = 2
 CLOSE = 1e-3
 
 
 def engines(subject: TaskUnderTest) -> Iterator[Finding]:
-    """The task runs on the GPU's engine too, and starts and steps there as on the CPU's, but for rounding."""
-    other = _warp(subject)
+    """Check that the task runs on the GPU engine, and that reset and step agree with the CPU engine within rounding."""
+    warp = _warp_env(subject)
     env = subject.env(episode_steps=EPISODE, flags={"scene.num_envs": FEW_WORLDS})
-    place = "sim.engine = warp"
-    hint = "use the selection's methods and the engine's fields alone; or say sim.engine: batch, if it is for CPUs only"
+    hint = "use only the selection's methods and the engine's fields; or set sim.engine: batch, if it is for CPUs only"
     action = next(random_actions(env, subject.bound))
-    seen = []
-    for one in (env, other):
-        torch.manual_seed(0)  # what a task draws from torch itself is same-seed's business
-        seen.append((one.reset(seed=0), step_outputs(one.step(action.clone()))))
-    other.check()
-    pairs = list(zip(*seen, strict=True))
-    for when, (left, right) in zip(("at the start", "after a step"), pairs, strict=True):
-        for what, values in left.items():
-            there = right[what].to(values.device)
-            if values.shape != there.shape or values.dtype != there.dtype:
-                message = f"{what} is {tuple(values.shape)} {values.dtype} on the CPU's engine and"
-                message += f" {tuple(there.shape)} {there.dtype} on the GPU's, {when}"
-                yield error_at(place, message, hint)
-                return
-            far = (values.float() - there.float()).abs() > CLOSE * (1.0 + values.float().abs())
-            if bool(far.any()):
+    outputs = []
+    for one in (env, warp):
+        torch.manual_seed(0)  # draws from torch's own generator are checked by `same-seed`
+        outputs.append((one.reset(seed=0), step_outputs(one.step(action.clone()))))
+    warp.check()
+    for when, cpu, gpu in zip(("at the start", "after a step"), *outputs, strict=True):
+        for name, values in cpu.items():
+            others = gpu[name].to(values.device)
+            make, found, expected, where = error_at, "", "", ""
+            if values.shape != others.shape or values.dtype != others.dtype:
+                found, expected = (f"{tuple(tensor.shape)} {tensor.dtype}" for tensor in (others, values))
+            elif bool((far := (values.float() - others.float()).abs() > CLOSE * (1.0 + values.float().abs())).any()):
                 index = tuple(far.nonzero()[0].tolist())
-                message = (
-                    f"{what} is {float(values[index]):.5g} on the CPU's engine and {float(there[index]):.5g} on the"
-                )
-                message += f" GPU's in environment {index[0]}, {when}"
-                yield warning_at(place, message, hint)
+                make, where = warning_at, f" in environment {index[0]}"
+                found, expected = (f"{float(tensor[index]):.5g}" for tensor in (others, values))
+            if found:
+                message = f"{name} is {expected} on the CPU engine and {found} on the GPU engine{where}, {when}"
+                yield make("sim.engine = warp", message, hint)
                 return
 
 
 def captured(subject: TaskUnderTest) -> Iterator[Finding]:
-    """A step on a GPU asks the host for nothing, so that it can be recorded once and replayed."""
+    """Check that a step on a GPU needs no host sync, so that it can be recorded once and replayed."""
     if subject.is_direct:
         env = subject.recording().env
         if isinstance(env, DirectEnv) and env.not_recorded is not None:
             raise NotRunError(env.not_recorded)
         if type(task_of(env)).reset_idx is not DirectTask.reset_idx:
-            raise NotRunError("reset_idx takes ids, so a GPU runs it as it is; `reset(selection)` could be recorded")
-    env = _warp(subject)
+            raise NotRunError("reset_idx takes ids, so a GPU cannot record it; `reset(selection)` could be recorded")
+    env = _warp_env(subject)
     action = torch.zeros(FEW_WORLDS, env.layout.action_size)
     env.reset(seed=0)
     env.step(action)
@@ -332,21 +295,21 @@ def captured(subject: TaskUnderTest) -> Iterator[Finding]:
             for _ in range(EPISODE + 1):
                 env.step(action)
     except HostSyncError as error:
-        hint = "compute with torch.where and masks over all rows: docs/tutorials/train-on-a-gpu.md; else it runs several times slower there"
-        yield warning_at(subject.place(error), f"{error}, in a step", hint)
+        hint = "compute with torch.where and masks over all rows: docs/tutorials/train-on-a-gpu.md; else a GPU is several times slower"
+        yield warning_at(subject.location(error), f"{error}, in a step", hint)
 
 
-def _warp(subject: TaskUnderTest) -> VecEnv:
-    """A few worlds on MuJoCo Warp's CPU device.
+def _warp_env(subject: TaskUnderTest) -> VecEnv:
+    """Return an environment with a few worlds on MuJoCo Warp's CPU device.
 
     Raises:
-        NotRunError: where there is none, or it cannot run this model.
+        NotRunError: if MuJoCo Warp is not installed, or cannot run this model.
     """
     if subject.resolved.task.sim.engine == "batch":
-        raise NotRunError("the task says sim.engine: batch")
+        raise NotRunError("the task sets sim.engine: batch")
     if find_spec("mujoco_warp") is None:
         raise NotRunError('MuJoCo Warp is not installed; pip install "rlcli[gpu]"')
     try:
         return subject.env(episode_steps=EPISODE, flags={"scene.num_envs": FEW_WORLDS, "sim.engine": "warp"})
     except (ConfigError, DeviceError) as error:
-        raise NotRunError(f"MuJoCo Warp does not take it: {' '.join(error.message.split())}") from None
+        raise NotRunError(f"MuJoCo Warp cannot run the model: {' '.join(error.message.split())}") from None

@@ -1,4 +1,4 @@
-"""Whether a physics time step is short enough: energy that it makes, and motion that half of it does not show."""
+"""Measurement of the energy error of a physics time step, by comparison with half of that step."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ import numpy as np
 from rlcli.envs.vec_env import VecEnv
 
 PASSIVE_S = 1.0
-"""How long the model is left to itself [s]."""
+"""Simulated time without actuators [s]."""
 MAX_STEPS = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """How the energy of a model that nothing drives depends on the time step."""
+    """Dependence of a model's energy on the time step, without actuators."""
 
     relative: float
-    """Largest difference between the energy at dt and at dt / 2, over the energy that moves to and fro; median over
-    the start states. Infinite where one of the two diverges."""
+    """Largest difference between the energy with dt and with dt / 2, relative to the energy that is exchanged between
+    potential and kinetic; median over the start states. Infinite if only the simulation with dt diverges."""
     seconds: float
+    """Simulated time."""
 
 
 def energy_drift(env: VecEnv, starts: int = 8) -> Drift:
-    """Leave the model alone, from the states that `env` is in, once with dt and once with half of it."""
+    """Simulate the model without actuators from the current states of `env`, with dt and with dt / 2."""
     model, _ = env.world(0)
     dt = float(model.opt.timestep)
     steps = max(1, min(MAX_STEPS, round(PASSIVE_S / dt)))
@@ -39,7 +40,7 @@ def energy_drift(env: VecEnv, starts: int = 8) -> Drift:
 
 
 def _energy(model: mujoco.MjModel, start: mujoco.MjData, dt: float, steps: int, parts: int) -> np.ndarray:
-    """Potential and kinetic energy after each `parts` steps, without actuators. (steps + 1, 2) [J]; NaN: diverged"""
+    """Return potential and kinetic energy after each `parts` steps. (steps + 1, 2) [J]; NaN after a divergence"""
     model = copy.copy(model)
     model.opt.timestep = dt
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
@@ -68,7 +69,7 @@ def _difference(coarse: np.ndarray, fine: np.ndarray) -> float:
     if np.isnan(coarse).any():
         return np.inf
     if np.isnan(fine).any():
-        return 0.0  # what half the step cannot do either is no matter of the step
+        return 0.0  # if half the step diverges too, the step's length is not the cause
     potential, kinetic = np.concatenate([coarse, fine]).T
     scale = max(float(np.ptp(fine[:, 0])), float(fine[:, 1].max()))
     largest = max(scale, 1e-9 * max(float(np.abs(potential).max()), float(kinetic.max())), 1e-12)

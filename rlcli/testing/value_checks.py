@@ -1,9 +1,9 @@
-"""Checks of names, files and step results. One function for each clause of the contract."""
+"""Checks of names, files and step results. Each function checks one clause of the contract."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +12,9 @@ import torch
 from torch import Tensor
 
 from rlcli.config.dump import to_data, to_yaml
+from rlcli.config.layers import leaves
 from rlcli.config.load import resolve
+from rlcli.config.messages import dotted
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DivergedError, listing
@@ -34,10 +36,10 @@ from rlcli.testing.task_under_test import (
 
 
 def names(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Every name in the YAML resolves; joints, actuators and bodies of the models have names."""
+    """Check that joints, actuators and bodies of the models have names, and that all names in the YAML exist."""
     for entity, config in subject.resolved.task.scene.entities.items():
         if config.model is None:
-            continue  # a shape has the names that rlcli gives it
+            continue  # rlcli names the elements of a shape
         root = subject.source.root
         spec = read_mjcf(model_file(root, config.model), model_roots(root, config.model))
         scalar = [joint for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]  # a root needs no name
@@ -47,13 +49,13 @@ def names(subject: TaskUnderTest) -> Iterator[Finding]:
                 places = [f"on '{e.target}'" if word == "actuator" else f"in '{e.parent.name}'" for e in unnamed]
                 yield warning_at(
                     f"scene.entities.{entity}: {config.model}",
-                    f"{word} without a name: {listing(places)}; a term can reach it only by its place in the file",
+                    f"{word} without a name: {listing(places)}; a term can select it only by its index",
                     f'name it in the MJCF: <{word} name="..."/>',
                 )
 
 
 def yaml_round_trip(subject: TaskUnderTest) -> Iterator[Finding]:
-    """The resolved configuration, written as YAML and read again, is the same configuration."""
+    """Check that the resolved configuration is the same after writing it as YAML and reading it."""
     data = to_data(subject.resolved)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "config.yaml"
@@ -64,106 +66,90 @@ def yaml_round_trip(subject: TaskUnderTest) -> Iterator[Finding]:
             for problem in error.problems:
                 yield error_at(
                     problem.path or subject.source.label,
-                    f"does not read back from YAML: {problem.message}",
+                    f"cannot be read back from YAML: {problem.message}",
                     problem.hint or "use a value that YAML has (finite numbers, text, lists)",
                 )
             return
-    for path, was, now in _differences(data, again):
-        yield error_at(
-            path,
-            f"is {was!r}, and {now!r} after writing and reading the configuration",
-            "a run keeps its configuration as YAML: use a value that YAML can hold",
-        )
+    before, after = dict(leaves(data)), dict(leaves(again))
+    for path in {**before, **after}:
+        was, now = before.get(path), after.get(path)
+        if was != now and not (isinstance(was, list | tuple) and list(was) == now):  # YAML has no tuples
+            yield error_at(
+                dotted(path),
+                f"is {was!r}, and {now!r} after writing and reading the configuration",
+                "a run stores its configuration as YAML: use a value that YAML has",
+            )
 
 
-def _differences(was: object, now: object, path: str = "") -> Iterator[tuple[str, object, object]]:
-    if isinstance(was, dict) and isinstance(now, dict):
-        for key in {**was, **now}:
-            yield from _differences(was.get(key), now.get(key), f"{path}.{key}" if path else str(key))
-    elif was != now and not (isinstance(was, list | tuple) and list(was) == now):
-        yield path, was, now
-
-
-# --- what a step gives ---
+# --- results of a step ---
 
 
 def finite(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Observations, final observations and rewards are finite numbers."""
-    where = subject.source.label
-    hint = "look for divisions, square roots and logarithms of what can be 0, and for buffers that are never filled"
+    """Check that observations, final observations and rewards are finite numbers."""
+    hint = "look for divisions, square roots and logarithms of values that can be 0, and for buffers that stay empty"
     try:
         recording = subject.recording()
     except DivergedError as error:
-        yield error_at(where, f"{error.message}; allowed are finite numbers", hint)
+        yield error_at(subject.source.label, f"{error.message}; allowed are finite numbers", hint)
         return
-    final = [v for step in recording.steps for v in (step.final_obs or {}).values()]
     for number, step in enumerate(recording.steps):
         rows = step.terminated | step.truncated
         for group, values in (step.final_obs or {}).items():
-            if final and not bool(values[rows].isfinite().all()):
+            if not bool(values[rows].isfinite().all()):
                 message = f"the final observation is not finite at step {number}; allowed are finite numbers"
                 yield error_at(f"observations.{group}", message, hint)
                 return
 
 
-def shapes(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Everything has the shape that the layout and the number of environments promise."""
+def shapes(subject: TaskUnderTest) -> Iterable[Finding]:
+    """Check that all tensors have the shape of the layout and the number of environments."""
+    return _check_outputs(subject, _check_shape)
+
+
+def dtypes(subject: TaskUnderTest) -> Iterable[Finding]:
+    """Check that observations and rewards are float32, and terminated and truncated are bool."""
+    return _check_outputs(subject, _check_dtype)
+
+
+def _check_outputs(
+    subject: TaskUnderTest, check: Callable[[str, Tensor, tuple[int, ...]], Iterator[Finding]]
+) -> list[Finding]:
+    """Apply a check of (name, tensor, expected shape) to the task's own outputs; if they pass, to those of a step."""
     recording = subject.recording()
-    env = recording.env
-    own = [finding for what, value, own_shape in _raw(env) for finding in _shape(what, value, (NUM_ENVS, *own_shape))]
-    yield from own
-    if own:
-        return  # what the framework makes of it follows from that
-    expected = {f"observation '{group}'": (NUM_ENVS, env.layout.size(group)) for group in env.layout.observations}
-    for step in recording.steps[-1:]:
-        for what, value in step_outputs(step).items():
-            yield from _shape(what, value, expected.get(what, (NUM_ENVS,)))
+    layout = recording.env.layout
+    own = [(name, value, (NUM_ENVS, *shape)) for name, value, shape in _task_outputs(recording.env)]
+    findings = [finding for output in own for finding in check(*output)]
+    if findings or not recording.steps:
+        return findings  # a defect of the task's own outputs causes the same defect in the step's outputs
+    shapes = {f"observation '{group}'": (NUM_ENVS, layout.size(group)) for group in layout.observations}
+    outputs = step_outputs(recording.steps[-1])
+    return [f for name, value in outputs.items() for f in check(name, value, shapes.get(name, (NUM_ENVS,)))]
 
 
-def _shape(what: str, value: Tensor, expected: tuple[int, ...]) -> Iterator[Finding]:
+def _check_shape(name: str, value: Tensor, expected: tuple[int, ...]) -> Iterator[Finding]:
     found = tuple(value.shape)
     if found != expected:
         message = f"has shape {found}, expected {expected} for {NUM_ENVS} environments"
-        hint = "return one row an environment, and fill buffers in place: buf[:] = ..."
-        yield error_at(what, message, hint)
+        hint = "return one row for each environment, and fill buffers in place: buf[:] = ..."
+        yield error_at(name, message, hint)
 
 
-def dtypes(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Observations and rewards are float32, terminated and truncated are bool."""
-    recording = subject.recording()
-    own = [finding for what, value, _ in _raw(recording.env) for finding in _dtype(what, value, _allowed(what))]
-    yield from own
-    if own:
-        return
-    for step in recording.steps[-1:]:
-        for what, value in step_outputs(step).items():
-            yield from _dtype(what, value, _FLAG if what in ("terminated", "truncated") else (torch.float32,))
-
-
-_FLAG = (torch.bool,)
-
-
-def _allowed(what: str) -> tuple[torch.dtype, ...]:
-    if what == "reset_buf":
-        return (torch.bool, torch.int64, torch.int32, torch.uint8)
-    if what.startswith("terminations."):
-        return _FLAG
-    return (torch.float32, torch.bool) if what.startswith("rewards.") else (torch.float32,)
-
-
-def _dtype(what: str, value: Tensor, allowed: tuple[torch.dtype, ...]) -> Iterator[Finding]:
-    if value.dtype not in allowed:
-        message = f"is {_name(value.dtype)}, expected {' or '.join(map(_name, allowed))}"
+def _check_dtype(name: str, value: Tensor, _: tuple[int, ...]) -> Iterator[Finding]:
+    allowed = ["float32"]
+    if name == "reset_buf":
+        allowed = ["bool", "int64", "int32", "uint8"]
+    elif name in ("terminated", "truncated") or name.startswith("terminations."):
+        allowed = ["bool"]
+    elif name.startswith("rewards."):
+        allowed = ["float32", "bool"]
+    found = str(value.dtype).removeprefix("torch.")
+    if found not in allowed:
         hint = "end a term with .float() or a comparison; fill buffers in place: buf[:] = ..."
-        yield error_at(what, message, hint)
+        yield error_at(name, f"is {found}, expected {' or '.join(allowed)}", hint)
 
 
-def _name(dtype: torch.dtype) -> str:
-    return str(dtype).removeprefix("torch.")
-
-
-def _raw(env: VecEnv) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]:
-    """What the task itself gives, before the framework casts it: (name, value, its shape in one environment)."""
+def _task_outputs(env: VecEnv) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]:
+    """Yield the task's own outputs before rlcli casts them: (name, value, shape in one environment)."""
     if not isinstance(env, ManagedEnv):
         task = task_of(env)
         yield "obs_buf", task.obs_buf, (task.num_observations,)
@@ -181,21 +167,21 @@ def _raw(env: VecEnv) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]:
 
 
 def random_actions_stay_stable(subject: TaskUnderTest) -> Iterator[Finding]:
-    """200 steps of random actions within the action bound, and no simulation diverges."""
+    """Check that no simulation diverges in 200 steps of random actions within the action bound."""
     recording = subject.recording()
-    yield from _stable(subject, recording.env, len(recording.steps))
+    yield from _check_divergence(subject, recording.env, len(recording.steps))
 
 
 def extreme_actions_stay_stable(subject: TaskUnderTest) -> Iterator[Finding]:
-    """200 steps of actions at the bound, signs alternating, and no simulation diverges."""
+    """Check that no simulation diverges in 200 steps of actions at the bound with alternating signs."""
     env = subject.env()
     recording = record(env, extreme_actions(env, subject.bound))
-    yield from _stable(subject, env, len(recording.steps))
+    yield from _check_divergence(subject, env, len(recording.steps))
     if recording.error is not None:
         raise recording.error
 
 
-def _stable(subject: TaskUnderTest, env: VecEnv, steps: int) -> Iterator[Finding]:
+def _check_divergence(subject: TaskUnderTest, env: VecEnv, steps: int) -> Iterator[Finding]:
     if env.divergences:
         yield error_at(
             f"sim.dt = {env.physics_dt:g} s, {steps} of {STEPS} steps",
@@ -205,34 +191,27 @@ def _stable(subject: TaskUnderTest, env: VecEnv, steps: int) -> Iterator[Finding
 
 
 def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
-    """No observation column keeps one value in all environments and steps; of a picture, some pixel does not."""
+    """Check that every observation column varies between environments or steps; of a picture, at least one pixel."""
     recording = subject.recording()
     for group in recording.env.layout.observations:
-        seen = torch.stack([obs[group] for obs in recording.obs])
+        obs = torch.stack([obs[group] for obs in recording.obs])
         for where, columns in observation_parts(recording.env, group):
-            values = seen[:, :, columns]
+            values = obs[:, :, columns]
             if bool((values == values[0, 0]).all()):
-                what = f"is {float(values[0, 0]):g}" if values.shape[2] == 1 else "is the same"
+                value = f"is {float(values[0, 0]):g}" if values.shape[2] == 1 else "is the same"
+                message = f"{value} in {NUM_ENVS} environments and {len(obs)} observations"
                 yield error_at(
-                    where,
-                    f"{what} in {NUM_ENVS} environments and {len(seen)} observations",
-                    "a policy cannot learn from it: compute it from the state, or leave it out",
+                    where, message, "a policy cannot learn from it: compute it from the state, or leave it out"
                 )
 
 
 def aliasing(subject: TaskUnderTest) -> Iterator[Finding]:
-    """What a step gave keeps its values while the next step runs, and actions are not written to."""
+    """Check that the outputs of a step are not changed during the next step, and that actions are not changed."""
     recording = subject.recording()
-    for what, step in recording.late_writes.items():
-        yield error_at(
-            what,
-            f"was changed in place at step {step}; a trainer keeps it",
-            "write into a tensor of your own, or clone() first",
-        )
-    for what, step in recording.shared.items():
-        if what not in recording.late_writes:
-            yield error_at(
-                what,
-                f"shares its memory with the one before, at step {step}",
-                "return a new tensor instead of a buffer that the term keeps",
-            )
+    for name, step in recording.late_writes.items():
+        message = f"was changed in place at step {step}, while a trainer still uses it"
+        yield error_at(name, message, "write into a tensor of your own, or clone() first")
+    for name, step in recording.shared.items():
+        if name not in recording.late_writes:
+            message = f"shares its memory with that of the step before, at step {step}"
+            yield error_at(name, message, "return a new tensor instead of a buffer that the term reuses")

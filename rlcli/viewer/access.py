@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 SOCKETS = ("/ui", "/state")
-"""Paths that a WebSocket may be opened to; models are not taken from browsers (`/drop`)."""
+"""Paths that accept a WebSocket. `/drop`, through which a browser would load a model, is not one of them."""
 
 HEADERS = {
     "Content-Security-Policy": (
@@ -28,7 +28,7 @@ HEADERS = {
 
 
 def response_headers(port: int) -> dict[str, str]:
-    """The response_headers of every answer of the server at `port`."""
+    """Return the headers of every response of the server at `port`."""
     sockets = " ".join(f"ws://{host}" for host in allowed_hosts(port))
     return {name: value.replace("{sockets}", sockets) for name, value in HEADERS.items()}
 
@@ -50,23 +50,23 @@ def refusal_reason(port: int, path: str, request_headers: Mapping[str, Sequence[
     host = [value.lower() for value in request_headers.get("host", ())]
     if len(host) != 1 or host[0] not in allowed_hosts(port):
         return "not a name of this machine"
-    place = path.partition("?")[0]
-    if not path.startswith("/") or ".." in place or "\\" in place or "%" in place:
+    route = path.partition("?")[0]
+    if not path.startswith("/") or ".." in route or "\\" in route or "%" in route:
         return "no such path"
-    opens = (
-        any("upgrade" in value.lower() for value in request_headers.get("connection", ()))
-        or "upgrade" in request_headers
-    )
-    if opens and place not in SOCKETS:
+    upgrades = any("upgrade" in value.lower() for value in request_headers.get("connection", ()))
+    is_websocket = upgrades or "upgrade" in request_headers
+    if is_websocket and route not in SOCKETS:
         return "no such socket"
     origin = [value.lower() for value in request_headers.get("origin", ())]
     own = f"http://{host[0]}"
-    if (opens and not origin) or any(value != own for value in origin) or len(origin) > 1:
+    # browsers always send Origin with a WebSocket, but not with every request for a page
+    if (is_websocket and not origin) or any(value != own for value in origin) or len(origin) > 1:
         return "another page"
     site, mode, target = (
         (*request_headers.get(f"sec-fetch-{name}", ()), "")[0].lower() for name in ("site", "mode", "dest")
     )
-    followed = mode == "navigate" and target == "document" and place in ("/", "/index.html") and not opens
-    if site not in ("", "same-origin", "none") and not followed:
+    # a link on another page may lead to ours: that request opens a new document and reveals nothing to the other page
+    is_link = mode == "navigate" and target == "document" and route in ("/", "/index.html") and not is_websocket
+    if site not in ("", "same-origin", "none") and not is_link:
         return "another page"
     return None

@@ -1,4 +1,4 @@
-"""The checkpoints of a run, as a viewer switches between them, also while the run goes on."""
+"""Checkpoints of a run for a viewer, which can switch between them while the run is still training."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from rlcli.runs.run import Run
 
 @dataclass(slots=True)
 class RunCheckpoints:
-    """Checkpoints of a run.
+    """Policies of a run's checkpoints, acting in an environment.
 
     Args:
         run: the run.
-        env: where the policies act.
-        stochastic: whether they sample.
-        seed: of what they sample.
+        env: the environment.
+        stochastic: whether the policies sample their actions.
+        seed: seed of the sampled actions.
     """
 
     run: Run
@@ -31,26 +31,26 @@ class RunCheckpoints:
     seed: int = 0
 
     def steps(self) -> list[int]:
-        """Steps of those that are there now, ascending; none where the folder is gone."""
+        """Return the steps of the existing checkpoints, ascending; an empty list if the folder was removed."""
         try:
             return steps(self.run.checkpoints)
         except OSError:
             return []
 
     def load(self, step: int) -> Act:
-        """The policy of one; what it remembers of an episode begins now.
+        """Return the policy of a checkpoint with a reset hidden state.
 
         Raises:
-            CheckpointError: if it is not there any more, damaged, or of another task.
+            CheckpointError: if the checkpoint was removed, is corrupt, or belongs to another task.
         """
         folder = self.run.checkpoints / f"{step:012d}"
         if step not in self.steps():
-            raise CheckpointError(f"{folder} is not there any more")
+            raise CheckpointError(f"{folder} does not exist any more")
         try:
             checkpoint = open_checkpoint(folder)
             policy = checkpoint.policy()
             require_fit(checkpoint, self.env.layout)
-        except OSError as error:  # removed while it is read
+        except OSError as error:  # training removed it while it was read
             raise CheckpointError(f"{folder} cannot be read: {error.strerror or error}") from None
         generator = torch.Generator().manual_seed(self.seed)
         return trained_policy(self.env, policy, stochastic=self.stochastic, generator=generator)

@@ -1,4 +1,4 @@
-"""Markers in a scene of MuJoCo's: the one place where they become shapes, whatever the viewer."""
+"""Drawing of markers as geoms of a MuJoCo scene, for all viewers."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from rlcli.sim.rotations import axis_x, axis_y, axis_z
 _ARROW, _SPHERE = int(mujoco.mjtGeom.mjGEOM_ARROW), int(mujoco.mjtGeom.mjGEOM_SPHERE)
 _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 _AXES: tuple[Color, ...] = ((0.9, 0.1, 0.1, 1.0), (0.1, 0.9, 0.1, 1.0), (0.1, 0.3, 1.0, 1.0))
-_GLOW = 0.4
-"""Light of their own, so that the colours are seen in any light."""
+_EMISSION = 0.4
+"""Emitted light of markers, so that their colours are visible in the dark."""
 
 
 class _Part(NamedTuple):
-    """A shape between two places, of which a sphere has but one."""
+    """Shape between two points (num_envs, 3) [m]. Both points of a sphere are its centre."""
 
     kind: int
     start: Tensor
@@ -34,20 +34,20 @@ class _Part(NamedTuple):
 def add_markers(
     scene: mujoco.MjvScene, markers: Iterable[Marker], numbers: Sequence[int], offsets: NDArray[np.float64]
 ) -> None:
-    """Append the markers of some environments, each moved by its offset, as many as the scene has room for.
+    """Append the markers of some environments to a scene until it is full.
 
     Args:
-        scene: holds what else is drawn.
-        markers: of all environments.
-        numbers: the environments that are drawn.
-        offsets: how far each of these is moved. (len(numbers), 3) [m]
+        scene: the scene, which may contain other geoms.
+        markers: markers of all environments.
+        numbers: the environments to draw.
+        offsets: displacement of each of them in the picture. (len(numbers), 3) [m]
     """
     for marker in markers:
         for part in _parts(marker):
-            starts, ends = (_places(tensor, numbers) + offsets for tensor in (part.start, part.end))
+            starts, ends = (_points(tensor, numbers) + offsets for tensor in (part.start, part.end))
             for start, end in zip(starts, ends, strict=True):
-                if _is_seen(part, start, end) and scene.ngeom < scene.maxgeom:
-                    _put(scene.geoms[scene.ngeom], part, start, end)
+                if _is_visible(part, start, end) and scene.ngeom < scene.maxgeom:
+                    _fill_geom(scene.geoms[scene.ngeom], part, start, end)
                     scene.ngeom += 1
 
 
@@ -61,24 +61,24 @@ def _parts(marker: Marker) -> list[_Part]:
     return [_Part(_CYLINDER, marker.position, tip, 0.05 * marker.length, color) for tip, color in pairs]
 
 
-def _places(tensor: Tensor, numbers: Sequence[int]) -> NDArray[np.float64]:
+def _points(tensor: Tensor, numbers: Sequence[int]) -> NDArray[np.float64]:
     return tensor.detach()[list(numbers)].to("cpu", torch.float64).numpy()
 
 
-def _is_seen(part: _Part, start: NDArray[np.float64], end: NDArray[np.float64]) -> bool:
-    length = np.linalg.norm(end - start)
+def _is_visible(part: _Part, start: NDArray[np.float64], end: NDArray[np.float64]) -> bool:
+    length = np.linalg.norm(end - start)  # NaN hides a marker
     return bool(np.isfinite(length) and (part.kind == _SPHERE or length > part.radius))
 
 
-def _put(geom: mujoco.MjvGeom, part: _Part, start: NDArray[np.float64], end: NDArray[np.float64]) -> None:
+def _fill_geom(geom: mujoco.MjvGeom, part: _Part, start: NDArray[np.float64], end: NDArray[np.float64]) -> None:
     mujoco.mjv_initGeom(
         geom, part.kind, np.full(3, part.radius), start, np.eye(3).ravel(), np.array(part.color, np.float32)
     )
     if part.kind != _SPHERE:
         mujoco.mjv_connector(geom, part.kind, part.radius, start, end)
     if part.kind == _ARROW:
-        geom.size[2] *= 2.0  # MuJoCo's renderers draw half of it
-    # left as they were by what is called above
+        geom.size[2] *= 2.0  # MuJoCo's renderers draw an arrow with half its length
+    # the functions above do not set these fields
     geom.category, geom.objtype = int(mujoco.mjtCatBit.mjCAT_DECOR), int(mujoco.mjtObj.mjOBJ_UNKNOWN)
     geom.objid, geom.segid = -1, -1
-    geom.emission, geom.castshadow = _GLOW, 0
+    geom.emission, geom.castshadow = _EMISSION, 0

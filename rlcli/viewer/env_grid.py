@@ -1,4 +1,4 @@
-"""What is drawn beside the environment shown: the others, on the grid of `env_spacing`, and the markers of all."""
+"""Drawing of further environments beside the selected one, on the grid of `env_spacing`, and of all their markers."""
 
 from __future__ import annotations
 
@@ -21,49 +21,53 @@ _FIELDS = [name for name in dir(mujoco.MjvGeom) if not name.startswith("_")]
 
 @dataclass(frozen=True, slots=True)
 class EnvGrid:
-    """Which environments are drawn, and where.
+    """Environments in a picture, and their positions.
 
     Args:
         env: the environments.
-        count: how many are in the picture; the one shown is the first of them.
+        count: number of environments in the picture, including the selected one (`shown`), which is the first.
     """
 
     env: VecEnv
     count: int
 
     def others(self, shown: int) -> list[int]:
-        """The environments beside the one shown."""
-        return [(shown + place) % self.env.num_envs for place in range(1, self.count)]
+        """Return the environments beside the selected one."""
+        return [(shown + number) % self.env.num_envs for number in range(1, self.count)]
 
     def offsets(self) -> NDArray[np.float64]:
-        """How far each is moved from where it is in its world: on terrain, which all share, by 0. (count, 3) [m]"""
+        """Return the displacement of each environment from its position in its world. (count, 3) [m]
+
+        On terrain they are 0: all environments are on one terrain, at different positions.
+        """
         if self.env.terrain is not None:
             return np.zeros((self.count, 3))
-        places = grid(self.count, self.env.config.scene.env_spacing).double().numpy()
-        offsets: NDArray[np.float64] = places - places[0]
+        positions = grid(self.count, self.env.config.scene.env_spacing).double().numpy()
+        offsets: NDArray[np.float64] = positions - positions[0]
         return offsets
 
     def fit_camera(self, camera: mujoco.MjvCamera, shown: int = 0) -> mujoco.MjvCamera:
-        """A camera that looks at the one shown, moved so that it has all in the picture."""
-        places = self.offsets()
+        """Move a camera that looks at the selected environment so that all environments are in the picture."""
+        positions = self.offsets()
         if self.env.terrain is not None:
-            starts = self.env.origins.double().cpu().numpy()
-            places = starts[[shown, *self.others(shown)]] - starts[shown]
-        low, high = places.min(axis=0), places.max(axis=0)
+            origins = self.env.origins.double().cpu().numpy()
+            positions = origins[[shown, *self.others(shown)]] - origins[shown]
+        low, high = positions.min(axis=0), positions.max(axis=0)
         camera.lookat[:] += (low + high) / 2.0
         camera.distance += 1.2 * float((high - low).max())
         return camera
 
     def add(self, scene: mujoco.MjvScene, shown: int, option: mujoco.MjvOption) -> None:
-        """Append the others, and the markers of all, to a scene that holds the one shown and with it the ground."""
+        """Append the other environments and all markers to a scene with the selected environment and the ground."""
         add_markers(scene, self.env.markers(), [shown, *self.others(shown)], self.offsets())
         category = _MOVING if self.env.terrain is not None else _MOVING | _FIXED
         for number, offset in zip(self.others(shown), self.offsets()[1:], strict=True):
             model, data = self.env.world(number)
             begin = scene.ngeom
             mujoco.mjv_addGeoms(model, data, option, mujoco.MjvPerturb(), category, scene)
-            for place in range(scene.ngeom - 1, begin - 1, -1):
-                geom = scene.geoms[place]
+            # backwards, so that the last geom, which replaces a removed one, was already moved
+            for index in range(scene.ngeom - 1, begin - 1, -1):
+                geom = scene.geoms[index]
                 if geom.type in _GROUND:
                     scene.ngeom -= 1
                     _copy(scene.geoms[scene.ngeom], geom)
@@ -71,7 +75,7 @@ class EnvGrid:
                     geom.pos[:] += offset
 
     def geoms(self, scene: mujoco.MjvScene, shown: int, option: mujoco.MjvOption) -> Iterator[mujoco.MjvGeom]:
-        """What `add` draws, each a copy of its own, as many as a scene that is overwritten has room for."""
+        """Yield copies of the geoms that `add` appends to a scene; `scene` is overwritten and limits their number."""
         scene.ngeom = 0
         self.add(scene, shown, option)
         for source in scene.geoms[: scene.ngeom]:

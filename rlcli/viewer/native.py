@@ -1,4 +1,4 @@
-"""A window on the environments, MuJoCo's own passive viewer."""
+"""Viewer in a window: MuJoCo's own passive viewer."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _REQUESTS = {
     264: "previous environment", 266: "newer checkpoint", 267: "older checkpoint", 268: "previous command",
     269: "next command", 260: "raise command", 261: "lower command",
 }  # fmt: skip
-"""Number of a key in GLFW -> request of the playback."""
+"""Key code of GLFW -> request of the playback."""
 
 
-def run(playback: Playback, *, title: str, together: int, port: int, ready: Ready) -> None:
+def run(playback: Playback, *, title: str, num_drawn: int, port: int, ready: Ready) -> None:
     """Play in real time until the window is closed; see `rlcli.viewer.protocol.Viewer`.
 
     Raises:
@@ -41,7 +41,7 @@ def run(playback: Playback, *, title: str, together: int, port: int, ready: Read
 
     _require_windows()
     env = playback.env
-    env_grid = EnvGrid(env, together)
+    env_grid = EnvGrid(env, num_drawn)
     shown = playback.shown
     model = copy.deepcopy(env.world(shown)[0])
     data = mujoco.MjData(model)
@@ -65,7 +65,7 @@ def run(playback: Playback, *, title: str, together: int, port: int, ready: Read
 
             run_in_real_time(playback, window.is_running, draw)
     finally:
-        for thread in drawing:  # a process that ends while it draws crashes
+        for thread in drawing:  # the process crashes if it exits while one of them draws
             thread.join(timeout=5.0)
 
 
@@ -76,7 +76,7 @@ def press(playback: Playback, code: int) -> None:
 
 
 def captions(view: View) -> tuple[str, str]:
-    """What stands in the window's corner: names, and values."""
+    """Return the text in the corner of the window: names, and values, one in each line."""
     rows = {
         "speed": "paused" if view.paused else f"{view.speed:g} x",
         "environment": f"{view.shown} of {view.num_envs}",
@@ -85,25 +85,25 @@ def captions(view: View) -> tuple[str, str]:
     }
     if view.checkpoint is not None:
         rows["checkpoint"] = f"{view.checkpoint}"
-    for place, knob in enumerate(view.knobs):
-        asked = f"{view.held[knob.name]:g}" if knob.name in view.held else "as drawn"
-        rows[f"{'> ' if place == view.knob else ''}{knob.name}"] = asked
+    for number, knob in enumerate(view.knobs):
+        value = f"{view.held[knob.name]:g}" if knob.name in view.held else "as drawn"
+        rows[f"{'> ' if number == view.knob else ''}{knob.name}"] = value
     if view.message:
         rows[""] = view.message[:80]
     return "\n".join(rows), "\n".join(rows.values())
 
 
 def _require_windows() -> None:
-    """MuJoCo opens its window in a thread, and waits for ever for one that does not open.
+    """Check that a window can be opened: MuJoCo opens it in a thread and would wait forever.
 
     Raises:
-        MachineError: if the display takes no window.
+        MachineError: if the display cannot show a window.
     """
-    if sys.platform == "darwin":  # there a window belongs to the main thread, and MuJoCo says so by itself
+    if sys.platform == "darwin":  # there only the main thread may open a window, and MuJoCo raises an error
         return
     import glfw
 
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         window = None
         if glfw.init():
@@ -111,7 +111,8 @@ def _require_windows() -> None:
             window = glfw.create_window(16, 16, "rlcli", None, None)
             glfw.default_window_hints()
     if window is None:
-        why = "; ".join(" ".join(str(warning.message).split()) for warning in said) or "GLFW does not start"
+        messages = [" ".join(str(warning.message).split()) for warning in caught]
+        why = "; ".join(messages) or "GLFW does not start"
         raise MachineError(
             f"the window cannot be opened: {why}", hint="--viewer web shows it in the browser, --video draws offscreen"
         )
@@ -119,7 +120,7 @@ def _require_windows() -> None:
 
 
 def _draw(window: Any, playback: Playback, env_grid: EnvGrid, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Copy the environment that is to be shown into what the window looks at."""
+    """Copy the shown environment into the MjData of the window, and redraw."""
     _, now = playback.env.world(playback.shown)
     with window.lock():
         mujoco.mj_copyData(data, model, now)
@@ -131,7 +132,7 @@ def _draw(window: Any, playback: Playback, env_grid: EnvGrid, model: mujoco.MjMo
 
 
 def _forces(window: Any, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """What the person at the window pushes with. (nbody, 6) [N, N m]"""
+    """Return forces and torques of the user's mouse on the bodies. (nbody, 6) [N, N m]"""
     with window.lock():
         data.xfrc_applied[:] = 0.0
         if window.perturb.active:

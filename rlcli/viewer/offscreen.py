@@ -1,7 +1,8 @@
-"""Offscreen pictures of an environment."""
+"""Offscreen rendering of an environment."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 
@@ -18,7 +19,7 @@ _PARALLEL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
 def free_camera(viewer: ViewerConfig, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> mujoco.MjvCamera:
-    """A camera at `eye` that looks at `lookat`, both from an environment's origin."""
+    """Return a camera at `eye` that looks at `lookat`, both relative to an environment's origin."""
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(mujoco.MjModel.from_xml_string("<mujoco/>"), camera)
     ray = np.subtract(viewer.lookat, viewer.eye)
@@ -29,16 +30,16 @@ def free_camera(viewer: ViewerConfig, origin: Sequence[float] = (0.0, 0.0, 0.0))
     return camera
 
 
-class Renderer:
-    """Draws an environment offscreen.
+class Renderer(contextlib.AbstractContextManager["Renderer"]):
+    """Offscreen renderer of an environment.
 
     Args:
-        model: its model.
-        viewer: size and camera.
+        model: the environment's model.
+        viewer: size of the pictures [pixels] and camera.
         env_grid: further environments in the picture; None: there are none.
 
     Raises:
-        MachineError: if nothing on this machine can draw.
+        MachineError: if this machine has no OpenGL backend that works.
     """
 
     def __init__(self, model: mujoco.MjModel, viewer: ViewerConfig, env_grid: EnvGrid | None = None) -> None:
@@ -65,44 +66,41 @@ class Renderer:
         return self._pixels()
 
     def draw(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """A forwarded state, and nothing else. (height, width, 3)"""
+        """Render only a model in a state for which `mj_forward` was called. (height, width, 3)"""
         self._compose(model, data, (0.0, 0.0, 0.0))
         return self._pixels()
 
     def _compose(self, model: mujoco.MjModel, data: mujoco.MjData, origin: Sequence[float]) -> None:
-        """Put a state into the scene, and the camera before the environment whose origin is there."""
+        """Put a state into the scene, and move the camera to the environment's origin."""
         self._camera.lookat[:] = np.add(self._lookat, origin)
-        away = np.zeros(3)
+        travelled = np.zeros(3)
         if self._followed is not None:
             body, start = self._followed
-            away = data.xpos[body] - start - origin
-            self._camera.lookat[:] += away
+            travelled = data.xpos[body] - start - origin
+            self._camera.lookat[:] += travelled
         everything = int(mujoco.mjtCatBit.mjCAT_ALL)
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self._scene)
         for light in self._scene.lights[: self._scene.nlight]:
-            if light.type == _PARALLEL:  # its place is where shadows are drawn
-                light.pos[:2] += away[:2]
+            if light.type == _PARALLEL:  # MuJoCo draws shadows only around the light's position
+                light.pos[:2] += travelled[:2]
 
     def _pixels(self) -> NDArray[np.uint8]:
         mujoco.mjr_render(self._rect, self._scene, self._mjr)
         pixels = np.empty((self._height, self._width, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, self._rect, self._mjr)
-        return np.ascontiguousarray(pixels[::-1])
-
-    def __enter__(self) -> Renderer:
-        return self
+        return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest one
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
-        """Free the context."""
+        """Free the OpenGL context."""
         self._mjr.free()
         self._context.free()
 
 
 def _root(model: mujoco.MjModel, entity: str | None) -> tuple[int, NDArray[np.float64]] | None:
-    """The root body of an entity, and where its default state has it; None if there is nothing to follow."""
+    """Return the root body of an entity and its default position [m]; None if there is no such entity."""
     bodies = [body for body in range(model.nbody) if model.body(body).name.startswith(f"{entity}/")]
     if entity is None or not bodies:
         return None

@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Multiples of real time."""
 _LAG = 0.25
-"""How far the simulation may fall behind before it stops to catch up [s]."""
+"""Longest real time that one call of `advance` catches up with [s]."""
 _FRAME_S = 1.0 / 60.0
 _REFRESH_S = 1.0
 """Time between two reads of the list of checkpoints [s]."""
@@ -36,13 +36,13 @@ _REFRESH_S = 1.0
 
 @dataclass(slots=True)
 class Playback:
-    """See the module.
+    """Playback of a policy; see the module.
 
     Args:
-        env: the environment; its episodes begin when the playback is made, unless they have `initial_obs`.
+        env: the environment; it is reset when the playback is made, unless `initial_obs` is given.
         act: the policy.
-        checkpoint_source: other policies, if there are.
-        checkpoint: the step of the first policy.
+        checkpoint_source: further policies; None: there are none.
+        checkpoint: step of the first policy's checkpoint.
     """
 
     env: VecEnv
@@ -52,11 +52,11 @@ class Playback:
     shown: int = 0
     speed: float = 1.0
     follow: bool = False
-    """Play each new checkpoint as it appears."""
+    """Switch to each new checkpoint as soon as it appears."""
     patience: float = 0.1
-    """How long steps may go on before a viewer is asked again what it wants [s]."""
+    """Longest time that `advance` makes steps before it returns to the viewer [s]."""
     initial_obs: Tensor | None = None
-    """Observations of an environment that goes on from where it stands; None: its episodes begin now."""
+    """Current observations of an environment whose episodes continue; None: the environment is reset."""
     steps: int = 0
     message: str = ""
     _knob: int = 0
@@ -84,15 +84,15 @@ class Playback:
 
     @property
     def view(self) -> View:
-        """What is to be shown now."""
+        """Current state for the viewer."""
         return self._view
 
     def submit(self, request: Callable[[], None]) -> None:
-        """Have one of the methods below called between two steps."""
+        """Queue a call of one of the methods below; it is executed between two steps."""
         self._requests.put(request)
 
     def requests(self) -> dict[str, Callable[[], None]]:
-        """Return the requests that every viewer has a key for, by their names."""
+        """Return the requests of the viewers' keys by name."""
         view = self._view
         return {
             "pause": partial(self.pause, not view.paused),
@@ -113,9 +113,9 @@ class Playback:
     # --- in the simulation's thread ---
 
     def advance(self, elapsed: float) -> int:
-        """Do what was asked, then as many steps as are due after `elapsed` seconds; how many those were.
+        """Execute the requests, then make the steps that are due after `elapsed` seconds; return their number.
 
-        A machine that is too slow falls behind real time; it does not try to catch up.
+        A machine that is too slow falls behind real time and does not catch up later.
         """
         while True:
             try:
@@ -137,7 +137,7 @@ class Playback:
         return done
 
     def pause(self, paused: bool = True) -> None:
-        """Pause: no step runs, and the environment says so. Or go on."""
+        """Pause or resume; `env.is_playing()` is false while it is paused."""
         self.env.pause(paused)
         self._due = 0.0
 
@@ -147,16 +147,16 @@ class Playback:
         self._single += 1
 
     def set_speed(self, speed: float) -> None:
-        """The nearest of `SPEEDS`."""
-        self.speed = min(SPEEDS, key=lambda known: abs(np.log(known / max(speed, 1e-9))))
+        """Set the speed to the nearest of `SPEEDS`, on a logarithmic scale."""
+        self.speed = min(SPEEDS, key=lambda available: abs(np.log(available / max(speed, 1e-9))))
 
-    def change_speed(self, places: int = 1) -> None:
-        """Up or down in `SPEEDS`."""
-        position = SPEEDS.index(self.speed) + places
+    def change_speed(self, change: int = 1) -> None:
+        """Move up or down in `SPEEDS`."""
+        position = SPEEDS.index(self.speed) + change
         self.speed = SPEEDS[max(0, min(position, len(SPEEDS) - 1))]
 
     def reset(self) -> None:
-        """A new episode in every environment."""
+        """Start a new episode in every environment."""
         self._obs = self.env.reset()["policy"]
         self._reward = torch.zeros(self.env.num_envs)
         self._due = 0.0
@@ -167,26 +167,26 @@ class Playback:
         self._push = None
 
     def hold(self, name: str, value: float | None) -> None:
-        """Ask this of the policy, whatever the task would ask; None: what the task asks."""
+        """Hold a command at a value; None: the task samples it again."""
         hold_command(self.env, name, value)
 
-    def select_command(self, places: int) -> None:
-        """Which command `adjust_command` changes: the next one, or the one before."""
+    def select_command(self, change: int) -> None:
+        """Select the next or previous command for `adjust_command`."""
         if self._commands is not None and (knobs := self._commands.knobs()):
-            self._knob = (self._knob + places) % len(knobs)
+            self._knob = (self._knob + change) % len(knobs)
 
-    def adjust_command(self, places: int) -> None:
-        """Hold the chosen command, some tenths of its range higher or lower; beyond the range it is let go."""
+    def adjust_command(self, change: int) -> None:
+        """Raise or lower the selected command by tenths of its range and hold it; outside the range, release it."""
         if self._commands is None or not (knobs := self._commands.knobs()):
             return
         knob = knobs[self._knob]
         start = min(max(0.0, knob.low), knob.high)
-        value = self._commands.held.get(knob.name, start) + places * (knob.high - knob.low) / 10.0
+        value = self._commands.held.get(knob.name, start) + change * (knob.high - knob.low) / 10.0
         inside = knob.low - 1e-6 <= value <= knob.high + 1e-6
         self.hold(knob.name, round(value, 6) if inside else None)
 
     def refresh_checkpoints(self) -> None:
-        """Read the list of checkpoints again; with `follow`, play the newest."""
+        """Read the list of checkpoints; with `follow`, switch to the newest if the list has changed."""
         if self.checkpoint_source is None:
             return
         before, self._checkpoints = self._checkpoints, tuple(self.checkpoint_source.steps())
@@ -194,7 +194,7 @@ class Playback:
             self._switch_to_newest()
 
     def set_follow(self, follow: bool) -> None:
-        """Whether each new checkpoint is played as it appears; the newest at once."""
+        """Set whether each new checkpoint is played as soon as it appears; if so, switch to the newest one now."""
         self.follow = follow
         self.refresh_checkpoints()
         if follow:
@@ -205,30 +205,30 @@ class Playback:
             self.switch(self._checkpoints[-1])
 
     def switch(self, step: int) -> None:
-        """Play another checkpoint in the running episodes; if it cannot be played, say so and change nothing."""
+        """Play another checkpoint in the running episodes; if it cannot be loaded, report it and keep the policy."""
         assert self.checkpoint_source is not None
         try:
             self.act = self.checkpoint_source.load(step)
         except CheckpointError as error:
-            self._report(f"step {step} cannot be played, step {self.checkpoint} goes on: {error.message}")
+            self._report(f"step {step} cannot be played, step {self.checkpoint} continues: {error.message}")
             self._checkpoints = tuple(self.checkpoint_source.steps())
             return
         self.checkpoint = step
         self._report(f"now playing step {step}")
 
-    def switch_relative(self, places: int) -> None:
-        """Play the next newer or older checkpoint."""
+    def switch_relative(self, change: int) -> None:
+        """Play the next newer (1) or older (-1) checkpoint."""
         self.refresh_checkpoints()
         if not self._checkpoints:
             return
         newer = [step for step in self._checkpoints if step > (self.checkpoint or 0)]
         older = [step for step in self._checkpoints if step < (self.checkpoint or 0)]
-        chosen = newer[:1] if places > 0 else older[-1:]
+        chosen = newer[:1] if change > 0 else older[-1:]
         if chosen:
             self.switch(chosen[0])
 
     def push(self, forces: np.ndarray | None) -> None:
-        """Forces and torques on the bodies of the environment shown, until the next call. (nbody, 6) [N, N m]"""
+        """Apply forces and torques to the bodies of the shown environment until the next call. (nbody, 6) [N, N m]"""
         usable = forces is not None and forces.shape == (self.env.engine.model.nbody, 6) and np.isfinite(forces).all()
         self._push = forces.copy() if forces is not None and usable and forces.any() else None
 
@@ -241,21 +241,21 @@ class Playback:
                 if self._push is None:
                     result = self.env.step(action)
                 else:
-                    result = self._pushed(action, self._push)
+                    result = self._step_under_force(action, self._push)
         finally:
             self.env.pause(not playing)
         self._obs, self._reward = result.obs["policy"], result.reward
         self.ended += result.terminated | result.truncated
         self.steps += 1
 
-    def _pushed(self, action: Tensor, push: np.ndarray) -> Any:
-        """A step under a force; where the step itself wrote another one, as a reset does, that stays."""
+    def _step_under_force(self, action: Tensor, push: np.ndarray) -> Any:
+        """Make a step with further external forces, then remove them where the step has not overwritten them."""
         row = self.env.engine.field("xfrc_applied")[self.shown]
         before = row.clone()
-        under = before + torch.from_numpy(push).to(row)
-        row.copy_(under)
+        pushed = before + torch.from_numpy(push).to(row)
+        row.copy_(pushed)
         result = self.env.step(action)
-        row.copy_(torch.where(row == under, before, row))
+        row.copy_(torch.where(row == pushed, before, row))  # a reset writes other forces: they stay
         return result
 
     def _report(self, message: str) -> None:
@@ -283,7 +283,7 @@ class Playback:
 
 
 def run_in_real_time(playback: Playback, is_open: Callable[[], bool], draw: Callable[[], None]) -> None:
-    """Advance and draw, 60 times a second, until the viewer is closed."""
+    """Advance and draw 60 times a second until the viewer is closed."""
     before, refreshed = time.perf_counter(), 0.0
     while is_open():
         now = time.perf_counter()
@@ -297,10 +297,10 @@ def run_in_real_time(playback: Playback, is_open: Callable[[], bool], draw: Call
 
 
 def hold_command(env: VecEnv, name: str, value: float | None) -> None:
-    """Ask a value of the policy; see `CommandManager.hold`.
+    """Hold a command at a value; see `CommandManager.hold`.
 
     Raises:
-        UsageError: for a name that there is not.
+        UsageError: for a name that does not exist.
     """
     manager = _commands(env)
     if manager is None:
@@ -309,5 +309,5 @@ def hold_command(env: VecEnv, name: str, value: float | None) -> None:
 
 
 def _commands(env: VecEnv) -> CommandManager | None:
-    """Only manager-based tasks have command terms."""
+    """Return the command manager; None for a direct task."""
     return getattr(env, "command_manager", None)

@@ -1,4 +1,4 @@
-"""What viewers and playback share: the table of viewers, the interface of each, and the state that each shows.
+"""Interfaces between viewers and playback: the table of viewers, their protocol, and the state that they show.
 
 A new viewer is a module in this folder with a function of the protocol `Viewer`, and a line in `VIEWERS`.
 """
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rlcli.viewer.playback import Playback
 
 VIEWERS = {"native": "rlcli.viewer.native:run", "web": "rlcli.viewer.web:run"}
-"""Name of a viewer -> the function that runs it, imported when the viewer opens."""
+"""Name of a viewer -> import path of the function that runs it."""
 DEFAULT_PORT = 8080
 
 Ready = Callable[[Sequence[str], str | None], None]
@@ -25,25 +25,25 @@ Ready = Callable[[Sequence[str], str | None], None]
 class Viewer(Protocol):
     """A function that shows a playback until the user closes the viewer."""
 
-    def __call__(self, playback: Playback, *, title: str, together: int, port: int, ready: Ready) -> None:
+    def __call__(self, playback: Playback, *, title: str, num_drawn: int, port: int, ready: Ready) -> None:
         """Show the playback in real time.
 
         Args:
             playback: environments and policy.
             title: task and run, for the user.
-            together: how many environments are drawn.
-            port: port on the loopback interface, of a viewer that is a server; 0: a free one.
+            num_drawn: number of environments in the picture.
+            port: port on the loopback interface, for a viewer that is a server; 0: any free port.
             ready: called when the viewer is open.
 
         Raises:
             MachineError: if this machine cannot open the viewer.
-            DependencyError: if a package is missing, or of another version.
+            DependencyError: if a package is missing, or its version is not supported.
         """
         ...
 
 
 class CheckpointSource(Protocol):
-    """The checkpoints that may be played."""
+    """Source of checkpoints for a playback."""
 
     def steps(self) -> list[int]:
         """Return the steps of the checkpoints that exist now, ascending."""
@@ -53,14 +53,14 @@ class CheckpointSource(Protocol):
         """Return the policy of a checkpoint.
 
         Raises:
-            CheckpointError: if it is not there any more, damaged, or of another task.
+            CheckpointError: if the checkpoint was removed, is corrupt, or belongs to another task.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Immutable state of a playback, as a viewer shows it."""
+    """Immutable snapshot of a playback for a viewer."""
 
     paused: bool
     speed: float
@@ -73,11 +73,11 @@ class View:
     episodes: int
     """Episodes of the shown environment that have ended."""
     checkpoint: int | None
-    """Step of the policy; None: it is of no checkpoint."""
+    """Step of the policy's checkpoint; None: the policy has no checkpoint."""
     checkpoints: tuple[int, ...]
     follow: bool
     knobs: tuple[Knob, ...]
     held: Mapping[str, float]
     knob: int
-    """Index of the knob that keys change."""
+    """Index of the command that the keys change."""
     message: str

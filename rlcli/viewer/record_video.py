@@ -1,4 +1,4 @@
-"""One episode of an environment as a video file."""
+"""Recording of one episode to a video file."""
 
 from __future__ import annotations
 
@@ -17,22 +17,21 @@ from rlcli.viewer.video_writer import VideoWriter
 def record_episode(
     env: VecEnv, act: Callable[[Tensor], Tensor], file: Path, *, longest_s: float | None = None
 ) -> tuple[int, float, str]:
-    """Film environment 0 from a reset to its episode's end, a picture of each state that the policy acts in.
+    """Film environment 0 from a reset to the end of its episode. Frames show the states in which the policy acts.
 
     Args:
         env: the environments.
-        act: what acts in them.
-        file: an .mp4 or .gif; it appears when it is whole.
-        longest_s: after so much simulated time it ends anyway; None: after as many episode lengths as an evaluation
-            waits for.
+        act: the policy: observations (num_envs, d) -> actions (num_envs, a).
+        file: an .mp4 or .gif. It gets its name when it is complete.
+        longest_s: longest simulated time of the video [s]; None: `PATIENCE` episode lengths, as in an evaluation.
 
     Returns:
-        The pictures, how many a second, and what drew them.
+        Number of frames, frames per second, and the OpenGL backend.
 
     Raises:
-        UsageError: for another kind of file.
+        UsageError: for a file with another suffix.
         DependencyError: if imageio is not installed.
-        MachineError: if nothing on this machine can draw, or the disk refuses.
+        MachineError: if this machine cannot render, or the file cannot be written.
     """
     stride = max(1, env.config.sim.render_interval // env.config.decimation)
     steps = PATIENCE * env.max_episode_length if longest_s is None else max(1, round(longest_s / env.step_dt))

@@ -31,14 +31,11 @@ def film_replay(
 
 
 def film_case(case: StagedCase, file: Path) -> tuple[int, float, str]:
-    """Film the kept steps of a failure case; return the frames, frames per second and what drew them."""
+    """Film the recorded steps of a failure case; return the frames, frames per second and the OpenGL backend."""
     config = case.staged.resolved.task
     stride = max(1, config.sim.render_interval // config.decimation)
-    shown = range((len(case.states) - 1) % stride, len(case.states), stride)  # the last state is among them
-    with (
-        Renderer(case.staged.model, config.viewer) as renderer,
-        VideoWriter(file, stride * config.step_dt) as writer,
-    ):
+    shown = range((len(case.states) - 1) % stride, len(case.states), stride)  # this start includes the last state
+    with Renderer(case.staged.model, config.viewer) as renderer, VideoWriter(file, stride * config.step_dt) as writer:
         for number in shown:
             writer.add(renderer.draw(*case.forward(number)))
     return writer.frames, writer.fps, renderer.backend

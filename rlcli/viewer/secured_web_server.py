@@ -1,8 +1,8 @@
-"""MuJoCo's web viewer behind a fence: on the loopback interface alone, for its own page alone, silent.
+"""MuJoCo's web viewer with access control: only on the loopback interface, only for its own page, without output.
 
-What MuJoCo ships (`mujoco.studio`, private and new in 4.0) listens on every interface, answers any page and takes its
-models. The module is left as it is on disk; while a viewer runs, the few functions that open sockets and answer
-requests are replaced here. `verify_refusals` then sends requests that the server must refuse.
+MuJoCo's web viewer (`mujoco.studio`, private and new in 4.0) listens on every interface, answers requests of any page
+and loads models from them. The files of that package stay unchanged: while a viewer runs, this module replaces the few
+functions that open sockets and answer requests. `verify_refusals` then sends requests that the server must refuse.
 """
 
 from __future__ import annotations
@@ -34,92 +34,82 @@ _REQUIRED_NAMES = {
     "launch_thread": ("make_thread_endpoints",),
     "viewer_protocol": ("ViewerConfig", "run_viewer_loop"),
     "messages": (
-        "StateSnapshot",
-        "ModelEvent",
-        "PostModelEvent",
-        "ExitEvent",
-        "UpdateEvent",
-        "BuildGuiEvent",
-        "handler",
+        *("StateSnapshot", "ModelEvent", "PostModelEvent", "ExitEvent", "UpdateEvent", "BuildGuiEvent", "handler"),
     ),
     "plugin": ("ViewerPlugin", "ViewerInitEvent", "ThemeEvent"),
     "ux": ("UxState", "setup_theme", "configure_docking_layout", "view_gizmo_gui", "rendering_gui", "groups_gui"),
     "app.inputs": ("handle_mouse_events", "handle_vis_options_keyboard_events", "handle_camera_select_keyboard_events"),
     "dear_imgui.dear_imgui": ("Begin", "Button", "Combo", "SliderFloat", "IsKeyChordPressed"),
 }
-"""Module of `mujoco.studio` -> what is used of it."""
-_MOST_OF_A_MESSAGE = 2**20
+"""Module of `mujoco.studio` -> the names that are used from it."""
+_MAX_MESSAGE_BYTES = 2**20
 
 
 def load() -> SimpleNamespace:
-    """The modules of the viewer, by the last part of their names.
+    """Return the modules of the viewer by the last part of their names.
 
     Raises:
-        DependencyError: if the installed MuJoCo has no such viewer.
+        DependencyError: if the installed MuJoCo has another viewer or none.
     """
-    found, lacks = {}, []
+    modules, missing = {}, []
     for name, attributes in _REQUIRED_NAMES.items():
         try:
             module = importlib.import_module(f"mujoco.studio.{name}")
-        except Exception as error:  # a wheel without it, or with another one; whatever an import may raise
+        except Exception as error:  # a wheel without the viewer, or with another one, whose import may raise anything
             raise incompatible_viewer(f"{type(error).__name__}: {error}") from None
-        lacks += [f"{name}.{attribute}" for attribute in attributes if not hasattr(module, attribute)]
-        found[name.rpartition(".")[2]] = module
-    if not lacks:
+        missing += [f"{name}.{attribute}" for attribute in attributes if not hasattr(module, attribute)]
+        modules[name.rpartition(".")[2]] = module
+    if not missing:
         expected = {"config", "endpoint", "model", "plugins", "camera"}
-        missing = expected - set(inspect.signature(found["web_viewer"].WebViewer).parameters)
-        lacks += [f"web_viewer.WebViewer({name})" for name in sorted(missing)]
-    if lacks:
-        raise incompatible_viewer(f"it lacks {', '.join(lacks[:5])}")
-    return SimpleNamespace(**found)
+        absent = expected - set(inspect.signature(modules["web_viewer"].WebViewer).parameters)
+        missing += [f"web_viewer.WebViewer({name})" for name in sorted(absent)]
+    if missing:
+        raise incompatible_viewer(f"it lacks {', '.join(missing[:5])}")
+    return SimpleNamespace(**modules)
 
 
 def incompatible_viewer(why: str) -> DependencyError:
-    """What to say where MuJoCo's viewer is not the one that this module knows."""
+    """Return the error for a version of MuJoCo whose web viewer is not supported."""
     return DependencyError(
         f"the browser's viewer does not work with the installed mujoco {mujoco.__version__}: {' '.join(why.split())}",
         hint='pip install "mujoco==4.0.*", or use --video FILE.mp4, or --viewer none',
     )
 
 
-def listen(port: int) -> socket.socket:
-    """A listening socket on the loopback interface; port 0: a free one.
+def listen(port: int, socket_class: type[socket.socket] = socket.socket) -> socket.socket:
+    """Return a listening socket on the loopback interface; port 0: any free port.
 
     Raises:
-        MachineError: if the port is taken, or not allowed.
+        MachineError: if the port is in use, or not allowed.
     """
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    if os.name == "posix":  # else a port stays taken for a minute after its server has gone
+    listener = socket_class(socket.AF_INET, socket.SOCK_STREAM)
+    if os.name == "posix":  # else the port stays in use for a minute after its server has ended
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind(("127.0.0.1", port))
         listener.listen()
     except OSError as error:
         listener.close()
-        if error.errno == errno.EADDRINUSE:
-            raise MachineError(
-                f"port {port} is in use, perhaps by another viewer", hint="--port 0 takes a free one, --port N another"
-            ) from None
-        raise MachineError(
-            f"port {port} cannot be opened: {error.strerror}", hint="--port 0 takes a free one"
-        ) from None
+        in_use = error.errno == errno.EADDRINUSE
+        problem = "is in use, perhaps by another viewer" if in_use else f"cannot be opened: {error.strerror}"
+        raise MachineError(f"port {port} {problem}", hint="--port 0 takes a free one, --port N another") from None
     return listener
 
 
 @contextlib.contextmanager
 def secured_server(studio: SimpleNamespace, listener: socket.socket) -> Iterator[None]:
-    """While it lasts, a viewer that is made uses this socket, asks the gate and prints nothing."""
+    """Make viewers created in this context use a socket, refuse requests of other pages, and print nothing."""
     server, viewer = studio.web_server, studio.web_viewer
     port = listener.getsockname()[1]
-    ours: list[tuple[Any, str, Any]] = [
+    replacements: list[tuple[Any, str, Any]] = [
         (server, "serve", _serve_with_checks(server, port)),
         (server, "bind_public_socket", lambda *_: listener),
-        (server, "bind_loopback_socket", lambda *_: _inner_listener()),
+        (server, "bind_loopback_socket", lambda *_: listen(0, _OwnProcessListener)),
         (viewer, "_print_url_banner", lambda *_: None),
         (viewer, "print", lambda *_, **__: None),
     ]
-    before = [(module, name, getattr(module, name, None)) for module, name, _ in ours]
-    for module, name, value in ours:
+    before = [(module, name, getattr(module, name, None)) for module, name, _ in replacements]
+    for module, name, value in replacements:
         setattr(module, name, value)
     with _quiet():
         try:
@@ -130,30 +120,27 @@ def secured_server(studio: SimpleNamespace, listener: socket.socket) -> Iterator
 
 
 def verify_refusals(port: int) -> None:
-    """Ask the running server for its page, and for what it must refuse.
+    """Request the page of the running server, and send requests that it must refuse.
 
     Raises:
-        DependencyError: if it does not refuse.
+        DependencyError: if the server answers with another status than expected.
     """
     own = f"127.0.0.1:{port}"
-    asked = {
+    requests = {
         "its page": ({"Host": own}, 200),
         "a foreign Host": ({"Host": f"rlcli.invalid:{port}"}, 403),
         "a foreign Origin": ({"Host": own, "Origin": "http://rlcli.invalid"}, 403),
     }
-    for what, (given, expected) in asked.items():
-        status = _status(port, given)
+    for name, (headers, expected) in requests.items():
+        status = _status(port, headers)
         if status != expected:
-            raise incompatible_viewer(f"asked with {what}, it answers {status}")
+            raise incompatible_viewer(f"its server answers a request with {name} by {status}, expected {expected}")
 
 
-def _status(port: int, given: dict[str, str]) -> int:
+def _status(port: int, headers: dict[str, str]) -> int:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
     try:
-        connection.putrequest("GET", "/", skip_host=True)
-        for name, value in given.items():
-            connection.putheader(name, value)
-        connection.endheaders()
+        connection.request("GET", "/", headers=headers)
         return connection.getresponse().status
     except (OSError, http.client.HTTPException) as error:
         raise incompatible_viewer(f"its server does not answer: {error}") from None
@@ -162,58 +149,53 @@ def _status(port: int, given: dict[str, str]) -> int:
 
 
 def _serve_with_checks(server: Any, port: int) -> Any:
-    """`websockets`' serve, with the gate before what the viewer does with a request."""
-    serve, own = server.serve, response_headers(port)
+    """Return the `serve` of `websockets` with access control before the viewer's own handling of a request."""
+    serve, own_headers = server.serve, response_headers(port)
 
-    def serve_checked(*places: Any, process_request: Any, process_response: Any, **settings: Any) -> Any:
+    def serve_checked(*arguments: Any, process_request: Any, process_response: Any, **settings: Any) -> Any:
         def check(connection: Any, request: Any) -> Any:
-            given: dict[str, list[str]] = {}
+            headers: dict[str, list[str]] = {}
             for name, value in request.headers.raw_items():
-                given.setdefault(name.lower(), []).append(value)
-            why = refusal_reason(port, request.path, given)
-            if why is not None:
-                body = f"refused: {why}\n".encode()
-                said = server.Headers({"Content-Type": "text/plain", "Content-Length": str(len(body))})
-                return server.Response(403, "Forbidden", said, body)
+                headers.setdefault(name.lower(), []).append(value)
+            reason = refusal_reason(port, request.path, headers)
+            if reason is not None:
+                body = f"refused: {reason}\n".encode()
+                refusal = server.Headers({"Content-Type": "text/plain", "Content-Length": str(len(body))})
+                return server.Response(403, "Forbidden", refusal, body)
             return process_request(connection, request)
 
-        def answer(connection: Any, request: Any, response: Any) -> Any:
-            """Any answer, a refusal too: without what lets other pages read it."""
+        def respond(connection: Any, request: Any, response: Any) -> Any:
+            """Replace the headers of a response, also of a refusal, so that no other page can read it."""
             response = process_response(connection, request, response) or response
-            for name in ("Access-Control-Allow-Origin", *own):
+            for name in ("Access-Control-Allow-Origin", *own_headers):
                 if name in response.headers:
                     del response.headers[name]
-            response.headers.update(own)
+            response.headers.update(own_headers)
             return response
 
-        return serve(
-            *places, **{**settings, "max_size": _MOST_OF_A_MESSAGE}, process_request=check, process_response=answer
-        )
+        settings["max_size"] = _MAX_MESSAGE_BYTES
+        return serve(*arguments, **settings, process_request=check, process_response=respond)
 
     return serve_checked
 
 
-class _InnerListener(socket.socket):
-    """Takes connections of this process alone: the drawing of the panel comes over the loopback interface too."""
+class _OwnProcessListener(socket.socket):
+    """Socket that accepts only connections of this process.
+
+    The panel sends its drawing to the viewer over the loopback interface too, which every local user can reach.
+    """
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """As every socket's."""
+        """Accept a connection; close it if another process has opened it."""
         connection, peer = super().accept()
-        if _is_ours(peer):
+        if _is_own_socket(peer):
             return connection, peer
         connection.close()
         raise ConnectionAbortedError
 
 
-def _inner_listener() -> socket.socket:
-    listener = _InnerListener(socket.AF_INET, socket.SOCK_STREAM)
-    listener.bind(("127.0.0.1", 0))
-    listener.listen()
-    return listener
-
-
-def _is_ours(peer: object) -> bool:
-    """Whether the socket at an address is one of this process, as far as the system tells."""
+def _is_own_socket(peer: object) -> bool:
+    """Return whether this process has opened the socket at an address; True if the system has no list of sockets."""
     try:
         numbers = [int(name) for name in os.listdir("/dev/fd")]
     except OSError:
@@ -229,7 +211,7 @@ def _is_ours(peer: object) -> bool:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """What the viewer logs goes to stderr, and only what is wrong; that a browser has gone is not wrong."""
+    """Send the viewer's warnings to stderr, and drop its other log records and those of closed browsers."""
     log, loop = logging.getLogger("WebServer"), logging.getLogger("asyncio")
     level, streams = log.level, [(h, h.stream) for h in log.handlers if isinstance(h, logging.StreamHandler)]
     log.setLevel(logging.WARNING)
@@ -237,11 +219,11 @@ def _quiet() -> Iterator[None]:
         handler.setStream(sys.stderr)
     loop.addFilter(_is_unexpected)
     viewer = logging.getLogger("mujoco.studio.viewer_protocol")
-    was, viewer.disabled = viewer.disabled, True  # what ends the viewer is raised, and said once
+    was_disabled, viewer.disabled = viewer.disabled, True  # its errors are raised, so they would be printed twice
     try:
         yield
     finally:
-        viewer.disabled = was
+        viewer.disabled = was_disabled
         loop.removeFilter(_is_unexpected)
         log.setLevel(level)
         for handler, stream in streams:

@@ -1,4 +1,4 @@
-"""Videos of a training: now and then one episode of the policy as it is, in an environment of its own."""
+"""Videos during a training: every few iterations one episode of the current policy, in a separate environment."""
 
 from __future__ import annotations
 
@@ -20,27 +20,23 @@ _log = logging.getLogger(__name__)
 
 
 class VideoAborted(Exception):
-    """Somebody asks training to stop, and the clip is not waited for."""
+    """Raised to abort a video when training is stopped."""
 
 
 class TrainingVideos(StepObserver):
-    """Films the deterministic policy every so many iterations, always in the same episode; training does not notice.
+    """Recorder of the deterministic policy, always in the same episode. It does not change the training.
 
-    Between clips there is nothing but the idle environment: the OpenGL context is freed.
+    Between videos only the idle environment remains: the OpenGL context is freed.
 
     Args:
-        make_env: builds an environment of one world, at the first clip.
-        folder: where `STEP.mp4` goes.
-        interval: iterations between clips.
-        stopping: whether somebody asks training to stop.
+        make_env: builds an environment of one world, before the first video.
+        folder: folder of the videos `STEP.mp4`.
+        interval: iterations between videos.
+        stopping: returns whether training was asked to stop.
     """
 
     def __init__(
-        self,
-        make_env: Callable[[], VecEnv],
-        folder: Path,
-        interval: int,
-        stopping: Callable[[], bool] = lambda: False,
+        self, make_env: Callable[[], VecEnv], folder: Path, interval: int, stopping: Callable[[], bool] = lambda: False
     ) -> None:
         self._make_env, self._folder, self._interval = make_env, folder, interval
         self._stopping = stopping
@@ -48,36 +44,36 @@ class TrainingVideos(StepObserver):
         self._warned: set[str] = set()
 
     def due(self, iteration: int) -> bool:
-        """Whether there is a clip of the policy after this iteration."""
+        """Return whether the policy is filmed after this iteration."""
         return iteration % self._interval == 0
 
     def record(self, policy: Callable[[], Policy], step: int) -> Path | None:
-        """Write a clip of the policy that is made for it; None if that failed."""
+        """Write a video and return its file; None if that failed. `policy` makes a copy of the policy for it."""
         file = self._folder / f"{step:012d}.mp4"
         try:
             with undisturbed():
                 if self._env is None:
-                    seed_generators(0)  # whenever it is built, of tasks that draw as they are
+                    seed_generators(0)  # some tasks draw while they are built: the same numbers at any iteration
                     self._env = self._make_env()
                     self._env.observers.add(self)
                 seed_generators(self._env.seed)
                 record_episode(self._env, trained_policy(self._env, policy()), file)
         except VideoAborted:
             return None
-        except Exception as error:  # a full disk, a driver, an encoder, a task's own code
+        except Exception as error:  # a full disk, a driver, an encoder, or the task's own code must not stop training
             kind = type(error).__name__
             if kind not in self._warned:
-                _log.warning(f"no clip {file.name}: {' '.join(str(error).split()) or kind}; training goes on")
+                _log.warning(f"no video {file.name}: {' '.join(str(error).split()) or kind}; training goes on")
             self._warned.add(kind)
             return None
         return file
 
     def close(self) -> None:
-        """Let go of the environment."""
+        """Close the environment."""
         if self._env is not None:
             self._env.close()
 
     def before_step(self) -> None:
-        """Raise `VideoAborted` once training stops."""
+        """Raise `VideoAborted` if training is being stopped."""
         if self._stopping():
             raise VideoAborted

@@ -1,7 +1,8 @@
-"""Video files; light, so that a wrong name is refused before anything is built."""
+"""Writer of video files. The import is cheap, so that commands can refuse a wrong file name at once."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import shutil
 from pathlib import Path
@@ -19,10 +20,10 @@ FORMATS = (".mp4", ".gif")
 
 
 def check_video(file: Path) -> None:
-    """Refuse what cannot be written, before anything is simulated.
+    """Check that a video can be written, before anything is simulated.
 
     Raises:
-        UsageError: for a file that is neither .mp4 nor .gif, or whose folder is a file.
+        UsageError: for a file that is neither .mp4 nor .gif.
         DependencyError: if imageio is not installed.
         MachineError: if there is no ffmpeg for an .mp4.
     """
@@ -36,33 +37,32 @@ def check_video(file: Path) -> None:
 
 
 def _require_ffmpeg() -> None:
-    """imageio-ffmpeg brings one, where the platform has a wheel with it."""
+    """Check that there is an ffmpeg; imageio-ffmpeg contains one on platforms for which it has a wheel."""
     import imageio_ffmpeg
 
     try:
         program = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError:
-        said = "there is no ffmpeg, which writes .mp4"
+        problem = "there is no ffmpeg, which writes .mp4"
     else:
         if shutil.which(program):
             return
-        said = f"IMAGEIO_FFMPEG_EXE names no program: {program}"
-    hint = "install it (Debian, Ubuntu: apt install ffmpeg); a .gif needs none"
-    raise MachineError(said, hint=hint)
+        problem = f"IMAGEIO_FFMPEG_EXE is not a program: {program}"
+    raise MachineError(problem, hint="install ffmpeg (Debian, Ubuntu: apt install ffmpeg); a .gif needs none")
 
 
-class VideoWriter:
-    """Writes frames to an .mp4 or .gif; the file appears under its name only when it is whole.
+class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
+    """Writer of frames to an .mp4 or .gif; the file gets its name only when it is complete.
 
-    A GIF's frames last whole hundredths of a second, and players slow down those under two: of faster episodes it
-    holds every second, third, ... frame, the first choice whose speed is right within 2 %.
+    A frame of a GIF lasts a whole number of hundredths of a second, and players slow down frames shorter than two. So a
+    GIF of faster frames gets only every second, third, ... frame: the smallest stride whose speed is right within 2 %.
 
     Args:
-        file: where to.
+        file: the video.
         period: time between two pictures [s].
 
     Raises:
-        UsageError: for another kind of file.
+        UsageError: for a file with another suffix.
         DependencyError: if imageio is not installed.
     """
 
@@ -73,27 +73,21 @@ class VideoWriter:
         self.file = file
         self.frames = 0
         self._added = 0
-        self._every = gif_stride(period) if file.suffix == ".gif" else 1
-        self.fps = 1.0 / (period * self._every)
+        self._stride = gif_stride(period) if file.suffix == ".gif" else 1
+        self.fps = 1.0 / (period * self._stride)
         self._temporary = file.with_name(f".{file.stem}.tmp{file.suffix}")
+        # duration of a frame: [ms]
         settings: dict[str, Any] = {"duration": 10.0 * round(100.0 / self.fps), "loop": 0}
         if file.suffix == ".mp4":
-            settings = {
-                "fps": self.fps,
-                "codec": "libx264",
-                "quality": 7,
-                "macro_block_size": 2,
-                "ffmpeg_log_level": "error",
-            }
+            # H.264 needs an even width and height: macro blocks of 2 pixels keep the size closest
+            settings = {"fps": self.fps, "codec": "libx264", "quality": 7, "macro_block_size": 2}
+            settings["ffmpeg_log_level"] = "error"
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            self._temporary.unlink(missing_ok=True)  # a link in its place would be followed
+            self._temporary.unlink(missing_ok=True)  # the writer would follow a symbolic link
             self._writer: Any = imageio.get_writer(self._temporary, **settings)
         except OSError as error:
             raise disk_error(file, error) from error
-
-    def __enter__(self) -> VideoWriter:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -110,7 +104,7 @@ class VideoWriter:
     def add(self, picture: NDArray[np.uint8]) -> None:
         """Append a picture. (height, width, 3)"""
         self._added += 1
-        if (self._added - 1) % self._every:
+        if (self._added - 1) % self._stride:
             return
         try:
             self._writer.append_data(picture)
@@ -120,7 +114,7 @@ class VideoWriter:
 
 
 def gif_stride(period: float) -> int:
-    """Every how many pictures a GIF takes, for a period [s] between pictures."""
+    """Return how many pictures a GIF advances from one frame to the next, for a period [s] between pictures."""
     strides = range(1, 64)
     return next(
         (k for k in strides if (n := round(100 * period * k)) >= 2 and abs(n / (100 * period * k) - 1) < 0.02), 1

@@ -1,4 +1,4 @@
-"""An environment in the browser, with MuJoCo's own web viewer."""
+"""Viewer in the browser: MuJoCo's own web viewer."""
 
 from __future__ import annotations
 
@@ -24,67 +24,67 @@ _VISIBLE_FIELDS = (
     *("geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_type", "geom_dataid", "geom_matid", "mat_", "light_"),
     *("site_size", "site_pos", "site_quat", "site_rgba", "body_pos", "body_quat", "jnt_pos", "jnt_axis", "qpos0"),
 )
-"""How the names of those model fields begin that a picture shows."""
+"""Prefixes of the model fields that change the picture."""
 
 
-def run(playback: Playback, *, title: str, together: int = 1, port: int, ready: Ready) -> None:
-    """Play until the page's Quit, or an exception such as Ctrl-C; see `rlcli.viewer.protocol.Viewer`.
+def run(playback: Playback, *, title: str, num_drawn: int = 1, port: int, ready: Ready) -> None:
+    """Play until the user chooses Quit in the page, or an exception such as Ctrl-C; see `rlcli.viewer.protocol.Viewer`.
 
     Raises:
-        DependencyError: if MuJoCo's viewer is not the one that is known.
-        MachineError: if the port is taken.
+        DependencyError: if the installed MuJoCo has another web viewer or none.
+        MachineError: if the port is in use.
     """
     studio = load()
     with listen(port) as listener, secured_server(studio, listener):
         port = listener.getsockname()[1]
-        viewer = _ViewerThread(studio, playback, title, together)
+        viewer = _ViewerThread(studio, playback, title, num_drawn)
         try:
             verify_refusals(port)
-            viewer.require()
+            viewer.raise_error()
             instructions = [f"open http://127.0.0.1:{port}/ in a browser of this machine; Ctrl-C ends it"]
             tunnel = ssh_tunnel_command(port)
             if tunnel is not None:
-                instructions.append(f"from where you came over SSH: {tunnel}, then open http://localhost:{port}/")
+                instructions.append(f"on the machine of your SSH client: {tunnel}, then open http://localhost:{port}/")
             ready(instructions, f"http://127.0.0.1:{port}/")
             run_in_real_time(playback, viewer.is_open, viewer.send)
-            viewer.require()
+            viewer.raise_error()
         finally:
             viewer.close()
 
 
 def ssh_tunnel_command(port: int) -> str | None:
-    """Return the command that forwards a port to the user's machine; None: the user did not come over SSH."""
+    """Return the command that forwards a port to the user's machine; None: this is not an SSH session."""
     connection = os.environ.get("SSH_CONNECTION", "").split()
     if len(connection) != 4:
         return None
     try:
         user = getpass.getuser()
-    except (OSError, KeyError, ImportError):  # a number without a name
+    except (OSError, KeyError, ImportError):  # the user id has no name
         user = "USER"
     return f"ssh -N -L {port}:127.0.0.1:{port} {shlex.quote(f'{user}@{connection[2]}')}"
 
 
 class _ViewerThread:
-    """The viewer's thread, and the way to it."""
+    """Thread of MuJoCo's viewer, and the endpoint that sends states to it."""
 
-    def __init__(self, studio: Any, playback: Playback, title: str, together: int) -> None:
+    def __init__(self, studio: Any, playback: Playback, title: str, num_drawn: int) -> None:
         from rlcli.viewer.web_panel import WebPanel
 
         self.playback, self._studio = playback, studio
         self._error: BaseException | None = None
         self._viewer_endpoint, self._endpoint = studio.launch_thread.make_thread_endpoints()
         env = playback.env
-        self.env_grid = EnvGrid(env, together)
+        self.env_grid = EnvGrid(env, num_drawn)
         camera = self.env_grid.fit_camera(free_camera(env.config.viewer))
         self.panel = WebPanel(playback, title, camera, env.origins.double().cpu().numpy())
         self._shown = playback.shown
-        self._beside = mujoco.MjvScene(env.engine.model, maxgeom=studio.state_payload.MAX_EXTRA_GEOMS)
+        self._overlay_scene = mujoco.MjvScene(env.engine.model, maxgeom=studio.state_payload.MAX_EXTRA_GEOMS)
         model = copy.deepcopy(env.world(playback.shown)[0])
         config = studio.viewer_protocol.ViewerConfig(title="rlcli", gfx="web", http_port=0)
-        self._thread = threading.Thread(target=self._watch, args=(config, model), name="viewer", daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(config, model), name="viewer", daemon=True)
         self._thread.start()
 
-    def _watch(self, config: Any, model: mujoco.MjModel) -> None:
+    def _run(self, config: Any, model: mujoco.MjModel) -> None:
         try:
             viewer = self._studio.web_viewer.WebViewer(config, self._viewer_endpoint, model=model, plugins=[self.panel])
             self._studio.viewer_protocol.run_viewer_loop(viewer)
@@ -92,22 +92,22 @@ class _ViewerThread:
             self._error = error
 
     def is_open(self) -> bool:
-        """Whether the viewer still runs."""
+        """Return whether the viewer still runs; also empties its queues of events, which would grow otherwise."""
         self._endpoint.get_viewer_events()
         self._endpoint.get_viewer_snapshots()
         return self._thread.is_alive()
 
-    def require(self) -> None:
-        """Raise what has ended the viewer.
+    def raise_error(self) -> None:
+        """Raise the error that has ended the viewer's thread, if there is one.
 
         Raises:
-            DependencyError: if it was not the page's Quit.
+            DependencyError: if the viewer has raised an error.
         """
         if self._error is not None and not isinstance(self._error, RlcliError):
             raise incompatible_viewer(f"{type(self._error).__name__}: {self._error}") from self._error
 
     def send(self) -> None:
-        """Have the page draw what is."""
+        """Send the current state of the shown environment to the page."""
         model, data = self.playback.env.world(self.playback.shown)
         if self._shown != self.playback.shown:
             self._shown = self.playback.shown
@@ -117,10 +117,11 @@ class _ViewerThread:
         state = np.empty(mujoco.mj_stateSize(model, kind))
         mujoco.mj_getState(model, data, state, kind)
         self._endpoint.send_to_viewer(self._studio.messages.StateSnapshot(state=state, state_sig=kind))
-        self.panel.overlay_geoms = list(self.env_grid.geoms(self._beside, self.playback.shown, mujoco.MjvOption()))
+        overlay = self.env_grid.geoms(self._overlay_scene, self.playback.shown, mujoco.MjvOption())
+        self.panel.overlay_geoms = list(overlay)
 
     def close(self) -> None:
-        """End the viewer; its server is gone when this returns."""
+        """End the viewer and its server."""
         with contextlib.suppress(Exception):
             self._endpoint.send_to_viewer(self._studio.messages.ExitEvent())
         self._thread.join(timeout=10.0)

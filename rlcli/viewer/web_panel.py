@@ -1,7 +1,7 @@
-"""The panel of the browser's viewer: what MuJoCo's web viewer draws beside the scene, and its keys.
+"""Panel of the browser's viewer: the controls beside the scene, and the keys.
 
-The panel runs in the viewer's thread. It reads the playback's view and submits requests; it changes nothing else. A
-dragged body pushes on the simulation; other edits of the page never reach it.
+The panel runs in the viewer's thread. It reads the playback's view and submits requests; it changes nothing else. The
+force on a dragged body is applied in the simulation; other edits in the page have no effect on it.
 """
 
 from __future__ import annotations
@@ -20,32 +20,38 @@ from rlcli.viewer.playback import SPEEDS, Playback
 from rlcli.viewer.protocol import View
 
 TITLE = "Options"
-"""The window that the viewer docks to the left."""
+"""Title of the window that MuJoCo's viewer docks to the left."""
 _SPEEDS = ["1/8 x", "1/4 x", "1/2 x", "real time", "2 x", "4 x", "8 x"]
+_REQUESTS = {
+    "Space": "pause", "RightArrow": "step", "Backspace": "reset", "Minus": "slower", "Equal": "faster",
+    "UpArrow": "next environment", "DownArrow": "previous environment", "PageUp": "newer checkpoint",
+    "PageDown": "older checkpoint",
+}  # fmt: skip
+"""Name of a key in Dear ImGui -> request of the playback."""
 _LAST = 0
-"""Handlers of this priority run when those of MuJoCo have."""
+"""Priority of handlers that run after those of MuJoCo."""
 
 Method = TypeVar("Method", bound=Callable[..., None])
 
 
 def _handler(priority: int) -> Callable[[Method], Method]:
-    """`messages.handler` with types, which MuJoCo's lacks."""
+    """Return the decorator `messages.handler` with type annotations."""
     return cast("Callable[[Method], Method]", messages.handler(priority=priority))
 
 
 class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no types
-    """The panel.
+    """Panel and keys of the browser's viewer.
 
     Args:
-        playback: what it shows and asks.
+        playback: the playback that is shown and controlled.
         title: the task and the run.
-        camera: where the viewer begins.
-        env_origins: where each environment starts in its world. (num_envs, 3) [m]
+        camera: initial camera.
+        env_origins: origin of each environment in its world. (num_envs, 3) [m]
     """
 
     def __init__(self, playback: Playback, title: str, camera: mujoco.MjvCamera, env_origins: np.ndarray) -> None:
         self.overlay_geoms: Sequence[mujoco.MjvGeom] = ()
-        """Markers, and geoms of further environments, set by the simulation's thread."""
+        """Markers and geoms of further environments; the simulation's thread sets them."""
         self._playback, self._title, self._start_camera, self._env_origins = playback, title, camera, env_origins
         self._shown = playback.view.shown
         self._ux = ux.UxState()
@@ -67,7 +73,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
     @_handler(messages.Priority.USER)
     def _on_update(self, _: messages.UpdateEvent) -> None:
         view = self._playback.view
-        if view.shown != self._shown:  # on terrain another environment is elsewhere
+        if view.shown != self._shown:  # on terrain each environment has another origin
             self.viewer.camera.lookat[:] += self._env_origins[view.shown] - self._env_origins[self._shown]
             self._shown = view.shown
         self.viewer.extra_geoms[:] = self.overlay_geoms
@@ -103,9 +109,9 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         if imgui.Button("Camera"):
             self._reset_camera()
         imgui.PushItemWidth(imgui.GetContentRegionAvail().x * 0.5)
-        changed, place = imgui.Combo("Speed", SPEEDS.index(view.speed), _SPEEDS)
+        changed, index = imgui.Combo("Speed", SPEEDS.index(view.speed), _SPEEDS)
         if changed:
-            playback.submit(partial(playback.set_speed, SPEEDS[place]))
+            playback.submit(partial(playback.set_speed, SPEEDS[index]))
         if view.num_envs > 1:
             changed, shown = imgui.SliderInt("Environment", view.shown, 0, view.num_envs - 1)
             if changed:
@@ -125,11 +131,10 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         if not view.checkpoints:
             return
         playback = self._playback
-        names = [f"{step}{' (newest)' if step == view.checkpoints[-1] else ''}" for step in view.checkpoints]
-        there = view.checkpoint in view.checkpoints
         if imgui.BeginCombo("Checkpoint", str(view.checkpoint)):
-            for step, name in zip(view.checkpoints, names, strict=True):
-                if imgui.Selectable(name, there and step == view.checkpoint):
+            for step in view.checkpoints:
+                name = f"{step}{' (newest)' if step == view.checkpoints[-1] else ''}"
+                if imgui.Selectable(name, step == view.checkpoint):
                     playback.submit(partial(playback.switch, step))
             imgui.EndCombo()
         changed, follow = imgui.Checkbox("Play new ones as they appear", view.follow)
@@ -163,7 +168,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
             imgui.TreePop()
 
     def _reset_camera(self) -> None:
-        """Look as the task's `viewer` says."""
+        """Move the camera to the position in the task's `viewer` settings."""
         camera, begin = self.viewer.camera, self._start_camera
         camera.type, camera.fixedcamid, camera.trackbodyid = int(mujoco.mjtCamera.mjCAMERA_FREE), -1, -1
         camera.lookat[:] = begin.lookat + self._env_origins[self._shown]
@@ -171,7 +176,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         self._ux.camera_index = ux.TUMBLE_CAMERA_IDX
 
     def _push(self) -> None:
-        """A dragged body pushes on the simulation."""
+        """Apply the force on a dragged body in the simulation, until the user releases it."""
         model, data, perturb = self.viewer.model, self.viewer.data, self.viewer.perturb
         if not perturb.active and not self._pushing:
             return
@@ -184,25 +189,13 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
     def _keys(self) -> None:
         if imgui.GetIO().WantCaptureKeyboard:
             return
-        key = imgui.Key
-        requests: dict[int, str] = {
-            key.Space: "pause",
-            key.RightArrow: "step",
-            key.Backspace: "reset",
-            key.Minus: "slower",
-            key.Equal: "faster",
-            key.UpArrow: "next environment",
-            key.DownArrow: "previous environment",
-            key.PageUp: "newer checkpoint",
-            key.PageDown: "older checkpoint",
-        }
-        for code, request in requests.items():
-            if imgui.IsKeyChordPressed(code):
+        for key, request in _REQUESTS.items():
+            if imgui.IsKeyChordPressed(getattr(imgui.Key, key)):
                 self._playback.submit(self._playback.requests()[request])
                 return
-        flies = self._ux.camera_index == ux.FREE_CAMERA_IDX
+        is_free_camera = self._ux.camera_index == ux.FREE_CAMERA_IDX
         if not inputs.handle_camera_select_keyboard_events(self.viewer.model, self.viewer.camera, self._ux):
-            inputs.handle_vis_options_keyboard_events(self.viewer.vis_options, flies)
+            inputs.handle_vis_options_keyboard_events(self.viewer.vis_options, is_free_camera)
 
 
 KEYS = (

@@ -1,4 +1,4 @@
-"""The pages of the benchmarks: their figures are those that were measured, wherever they stand."""
+"""Pages of the benchmarks: their figures equal the stored results."""
 
 import json
 import re
@@ -21,17 +21,17 @@ PAGE, README = tables.PAGES
 
 
 @pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
-def test_the_generated_parts_are_what_was_measured(page):
+def test_generated_parts_match_results(page):
     text = page.read_text()
     assert text == tables.filled(text, bench.texts(tables.results())), "python benchmarks/bench.py --pages"
 
 
-def test_every_table_has_a_place_and_every_place_a_table():
+def test_tables_and_placeholders_match():
     assert sorted(tables.marked(PAGE.read_text())) == sorted(bench.TABLES)
     assert tables.marked(README.read_text()) == ["readme"]
 
 
-def test_the_figures_of_the_readme_are_the_pages():
+def test_readme_figures_match_pages():
     text, page = README.read_text(), PAGE.read_text()
     begin, end = text.index("<!-- bench: readme -->"), text.index("## Install")
     figures = re.findall(r"\d+\.\d+", re.sub(r"\]\([^)]*\)", "", text[begin:end]))
@@ -39,14 +39,14 @@ def test_the_figures_of_the_readme_are_the_pages():
     assert [figure for figure in figures if figure not in page] == []
 
 
-def test_a_part_is_replaced_alone_and_keeps_its_indentation():
+def test_replace_part_keeps_indentation():
     text = "# Page\n- a\n  <!-- bench: one -->\n  old\n  <!-- end bench -->\n<!-- bench: two -->\n<!-- end bench -->\n"
     new = tables.filled(text, {"one": "first\n\n| a |"})
     assert new == text.replace("  old\n", "  first\n\n  | a |\n")
     assert tables.filled(new, {"one": "first\n\n| a |"}) == new
 
 
-def test_what_was_kept_stays_beside_what_is_kept_next(tmp_path, monkeypatch):
+def test_save_keeps_other_results(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "RESULTS", tmp_path / "results.json")
     tables.keep("one", {"machine": "M", "ratio": 0.123456789})
     tables.keep("two", {"machine": "M"})
@@ -56,7 +56,7 @@ def test_what_was_kept_stays_beside_what_is_kept_next(tmp_path, monkeypatch):
 TIMES = {"ratio": 9.87, "ratio_min": 9.0, "ratio_max": 11.0}
 
 
-def test_a_peer_that_failed_is_a_row_with_its_reason_among_the_others():
+def test_failed_peer_is_row_with_reason():
     column = {**TIMES, "limit": 2.5, "ours": 2e6, "envpool": 1e5, "steps": 4}
     rows = [
         {"task": "gym-ant", "64": column, "1024": column, "mujoco": TIMES},
@@ -80,7 +80,7 @@ def test_a_peer_that_failed_is_a_row_with_its_reason_among_the_others():
     assert "mjlab: not installed: no wheel" in text
 
 
-def test_an_unknown_table_is_refused_with_those_that_there_are():
+def test_unknown_table_error_lists_valid_names():
     program = [sys.executable, str(REPOSITORY / "benchmarks" / "bench.py"), "envpol"]
     done = subprocess.run(program, capture_output=True, text=True)
     assert done.returncode == 2
@@ -89,7 +89,7 @@ def test_an_unknown_table_is_refused_with_those_that_there_are():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["env_step", "train", "growth"])
-def test_the_tables_without_peers_can_be_measured(name):
+def test_tables_without_peers_can_be_measured(name):
     before = tables.RESULTS.read_text()
     assert bench.run(name, quick=True)
     assert tables.RESULTS.read_text() == before

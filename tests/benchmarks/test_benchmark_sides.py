@@ -1,4 +1,4 @@
-"""The instruments of the benchmarks: children that take turns, peers that fail, commands that end at a call."""
+"""Tools of the benchmarks: alternating subprocesses, failing peers, and commands that end at a call."""
 
 import subprocess
 import sys
@@ -56,7 +56,7 @@ def child(tmp_path, monkeypatch):
         yield side
 
 
-def test_a_closed_child_leaves_nothing_behind_that_it_has_started(child):
+def test_closed_side_ends_its_subprocesses(child):
     started = child("start")
     assert Path(f"/proc/{started}").exists()
     child.close()
@@ -68,29 +68,29 @@ def test_a_closed_child_leaves_nothing_behind_that_it_has_started(child):
 
 
 def running(process):
-    """Whether it lives; one that nobody has waited for does not."""
+    """Return whether a process runs; a zombie process does not."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
 
 
-def test_a_side_answers_and_what_it_prints_is_not_an_answer(child):
+def test_side_returns_results_and_ignores_prints(child):
     assert [child("double", number=n) for n in (1, 2, 3)] == [2, 4, 6]
 
 
-def test_a_side_that_raises_says_why_and_goes_on(child):
+def test_side_reports_exception_and_continues(child):
     with pytest.raises(sides.Failed, match="ValueError: no such thing"):
         child("fail")
     assert child("double", number=4) == 8
 
 
-def test_a_side_that_ends_is_reported_with_its_last_words(child):
+def test_ended_side_is_reported_with_its_output(child):
     with pytest.raises(sides.Failed, match="ended: I am leaving"):
         child("end")
 
 
-def test_a_side_that_does_not_answer_in_time_is_ended(child):
+def test_side_is_ended_after_timeout(child):
     assert child("double", number=1) == 2
     with pytest.raises(sides.Failed, match="did not answer sleep within"):
         child("sleep", timeout=0.2)
@@ -98,7 +98,7 @@ def test_a_side_that_does_not_answer_in_time_is_ended(child):
         child("double", number=1)
 
 
-def test_blocks_take_turns():
+def test_blocks_alternate():
     order = []
 
     def block(name, cost):
@@ -115,12 +115,12 @@ def test_blocks_take_turns():
 
 
 @pytest.mark.parametrize("cost", [1e-6, 0.003, 5.0])
-def test_a_block_becomes_as_long_as_asked(cost):
+def test_block_length_reaches_requested_time(cost):
     steps = sides.steps_for(lambda n: 1e-5 + cost * n, 1.0)
     assert steps == 1 if cost > 1 else 0.8 < steps * cost < 1.2
 
 
-def test_a_command_ends_where_its_method_has_been_called_once(tmp_path):
+def test_command_ends_after_first_call_of_method(tmp_path):
     (tmp_path / "library.py").write_text(
         "print('loaded')\nclass Thing:\n    def work(self, n):\n        print('working', n, flush=True)\n"
     )
@@ -142,12 +142,12 @@ def test_a_command_ends_where_its_method_has_been_called_once(tmp_path):
     assert "library:Thing.work was not called" in done.stderr
 
 
-def test_a_command_that_fails_is_reported_with_its_message():
+def test_failed_command_is_reported_with_message():
     with pytest.raises(sides.Failed, match="exit 1: SystemError: broken"):
         sides.wall([sys.executable, "-c", "raise SystemError('broken')"])
 
 
-def test_the_plain_cartpole_is_the_tasks():
+def test_plain_cartpole_equals_task():
     env = make_env(resolve(find_task("cartpole"), flags={"scene.num_envs": 4}), seed=0)
     env.reset(seed=0)
     qpos, qvel = env.engine.field("qpos"), env.engine.field("qvel")

@@ -1,4 +1,4 @@
-"""`rlcli export --verify`: an exported file drives plain MuJoCo, and what is wrong with it shows."""
+"""`rlcli export --verify`: an exported file controls plain MuJoCo, and errors in the file are found."""
 
 import json
 import os
@@ -50,7 +50,7 @@ agents:
         torch_threads: 1, actor: {hidden: [8]}, critic: {hidden: [8]}, compile: false}
 """
 TERMS = '''
-"""Terms that no formula stands for."""
+"""Terms without a formula."""
 import torch
 
 from rlcli.task import Address, Entity, Joints
@@ -101,7 +101,7 @@ def verify(capfd, run, output, *more, code=0):
 
 
 @pytest.mark.parametrize("label", ["cartpole", "cartpole sac", "cartpole-direct"])
-def test_a_file_drives_plain_mujoco_through_the_episodes_of_the_evaluation(newest, tmp_path, capfd, label):
+def test_verify_passes_for_each_built_in_task(newest, tmp_path, capfd, label):
     run = newest(label).parent.parent
     more = ("--format", "numpy", "--episodes", "8")
     document = verify(capfd, run, tmp_path / "policy.py", *more)
@@ -118,7 +118,7 @@ def test_a_file_drives_plain_mujoco_through_the_episodes_of_the_evaluation(newes
 
 @pytest.fixture(scope="module")
 def pushed(tmp_path_factory):
-    """A run of a task with all that a controller must keep, and a term that only the task knows."""
+    """Run of a task with histories, an RNN, pushes and commands, and with a term without a formula."""
     folder = tmp_path_factory.mktemp("pushed")
     task = folder / "pushed"
     task.mkdir()
@@ -129,7 +129,7 @@ def pushed(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_histories_memories_pushes_masses_and_commands_are_lived_through(pushed, tmp_path, capfd):
+def test_verify_covers_histories_rnn_pushes_and_commands(pushed, tmp_path, capfd):
     verified = verify(capfd, pushed, tmp_path / "p.py", "--format", "numpy", "--episodes", "24")["verified"]
     assert verified["passed"]
     assert verified["closed_by_task"] == ["observation own"]
@@ -140,7 +140,7 @@ def test_histories_memories_pushes_masses_and_commands_are_lived_through(pushed,
 
 @pytest.fixture
 def copied(newest, tmp_path):
-    """A run of the cartpole to be tampered with."""
+    """Copy of a cartpole run that a test may change."""
     return Path(shutil.copytree(newest("cartpole").parent.parent, tmp_path / "copied"))
 
 
@@ -168,7 +168,7 @@ def weaken(manifest):
     [(swap, "observation"), (shift, "observation"), (weaken, "control")],
     ids=["swapped columns", "shifted value", "weakened control"],
 )
-def test_metadata_that_says_something_else_than_the_task_does_is_found_out(copied, tmp_path, capfd, change, fails):
+def test_verify_fails_on_wrong_metadata(copied, tmp_path, capfd, change, fails):
     tamper(copied, change)
     document = verify(capfd, copied, tmp_path / "policy.py", "--format", "numpy", "--episodes", "16", code=9)
     assert not document["verified"]["passed"]
@@ -177,7 +177,7 @@ def test_metadata_that_says_something_else_than_the_task_does_is_found_out(copie
     assert held["action"]
 
 
-def test_timing_that_is_not_the_runs_shows_in_the_return(copied, tmp_path, capfd):
+def test_verify_fails_on_wrong_decimation(copied, tmp_path, capfd):
     tamper(copied, lambda manifest: manifest["layout"].update(decimation=8))
     document = verify(capfd, copied, tmp_path / "policy.py", "--format", "numpy", "--episodes", "16", code=9)
     found = checks(document)
@@ -196,8 +196,8 @@ ELSEWHERE = {
 
 
 @pytest.mark.parametrize("place", ELSEWHERE)
-def test_a_robot_that_is_described_otherwise_than_by_its_task_is_found_out(copied, tmp_path, capfd, place):
-    """None of it need show in the episodes that are lived."""
+def test_verify_fails_on_wrong_robot_description(copied, tmp_path, capfd, place):
+    """The differences need not show in the episodes."""
     tamper(copied, ELSEWHERE[place])
     document = verify(capfd, copied, tmp_path / "policy.py", "--format", "numpy", "--episodes", "2", code=9)
     assert not checks(document)["description"]
@@ -207,19 +207,19 @@ def test_a_robot_that_is_described_otherwise_than_by_its_task_is_found_out(copie
 SENSELESS = {
     "a control that is not there": lambda d: d["controls"][0].update(ctrl=[7]),
     "a command that is not there": lambda d: d["controls"][0]["value"].update(at=[7]),
-    "a formula that nobody computes": lambda d: d["observations"]["policy"][0].update(closed=False),
+    "a formula that is marked as open": lambda d: d["observations"]["policy"][0].update(closed=False),
     "a control without a formula": lambda d: d["controls"][0].update(value=None),
 }
 
 
 @pytest.mark.parametrize("kind", SENSELESS)
-def test_a_description_that_contradicts_itself_is_refused(copied, tmp_path, capfd, kind):
+def test_verify_rejects_inconsistent_description(copied, tmp_path, capfd, kind):
     tamper(copied, lambda manifest: SENSELESS[kind](manifest["deployment"]))
     asked = ["export", "--checkpoint", str(copied), "--format", "numpy", "--output", str(tmp_path / "p.py"), "--verify"]
     assert main([*asked, "--episodes", "1"]) == 5
 
 
-def test_a_table_says_what_failed(copied, tmp_path, capfd):
+def test_verify_prints_table_of_checks(copied, tmp_path, capfd):
     tamper(copied, swap)
     asked = ["export", "--checkpoint", str(copied), "--output", str(tmp_path / "p.py"), "--format", "numpy"]
     assert main([*asked, "--verify", "--episodes", "4"]) == 9
@@ -233,7 +233,7 @@ def test_a_table_says_what_failed(copied, tmp_path, capfd):
     ["text", [], {"joints": []}, {"field": "__class__"}, None],
     ids=["text", "list", "half", "class", "null"],
 )
-def test_a_description_that_makes_no_sense_is_refused(copied, tmp_path, capfd, value):
+def test_export_rejects_invalid_description(copied, tmp_path, capfd, value):
     def change(manifest):
         if isinstance(value, dict) and "field" in value:
             manifest["deployment"]["observations"]["policy"][0]["value"] = {"field": "__class__", "at": [0]}
@@ -251,13 +251,13 @@ def test_a_description_that_makes_no_sense_is_refused(copied, tmp_path, capfd, v
     assert not output.exists()
 
 
-def test_a_checkpoint_that_says_nothing_of_its_robot_is_verified_by_what_the_task_says(copied, tmp_path, capfd):
+def test_verify_describes_task_if_checkpoint_has_no_description(copied, tmp_path, capfd):
     tamper(copied, lambda manifest: manifest.pop("deployment"))
     more = ("--format", "numpy", "--episodes", "4")
     assert verify(capfd, copied, tmp_path / "policy.py", *more)["verified"]["passed"]
 
 
-def test_formulas_that_reach_beyond_the_model_are_refused(copied, tmp_path, capfd):
+def test_verify_rejects_formula_with_index_out_of_range(copied, tmp_path, capfd):
     def change(manifest):
         manifest["deployment"]["observations"]["policy"][0]["value"]["of"][0]["at"] = [0, 5000]
 
@@ -267,23 +267,23 @@ def test_formulas_that_reach_beyond_the_model_are_refused(copied, tmp_path, capf
     assert "does not fit the model" in capfd.readouterr().err
 
 
-def test_verify_outside_of_a_run_is_a_usage_error(newest, tmp_path, capfd):
+def test_verify_outside_run_is_usage_error(newest, tmp_path, capfd):
     folder = shutil.copytree(newest("cartpole"), tmp_path / "alone")
     assert main(["export", "--checkpoint", str(folder), "--output", str(tmp_path / "p.onnx"), "--verify"]) == 2
     assert "--verify" in capfd.readouterr().err
 
 
-def test_a_program_that_somebody_has_changed_stays(newest, tmp_path, capfd):
+def test_verify_keeps_edited_program(newest, tmp_path, capfd):
     own = tmp_path / "run_policy.py"
     own.write_text("raise SystemExit('mine')\n")
     run = newest("cartpole").parent.parent
     asked = ["export", "--checkpoint", str(run), "--output", str(tmp_path / "policy.py"), "--format", "numpy"]
     assert main([*asked, "--verify", "--episodes", "4"]) == 0
     assert own.read_text() == "raise SystemExit('mine')\n"
-    assert "stays as it is" in capfd.readouterr().err
+    assert "is not replaced" in capfd.readouterr().err
 
 
-def test_nothing_takes_the_place_of_somebodys_own_file(newest, tmp_path, capfd):
+def test_verify_does_not_overwrite_user_files(newest, tmp_path, capfd):
     run = newest("cartpole").parent.parent
     asked = ["export", "--checkpoint", str(run), "--format", "numpy", "--verify", "--episodes", "1", "--output"]
     assert main([*asked, str(tmp_path / "run_policy.py")]) == 2
@@ -307,7 +307,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 
 
 @pytest.mark.parametrize("format_", [pytest.param("onnx", marks=pytest.mark.slow), "numpy"])
-def test_the_program_is_80_lines_and_runs_without_rlcli(newest, tmp_path, capfd, format_):
+def test_program_is_short_and_runs_without_rlcli(newest, tmp_path, capfd, format_):
     run, suffix = newest("cartpole").parent.parent, {"onnx": ".onnx", "numpy": ".py"}[format_]
     verify(capfd, run, tmp_path / f"policy{suffix}", "--format", format_, "--episodes", "2")
     file = tmp_path / "run_policy.py"
@@ -320,7 +320,7 @@ def test_the_program_is_80_lines_and_runs_without_rlcli(newest, tmp_path, capfd,
     assert result.stdout.startswith("60 steps, 1.00 s; qpos ")
 
 
-def test_the_model_that_is_written_is_the_one_that_was_trained_on(newest, tmp_path, capfd):
+def test_written_model_equals_trained_model(newest, tmp_path, capfd):
     run = newest("arm").parent.parent
     verify(capfd, run, tmp_path / "policy.py", "--format", "numpy", "--episodes", "2")
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
@@ -328,7 +328,7 @@ def test_the_model_that_is_written_is_the_one_that_was_trained_on(newest, tmp_pa
     np.testing.assert_allclose(model.actuator_gainprm[1, 0], 5.0)
 
 
-def test_a_model_with_meshes_from_files_is_written_compiled_and_whole(tmp_path):
+def test_model_with_mesh_files_is_written_as_binary(tmp_path):
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
     (tmp_path / "part.obj").write_text(corners)
     text = """<mujoco><asset><mesh name="part" file="part.obj"/></asset><worldbody>
@@ -347,7 +347,7 @@ def test_a_model_with_meshes_from_files_is_written_compiled_and_whole(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_program_runs_where_there_are_only_numpy_onnxruntime_and_mujoco(newest, tmp_path, capfd):
+def test_program_needs_only_numpy_onnxruntime_and_mujoco(newest, tmp_path, capfd):
     verify(capfd, newest("cartpole").parent.parent, tmp_path / "policy.onnx", "--episodes", "2")
     venv.create(tmp_path / "bare", with_pip=True)
     python = next(path for name in ("bin/python", "Scripts/python.exe") if (path := tmp_path / "bare" / name).exists())

@@ -1,4 +1,4 @@
-"""Policies of every trainer and every algorithm: exported in every format without the simulator, and verified."""
+"""Policies of all trainers and algorithms: exported in all formats without the simulator, and verified."""
 
 import json
 import subprocess
@@ -48,13 +48,13 @@ for format_, output in zip(sys.argv[2::2], sys.argv[3::2]):
 """
 
 
-def test_every_algorithm_of_sb3_is_tried_here():
+def test_all_sb3_algorithms_are_covered():
     assert {*SB3} == {*SPEC.algorithms}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("label", [*(f"sb3 {name}" for name in SB3), *OTHERS])
-def test_a_policy_is_exported_in_every_format_and_drives_plain_mujoco(tmp_path, capfd, label):
+def test_policy_exports_in_all_formats_and_verifies(tmp_path, capfd, label):
     if label in OTHERS:
         task, agent, overrides = OTHERS[label]
         chosen = [*overrides, "--agent", agent]
@@ -97,7 +97,7 @@ def test_a_policy_is_exported_in_every_format_and_drives_plain_mujoco(tmp_path, 
         ("cartpole", ["--agent", "rsl-rl", "agent.policy.rnn_type=gru"], "gru"),
     ],
 )
-def test_what_could_not_be_exported_is_refused_before_it_is_trained(tmp_path, capfd, task, chosen, says):
+def test_unexportable_policy_is_rejected_before_training(tmp_path, capfd, task, chosen, says):
     assert main(["train", task, *chosen, "--runs-dir", str(tmp_path)]) in (2, 3)
     assert says in capfd.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""`rlcli export` on the command line: where it writes, what it says, and what it refuses."""
+"""`rlcli export` on the command line: its files, its output and its errors."""
 
 import hashlib
 import json
@@ -41,7 +41,7 @@ COMMAND = "from rlcli.cli.app import main\nsys.exit(main(sys.argv[1:]))"
 
 @pytest.fixture
 def copied(newest, tmp_path):
-    """A checkpoint folder of the PPO cartpole, on its own, to be damaged."""
+    """Copy of a checkpoint folder of the PPO cartpole that a test may damage."""
     return Path(shutil.copytree(newest("cartpole"), tmp_path / "checkpoint"))
 
 
@@ -49,7 +49,7 @@ def files(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
-def test_export_writes_into_the_run_and_says_only_the_path_on_stdout(runs, newest, capfd):
+def test_export_writes_into_run_and_prints_path(runs, newest, capfd):
     assert main(["export", "--checkpoint", str(newest("cartpole").parent.parent)]) == 0
     out, err = capfd.readouterr()
     file = newest("cartpole").parent.parent / "exports" / "policy.onnx"
@@ -59,7 +59,7 @@ def test_export_writes_into_the_run_and_says_only_the_path_on_stdout(runs, newes
     assert "equal to the policy on" in err
 
 
-def test_export_of_a_task_takes_its_newest_run_and_gives_one_document(runs, newest, capfd, tmp_path):
+def test_export_of_task_uses_newest_run(runs, newest, capfd, tmp_path):
     file = tmp_path / "a" / "b" / "arm.pt2"
     arguments = ["--runs-dir", str(runs), "--format", "torch", "--output", str(file), "--json", "-q"]
     assert main(["export", "arm", *arguments]) == 0
@@ -80,7 +80,7 @@ def test_export_of_a_task_takes_its_newest_run_and_gives_one_document(runs, newe
 @pytest.mark.slow
 @pytest.mark.parametrize("format_", ["onnx", "torch"])
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
-def test_export_needs_neither_the_simulator_nor_the_task(runs, newest, tmp_path, task, format_):
+def test_export_imports_neither_simulator_nor_task(runs, newest, tmp_path, task, format_):
     output = tmp_path / ("policy.onnx" if format_ == "onnx" else "policy.pt2")
     arguments = ("export", task, "--runs-dir", runs, "--format", format_, "--output", output)
     result = python(COMMAND, *arguments, cwd=tmp_path, blocked=MODULES)
@@ -88,14 +88,14 @@ def test_export_needs_neither_the_simulator_nor_the_task(runs, newest, tmp_path,
     assert len(result.stderr.splitlines()) == 2, result.stderr  # the exporter itself says nothing
 
 
-def test_export_needs_neither_the_simulator_nor_a_run_around_the_checkpoint(copied, tmp_path):
+def test_export_of_bare_checkpoint_without_simulator(copied, tmp_path):
     output = tmp_path / "policy.onnx"
     arguments = ("export", "--checkpoint", copied, "--output", output)
     result = python(COMMAND, *arguments, cwd=tmp_path, blocked=MODULES)
     assert (result.returncode, result.stdout) == (0, f"{output}\n"), result.stderr
 
 
-def test_a_checkpoint_outside_a_run_needs_an_output(copied, capsys):
+def test_checkpoint_outside_run_needs_output(copied, capsys):
     assert main(["export", "--checkpoint", str(copied)]) == 2
     assert "--output FILE" in capsys.readouterr().err
 
@@ -116,7 +116,7 @@ numpy.save("command.npy", command)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".onnx", ".pt2"])
-def test_an_exported_file_runs_without_rlcli(newest, tmp_path, suffix):
+def test_exported_file_runs_without_rlcli(newest, tmp_path, suffix):
     import numpy as np
 
     from rlcli.deploy.export import export
@@ -144,7 +144,7 @@ def test_an_exported_file_runs_without_rlcli(newest, tmp_path, suffix):
         (["--output", "."], "does not end in .onnx"),
     ],
 )
-def test_unknown_formats_and_wrong_suffixes_are_usage_errors(copied, tmp_path, monkeypatch, capsys, arguments, says):
+def test_unknown_format_or_wrong_suffix_is_usage_error(copied, tmp_path, monkeypatch, capsys, arguments, says):
     monkeypatch.chdir(tmp_path)
     assert main(["export", "--checkpoint", str(copied), *arguments]) == 2
     out, err = capsys.readouterr()
@@ -163,13 +163,13 @@ def test_unknown_formats_and_wrong_suffixes_are_usage_errors(copied, tmp_path, m
         (["cartpol"], 4, "did you mean 'cartpole'"),
     ],
 )
-def test_what_to_export_must_be_there(tmp_path, capsys, arguments, code, says):
+def test_missing_checkpoint_is_reported(tmp_path, capsys, arguments, code, says):
     assert main(["export", *arguments, "--runs-dir", str(tmp_path)]) == code
     assert says in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("missing", ["onnx", "onnxscript", "onnxruntime"])
-def test_without_the_extra_it_says_what_to_install(copied, tmp_path, monkeypatch, capsys, missing):
+def test_missing_extra_names_pip_command(copied, tmp_path, monkeypatch, capsys, missing):
     monkeypatch.setitem(sys.modules, missing, None)
     output = tmp_path / "out" / "policy.onnx"
     assert main(["export", "--checkpoint", str(copied), "--output", str(output)]) == 7
@@ -179,7 +179,7 @@ def test_without_the_extra_it_says_what_to_install(copied, tmp_path, monkeypatch
     assert not output.parent.exists()
 
 
-def test_the_torch_format_needs_no_extra(copied, tmp_path, monkeypatch):
+def test_torch_format_needs_no_extra(copied, tmp_path, monkeypatch):
     for missing in ("onnx", "onnxscript", "onnxruntime"):
         monkeypatch.setitem(sys.modules, missing, None)
     output = tmp_path / "policy.pt2"
@@ -188,7 +188,7 @@ def test_the_torch_format_needs_no_extra(copied, tmp_path, monkeypatch):
 
 
 def damage(folder, how):
-    """Spoil a checkpoint; where the manifest is to agree with the damage, it is made to."""
+    """Damage a checkpoint; for some kinds of damage the manifest is changed to agree with it."""
     manifest = json.loads((folder / "manifest.json").read_text())
     policy = folder / "policy.safetensors"
     if how == "truncated weights":
@@ -242,7 +242,7 @@ def damage(folder, how):
         "broken manifest",
     ],
 )
-def test_a_damaged_checkpoint_is_refused_and_nothing_is_written(copied, tmp_path, capsys, how):
+def test_damaged_checkpoint_is_rejected_without_output(copied, tmp_path, capsys, how):
     damage(copied, how)
     output = tmp_path / "out" / "policy.onnx"
     assert main(["export", "--checkpoint", str(copied), "--output", str(output)]) == 5
@@ -253,13 +253,13 @@ def test_a_damaged_checkpoint_is_refused_and_nothing_is_written(copied, tmp_path
 
 
 @pytest.mark.parametrize("place", ["below a file", "/proc", "/proc/deep/er"])
-def test_a_folder_that_cannot_be_written_is_the_machines_no(copied, tmp_path, capsys, place):
+def test_unwritable_folder_is_machine_error(copied, tmp_path, capsys, place):
     folder = Path(place)
     if place == "below a file":
         folder = tmp_path / "file" / "deep"
         folder.parent.write_text("")
     elif not Path("/proc").is_dir():
-        pytest.skip("no /proc on this system, the one folder that nobody can write to")
+        pytest.skip("no /proc on this system, the one folder that not even root can write to")
     before = files(tmp_path)
     assert main(["export", "--checkpoint", str(copied), "--output", str(folder / "policy.onnx")]) == 10
     err = capsys.readouterr().err
@@ -279,7 +279,7 @@ sys.exit(main(sys.argv[1:]))
 
 @pytest.mark.skipif(os.name != "posix", reason="limits on file sizes are POSIX")
 @pytest.mark.parametrize("suffix", [".onnx", ".pt2"])
-def test_a_full_disk_leaves_nothing_new_and_the_old_file(copied, tmp_path, suffix):
+def test_full_disk_keeps_old_file(copied, tmp_path, suffix):
     old = tmp_path / f"policy{suffix}"
     old.write_text("the last export")
     before = files(tmp_path)

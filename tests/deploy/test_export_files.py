@@ -1,4 +1,4 @@
-"""What an exported file computes and what it says of itself."""
+"""Outputs and metadata of exported files."""
 
 import copy
 import hashlib
@@ -71,7 +71,7 @@ def thousand(newest, task):
 @pytest.mark.parametrize("batch", [1, 7])
 @pytest.mark.parametrize("format_", ["onnx", "torch", "numpy"])
 @pytest.mark.parametrize("task", POLICIES)
-def test_export_equals_the_policy_on_1000_observations(exported, newest, task, format_, batch):
+def test_export_equals_policy_on_1000_observations(exported, newest, task, format_, batch):
     policy, run, metadata, _ = exported(task, format_)
     observations = thousand(newest, task)
     assert len(observations) == 1000
@@ -87,8 +87,8 @@ def test_export_equals_the_policy_on_1000_observations(exported, newest, task, f
     assert len(actions.unique()) > 100  # a constant would also be bounded and equal
 
 
-def test_outputs_stay_inside_the_bound_where_a_runtimes_tanh_does_not(newest, tmp_path):
-    """onnxruntime's float32 tanh of 8.3 .. 9 is 1.0000001 here and there."""
+def test_outputs_stay_in_bound_despite_runtime_tanh(newest, tmp_path):
+    """For some inputs from 8.3 to 9, onnxruntime's float32 tanh is 1.0000001."""
     folder = Path(shutil.copytree(newest("cartpole-direct sac"), tmp_path / "checkpoint"))
     weights = {name: torch.zeros_like(t) for name, t in open_checkpoint(folder).tensors("policy").items()}
     for layer in (0, 2, 4):
@@ -107,7 +107,7 @@ def test_outputs_stay_inside_the_bound_where_a_runtimes_tanh_does_not(newest, tm
     np.testing.assert_allclose(action[:, 0], np.tanh(obs[:, 0].numpy()), atol=1e-6)
 
 
-def test_the_deployed_policy_does_not_depend_on_the_batch(newest):
+def test_deployed_policy_is_independent_of_batch_size(newest):
     policy = open_checkpoint(newest("cartpole")).policy()
     observations = thousand(newest, "cartpole")
     whole = policy(observations)
@@ -116,12 +116,12 @@ def test_the_deployed_policy_does_not_depend_on_the_batch(newest):
 
 
 @pytest.mark.parametrize("format_", ["onnx", "torch", "numpy"])
-def test_export_writes_exactly_one_file(exported, tmp_path, format_):
+def test_export_writes_one_file(exported, tmp_path, format_):
     _, _, _, done = exported("cartpole", format_)
     assert [file for file in tmp_path.rglob("*") if file.is_file()] == [done.file]
 
 
-def test_onnx_graph_has_named_ends_a_dynamic_batch_and_no_external_data(exported):
+def test_onnx_graph_has_names_dynamic_batch_no_external_data(exported):
     _, _, _, done = exported("cartpole")
     model = onnx.load(done.file, load_external_data=False)
     onnx.checker.check_model(model, full_check=True)
@@ -133,14 +133,14 @@ def test_onnx_graph_has_named_ends_a_dynamic_batch_and_no_external_data(exported
     assert not any(t.data_location == onnx.TensorProto.EXTERNAL for t in model.graph.initializer)
 
 
-def test_onnx_file_does_not_hold_paths_of_the_machine(exported):
+def test_onnx_file_has_no_local_paths(exported):
     _, _, _, done = exported("cartpole")
     data = done.file.read_bytes()
     assert os.getcwd().encode() not in data
     assert b"site-packages" not in data
 
 
-def test_two_exports_of_one_checkpoint_are_the_same_bytes(exported):
+def test_repeated_export_gives_equal_bytes(exported):
     first = exported("cartpole")[3].file.read_bytes()
     assert exported("cartpole")[3].file.read_bytes() == first
 
@@ -198,7 +198,7 @@ def require_shape(value, schema, path="metadata"):
 
 @pytest.mark.parametrize("format_", ["onnx", "torch", "numpy"])
 @pytest.mark.parametrize("task", [*POLICIES, "arm"])
-def test_metadata_is_complete_and_fits_the_run(exported, runs, task, format_):
+def test_metadata_is_complete_and_fits_run(exported, runs, task, format_):
     _, _, metadata, _ = exported(task, format_)
     require_shape(metadata, SCHEMA)
     run = open_run(runs / task.split()[0] / metadata["run"])
@@ -219,7 +219,7 @@ def test_metadata_is_complete_and_fits_the_run(exported, runs, task, format_):
         assert edges[1:-1:2] == edges[2::2]
 
 
-def test_metadata_of_a_managed_task_names_joints_units_scales_and_limits(exported):
+def test_managed_metadata_has_joints_units_scales_limits(exported):
     _, _, metadata, _ = exported("arm")
     rates, angle = metadata["observations"]
     assert rates["elements"] == ["shoulder", "elbow", "wrist"]
@@ -239,7 +239,7 @@ def test_metadata_of_a_managed_task_names_joints_units_scales_and_limits(exporte
     assert all(term["command"] == "actuator" for term in metadata["actions"])
 
 
-def test_metadata_of_a_direct_task_says_that_the_command_is_the_tasks_affair(exported):
+def test_direct_metadata_marks_command_as_task(exported):
     _, run, metadata, _ = exported("cartpole-direct")
     (actions,) = metadata["actions"]
     assert actions["command"] == "task"
@@ -254,7 +254,7 @@ def test_metadata_of_a_direct_task_says_that_the_command_is_the_tasks_affair(exp
     assert torch.equal(out["action"], out["command"])
 
 
-def test_command_is_what_the_actuators_of_the_cartpole_receive(exported):
+def test_command_equals_cartpole_actuator_input(exported):
     _, run, _, _ = exported("cartpole")
     env = make_env(resolve(find_task("cartpole"), overrides=["scene.num_envs=32"]), seed=3)
     obs = env.reset(seed=3)["policy"]
@@ -268,7 +268,7 @@ def test_command_is_what_the_actuators_of_the_cartpole_receive(exported):
     assert len(torch.cat(seen).unique()) > 100
 
 
-def test_command_is_the_effort_and_the_target_under_every_limit_of_the_arm(exported, runs):
+def test_command_applies_all_limits_of_arm(exported, runs):
     _, run, _, _ = exported("arm")
     env = make_env(resolve_run(find_run("latest", runs, "arm")[0], play=True), seed=3)
     model = env.engine.model
@@ -291,7 +291,7 @@ def test_command_is_the_effort_and_the_target_under_every_limit_of_the_arm(expor
     env.close()
 
 
-def test_action_stays_in_a_bound_other_than_one(exported):
+def test_action_respects_bound_other_than_one(exported):
     _, run, metadata, _ = exported("arm")
     action = run(1000.0 * torch.randn(1000, 4))["action"]
     assert metadata["action_bound"] == 0.8
@@ -299,7 +299,7 @@ def test_action_stays_in_a_bound_other_than_one(exported):
 
 
 @pytest.mark.parametrize("format_", ["onnx", "torch", "numpy"])
-def test_a_file_that_does_not_compute_the_policy_is_not_kept(newest, tmp_path, monkeypatch, format_):
+def test_file_that_differs_from_policy_is_deleted(newest, tmp_path, monkeypatch, format_):
     # the graph is given other weights behind the checker's back
     write = module.formats.write
 
@@ -315,7 +315,7 @@ def test_a_file_that_does_not_compute_the_policy_is_not_kept(newest, tmp_path, m
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failed_export_leaves_the_file_of_the_last_one(newest, tmp_path, monkeypatch):
+def test_failed_export_keeps_previous_file(newest, tmp_path, monkeypatch):
     checkpoint, file = open_checkpoint(newest("cartpole")), tmp_path / "policy.onnx"
     export(checkpoint, file)
     before = file.read_bytes()
@@ -327,7 +327,7 @@ def test_a_failed_export_leaves_the_file_of_the_last_one(newest, tmp_path, monke
 
 
 @pytest.mark.parametrize("task", POLICIES)
-def test_checkpoint_keeps_recent_observations_as_the_environment_gave_them(newest, task):
+def test_checkpoint_stores_recent_raw_observations(newest, task):
     checkpoint = open_checkpoint(newest(task))
     observations = checkpoint.tensors("trainer")["observations"]
     assert observations.shape == (160, 4)  # of the reset and of 4 iterations, 32 environments each
@@ -336,7 +336,7 @@ def test_checkpoint_keeps_recent_observations_as_the_environment_gave_them(newes
     assert float(observations[-32:, 0].abs().max()) > 0.5  # start positions in metres, not normalised
 
 
-def test_checkpoint_without_recorded_observations_is_checked_on_random_ones(newest, tmp_path, monkeypatch):
+def test_export_without_recorded_observations_uses_random_ones(newest, tmp_path, monkeypatch):
     checkpoint = open_checkpoint(newest("cartpole"))
     tensors = type(checkpoint).tensors
     older = lambda self, *args: {k: v for k, v in tensors(self, *args).items() if k != "observations"}  # noqa: E731

@@ -1,4 +1,4 @@
-"""Policies with a memory: exported with the memory as input and output."""
+"""Recurrent policies: exported with the hidden state as input and output."""
 
 import runpy
 
@@ -49,7 +49,7 @@ def saved(folder, memory, **changes):
 
 
 def runner(file):
-    """A file as its own library runs it: inputs by name -> outputs by name, numpy."""
+    """Return the function of a file, run by its own library: inputs by name -> outputs by name, numpy."""
     if file.suffix == ".py":
         return runpy.run_path(str(file))["run"]
     if file.suffix == ".onnx":
@@ -61,7 +61,7 @@ def runner(file):
 
 @pytest.mark.parametrize(("memory", "normalize"), [([5], True), ([4, 4], False)])
 @pytest.mark.parametrize("format_", FORMATS)
-def test_a_memory_is_an_input_and_an_output(tmp_path, format_, memory, normalize):
+def test_hidden_state_is_input_and_output(tmp_path, format_, memory, normalize):
     checkpoint = saved(tmp_path / "run", memory, normalize=normalize)
     done = export(checkpoint, tmp_path / f"policy{FORMATS[format_]}", format_)
     shape = [len(memory), "batch", memory[0]]
@@ -86,7 +86,7 @@ def test_a_memory_is_an_input_and_an_output(tmp_path, format_, memory, normalize
                   - first).max() > 1e-4  # it remembers  # fmt: skip
 
 
-def test_an_episode_of_the_numpy_file_keeps_histories_and_the_memory(tmp_path):
+def test_numpy_episode_keeps_history_and_hidden_state(tmp_path):
     checkpoint = saved(tmp_path / "run", [5])
     space = runpy.run_path(str(export(checkpoint, tmp_path / "policy.py", "numpy").file))
     policy = checkpoint.policy()
@@ -101,15 +101,15 @@ def test_an_episode_of_the_numpy_file_keeps_histories_and_the_memory(tmp_path):
             np.testing.assert_allclose(action, expected[0].numpy(), atol=1e-6)
 
 
-def test_a_memory_of_unequal_layers_is_refused_with_a_reason(tmp_path):
+def test_unequal_recurrent_layers_are_rejected(tmp_path):
     checkpoint = saved(tmp_path / "run", [4, 5])
-    with pytest.raises(UsageError, match="layers differ in size"):
+    with pytest.raises(UsageError, match="recurrent layers of different sizes"):
         export(checkpoint, tmp_path / "policy.py", "numpy")
     assert not (tmp_path / "policy.py").exists()
 
 
 @pytest.mark.parametrize("name", ["'''", '"""', "\\", "\n", "}", "é中\U0001f600", "import os", "\u2028", "{0}"])
-def test_what_a_checkpoint_says_is_data_in_the_numpy_file(tmp_path, name, monkeypatch):
+def test_numpy_file_contains_checkpoint_values_as_literals(tmp_path, name, monkeypatch):
     monkeypatch.setitem(LAYOUT["observations"]["policy"][0], "name", f"x{name}__import__('os')._exit(3)")
     file = export(saved(tmp_path / "run", []), tmp_path / "policy.py", "numpy").file
     assert runpy.run_path(str(file))["METADATA"]["observations"][0]["name"].startswith(f"x{name}")

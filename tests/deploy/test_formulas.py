@@ -1,4 +1,4 @@
-"""Formulas against the terms that they stand for: numpy on an MjData, by the program that users get."""
+"""Formulas compared with their terms: computed by the exported program, with numpy, from an MjData."""
 
 import copy
 import functools
@@ -137,8 +137,8 @@ def walker(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def lives(walker):
-    """What the environment and what the formulas saw in each step, over several episodes: name -> two lists of rows."""
+def trajectories(walker):
+    """Values of the environment and of the formulas in each step of several episodes: name -> two lists of rows."""
     torch.set_num_threads(1)
     env = make_env(resolve(folder_task(walker, "task.yaml")), seed=5)
     plan = json.loads(json.dumps(describe(env)))
@@ -180,34 +180,34 @@ def lives(walker):
 
 def controller_of(about):
     controller = copy.copy(Controller.__new__(Controller))
-    controller.about, controller.plan = about, about["deployment"]
+    controller.metadata, controller.plan = about, about["deployment"]
     ranges = [actuator["range"] or (-np.inf, np.inf) for actuator in controller.plan["actuators"]]
-    controller.ends = np.reshape(ranges, (-1, 2)).T
+    controller.bounds = np.reshape(ranges, (-1, 2)).T
     controller.reset()
     return controller
 
 
 def answer(action, inputs):
-    """What a policy file gives for the walker: its knee is affine, its hip in the term's own way."""
+    """Return the outputs of a policy file for the walker: its knee has an affine term, its hip another one."""
     command = torch.stack([action[0] * 0.5 + (0.4 + 0.2), action[1]])
     return {"action": action[None].numpy(), "command": command[None].numpy()}
 
 
 @pytest.mark.parametrize("name", [*TERMS, *PREPARED])
-def test_formula_of_a_term_computes_what_the_term_does(lives, name):
-    expected, found = (np.stack(rows) for rows in lives[0][name])
+def test_observation_formula_equals_term(trajectories, name):
+    expected, found = (np.stack(rows) for rows in trajectories[0][name])
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2e-5)
     if name != "joint_effort":
         assert len(np.unique(expected.round(4), axis=0)) > 2  # a constant would agree with much
 
 
-def test_formulas_of_actions_write_the_controls_that_the_environment_writes(lives):
-    expected, found = (np.concatenate(rows) for rows in lives[1])
+def test_action_formulas_equal_environment_controls(trajectories):
+    expected, found = (np.concatenate(rows) for rows in trajectories[1])
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
     assert len(np.unique(expected[:, 0])) > 50
 
 
-def test_every_observation_term_that_mjdata_can_tell_has_a_formula():
+def test_all_mjdata_observation_terms_have_formulas():
     ours = set(builtin_terms("observations"))
     without = {  # contacts, rays, pictures and memories of the environment's own
         "height_scan", "foot_air_time", "foot_contact", "foot_contact_forces", "fingers_contact_force_b",
@@ -219,11 +219,11 @@ def test_every_observation_term_that_mjdata_can_tell_has_a_formula():
 
 
 def aliases(ours, known):
-    """Names of YAML that stand for a function of another name."""
+    """Return the names in YAML whose function has another name."""
     return {name for name in ours if builtin_terms("observations")[name].attribute in known}
 
 
-def test_the_program_and_the_reader_know_the_same_operations():
+def test_program_and_reader_have_same_operations():
     assert set(OPS) | {"filter"} == set(KNOWN)
 
 
@@ -245,12 +245,12 @@ def test_the_program_and_the_reader_know_the_same_operations():
         None,
     ],
 )
-def test_what_is_no_formula_is_refused(value):
+def test_invalid_formula_is_rejected(value):
     with pytest.raises(ValueError, match=r"."):
         check_formula(value)
 
 
-def test_terms_that_read_a_terrain_or_a_gravity_of_their_own_have_no_formula(walker):
+def test_terrain_and_own_gravity_have_no_formula(walker):
     text = (walker / "task.yaml").read_text()
     terrain = "  terrain: {kind: generator, rows: 1, columns: 1, sub_terrains: {flat: {kind: flat}}}\n"
     (walker / "hilly.yaml").write_text(text.replace("scene:\n", f"scene:\n{terrain}"))
@@ -265,7 +265,7 @@ def test_terms_that_read_a_terrain_or_a_gravity_of_their_own_have_no_formula(wal
     env.close()
 
 
-def test_one_step_of_mjdata_is_current_after_step1():
+def test_mj_step1_updates_derived_fields():
     model = mujoco.MjModel.from_xml_string(WALKER)
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 3)

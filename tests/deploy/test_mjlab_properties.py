@@ -15,7 +15,7 @@ def file(runs, tmp_path_factory):
     return export(open_checkpoint(checkpoint), tmp_path_factory.mktemp("mjlab") / "policy.onnx")
 
 
-def test_a_reader_of_mjlabs_files_finds_its_keys_in_ours(file):
+def test_properties_have_mjlab_keys_and_format(file):
     found = {entry.key: entry.value for entry in onnx.load(file.file).metadata_props}
     assert found["joint_names"] == "shoulder,elbow,wrist"
     assert found["joint_stiffness"] == "0,5,0"
@@ -33,14 +33,14 @@ def test_a_reader_of_mjlabs_files_finds_its_keys_in_ours(file):
     assert found["run_path"] == file.metadata["run"]
 
 
-def test_names_that_a_reader_would_cut_apart_are_left_out(file):
+def test_names_with_separators_are_left_out(file):
     first = {**file.metadata["observations"][0], "name": "a,b"}
     properties = mjlab_properties({**file.metadata, "observations": [first, file.metadata["observations"][1]]})
     assert "observation_names" not in properties
     assert properties["joint_names"] == "shoulder,elbow,wrist"
 
 
-def test_a_checkpoint_without_a_description_of_its_robot_gives_what_it_knows(file):
+def test_properties_without_robot_description(file):
     properties = mjlab_properties({**file.metadata, "deployment": None})
     assert "joint_names" not in properties
     assert properties["action_scale"]

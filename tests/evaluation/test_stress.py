@@ -179,7 +179,7 @@ def test_stress_accepts_run_checkpoint_and_task(cli, only_run):
         (("cartpole", "--policy", "zero", "--sweep", "gravity=1:2", "--against", "lqrr"), 2, "did you mean 'lqr'"),
         (("cartpole", "--policy", "zero", "--sweep", "gravity=1:2", "--against", "trained"), 2, "--against trained"),
         (("cartpole", "--sweep", "gravity=1:2", "--fail-under", "succes=1"), 2, "--fail-under"),
-        (("cartpole", "--sweep", "gravity=1:2", "-o", "x.jpg"), 2, "is no picture"),
+        (("cartpole", "--sweep", "gravity=1:2", "-o", "x.jpg"), 2, "is not a picture"),
         (("cartpole", "--sweep", "gravity=1:2", "-o", "nowhere/x.png"), 10, "no folder"),
         (("cartpole", "--sweep", "gravity=1:2:200", "--sweep", "push=0:1:200"), 2, "40,000 variants"),
         (("cartpol", "--sweep", "gravity=1:2"), 4, "did you mean 'cartpole"),
@@ -232,8 +232,8 @@ def test_heat_map_of_three_sweeps_shows_the_worst_of_the_third():
     sweeps = read_sweeps(["gravity=1,2", "action_delay=0:2", "push=0,1"], 5)
     values = {at: at[0] + 10 * at[1] - 100 * at[2] for at in grid(sweeps)}
     found = heat_map("success", sweeps, values)
-    assert found.rows == ("1", "2")
-    assert found.columns == ("0", "1", "2")
+    assert found.rows.values == ("1", "2")
+    assert found.columns.values == ("0", "1", "2")
     assert found.cells == ((-99, -89, -79), (-98, -88, -78))
     assert found.title == "success, the worst over push"
     assert (found.share(found.low), found.share(found.high)) == (0.0, 1.0)
@@ -242,7 +242,7 @@ def test_heat_map_of_three_sweeps_shows_the_worst_of_the_third():
 def test_heat_map_of_one_sweep_is_a_row():
     sweeps = read_sweeps(["gravity=1,2,3"], 5)
     found = heat_map("success", sweeps, {(1.0,): 0.5, (2.0,): 0.2, (3.0,): 0.9})
-    assert (found.rows, found.columns, found.cells) == (("",), ("1", "2", "3"), ((0.5, 0.2, 0.9),))
+    assert (found.rows.values, found.columns.values, found.cells) == (("",), ("1", "2", "3"), ((0.5, 0.2, 0.9),))
 
 
 def test_heat_map_on_a_terminal_has_colours(capfd, monkeypatch):

@@ -1,4 +1,4 @@
-"""Learning curves: what is read of runs, which belong together, and what several seeds tell."""
+"""Learning curves: reading of runs, grouping by settings, and statistics over seeds."""
 
 import json
 import os
@@ -26,11 +26,11 @@ def column(*values):
         ([9.0, 1.0, 8.0, 2.0, 3.0, 4.0, 5.0, -100.0], 3.5),  # 2, 3, 4, 5 are left
     ],
 )
-def test_the_interquartile_mean_cuts_a_quarter_at_either_end(values, expected):
+def test_iqm_cuts_quarter_at_each_end(values, expected):
     assert iqm(column(*values))[0] == pytest.approx(expected)
 
 
-def test_the_interval_is_that_of_a_percentile_bootstrap_over_runs():
+def test_interval_is_percentile_bootstrap_over_runs():
     values = column(1.0, 2.0, 3.0, 4.0, 10.0)
     low, high = interval(values)
     means = sorted(iqm(values[np.array(p)])[0] for p in np.ndindex(5, 5, 5, 5, 5))  # every resample there is
@@ -40,13 +40,13 @@ def test_the_interval_is_that_of_a_percentile_bootstrap_over_runs():
     assert low[0] < iqm(values)[0] < high[0]
 
 
-def test_the_interval_holds_the_truth_about_as_often_as_it_says():
+def test_interval_coverage_is_near_nominal():
     draws = np.random.default_rng(1).normal(5.0, 1.0, (10, 400))  # 400 experiments of ten seeds
     low, high = interval(draws)
     assert 0.84 < np.mean((low < 5.0) & (high > 5.0)) < 0.98  # of few seeds a percentile bootstrap is a little narrow
 
 
-def test_the_interval_is_the_same_each_time_however_many_points_there_are():
+def test_interval_is_independent_of_number_of_points():
     values = np.random.default_rng(0).normal(size=(5, 900))
     low, high = interval(values)
     again, _ = interval(values[:, :1])
@@ -55,14 +55,14 @@ def test_the_interval_is_the_same_each_time_however_many_points_there_are():
     assert np.all(low <= high)
 
 
-def test_lines_meet_only_where_all_of_them_are():
+def test_align_uses_common_range():
     x, values = align([(np.array([0.0, 10.0, 20.0]), np.array([0.0, 1.0, 2.0])), (np.array([5.0, 15.0]), np.zeros(2))])
     assert x.tolist() == [5.0, 10.0, 15.0]
     assert values[0].tolist() == [0.5, 1.0, 1.5]
     assert align([(np.array([0.0, 1.0]), np.zeros(2)), (np.array([2.0, 3.0]), np.zeros(2))]) is None
 
 
-def test_a_history_has_steps_iterations_and_the_time_of_rollouts_and_updates(tmp_path):
+def test_read_history_has_all_axes(tmp_path):
     history = read_history(write_run(tmp_path, rows=learning(3)))
     assert history.axes["steps"].tolist() == [100, 200, 300]
     assert history.axes["iterations"].tolist() == [1, 2, 3]
@@ -70,7 +70,7 @@ def test_a_history_has_steps_iterations_and_the_time_of_rollouts_and_updates(tmp
     assert history.metrics["Train/mean_reward"].tolist() == [1, 2, 3]
 
 
-def test_a_metric_that_an_iteration_did_not_tell_is_passed_over(tmp_path):
+def test_missing_metric_in_iteration_is_skipped(tmp_path):
     rows = [(1, 10, {}), (2, 20, {"Train/mean_reward": 5.0}), (3, 30, {}), (4, 40, {"Train/mean_reward": 7.0})]
     (curve,), _ = gather([write_run(tmp_path, rows=rows)])
     line = curve.line("Train/mean_reward")
@@ -92,14 +92,14 @@ def test_a_metric_that_an_iteration_did_not_tell_is_passed_over(tmp_path):
         "[" * 100_000,
     ],
 )
-def test_what_stands_before_a_broken_line_is_read(tmp_path, line):
+def test_rows_before_corrupt_line_are_read(tmp_path, line):
     run = write_run(tmp_path, rows=learning(2))
     with run.metrics.open("a") as file:
         file.write(line + "\n" + json.dumps({"iteration": 4, "step": 400}) + "\n")
     assert read_history(run).axes["steps"].tolist() == [100, 200]
 
 
-def test_what_is_no_number_is_no_metric(tmp_path):
+def test_non_numeric_values_are_not_metrics(tmp_path):
     odd = {"text": "x", "yes": True, "list": [1], "huge": 10**400, "none": None}
     run = write_run(tmp_path, rows=[(1, 10, {"Loss/value": 1.0, **odd})])
     with run.metrics.open("a") as file:
@@ -107,7 +107,7 @@ def test_what_is_no_number_is_no_metric(tmp_path):
     assert list(read_history(run).metrics) == ["Loss/value"]
 
 
-def test_a_run_that_has_told_nothing_is_refused_by_name(tmp_path):
+def test_run_without_metrics_is_rejected_by_name(tmp_path):
     run = write_run(tmp_path)
     with pytest.raises(CheckpointError, match=f"{run.folder.name} has no metrics yet"):
         gather([run])
@@ -116,7 +116,7 @@ def test_a_run_that_has_told_nothing_is_refused_by_name(tmp_path):
         read_history(run)
 
 
-def test_runs_that_differ_in_their_seed_only_are_one_curve(tmp_path):
+def test_runs_with_different_seeds_are_one_curve(tmp_path):
     runs = [write_run(tmp_path, seed=seed, rows=learning(scale=seed)) for seed in (1, 2, 3, 4)]
     (curve,), notes = gather(runs)
     assert (curve.label, curve.seeds, notes) == ("cartpole, sb3-ppo (4 seeds)", [1, 2, 3, 4], [])
@@ -126,7 +126,7 @@ def test_runs_that_differ_in_their_seed_only_are_one_curve(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"overrides": ["rewards.cart_vel.weight=-0.5"]}, "rewards.cart_vel.weight=-0.5"),
         ({"overrides": ["agent.gamma=0.5"]}, "agents.sb3-ppo.gamma=0.5"),
@@ -137,14 +137,14 @@ def test_runs_that_differ_in_their_seed_only_are_one_curve(tmp_path):
         ({"device": "cuda:0"}, "device=cuda"),
     ],
 )
-def test_runs_that_differ_in_anything_else_are_curves_of_their_own_named_by_it(tmp_path, change, said):
+def test_runs_with_different_settings_are_separate_curves(tmp_path, change, message):
     curves, _ = gather([write_run(tmp_path, rows=learning()), write_run(tmp_path, seed=2, rows=learning(), **change)])
     one, other = (curve.label for curve in curves)
-    assert said in other
-    assert said not in one
+    assert message in other
+    assert message not in one
 
 
-def test_a_label_names_three_settings_and_counts_the_rest(tmp_path):
+def test_label_names_three_settings(tmp_path):
     terms = ("alive", "terminating", "pole_pos", "cart_vel")
     runs = [
         write_run(
@@ -157,7 +157,7 @@ def test_a_label_names_three_settings_and_counts_the_rest(tmp_path):
     assert len(set(labels)) == 2
 
 
-def test_a_seed_counts_once_and_a_short_run_is_told(tmp_path):
+def test_duplicate_seed_is_dropped_and_short_run_noted(tmp_path):
     runs = [
         write_run(tmp_path, seed=1, rows=learning(10, scale=5.0)),
         write_run(tmp_path, seed=1, rows=learning(10)),
@@ -170,7 +170,7 @@ def test_a_seed_counts_once_and_a_short_run_is_told(tmp_path):
     assert any(str(runs[2].folder) in note and "ends at step 400" in note for note in notes)
 
 
-def test_seeds_of_other_step_counts_are_interpolated(tmp_path):
+def test_different_step_counts_are_interpolated(tmp_path):
     runs = [
         write_run(tmp_path, seed=1, rows=learning(4, steps=100, scale=1.0)),
         write_run(tmp_path, seed=2, rows=learning(8, steps=50, scale=0.5)),
@@ -181,7 +181,7 @@ def test_seeds_of_other_step_counts_are_interpolated(tmp_path):
     assert line.middle == pytest.approx(line.x / 100)
 
 
-def test_one_bad_run_among_several_is_left_out_and_told(tmp_path):
+def test_unreadable_run_is_left_out_with_note(tmp_path):
     good, empty, broken = write_run(tmp_path, rows=learning()), write_run(tmp_path), write_run(tmp_path, config="a: [")
     (curve,), notes = gather([good, empty, broken])
     assert [h.run.folder for h in curve.histories] == [good.folder]
@@ -190,7 +190,7 @@ def test_one_bad_run_among_several_is_left_out_and_told(tmp_path):
         gather([broken])
 
 
-def test_a_pipe_in_place_of_the_configuration_is_not_waited_for(tmp_path):
+def test_fifo_as_configuration_does_not_block(tmp_path):
     run = write_run(tmp_path, rows=learning())
     run.config.unlink()
     os.mkfifo(run.config)
@@ -198,7 +198,7 @@ def test_a_pipe_in_place_of_the_configuration_is_not_waited_for(tmp_path):
         gather([run])
 
 
-def test_the_usual_panels_of_one_curve(tmp_path):
+def test_default_panels_of_one_curve(tmp_path):
     curves, _ = gather([write_run(tmp_path, rows=learning())])
     panels = choose(curves)
     assert [panel.title for panel in panels] == [
@@ -208,7 +208,7 @@ def test_the_usual_panels_of_one_curve(tmp_path):
     assert panels[4].stacked
 
 
-def test_several_curves_have_a_panel_a_reward_term_and_a_stack_each(tmp_path):
+def test_panels_of_several_curves(tmp_path):
     runs = [write_run(tmp_path, rows=learning()), write_run(tmp_path, agent="sac", rows=learning())]
     panels = choose(gather(runs)[0])
     assert [len(panel.items) for panel in panels[:5]] == [2] * 5
@@ -217,7 +217,7 @@ def test_several_curves_have_a_panel_a_reward_term_and_a_stack_each(tmp_path):
     ]  # fmt: skip
 
 
-def test_metrics_are_chosen_by_short_name_name_and_what_stands_before_the_slash(tmp_path):
+def test_metrics_are_selected_by_name_short_name_and_group(tmp_path):
     curves, _ = gather([write_run(tmp_path, rows=learning(**{"Loss/kl": 1.0}))])
     titles = [panel.title for panel in choose(curves, ["success", "Episode_Reward/alive", "Loss"])]
     assert titles == ["Success", "Reward: alive", "Loss/value", "Loss/kl"]
@@ -226,7 +226,7 @@ def test_metrics_are_chosen_by_short_name_name_and_what_stands_before_the_slash(
 @pytest.mark.parametrize(
     ("name", "near"), [("retrun", "'return'"), ("alvie", "'Episode_Reward/alive'"), ("loss/value", "'Loss/value'")]
 )
-def test_an_unknown_metric_is_answered_with_the_nearest_and_all_there_are(tmp_path, name, near):
+def test_unknown_metric_error_lists_valid_names(tmp_path, name, near):
     curves, _ = gather([write_run(tmp_path, rows=learning())])
     with pytest.raises(UsageError) as caught:
         choose(curves, [name])
@@ -234,7 +234,7 @@ def test_an_unknown_metric_is_answered_with_the_nearest_and_all_there_are(tmp_pa
     assert all(known in caught.value.hint for known in ("terminations", "Loss/value", "Episode_Reward/effort"))
 
 
-def test_a_run_without_an_ended_episode_has_nothing_to_show_by_itself(tmp_path):
+def test_run_without_ended_episode_has_no_default_panels(tmp_path):
     run = write_run(tmp_path)
     write_metrics(run, [(1, 10, {"Loss/value": 1.0})])
     assert choose(gather([run])[0]) == []

@@ -29,7 +29,7 @@ class Cells(HTMLParser):
             self.rows[-1][-1] += data
 
 
-def test_a_card_as_html_has_every_cell_of_its_tables():
+def test_card_html_has_all_cells():
     content = task_card(resolve(find_task("cartpole")))
     rows = [row for row in Cells(card_html(content)).rows if row]
     wanted = []
@@ -39,11 +39,11 @@ def test_a_card_as_html_has_every_cell_of_its_tables():
     assert rows == wanted
 
 
-def test_headings_begin_at_the_level_that_is_asked_for():
+def test_card_html_heading_level():
     assert "<h5>Rewards</h5>" in card_html(task_card(resolve(find_task("cartpole"))), level=4)
 
 
-def test_text_of_a_card_is_escaped_and_only_names_are_code():
+def test_card_html_is_escaped():
     odd = "<script>alert(1)</script> `a<b` \u202e"
     table = Table(odd, odd, (Column(odd, "code"), Column("B")), ((odd, "one ` alone"),))
     text = card_html(Card(odd, odd, ((odd, odd),), (table,)))

@@ -1,4 +1,4 @@
-"""`rlcli report`: what stands on the page, what is said where something is missing, and that it is text and no more."""
+"""`rlcli report`: content of the page, messages for missing parts, and escaping of untrusted text."""
 
 import base64
 import html
@@ -21,7 +21,7 @@ ATTACK = "<script>document.title='run'</script><img src=x onerror=alert(1)>\"'&{
 
 
 class Reader(HTMLParser):
-    """The tags, the attributes and the text of a page."""
+    """Parser of the tags, the attributes and the text of a page."""
 
     def __init__(self, text):
         super().__init__()
@@ -44,14 +44,14 @@ def read(file):
     return Reader(Path(file).read_text(encoding="utf-8"))
 
 
-def written(text, key):
-    """Where a page says that a value was written."""
+def origin_of(text, key):
+    """Return the origin of a value on a page."""
     row = rf"<code>{re.escape(key)}</code></td><td><code>[^<]*</code></td><td class=\"origin\">([^<]*)</td>"
     return html.unescape(re.search(row, text)[1])
 
 
 def require_harmless(page):
-    """Nothing that runs, nothing from elsewhere."""
+    """Check that a page has no scripts and no external resources."""
     assert not {"script", "iframe", "object", "embed", "link", "base", "form", "foreignobject"} & set(page.tags)
     assert not [name for name, _ in page.attributes if name.startswith("on")]
     places = [value for name, value in page.attributes if name in ("src", "href", "xlink:href", "srcset", "data")]
@@ -61,7 +61,7 @@ def require_harmless(page):
 
 @pytest.fixture(scope="module")
 def template(tmp_path_factory):
-    """A run of a task with short episodes, trained once."""
+    """Run of a task with short episodes, trained once."""
     runs = tmp_path_factory.mktemp("trained")
     words = ["scene.num_envs=4", "episode_length_s=0.5", "agent.n_steps=32", "agent.num_minibatches=2"]
     train = ["train", "cartpole", *words, "--max-iterations", "2", "--logger", "none", "-q", "--runs-dir", str(runs)]
@@ -75,12 +75,12 @@ def trained(template, tmp_path):
     return Path(shutil.copytree(template, tmp_path / "runs" / "cartpole" / template.name))
 
 
-def test_a_run_has_its_page_with_everything_of_it(cli, tmp_path):
+def test_report_has_all_sections(cli, tmp_path):
     run = write_run(tmp_path / "runs", rows=learning(), overrides=["rewards.alive.weight=1.5"], cpu={"model": "A chip"})
-    said = cli("report", "latest", "--json")
-    assert said.code == 0
-    assert Path(said.json["file"]) == Path("runs/cartpole") / run.folder.name / "report.html"
-    page = read(said.json["file"])
+    result = cli("report", "latest", "--json")
+    assert result.code == 0
+    assert Path(result.json["file"]) == Path("runs/cartpole") / run.folder.name / "report.html"
+    page = read(result.json["file"])
     require_harmless(page)
     for words in (
         "cartpole", "Balance a pole on a cart", "1,000 steps in 10 iterations", "Squared joint deviation from",
@@ -89,14 +89,14 @@ def test_a_run_has_its_page_with_everything_of_it(cli, tmp_path):
     ):  # fmt: skip
         assert words in page.text, words
     assert page.tags.count("svg") == 5
-    assert said.json["charts"] == ["Return", "Success", "Episode length", "Reward terms", "Why episodes ended"]
-    assert said.json["missing"] == {
+    assert result.json["charts"] == ["Return", "Success", "Episode length", "Reward terms", "Why episodes ended"]
+    assert result.json["missing"] == {
         "evaluation": "There is no evaluation: the run has no complete checkpoint.",
         "video": "There is no video: the run has no complete checkpoint.",
     }
 
 
-def test_the_page_forbids_everything_external_before_anything_else(cli, tmp_path):
+def test_page_starts_with_content_security_policy(cli, tmp_path):
     write_run(tmp_path / "runs", rows=learning())
     text = Path(cli("report", "latest").out.strip()).read_text()
     head = text[: text.index("<title>")]
@@ -107,13 +107,13 @@ def test_the_page_forbids_everything_external_before_anything_else(cli, tmp_path
     assert {rules["img-src"], rules["media-src"]} == {"data:"}
 
 
-def test_every_value_of_the_configuration_says_where_it_was_written(cli, tmp_path):
+def test_settings_have_origins(cli, tmp_path):
     runs = tmp_path / "runs"
     write_run(runs, rows=learning(), overrides=["rewards.alive.weight=1.5"])
     text = Path(cli("report", "latest").out.strip()).read_text()
 
     def origin(key):
-        return written(text, key)
+        return origin_of(text, key)
 
     assert origin("rewards.alive.weight") == "override 'rewards.alive.weight=1.5'"
     assert re.fullmatch(r"task\.yaml:\d+:\d+", origin("episode_length_s"))
@@ -121,23 +121,23 @@ def test_every_value_of_the_configuration_says_where_it_was_written(cli, tmp_pat
     assert origin("sim.gravity") == "default"
 
 
-def test_a_value_that_the_installed_task_no_longer_has_is_a_line_of_the_run(cli, tmp_path):
+def test_origin_of_changed_value_is_run_file(cli, tmp_path):
     run = write_run(tmp_path / "runs", rows=learning())
     text = run.config.read_text()
     run.config.write_text(text.replace("episode_length_s: 5.0", "episode_length_s: 7.0"))
     line = text[: text.index("episode_length_s")].count("\n") + 1
     page = Path(cli("report", "latest").out.strip()).read_text()
-    assert written(page, "episode_length_s") == f"config.yaml:{line}:1 (the installed task differs)"
+    assert origin_of(page, "episode_length_s") == f"config.yaml:{line}:1 (the installed task differs)"
 
 
-def test_a_direct_tasks_page_has_its_parameters_and_words(cli, tmp_path):
+def test_direct_task_page_has_parameters_and_docstrings(cli, tmp_path):
     write_run(tmp_path / "runs", "cartpole-direct", rows=learning())
     page = read(cli("report", "latest").out.strip())
     assert "Upright and calm is good" in page.text
     assert "Force at action 1 [N]." in page.text
 
 
-def test_text_of_a_stranger_is_text(cli, tmp_path):
+def test_untrusted_text_is_escaped(cli, tmp_path):
     rows = learning(**{f"Episode_Reward/{ATTACK}": 1.0, f"Episode_Termination/{ATTACK}": 0.5})
     run = write_run(tmp_path / "runs", rows=rows)
     run.update(
@@ -159,8 +159,8 @@ def test_text_of_a_stranger_is_text(cli, tmp_path):
         )
     )
     folder = run.folder.rename(run.folder.with_name("a<b onclick=x>'\""))
-    said = cli("report", folder)
-    assert said.code == 0, said.err
+    result = cli("report", folder)
+    assert result.code == 0, result.err
     text = (folder / "report.html").read_text()
     page = Reader(text)
     require_harmless(page)
@@ -169,34 +169,34 @@ def test_text_of_a_stranger_is_text(cli, tmp_path):
     assert not re.search("[\x00-\x08\u202e]", text)
 
 
-def test_a_run_that_names_code_of_a_stranger_runs_none_of_it_and_still_has_a_page(cli, tmp_path, coin):
+def test_untrusted_task_code_is_not_executed(cli, tmp_path, coin):
     canary = tmp_path / "canary"
     Path("coin/task.py").write_text(f"open({str(canary)!r}, 'w')\n")
     run = write_run(tmp_path / "runs", rows=learning())
     run.update(task={"name": "coin", "distribution": None, "version": None, "folder": str(tmp_path / "coin")})
-    said = cli("report", run.folder)
-    assert said.code == 0, said.err
+    result = cli("report", run.folder)
+    assert result.code == 0, result.err
     page = read(run.folder / "report.html")
-    assert "Squared joint deviation from" in page.text  # rlcli's own terms are known all the same
+    assert "Squared joint deviation from" in page.text  # rlcli's own terms are described
     assert not canary.exists()
 
 
 @pytest.mark.parametrize("config", ["a: [", "rewards: 7", "x: !!python/object/apply:os.system [ls]", ""])
-def test_a_configuration_that_is_none_is_said_on_the_page(cli, tmp_path, config):
+def test_invalid_configuration_is_reported_on_page(cli, tmp_path, config):
     run = write_run(tmp_path / "runs", rows=learning(), config=config)
-    said = cli("report", run.folder)
-    assert said.code == 0, said.err
+    result = cli("report", run.folder)
+    assert result.code == 0, result.err
     assert "cannot be described" in read(run.folder / "report.html").text
-    assert "cannot be described" in said.err
+    assert "cannot be described" in result.err
 
 
-def test_a_run_that_has_told_nothing_has_a_page(cli, tmp_path):
+def test_run_without_metrics_has_page(cli, tmp_path):
     run = write_run(tmp_path / "runs")
     assert cli("report", run.folder).code == 0
     assert "has no metrics yet" in read(run.folder / "report.html").text
 
 
-def test_without_matplotlib_the_page_says_what_to_install_and_has_the_rest(cli, tmp_path, monkeypatch):
+def test_page_without_matplotlib_names_pip_command(cli, tmp_path, monkeypatch):
     from importlib import util
 
     find = util.find_spec
@@ -210,7 +210,7 @@ def test_without_matplotlib_the_page_says_what_to_install_and_has_the_rest(cli, 
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["latest", "-o", "x.pdf"], 2, "name it *.html"),
         (["latest", "-o", "nowhere/x.html"], 10, "there is no folder"),
@@ -219,17 +219,17 @@ def test_without_matplotlib_the_page_says_what_to_install_and_has_the_rest(cli, 
         ([], 2, "Missing argument"),
     ],
 )
-def test_what_cannot_be_reported_is_refused_in_words(cli, tmp_path, arguments, code, said):
+def test_invalid_arguments_are_rejected(cli, tmp_path, arguments, code, message):
     run = write_run(tmp_path / "runs", rows=learning())
     result = cli("report", *arguments)
     assert (result.code, result.out) == (code, "")
-    assert said in result.err
+    assert message in result.err
     assert cli("report", *arguments, "--json").json["error"]["exit_code"] == code
     assert not (run.folder / "report.html").exists()
 
 
 @pytest.mark.parametrize("name", ["report.html", "videos"])
-def test_a_link_in_a_strangers_run_is_not_followed(cli, tmp_path, name):
+def test_symlink_in_untrusted_run_is_not_followed(cli, tmp_path, name):
     run = write_run(tmp_path / "runs", rows=learning())
     outside = tmp_path / "outside"
     outside.write_text("mine")
@@ -238,9 +238,9 @@ def test_a_link_in_a_strangers_run_is_not_followed(cli, tmp_path, name):
     assert outside.read_text() == "mine"
 
 
-def test_an_evaluation_is_made_once_and_kept_with_its_intervals(cli, trained):
-    said = cli("report", trained, "--no-video", "--json")
-    assert (said.code, said.json["evaluation"], said.json["video"]) == (0, "made", None)
+def test_evaluation_is_made_once_and_stored(cli, trained):
+    result = cli("report", trained, "--no-video", "--json")
+    assert (result.code, result.json["evaluation"], result.json["video"]) == (0, "made", None)
     page = read(trained / "report.html")
     assert "200 episodes of the deterministic policy" in page.text
     assert re.search(r"Success [\d.]+ % [\d.]+ to [\d.]+ %", page.text)
@@ -256,41 +256,41 @@ def test_an_evaluation_is_made_once_and_kept_with_its_intervals(cli, trained):
     assert "is corrupt" in broken.json["missing"]["evaluation"]
 
 
-def test_a_report_of_a_checkpoint_is_of_that_one_and_one_episode_has_no_interval(cli, trained):
+def test_report_of_given_checkpoint_and_single_episode(cli, trained):
     assert cli("eval", "--checkpoint", f"{trained}@step:0", "--episodes", 1, "-q").code == 0
-    said = cli("report", f"{trained}@step:0", "--no-video", "-o", "page.html", "--json")
-    assert (said.code, said.json["evaluation"]) == (0, "stored")
+    result = cli("report", f"{trained}@step:0", "--no-video", "-o", "page.html", "--json")
+    assert (result.code, result.json["evaluation"]) == (0, "stored")
     page = read("page.html")
     assert "Checkpoint step 0" in page.text
     assert "1 episode of the deterministic policy" in page.text
     assert "unknown" in page.text
     newest = cli("report", trained, "--no-video", "--no-eval", "--json")
     assert newest.json["evaluation"] is None
-    assert newest.json["checkpoint"] != said.json["checkpoint"]
+    assert newest.json["checkpoint"] != result.json["checkpoint"]
 
 
-def test_nothing_is_evaluated_or_drawn_where_that_is_asked(cli, trained):
-    said = cli("report", trained, "--no-eval", "--no-video", "-o", "page.html", "--json")
-    assert (said.code, said.json["evaluation"], said.json["video"]) == (0, None, None)
+def test_no_eval_and_no_video_flags(cli, trained):
+    result = cli("report", trained, "--no-eval", "--no-video", "-o", "page.html", "--json")
+    assert (result.code, result.json["evaluation"], result.json["video"]) == (0, None, None)
     assert not (trained / "evaluations").exists()
     assert not (trained / "videos").exists()
     assert not (trained / "report.html").exists()
     assert "rlcli eval --checkpoint" in read("page.html").text
 
 
-def test_a_video_of_the_checkpoint_is_in_the_page(cli, trained):
+def test_page_contains_checkpoint_video(cli, trained):
     step = sorted((trained / "checkpoints").glob("0*"))[-1].name
     (trained / "videos").mkdir()
     (trained / "videos" / f"{step}.mp4").write_bytes(MP4)
-    said = cli("report", trained, "--no-eval", "--json")
-    assert said.json["video"] == "stored"
+    result = cli("report", trained, "--no-eval", "--json")
+    assert result.json["video"] == "stored"
     page = read(trained / "report.html")
     require_harmless(page)
     assert ("src", f"data:video/mp4;base64,{base64.b64encode(MP4).decode()}") in page.attributes
 
 
 @pytest.mark.parametrize("kind", ["text", "link", "large", "pipe"])
-def test_what_is_no_video_of_the_run_is_not_in_the_page(cli, trained, tmp_path, kind, monkeypatch):
+def test_invalid_video_is_not_in_page(cli, trained, tmp_path, kind, monkeypatch):
     step = sorted((trained / "checkpoints").glob("0*"))[-1].name
     (trained / "videos").mkdir()
     file = trained / "videos" / f"{step}.mp4"
@@ -305,20 +305,20 @@ def test_what_is_no_video_of_the_run_is_not_in_the_page(cli, trained, tmp_path, 
         with file.open("wb") as handle:
             handle.write(MP4)
             handle.truncate(25 << 20)
-    said = cli("report", trained, "--no-eval", "--json", "-o", "page.html")
-    assert said.code == 0, said.err
-    assert said.json["video"] is None
-    assert "There is no video" in said.json["missing"]["video"]
+    result = cli("report", trained, "--no-eval", "--json", "-o", "page.html")
+    assert result.code == 0, result.err
+    assert result.json["video"] is None
+    assert "There is no video" in result.json["missing"]["video"]
     assert "video" not in read("page.html").tags
 
 
-def test_where_nothing_can_draw_the_page_says_so_and_has_the_rest(cli, trained, monkeypatch):
+def test_page_without_renderer_reports_missing_video(cli, trained, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
-    said = cli("report", trained, "--json")
-    assert said.code == 0, said.err
-    assert "rendering is disabled by MUJOCO_GL=disable" in said.json["missing"]["video"]
-    assert said.json["evaluation"] == "made"
+    result = cli("report", trained, "--json")
+    assert result.code == 0, result.err
+    assert "rendering is disabled by MUJOCO_GL=disable" in result.json["missing"]["video"]
+    assert result.json["evaluation"] == "made"
     (trained / "videos").mkdir(exist_ok=True)
     (trained / "videos" / "000000000000.mp4").write_bytes(MP4)
     assert cli("report", trained, "--json").json["video"] == "older"
-    assert "of the newest checkpoint there is none" in read(trained / "report.html").text
+    assert "The newest checkpoint has no video" in read(trained / "report.html").text

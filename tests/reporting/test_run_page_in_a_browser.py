@@ -1,4 +1,4 @@
-"""A run's page in a real Chromium without a network: curves and video are seen, and nothing is asked of anybody."""
+"""A run's page in a real Chromium without a network: curves and video are visible, and no request is sent."""
 
 import io
 import shutil
@@ -22,7 +22,7 @@ pytestmark = [
 
 @pytest.fixture
 def browser():
-    """Opens a file as a page that is cut off from every network, and notes what it asks for and says."""
+    """Function that opens a file without a network and records the page's requests and messages."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -33,11 +33,11 @@ def browser():
         def visit(file, *, offline=True, width=1200, **settings):
             context = chromium.new_context(offline=offline, viewport={"width": width, "height": 900}, **settings)
             page = context.new_page()
-            page.asked, page.said = [], []
-            page.on("request", lambda request: page.asked.append(request.url))
-            page.on("console", lambda message: page.said.append(message.text))
-            page.on("pageerror", lambda error: page.said.append(str(error)))
-            page.on("dialog", lambda dialog: (page.said.append("dialog"), dialog.dismiss()))
+            page.requests, page.messages = [], []
+            page.on("request", lambda request: page.requests.append(request.url))
+            page.on("console", lambda message: page.messages.append(message.text))
+            page.on("pageerror", lambda error: page.messages.append(str(error)))
+            page.on("dialog", lambda dialog: (page.messages.append("dialog"), dialog.dismiss()))
             page.goto(file.absolute().as_uri())
             return page
 
@@ -47,7 +47,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    """The page of a run that was trained, with an evaluation and a video."""
+    """Page of a trained run, with an evaluation and a video."""
     from rlcli.cli.app import main
 
     runs = tmp_path_factory.mktemp("runs")
@@ -59,7 +59,7 @@ def report(tmp_path_factory):
 
 
 def wait(page, condition):
-    """Until a condition holds; the page's policy forbids the evaluation that the browser's own waiting needs."""
+    """Wait for a condition; the browser's own wait function needs an evaluation that the page's policy forbids."""
     for _ in range(300):
         if page.evaluate(condition):
             return
@@ -72,7 +72,7 @@ def pixels(element):
         return np.asarray(image.convert("RGB"), dtype=float)
 
 
-def test_the_page_shows_curves_and_plays_the_video_and_asks_for_nothing(browser, report):
+def test_page_shows_curves_and_video_without_network(browser, report):
     page = browser(report)
     wait(page, "document.querySelector('video').readyState >= 3")
     charts = page.locator(".charts svg")
@@ -94,12 +94,12 @@ def test_the_page_shows_curves_and_plays_the_video_and_asks_for_nothing(browser,
     middle = pixels(film)[100:-100, 100:-100]
     assert middle.std() > 10  # a picture, and neither black nor white
     assert middle.mean() > 20
-    assert [url for url in page.asked if not url.startswith("data:video/mp4;")] == [report.absolute().as_uri()]
-    assert page.said == []
+    assert [url for url in page.requests if not url.startswith("data:video/mp4;")] == [report.absolute().as_uri()]
+    assert page.messages == []
 
 
 @pytest.mark.parametrize(("scheme", "bright"), [("light", True), ("dark", False)])
-def test_a_phone_has_it_in_its_width_and_colours(browser, report, scheme, bright):
+def test_page_fits_phone_width_and_colour_scheme(browser, report, scheme, bright):
     page = browser(report, width=390, color_scheme=scheme)
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     background = page.evaluate("getComputedStyle(document.body).backgroundColor")
@@ -108,7 +108,7 @@ def test_a_phone_has_it_in_its_width_and_colours(browser, report, scheme, bright
     assert (sum(map(int, text[4:-1].split(","))) < 200) == bright
 
 
-def test_in_print_all_of_the_configuration_is_there(browser, report):
+def test_print_shows_whole_configuration(browser, report):
     page = browser(report)
     page.emulate_media(media="print")
     closed = page.locator("details:not([open]) td").first
@@ -118,12 +118,12 @@ def test_in_print_all_of_the_configuration_is_there(browser, report):
 
 @pytest.fixture
 def listener():
-    """A server on this machine that notes who asks."""
-    asked = []
+    """Local server that records its requests."""
+    requests = []
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
-            asked.append(self.path)
+            requests.append(self.path)
             self.send_response(404)
             self.send_header("Content-Length", "0")
             self.send_header("Connection", "close")
@@ -134,13 +134,13 @@ def listener():
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
-    yield f"http://127.0.0.1:{server.server_address[1]}", asked
+    yield f"http://127.0.0.1:{server.server_address[1]}", requests
     server.shutdown()
     thread.join()
     server.server_close()
 
 
-def test_what_a_stranger_wrote_does_not_run(browser, cli, tmp_path):
+def test_untrusted_text_does_not_run(browser, cli, tmp_path):
     rows = learning(**{f"Episode_Reward/{ATTACK}": 1.0})
     run = write_run(tmp_path / "runs", rows=rows, versions={ATTACK: ATTACK}, platform=ATTACK)
     run.update(state=ATTACK)
@@ -149,12 +149,12 @@ def test_what_a_stranger_wrote_does_not_run(browser, cli, tmp_path):
     page = browser(folder / "report.html")
     page.wait_for_timeout(500)
     assert page.title() == f"cartpole · {folder.name}"
-    assert page.said == []
+    assert page.messages == []
     assert page.locator("img, script").count() == 0
 
 
-def test_even_markup_that_got_in_would_reach_nobody_and_run_nothing(browser, cli, tmp_path, listener):
-    place, asked = listener
+def test_injected_markup_is_blocked_by_policy(browser, cli, tmp_path, listener):
+    place, requests = listener
     run = write_run(tmp_path / "runs", rows=learning())
     assert cli("report", run.folder, "-o", "page.html").code == 0
     smuggled = (
@@ -168,9 +168,9 @@ def test_even_markup_that_got_in_would_reach_nobody_and_run_nothing(browser, cli
     (tmp_path / "open.html").write_text(f"<!doctype html>{smuggled}")
     page = browser(tmp_path / "smuggled.html", offline=False)
     page.wait_for_timeout(1000)
-    assert asked == []
+    assert requests == []
     assert page.title() != "run"
     page = browser(tmp_path / "open.html", offline=False)  # without the policy all of it would have worked
     wait(page, "document.title === 'run'")
     page.wait_for_timeout(1000)
-    assert {"/img", "/script", "/css", "/frame"} <= set(asked)
+    assert {"/img", "/script", "/css", "/frame"} <= set(requests)

@@ -1,4 +1,4 @@
-"""The card of a task: what its MDP is, from configuration and docstrings, as data and as Markdown."""
+"""Task card: description of the MDP from configuration and docstrings, as data and as Markdown."""
 
 import json
 
@@ -28,13 +28,13 @@ def built(task, *overrides, layout=None, **settings):
 
 
 def rows(content, title):
-    """A table's rows, by column; no table, no rows."""
+    """Return the rows of a table as dicts by column; an empty list if there is no such table."""
     table = next((table for table in content.tables if table.title == title), None)
     titles = [column.title for column in table.columns] if table else []
     return {row[0]: dict(zip(titles, row, strict=True)) for row in table.rows} if table else {}
 
 
-def test_observations_have_meaning_unit_size_and_elements():
+def test_observation_table_has_meaning_unit_size_elements():
     terms = rows(built("cartpole", layout="task.layout.json"), "Observations: policy")
     assert terms["joint_vel_rel"] == {
         "Term": "joint_vel_rel",
@@ -45,7 +45,7 @@ def test_observations_have_meaning_unit_size_and_elements():
     }
 
 
-def test_what_is_done_to_an_observation_is_on_the_card():
+def test_observation_table_has_processing_steps():
     terms = rows(built("cartpole", *NOISY), "Observations: policy")
     assert terms["joint_pos_rel"]["Noise"] == "+ uniform [-0.01, 0.02]"
     assert terms["joint_pos_rel"]["Clip"] == "[-5, 5]"
@@ -57,14 +57,14 @@ def test_what_is_done_to_an_observation_is_on_the_card():
     assert velocity["Modifiers"] == "scale factor: 2"
 
 
-def test_noise_that_is_switched_off_is_not_on_the_card():
+def test_disabled_noise_is_left_out():
     content = built("cartpole", *NOISY, "observations.policy.enable_corruption=false")
     terms = rows(content, "Observations: policy")
     assert not {"Noise", "Bias", "Delay"} & set(terms["joint_vel_rel"])
     assert "Without noise" in next(t for t in content.tables if t.title == "Observations: policy").note
 
 
-def test_rewards_have_weight_formula_and_parameters():
+def test_reward_table_has_weight_docstring_parameters():
     content = built("cartpole", "rewards.pole_pos.weight=-2.5", "rewards.pole_pos.target=0.125")
     term = rows(content, "Rewards")["pole_pos"]
     assert term["Weight"] == "-2.5"
@@ -76,18 +76,18 @@ def test_rewards_have_weight_formula_and_parameters():
     assert "0.0166667" not in unscaled
 
 
-def test_a_term_that_was_removed_is_not_on_the_card():
+def test_removed_term_is_left_out():
     assert "pole_vel" not in rows(built("cartpole", "rewards.pole_vel=null"), "Rewards")
 
 
-def test_terminations_tell_truncation_from_termination():
+def test_termination_table_distinguishes_truncation():
     terms = rows(built("cartpole"), "Terminations")
     assert terms["time_out"]["What it does"] == "truncates"
     assert terms["cart_out_of_bounds"]["What it does"] == "terminates"
     assert "`bounds` = [-3, 3]" in terms["cart_out_of_bounds"]["Parameters"]
 
 
-def test_events_have_their_time_and_ranges():
+def test_event_table_has_time_and_ranges():
     content = built(
         "cartpole",
         "events.push={func: push_by_setting_velocity, mode: interval, interval_range_s: [2, 4]}",
@@ -101,7 +101,7 @@ def test_events_have_their_time_and_ranges():
     assert "`range` = [0.8, 1.2]" in terms["mass"]["Ranges and parameters"]
 
 
-def test_models_of_actuators_are_on_the_card():
+def test_actuator_table_has_models():
     drive = "{joints: slider_to_cart, kind: pd, stiffness: 5, damping: 1, effort_limit: 9, delay: [1, 3]}"
     terms = rows(built("cartpole", f"scene.entities.robot.actuators={{drive: {drive}}}"), "Actuators")
     assert terms["drive"]["Kind"] == "pd"
@@ -109,32 +109,32 @@ def test_models_of_actuators_are_on_the_card():
     assert "delay: [1, 3]" in terms["drive"]["Settings"]
 
 
-def test_tables_and_columns_without_content_are_left_out():
+def test_empty_tables_and_columns_are_left_out():
     content = built("cartpole")
     titles = [table.title for table in content.tables]
     assert not {"Commands", "Curriculum", "Sensors", "Parameters"} & set(titles)
     assert all(any(row[i] for row in table.rows) for table in content.tables for i in range(len(table.columns)))
 
 
-def test_a_direct_task_has_its_parameters_and_the_words_of_its_hooks():
+def test_direct_task_card_has_parameters_and_docstrings():
     content = built("cartpole-direct", "params.max_effort=250", layout="direct.layout.json")
     assert rows(content, "Parameters")["max_effort"] == {
         "Parameter": "max_effort", "Value": "250", "What": "Force at action 1 [N].", "Default": "400",
     }  # fmt: skip
-    words = rows(content, "In the task's words")
+    words = rows(content, "Docstrings of the task")
     assert words["Reward"]["What"] == "Upright and calm is good, out of bounds costs 2."
     assert words["Start of an episode"]["Hook"] == "reset_idx"
     assert rows(content, "Observations: policy")["pole_vel"]["Unit"] == "rad/s"
     assert dict(content.facts)["Observations are clipped to"] == "±5"
 
 
-def test_hooks_that_a_direct_task_inherits_have_their_words_too(tmp_path):
+def test_inherited_hooks_have_docstrings(tmp_path):
     source = find_task("cartpole-direct")
     for name in ("direct.yaml", "cartpole.xml"):
         (tmp_path / name.replace("direct", "task")).write_text((source.root / name).read_text())
     (tmp_path / "base.py").write_text(
         'raise SystemExit("run")\nfrom rlcli.envs.direct import DirectTask\n\n'
-        'class Other(DirectTask):\n    """Not said."""\n    def reset(self, selection):\n        """From below."""\n'
+        'class Other(DirectTask):\n    """Not shown."""\n    def reset(self, selection):\n        """From below."""\n'
         '    def is_done(self):\n        """Replaced."""\n'
     )
     (tmp_path / "task.py").write_text(
@@ -142,12 +142,12 @@ def test_hooks_that_a_direct_task_inherits_have_their_words_too(tmp_path):
         '    def is_done(self):\n        """Never."""\n\n    class Params:\n'
         "        reset_dist: float = 1.0\n        max_effort: float = 1.0\n        pole_vel_weight: float = 1.0\n"
     )
-    words = rows(built(tmp_path), "In the task's words")
+    words = rows(built(tmp_path), "Docstrings of the task")
     assert {row["Hook"]: row["What"] for row in words.values()} == {
         "Task": "Balance.", "reset": "From below.", "is_done": "Never."}  # fmt: skip
 
 
-def test_nothing_of_a_tasks_code_runs_for_its_card(tmp_path):
+def test_card_does_not_execute_task_code(tmp_path):
     source = find_task("cartpole")
     (tmp_path / "task.yaml").write_text(source.config.read_text().replace("func: is_alive", "func: mine"))
     (tmp_path / "cartpole.xml").write_text((source.root / "cartpole.xml").read_text())
@@ -157,7 +157,7 @@ def test_nothing_of_a_tasks_code_runs_for_its_card(tmp_path):
     assert rows(built(tmp_path), "Rewards")["alive"]["Value"] == "How well it goes [1]."
 
 
-def test_a_configuration_alone_has_a_card_with_the_names_of_unknown_terms():
+def test_card_of_bare_configuration_names_unknown_terms():
     task = TaskConfig.model_validate_json(
         json.dumps(
             {
@@ -172,7 +172,7 @@ def test_a_configuration_alone_has_a_card_with_the_names_of_unknown_terms():
 
 
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct", "ant-direct"])
-def test_every_built_in_task_has_a_card_whose_markdown_keeps_its_tables(task):
+def test_markdown_of_built_in_tasks_keeps_tables(task):
     content = built(task)
     lines = markdown(content, level=2).splitlines()
     assert lines[0] == f"## {task}"
@@ -183,7 +183,7 @@ def test_every_built_in_task_has_a_card_whose_markdown_keeps_its_tables(task):
         assert widths == {len(table.columns) + 1}
 
 
-def test_markdown_shows_text_as_it_is():
+def test_markdown_escapes_text():
     odd = "<script>alert(1)</script> a|b *c* _d_ [e](f) `g|h` # i\nj"
     table = Table("T", "", (Column("A", "code"), Column("B")), ((odd, odd), ("a`b", "`")))
     text = markdown(Card("n", odd, (("key", odd),), (table,)))

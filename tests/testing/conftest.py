@@ -1,4 +1,4 @@
-"""Small tasks in folders: a pendulum in both workflows, in order until a test plants a defect in it."""
+"""Small task folders: a pendulum in both workflows, correct until a test plants a defect in it."""
 
 import copy
 from dataclasses import dataclass
@@ -99,7 +99,7 @@ class Task(DirectTask):
 
 @dataclass
 class Folder:
-    """A task folder that is written when it is asked for; `replace` edits the direct task's code."""
+    """Task folder that `write` writes; `replace` edits the code of the direct task."""
 
     path: Path
     config: dict

@@ -1,4 +1,4 @@
-"""`rlcli check` and the pytest fixture, as their users meet them: in processes of their own."""
+"""`rlcli check` and the pytest fixture, partly in separate processes."""
 
 import json
 import os
@@ -11,12 +11,12 @@ from rlcli.cli.app import main
 
 
 def check(capsys, *arguments):
-    """(exit code, stdout, stderr) of `rlcli check`."""
+    """Run `rlcli check`; return (exit code, stdout, stderr)."""
     code = main(["check", *map(str, arguments)])
     return code, *capsys.readouterr()
 
 
-def test_task_in_order_ends_with_0_and_a_table(managed, capsys):
+def test_correct_task_prints_table_and_exits_0(managed, capsys):
     code, out, err = check(capsys, managed.write())
     assert code == 0
     assert out.splitlines()[0].split() == ["CHECK", "RESULT"]
@@ -25,7 +25,7 @@ def test_task_in_order_ends_with_0_and_a_table(managed, capsys):
     assert err == ""
 
 
-def test_findings_end_with_9_and_say_what_to_do(managed, capsys):
+def test_errors_exit_9_and_print_hints(managed, capsys):
     managed.config["terminations"] = {}
     code, out, _ = check(capsys, managed.write())
     assert code == 9
@@ -34,7 +34,7 @@ def test_findings_end_with_9_and_say_what_to_do(managed, capsys):
     assert "time_out: true" in out
 
 
-def test_warnings_alone_end_with_0(direct, capsys):
+def test_warnings_alone_exit_0(direct, capsys):
     direct.replace("self.obs_buf[:, 0].abs() > 3.0", "self.progress_buf >= 40")
     code, out, _ = check(capsys, direct.write())
     assert code == 0
@@ -42,7 +42,7 @@ def test_warnings_alone_end_with_0(direct, capsys):
     assert out.splitlines()[-1].endswith("0 errors, 1 warning")
 
 
-def test_json_is_one_document_with_every_check_and_finding(managed, capsys):
+def test_json_document_has_checks_and_findings(managed, capsys):
     managed.config["events"]["start"]["position"] = [0.0, 0.0]
     code, out, _ = check(capsys, managed.write(), "--json")
     document = json.loads(out)
@@ -53,7 +53,7 @@ def test_json_is_one_document_with_every_check_and_finding(managed, capsys):
     assert set(document["findings"][0]) == {"check", "severity", "where", "message", "hint"}
 
 
-def test_task_that_cannot_be_built_names_the_checks_that_were_not_run(managed, capsys):
+def test_unbuildable_task_lists_checks_not_run(managed, capsys):
     managed.config["events"]["start"]["joints"] = ["elbow"]
     code, out, _ = check(capsys, managed.write())
     assert code == 9
@@ -61,7 +61,7 @@ def test_task_that_cannot_be_built_names_the_checks_that_were_not_run(managed, c
     assert "same-seed             not run" in out
 
 
-def test_only_runs_what_it_names_and_knows_the_names(managed, capsys):
+def test_only_selects_checks_and_rejects_unknown_names(managed, capsys):
     managed.config["terminations"] = {}
     assert check(capsys, managed.write(), "--only", "start-states", "--only", "names")[0] == 0
     code, _, err = check(capsys, managed.write(), "--only", "truncate")
@@ -69,13 +69,13 @@ def test_only_runs_what_it_names_and_knows_the_names(managed, capsys):
     assert "did you mean 'truncation'?" in err
 
 
-def test_overrides_are_checked_too(managed, capsys):
+def test_overrides_are_applied(managed, capsys):
     code, out, _ = check(capsys, managed.write(), "events.start.position=[0.2,0.2]")
     assert code == 9
     assert "start-states" in out
 
 
-def test_invalid_files_end_with_3_and_every_mistake(managed, capsys):
+def test_invalid_files_exit_3_with_all_errors(managed, capsys):
     managed.config["decimation"] = -2
     managed.config["rewards"]["upright"]["wieght"] = 1.0
     code, out, err = check(capsys, managed.write())
@@ -85,13 +85,13 @@ def test_invalid_files_end_with_3_and_every_mistake(managed, capsys):
     assert out == ""
 
 
-def test_unknown_task_ends_with_4(capsys):
+def test_unknown_task_exits_4(capsys):
     code, _, err = check(capsys, "cartpoel")
     assert code == 4
     assert "did you mean 'cartpole'" in err
 
 
-def test_task_whose_class_does_not_import_ends_with_4(direct, capsys):
+def test_import_error_of_task_exits_4(direct, capsys):
     direct.task = "import no_such_module\n" + direct.task.replace("from __future__ import annotations\n", "")
     code, _, err = check(capsys, direct.write())
     assert code == 4
@@ -100,7 +100,7 @@ def test_task_whose_class_does_not_import_ends_with_4(direct, capsys):
 
 @pytest.fixture
 def plugin_of_the_future(tmp_path):
-    """An installed package whose task was written for a newer rlcli."""
+    """Installed package whose task was written for a newer rlcli."""
     site = tmp_path / "site"
     (site / "future_task").mkdir(parents=True)
     (site / "future_task" / "__init__.py").write_text(
@@ -119,7 +119,7 @@ def in_process(*arguments, path, cwd):
     return subprocess.run([sys.executable, *arguments], cwd=cwd, env=environment, capture_output=True, text=True)
 
 
-def test_plugin_for_a_newer_api_is_refused_with_both_numbers(plugin_of_the_future, tmp_path):
+def test_plugin_for_newer_api_is_rejected(plugin_of_the_future, tmp_path):
     done = in_process("-m", "rlcli", "check", "future", path=plugin_of_the_future, cwd=tmp_path)
     assert done.returncode == 4
     assert "future-task:future" in done.stderr
@@ -141,14 +141,14 @@ def run_pytest(folder, test, *options):
 THREE_LINES = "def test_the_contract(rlcli_check):\n    rlcli_check('./pendulum')\n"
 
 
-def test_fixture_passes_a_task_in_order(managed, tmp_path):
+def test_fixture_passes_correct_task(managed, tmp_path):
     managed.write()
     code, output = run_pytest(tmp_path, THREE_LINES)
     assert code == 0, output
     assert "1 passed" in output
 
 
-def test_fixture_fails_with_every_error_and_no_traceback(managed, tmp_path):
+def test_fixture_fails_with_all_errors_without_traceback(managed, tmp_path):
     managed.config["terminations"] = {}
     managed.config["events"]["start"]["position"] = [0.2, 0.2]
     managed.write()
@@ -160,7 +160,7 @@ def test_fixture_fails_with_every_error_and_no_traceback(managed, tmp_path):
     assert "pytest_plugin.py" not in output
 
 
-def test_plugin_is_cheap_where_it_is_not_used(tmp_path):
+def test_unused_plugin_imports_nothing_heavy(tmp_path):
     test = (
         "import sys\n\ndef test_nothing_heavy_is_loaded():\n"
         "    assert {'torch', 'mujoco', 'numpy', 'pydantic', 'rlcli.testing'}.isdisjoint(sys.modules)\n"

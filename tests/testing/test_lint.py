@@ -1,4 +1,4 @@
-"""The linter finds each planted defect by its rule and place, and nothing in tasks that are in order."""
+"""The linter finds each planted defect with its rule and place, and nothing in correct tasks."""
 
 import json
 from pathlib import Path
@@ -18,21 +18,21 @@ def lint(folder, **arguments):
 
 
 def rules(folder, **arguments):
-    """Rule -> its first remark."""
+    """Return rule -> its first remark."""
     found = {}
     for remark in lint(folder, **arguments):
         found.setdefault(remark.rule, remark)
     return found
 
 
-# --- what is in order ---
+# --- correct tasks ---
 
 
-def test_the_example_plugin_has_nothing_to_remark():
+def test_example_plugin_has_no_remarks():
     assert lint_task(ACROBOT) == []
 
 
-def test_small_tasks_in_order_have_nothing_to_remark(managed, direct):
+def test_correct_tasks_have_no_remarks(managed, direct):
     assert lint(managed) == []
     direct.path = direct.path.with_name("direct")
     assert lint(direct) == []
@@ -41,7 +41,7 @@ def test_small_tasks_in_order_have_nothing_to_remark(managed, direct):
 # --- resets ---
 
 
-def test_start_behind_its_own_termination_is_found(managed):
+def test_early_resets_finds_start_beyond_termination(managed):
     managed.config["terminations"]["fell"] = {"func": "joint_pos_out_of_manual_limit", "bounds": [-0.1, 0.1]}
     managed.config["rewards"]["alive"] = {"func": "is_alive", "weight": 2.0}
     found = rules(managed)
@@ -50,7 +50,7 @@ def test_start_behind_its_own_termination_is_found(managed):
     assert found["early-resets"].numbers["share"] > 0.5
 
 
-def test_direct_task_that_is_done_when_it_begins_is_found(direct):
+def test_early_resets_finds_direct_task_done_at_start(direct):
     direct.replace("self.obs_buf[:, 0].abs() > 3.0", "self.obs_buf[:, 0].abs() > 0.3")
     assert rules(direct)["early-resets"].where == "terminations: task"
 
@@ -58,7 +58,7 @@ def test_direct_task_that_is_done_when_it_begins_is_found(direct):
 # --- rewards ---
 
 
-def test_reward_that_never_pays_is_found(managed):
+def test_silent_reward_finds_term_that_is_always_zero(managed):
     managed.terms = (
         "def far(env, *, entity: Entity = 'robot') -> Tensor:\n"
         "    return (entity.data.joint_pos[:, 0].abs() > 100.0).float()\n"
@@ -68,12 +68,12 @@ def test_reward_that_never_pays_is_found(managed):
     assert (remark.rule, remark.where) == ("silent-reward", "rewards.far")
 
 
-def test_reward_of_weight_0_may_be_silent(managed):
+def test_silent_reward_ignores_weight_0(managed):
     managed.config["rewards"]["rate"] = {"func": "joint_vel_l2", "weight": 0.0}
     assert lint(managed) == []
 
 
-def test_reward_beside_which_all_others_are_lost_is_found(managed):
+def test_dominant_reward_finds_oversized_term(managed):
     managed.config["rewards"]["rate"] = {"func": "joint_vel_l2", "weight": -50.0}
     (remark,) = lint(managed)
     assert (remark.rule, remark.where) == ("dominant-reward", "rewards.rate")
@@ -81,19 +81,19 @@ def test_reward_beside_which_all_others_are_lost_is_found(managed):
     assert remark.numbers["share"] > 0.99
 
 
-def test_reward_that_is_always_the_same_is_found(direct):
+def test_constant_reward_finds_constant(direct):
     direct.replace("1.0 - self.obs_buf[:, 0].square()", "1.0")
     direct.replace("self.obs_buf[:, 0].abs() > 3.0", "self.obs_buf[:, 0].abs() > 1e9")
     (remark,) = lint(direct)
     assert (remark.rule, remark.where) == ("constant-reward", "rew_buf")
 
 
-def test_constant_reward_for_living_on_is_in_order(direct):
+def test_constant_reward_accepts_alive_bonus_with_termination(direct):
     direct.replace("1.0 - self.obs_buf[:, 0].square()", "1.0")
     assert lint(direct) == []
 
 
-def test_dying_early_that_pays_is_found(managed):
+def test_dying_pays_finds_negative_rewards_with_termination(managed):
     managed.config["rewards"] = {
         "rate": {"func": "joint_vel_l2", "weight": -0.2},
         "effort": {"func": "action_l2", "weight": -1.0},
@@ -106,7 +106,7 @@ def test_dying_early_that_pays_is_found(managed):
     assert "is_alive" in remark.hint
 
 
-def test_prize_for_falling_is_found(managed):
+def test_dying_pays_warns_about_bonus_for_termination(managed):
     managed.config["rewards"] = {
         "alive": {"func": "is_alive", "weight": 0.1},
         "fell": {"func": "is_terminated", "weight": 100.0},
@@ -117,7 +117,7 @@ def test_prize_for_falling_is_found(managed):
     assert remark.numbers["last_step"] == pytest.approx(2.0)
 
 
-def test_death_that_costs_more_than_living_on_is_in_order(managed):
+def test_dying_pays_accepts_termination_penalty(managed):
     managed.config["rewards"]["fell"] = {"func": "is_terminated", "weight": -400.0}
     managed.config["terminations"]["fell"] = {"func": "joint_pos_out_of_manual_limit", "bounds": [-2.0, 2.0]}
     assert "dying-pays" not in rules(managed)
@@ -126,7 +126,7 @@ def test_death_that_costs_more_than_living_on_is_in_order(managed):
 # --- observations and actions ---
 
 
-def test_column_far_out_of_scale_is_found_and_a_scale_proposed(managed):
+def test_observation_scale_finds_column_and_proposes_scale(managed):
     managed.config["observations"]["policy"]["rate"]["scale"] = 1000.0
     (remark,) = lint(managed)
     assert remark.rule == "observation-scale"
@@ -137,20 +137,20 @@ def test_column_far_out_of_scale_is_found_and_a_scale_proposed(managed):
     assert remark.numbers["largest"] < 0.001
 
 
-def test_agent_that_normalises_may_see_any_scale(managed):
+def test_observation_scale_accepts_normalizing_agent(managed):
     managed.config["observations"]["policy"]["rate"]["scale"] = 1000.0
     managed.config["agents"] = agents(normalize_observations=True)
     assert lint(managed) == []
 
 
-def test_constant_column_is_found(direct):
+def test_constant_observation_finds_column(direct):
     direct.replace("self.obs_buf[:, 1] = self.arms.get_joint_velocities()[:, 0]", "self.obs_buf[:, 1] = 0.5")
     (remark,) = lint(direct)
     assert (remark.rule, remark.severity) == ("constant-observation", "error")
     assert "column 1" in remark.where
 
 
-def test_actuator_that_is_always_at_its_limit_is_found(managed):
+def test_saturated_actions_finds_saturated_actuator(managed):
     managed.config["actions"]["torque"]["scale"] = 300.0
     (remark,) = lint(managed)
     assert remark.rule == "saturated-actions"
@@ -158,7 +158,7 @@ def test_actuator_that_is_always_at_its_limit_is_found(managed):
     assert remark.numbers["share"] > 0.9
 
 
-def test_action_that_is_clipped_before_it_arrives_is_found(direct):
+def test_saturated_actions_finds_clipped_action(direct):
     direct.config["clip_actions"] = 0.05
     (remark,) = lint(direct)
     assert remark.rule == "saturated-actions"
@@ -166,7 +166,7 @@ def test_action_that_is_clipped_before_it_arrives_is_found(direct):
 
 
 @pytest.mark.parametrize("planted", ["without force", "column that nothing reads"])
-def test_action_that_moves_nothing_is_found(planted, managed, direct):
+def test_dead_action_finds_action_without_effect(planted, managed, direct):
     if planted == "without force":
         managed.config["actions"]["torque"]["scale"] = 0.0
         (remark,) = lint(managed)
@@ -179,7 +179,7 @@ def test_action_that_moves_nothing_is_found(planted, managed, direct):
     assert remark.numbers["moved"] == 0.0
 
 
-def test_action_that_only_multiplies_another_is_alive(direct):
+def test_dead_action_accepts_action_that_scales_another(direct):
     direct.replace("num_actions = 1", "num_actions = 2")
     direct.replace(
         "self.params.max_effort * actions", "self.params.max_effort * actions[:, :1] * (1.0 + 0.5 * actions[:, 1:])"
@@ -196,7 +196,7 @@ def stiff(managed, stiffness, dt):
     managed.config["decimation"] = 1
 
 
-def test_time_step_at_which_energy_drifts_is_found(managed):
+def test_timestep_finds_energy_drift(managed):
     stiff(managed, 200.0, 0.02)
     remark = rules(managed)["timestep"]
     assert remark.where == "sim.dt = 0.02 s"
@@ -205,7 +205,7 @@ def test_time_step_at_which_energy_drifts_is_found(managed):
     assert "timestep" not in rules(managed, seconds=0.1)
 
 
-def test_time_step_at_which_the_simulation_diverges_is_found(managed):
+def test_timestep_finds_divergence(managed):
     managed.xml = managed.xml.replace('damping="0.05"', 'armature="0.0001" stiffness="200000"')
     managed.config["sim"] = {"dt": 0.05, "integrator": "rk4"}
     remark = rules(managed)["timestep"]
@@ -213,7 +213,7 @@ def test_time_step_at_which_the_simulation_diverges_is_found(managed):
     assert remark.numbers["diverged"] > 0
 
 
-def test_gain_too_high_for_the_time_step_is_found(managed):
+def test_timestep_finds_gain_too_high(managed):
     managed.config["actions"] = {"target": {"func": "joint_position", "joints": ["hinge"]}}
     managed.config["scene"]["entities"]["robot"]["joints"] = {"hinge": {"kp": 500.0, "kv": 0.0}}
     managed.config["sim"] = {"dt": 0.05}
@@ -221,7 +221,7 @@ def test_gain_too_high_for_the_time_step_is_found(managed):
 
 
 @pytest.mark.parametrize(("gamma", "found"), [(0.5, True), (0.99, False), (0.99999, True)])
-def test_discount_that_looks_far_less_or_more_than_an_episode_is_found(gamma, found, managed):
+def test_horizon_finds_unsuitable_discount(gamma, found, managed):
     managed.config["agents"] = agents(gamma=gamma)
     remarks = lint(managed, only=["horizon"])
     assert [r.where for r in remarks] == ([f"agents.sb3.gamma = {gamma:g}"] if found else [])
@@ -232,7 +232,7 @@ def agents(**settings):
     return {"default": "sb3", "sb3": {"trainer": "sb3", "algorithm": "ppo", "max_iterations": 1, **settings}}
 
 
-def test_every_agent_of_the_task_is_judged_unless_one_is_chosen(managed):
+def test_horizon_checks_all_agents_or_selected_one(managed):
     managed.config["agents"] = agents() | {"other": {**agents()["sb3"], "gamma": 0.1}}
     assert [r.where for r in lint(managed, only=["horizon"])] == ["agents.other.gamma = 0.1"]
     assert lint(managed, only=["horizon"], agent="sb3") == []
@@ -241,7 +241,7 @@ def test_every_agent_of_the_task_is_judged_unless_one_is_chosen(managed):
 # --- the rules themselves ---
 
 
-def test_a_task_that_raises_in_a_step_is_one_remark_with_its_place(direct):
+def test_task_that_raises_in_step_is_one_remark(direct):
     direct.replace(
         "    def is_done(self):\n",
         "    def is_done(self):\n        if self.env.common_step > 5:\n            raise KeyError('late')\n",
@@ -252,18 +252,18 @@ def test_a_task_that_raises_in_a_step_is_one_remark_with_its_place(direct):
     assert "task.py:" in remark.where
 
 
-def test_a_task_that_raises_before_its_first_step_is_one_remark_too(direct):
+def test_task_that_raises_before_first_step_is_one_remark(direct):
     direct.replace("    def is_done(self):\n", "    def is_done(self):\n        raise KeyError('done')\n")
     (remark,) = lint(direct)
     assert remark.numbers == {"step": 0}
 
 
-def test_the_same_task_gets_the_same_remarks_again(managed):
+def test_lint_task_is_deterministic(managed):
     managed.config["observations"]["policy"]["rate"]["scale"] = 1000.0
     assert lint(managed) == lint(managed)
 
 
-def test_every_rule_has_a_docstring_that_says_what_it_wants():
+def test_rules_have_docstrings():
     assert all((rule.__doc__ or "").split("\n")[0].endswith(".") for rule in RULES.values())
 
 
@@ -271,12 +271,12 @@ def test_every_rule_has_a_docstring_that_says_what_it_wants():
 
 
 def command(capsys, *arguments):
-    """(exit code, stdout, stderr) of `rlcli lint`."""
+    """Run `rlcli lint`; return (exit code, stdout, stderr)."""
     code = main(["lint", *map(str, arguments)])
     return code, *capsys.readouterr()
 
 
-def test_task_in_order_ends_with_0_and_a_table(managed, capsys):
+def test_command_prints_table_and_exits_0(managed, capsys):
     code, out, err = command(capsys, managed.write(), "--seconds", "0.5")
     assert code == 0
     assert out.splitlines()[0].split() == ["RULE", "RESULT"]
@@ -285,7 +285,7 @@ def test_task_in_order_ends_with_0_and_a_table(managed, capsys):
     assert err == ""
 
 
-def test_a_warning_ends_with_9_and_can_be_ignored(managed, capsys):
+def test_command_exits_9_on_warning_unless_ignored(managed, capsys):
     managed.config["agents"] = agents(gamma=0.5)
     code, out, _ = command(capsys, managed.write(), "--seconds", "0.2")
     assert code == 9
@@ -293,7 +293,7 @@ def test_a_warning_ends_with_9_and_can_be_ignored(managed, capsys):
     assert command(capsys, managed.path, "--seconds", "0.2", "--ignore", "horizon")[0] == 0
 
 
-def test_json_is_one_document_with_rules_findings_and_numbers(managed, capsys):
+def test_command_json_document(managed, capsys):
     managed.config["actions"]["torque"]["scale"] = 0.0
     code, out, _ = command(capsys, managed.write(), "--json", "--seconds", "0.2")
     document = json.loads(out)
@@ -305,7 +305,7 @@ def test_json_is_one_document_with_rules_findings_and_numbers(managed, capsys):
     assert finding["numbers"]["moved"] == 0.0
 
 
-def test_unknown_rule_task_and_time_are_refused(managed, capsys):
+def test_command_rejects_unknown_rule_task_and_time(managed, capsys):
     folder = managed.write()
     code, _, err = command(capsys, folder, "--only", "horizons")
     assert code == 2

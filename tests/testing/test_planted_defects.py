@@ -1,4 +1,4 @@
-"""Each clause of the contract finds the defect that breaks it, by its name, and says where."""
+"""Each check finds the planted defect that breaks its clause of the contract, and its place."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ ACROBOT = Path(__file__).parents[2] / "plugins" / "rlcli-example-acrobot" / "rlc
 
 
 OTHER_ENGINE = ("engines", "captured")
-"""Checks with tests of their own: what they run on is slow to build."""
+"""Checks with separate tests: their environments are slow to build."""
 
 
 def check(folder):
@@ -20,7 +20,7 @@ def check(folder):
 
 
 def errors(folder):
-    """Check name -> its first error."""
+    """Return check -> its first error."""
     found = {}
     for finding in check(folder):
         if finding.severity == "error":
@@ -28,17 +28,17 @@ def errors(folder):
     return found
 
 
-def test_the_example_plugin_keeps_the_contract():
+def test_example_plugin_has_no_findings():
     assert check_task(ACROBOT) == []
 
 
-def test_small_tasks_in_order_have_no_findings(managed, direct):
+def test_correct_tasks_have_no_findings(managed, direct):
     assert check(managed) == []
     direct.path = direct.path.with_name("direct")
     assert check(direct) == []
 
 
-def test_every_check_has_a_docstring_that_says_what_it_demands():
+def test_checks_have_docstrings():
     assert all((function.__doc__ or "").split("\n")[0].endswith(".") for function in CHECKS.values())
 
 
@@ -58,7 +58,7 @@ ACTUATOR = '<actuator><position joint="hinge" kp="0.1"/></actuator></mujoco>'
         ("actuator", "on 'hinge'", "</mujoco>", ACTUATOR),
     ],
 )
-def test_what_the_model_leaves_unnamed_is_found(word, place, old, new, managed):
+def test_names_finds_unnamed_elements(word, place, old, new, managed):
     managed.xml = managed.xml.replace(old, new)
     (finding,) = [f for f in check_task(managed.write(), only=["names"]) if f.check == "names"]
     assert f"{word} without a name: {place}" in finding.message
@@ -66,7 +66,7 @@ def test_what_the_model_leaves_unnamed_is_found(word, place, old, new, managed):
     assert f"<{word} name=" in finding.hint
 
 
-def test_free_joint_needs_no_name(managed):
+def test_names_accepts_unnamed_free_joint(managed):
     managed.xml = managed.xml.replace("</worldbody>", FREE + "</worldbody>")
     assert check_task(managed.write(), only=["names"]) == []
 
@@ -74,7 +74,7 @@ def test_free_joint_needs_no_name(managed):
 FREE = '<body name="ball"><freejoint/><geom size="0.02" mass="0.1" contype="0" conaffinity="0"/></body>'
 
 
-def test_every_joint_that_the_model_lacks_is_a_finding(managed):
+def test_names_finds_all_missing_joints(managed):
     managed.config["rewards"]["upright"]["joints"] = ["hinges"]
     managed.config["events"]["start"]["joints"] = ["elbow"]
     found = check(managed)
@@ -88,7 +88,7 @@ def test_every_joint_that_the_model_lacks_is_a_finding(managed):
 # --- files ---
 
 
-def test_value_that_yaml_cannot_hold_is_found(managed):
+def test_yaml_round_trip_finds_infinite_value(managed):
     managed.terms = (
         "def near(env, *, entity: Entity = 'robot', limit: float = 1e999) -> Tensor:\n"
         "    return (entity.data.joint_pos[:, 0].abs() < limit)\n"
@@ -97,17 +97,17 @@ def test_value_that_yaml_cannot_hold_is_found(managed):
     assert "rewards.near.limit" in errors(managed)["yaml-round-trip"].where
 
 
-# --- what a step gives ---
+# --- results of a step ---
 
 
-def test_nan_after_some_steps_is_found_and_the_term_named(managed):
+def test_finite_finds_late_nan_and_names_term(managed):
     managed.terms = "def root(env) -> Tensor:\n    return torch.sqrt(60.0 - env.episode_length_buf.float())\n"
     managed.config["rewards"]["root"] = {"func": "root", "weight": 1.0}
     finding = errors(managed)["finite"]
     assert "'root'" in finding.message
 
 
-def test_wrong_shape_of_a_term_is_found(managed):
+def test_shapes_finds_wrong_term_shape(managed):
     managed.terms = "def flat(env, *, entity: Entity = 'robot') -> Tensor:\n    return entity.data.joint_pos[:, :1]\n"
     managed.config["rewards"]["flat"] = {"func": "flat", "weight": 1.0}
     finding = errors(managed)["shapes"]
@@ -115,14 +115,14 @@ def test_wrong_shape_of_a_term_is_found(managed):
     assert "(8, 1)" in finding.message
 
 
-def test_buffer_of_another_shape_is_found(direct):
+def test_shapes_finds_wrong_buffer_shape(direct):
     direct.replace(
         "self.rew_buf[:] = 1.0 - self.obs_buf[:, 0].square()", "self.rew_buf = 1.0 - self.obs_buf[:, 0].square().mean()"
     )
     assert errors(direct)["shapes"].where == "rew_buf"
 
 
-def test_float64_observations_are_found(direct):
+def test_dtypes_finds_float64_observations(direct):
     direct.replace(
         "    def set_up_scene",
         "    def post_reset(self):\n        self.obs_buf = self.obs_buf.double()\n\n    def set_up_scene",
@@ -133,7 +133,7 @@ def test_float64_observations_are_found(direct):
     assert "float32" in finding.message
 
 
-def test_termination_that_is_not_bool_is_found(managed):
+def test_dtypes_finds_termination_that_is_not_bool(managed):
     managed.terms = (
         "def fell(env, *, entity: Entity = 'robot') -> Tensor:\n"
         "    return (entity.data.joint_pos[:, 0].abs() > 1.0).to(torch.uint8)\n"
@@ -142,7 +142,7 @@ def test_termination_that_is_not_bool_is_found(managed):
     assert "terminations.fell" in str(errors(managed)["dtypes"])
 
 
-def test_unstable_time_step_is_found(managed):
+def test_random_and_extreme_actions_find_unstable_time_step(managed):
     managed.xml = managed.xml.replace('damping="0.05"', 'armature="0.0001" stiffness="200000"')
     managed.config["sim"] = {"dt": 0.05, "integrator": "rk4"}
     found = errors(managed)
@@ -151,7 +151,7 @@ def test_unstable_time_step_is_found(managed):
     assert "extreme-actions" in found
 
 
-def test_divergence_under_extreme_actions_alone_is_found(direct):
+def test_extreme_actions_finds_divergence_only_near_bound(direct):
     # a gain that explodes only near the bound, which uniform draws do not reach
     direct.replace(
         "self.arms.set_joint_efforts(self.params.max_effort * actions)",
@@ -162,7 +162,7 @@ def test_divergence_under_extreme_actions_alone_is_found(direct):
     assert "random-actions" not in found
 
 
-def test_constant_column_is_found(managed):
+def test_constant_columns_finds_constant_column(managed):
     managed.terms = "def height(env) -> Tensor:\n    return torch.full((env.num_envs, 1), 0.75)\n"
     managed.config["observations"]["policy"]["height"] = {"func": "height"}
     finding = errors(managed)["constant-columns"]
@@ -170,16 +170,16 @@ def test_constant_column_is_found(managed):
     assert "0.75" in finding.message
 
 
-def test_action_written_in_place_is_found(direct):
+def test_aliasing_finds_action_written_in_place(direct):
     direct.replace("self.arms.set_joint_efforts(self.params.max_effort * actions)",
                    "self.arms.set_joint_efforts(actions.mul_(self.params.max_effort))")  # fmt: skip
     assert errors(direct)["aliasing"].where == "the action"
 
 
-# --- seeds, starts, ends ---
+# --- seeds, start states, ends ---
 
 
-def test_torchs_own_random_numbers_in_a_reset_are_found(direct):
+def test_same_seed_finds_torch_rand_in_reset(direct):
     direct.replace("self.draws(env_ids).uniform(-0.5, 0.5, (1,))", "torch.rand(len(env_ids), 1) - 0.5")
     found = errors(direct)
     assert "two new environments" in found["same-seed"].message
@@ -187,7 +187,7 @@ def test_torchs_own_random_numbers_in_a_reset_are_found(direct):
     assert "partial-reset" not in found
 
 
-def test_memory_that_outlives_a_reset_is_found(managed):
+def test_same_seed_finds_state_that_survives_reset(managed):
     managed.terms = """
 class Travelled:
     def __init__(self, env, *, entity: Entity = "robot") -> None:
@@ -204,19 +204,19 @@ class Travelled:
     assert finding.where == "reward"
 
 
-def test_constant_start_state_is_found(managed):
+def test_start_states_finds_constant_start(managed):
     managed.config["events"]["start"]["position"] = [0.3, 0.3]
     found = [f for f in check(managed) if f.check == "start-states"]
     assert [f.where for f in found] == ["between environments", "between episodes"]
 
 
-def test_start_that_is_the_same_in_every_episode_is_found(direct):
+def test_start_states_finds_same_start_in_all_episodes(direct):
     direct.replace("self.draws(env_ids).uniform(-0.5, 0.5, (1,))", "0.05 * env_ids[:, None].float()")
     found = [f for f in check(direct) if f.check == "start-states"]
     assert [f.where for f in found] == ["between episodes"]
 
 
-def test_reset_that_touches_another_row_is_found(direct):
+def test_partial_reset_finds_write_to_other_row(direct):
     direct.replace(
         "        self.arms.set_joint_positions(angle, indices=env_ids)",
         "        self.arms.set_joint_positions(angle, indices=env_ids)\n"
@@ -227,7 +227,7 @@ def test_reset_that_touches_another_row_is_found(direct):
     assert "state" in finding.where
 
 
-def test_reward_that_averages_over_environments_is_found(managed):
+def test_partial_reset_finds_average_over_environments(managed):
     managed.terms = (
         "def relative(env, *, entity: Entity = 'robot') -> Tensor:\n"
         "    angle = entity.data.joint_pos[:, 0]\n    return angle - angle.mean()\n"
@@ -236,7 +236,7 @@ def test_reward_that_averages_over_environments_is_found(managed):
     assert errors(managed)["partial-reset"].where == "reward"
 
 
-def test_observation_that_is_stale_after_a_reset_is_found(direct):
+def test_final_observations_finds_stale_observation(direct):
     direct.replace(
         "    def get_observations(self):\n",
         "    def get_observations(self):\n"
@@ -247,27 +247,27 @@ def test_observation_that_is_stale_after_a_reset_is_found(direct):
     assert "[1, 4, 5]" in finding.message
 
 
-def test_missing_time_out_is_found(managed):
+def test_truncation_finds_missing_time_out(managed):
     managed.config["terminations"] = {}
     finding = errors(managed)["truncation"]
     assert "run on after step 6" in finding.message
     assert "time_out: true" in finding.hint
 
 
-def test_time_out_a_step_early_is_found(managed):
+def test_truncation_finds_early_time_out(managed):
     managed.terms = "def soon(env) -> Tensor:\n    return env.episode_length_buf >= env.max_episode_length - 1\n"
     managed.config["terminations"]["time_out"] = {"func": "soon", "time_out": True}
     assert "1 steps before its limit" in errors(managed)["truncation"].message
 
 
-def test_clock_that_is_not_declared_a_time_out_is_found(managed):
+def test_termination_finds_undeclared_time_out(managed):
     managed.config["terminations"]["clock"] = {"func": "time_out"}
     finding = errors(managed)["termination"]
     assert finding.where == "terminations: clock"
     assert "at 6 and at 9 steps" in finding.message
 
 
-def test_clock_in_is_done_is_found(direct):
+def test_termination_finds_time_limit_in_is_done(direct):
     # the idiom of OmniIsaacGymEnvs' tasks
     direct.replace(
         "self.reset_buf[:] = self.obs_buf[:, 0].abs() > 3.0",
@@ -278,22 +278,22 @@ def test_clock_in_is_done_is_found(direct):
     assert finding.where == "terminations: task"
 
 
-def test_clock_of_its_own_is_a_warning(direct):
+def test_termination_warns_about_own_timer(direct):
     direct.replace("self.obs_buf[:, 0].abs() > 3.0", "self.progress_buf >= 40")
     (finding,) = check(direct)
     assert (finding.check, finding.severity) == ("termination", "warning")
     assert "exactly 40 steps" in finding.message
 
 
-def test_reset_buf_that_is_replaced_by_a_comparison_is_in_order(direct):
+def test_replaced_reset_buf_is_accepted(direct):
     direct.replace("self.reset_buf[:] = self.obs_buf", "self.reset_buf = self.obs_buf")
     assert check(direct) == []
 
 
-# --- looking twice ---
+# --- repeated observations ---
 
 
-def test_observation_that_moves_on_when_computed_again_is_found(direct):
+def test_repeated_observation_finds_change_in_direct_task(direct):
     direct.replace(
         "self.obs_buf[:, 1] = self.arms.get_joint_velocities()[:, 0]",
         "self.obs_buf[:, 1] = self.obs_buf[:, 0] - getattr(self, 'last', 0.0)\n"
@@ -302,7 +302,7 @@ def test_observation_that_moves_on_when_computed_again_is_found(direct):
     assert errors(direct)["repeated-observation"].where == "obs_buf"
 
 
-def test_observation_term_with_a_memory_that_moves_when_called_is_found(managed):
+def test_repeated_observation_finds_stateful_term(managed):
     managed.terms = """
 class Change:
     def __init__(self, env, *, entity: Entity = "robot") -> None:
@@ -320,7 +320,7 @@ class Change:
     assert "observations.policy" in errors(managed)["repeated-observation"].where
 
 
-def test_running_rows_that_change_with_a_reset_of_others_are_found(direct):
+def test_observation_after_reset_finds_changed_running_rows(direct):
     direct.replace(
         "self.obs_buf[:, 1] = self.arms.get_joint_velocities()[:, 0]",
         "self.obs_buf[:, 1] = self.obs_buf[:, 0] - self.obs_buf[:, 0].mean()",
@@ -329,7 +329,7 @@ def test_running_rows_that_change_with_a_reset_of_others_are_found(direct):
     assert "[0, 2, 3, 6, 7]" in finding.message
 
 
-def test_environments_that_end_by_themselves_meanwhile_are_no_finding(direct):
+def test_observation_after_reset_ignores_other_ended_episodes(direct):
     direct.replace("self.obs_buf[:, 0].abs() > 3.0", "self.obs_buf[:, 0].abs() > 0.3")
     assert "observation-after-reset" not in errors(direct)
 
@@ -337,7 +337,7 @@ def test_environments_that_end_by_themselves_meanwhile_are_no_finding(direct):
 # --- isolation ---
 
 
-def test_a_check_that_raises_is_a_finding_with_its_place_and_the_others_still_run(direct):
+def test_raising_check_is_finding_and_others_run(direct):
     direct.replace(
         "    def reset_idx(self, env_ids):\n",
         "    def reset_idx(self, env_ids):\n        if 0 < len(env_ids) < 8:\n            raise KeyError('partial')\n",
@@ -350,7 +350,7 @@ def test_a_check_that_raises_is_a_finding_with_its_place_and_the_others_still_ru
     assert "start-states" in found
 
 
-def test_task_that_raises_while_it_is_built_is_one_finding(managed):
+def test_task_that_cannot_be_built_is_one_finding(managed):
     managed.terms = "def broken(env) -> Tensor:\n    raise RuntimeError('no such thing')\n"
     managed.config["rewards"]["broken"] = {"func": "broken", "weight": 1.0}
     (finding,) = check(managed)
@@ -358,7 +358,7 @@ def test_task_that_raises_while_it_is_built_is_one_finding(managed):
     assert "terms.py:10" in finding.where
 
 
-def test_the_callers_random_state_is_left_alone(managed):
+def test_check_task_keeps_random_state(managed):
     import torch
 
     torch.manual_seed(5)

@@ -1,4 +1,4 @@
-"""The checks of threads, sizes, engines, restarts, versions and speed find what is planted for them."""
+"""The checks of threads, sizes, engines, checkpoints, versions and speed find planted defects."""
 
 import json
 import shutil
@@ -14,7 +14,7 @@ from rlcli.testing.task_under_test import TaskUnderTest
 
 
 def only(folder, *names):
-    """(findings, notes) of some checks."""
+    """Run some checks; return (findings, notes)."""
     notes = {}
     found = check_task(folder.write(), only=names, on_note=notes.__setitem__)
     assert all(f.check in names and f.where and f.message and f.hint for f in found)
@@ -24,28 +24,28 @@ def only(folder, *names):
 # --- threads and sizes ---
 
 
-def test_what_depends_on_the_engines_threads_is_found(direct):
+def test_threads_finds_dependence_on_engine_threads(direct):
     direct.replace("1.0 - self.obs_buf[:, 0].square()", "float(self.env.engine.threads)")
     ((finding,), _) = only(direct, "threads")
     assert (finding.severity, finding.where) == ("error", "reward")
     assert "1 and 3 engine threads" in finding.message
 
 
-def test_rounding_that_depends_on_the_number_of_environments_is_found(direct):
+def test_num_envs_finds_dependence_on_number_of_environments(direct):
     direct.replace("1.0 - self.obs_buf[:, 0].square()", "self.obs_buf[:, 0] / self.num_envs")
     ((finding,), _) = only(direct, "num-envs")
     assert (finding.severity, finding.where) == ("error", "reward")
     assert "8 and 3 environments" in finding.message
 
 
-def test_task_that_draws_from_torch_is_told_and_not_failed(direct):
+def test_num_envs_warns_about_torch_draws(direct):
     direct.replace("self.draws(env_ids).uniform(-0.5, 0.5, (1,))", "torch.rand(len(env_ids), 1) - 0.5")
     ((finding,), _) = only(direct, "num-envs")
     assert finding.severity == "warning"
     assert "draws from torch" in finding.message
 
 
-def test_curriculum_that_averages_over_episodes_is_told_and_not_failed(managed):
+def test_num_envs_warns_about_averaging_curriculum(managed):
     managed.terms = """
 class Harder:
     def __init__(self, env) -> None:
@@ -74,7 +74,7 @@ def level(env) -> Tensor:
     assert "curriculum" in notes["back-fill"]
 
 
-# --- restarts ---
+# --- checkpoints and resets ---
 
 
 HISTORY = """
@@ -94,7 +94,7 @@ class Seen(StepObserver):
 """
 
 
-def test_history_that_is_not_filled_anew_at_a_reset_is_found(managed):
+def test_back_fill_finds_history_without_reset(managed):
     managed.terms = HISTORY
     managed.config["observations"]["policy"]["seen"] = {"func": "seen"}
     ((finding,), _) = only(managed, "back-fill")
@@ -102,7 +102,7 @@ def test_history_that_is_not_filled_anew_at_a_reset_is_found(managed):
     assert "environment 1" in finding.message
 
 
-def test_history_that_is_filled_anew_is_in_order(managed):
+def test_back_fill_accepts_history_with_reset(managed):
     managed.terms = HISTORY + (
         "\n    def reset(self, selection) -> None:\n"
         "        selection.write(self._last, selection.read(self._entity.data.joint_pos))\n"
@@ -111,7 +111,7 @@ def test_history_that_is_filled_anew_is_in_order(managed):
     assert only(managed, "back-fill") == ([], {})
 
 
-def test_histories_delays_and_noise_of_the_configuration_are_in_order(managed):
+def test_configured_history_delay_and_noise_are_accepted(managed):
     managed.config["observations"]["policy"]["angle"] |= {
         "history": 3,
         "delay": {"steps": [0, 2], "redraw": 0.5},
@@ -129,7 +129,7 @@ def test_histories_delays_and_noise_of_the_configuration_are_in_order(managed):
     assert only(managed, "back-fill") == ([], {})
 
 
-def test_direct_buffer_that_keeps_the_episode_before_is_found(direct):
+def test_back_fill_finds_direct_buffer_without_reset(direct):
     direct.replace(
         "    def pre_physics_step(self, actions):\n",
         "    def post_reset(self):\n        self.last = torch.zeros(self.num_envs)\n\n"
@@ -140,7 +140,7 @@ def test_direct_buffer_that_keeps_the_episode_before_is_found(direct):
     assert "obs_buf" in finding.where
 
 
-def test_memory_that_a_checkpoint_does_not_hold_is_found(managed):
+def test_checkpoint_finds_unsaved_generator(managed):
     managed.terms = """
 class Travelled:
     def __init__(self, env, *, entity: Entity = "robot") -> None:
@@ -168,7 +168,7 @@ class Travelled:
     assert only(managed, "checkpoint") == ([], {})
 
 
-def test_command_whose_state_is_forgotten_is_found(managed):
+def test_checkpoint_finds_incomplete_state_dict(managed):
     managed.terms = """
 class Turn:
     def __init__(self, env) -> None:
@@ -196,7 +196,7 @@ class Turn:
     assert "asked" in finding.where
 
 
-def test_direct_task_that_counts_in_an_iterator_is_found_and_in_a_number_not(direct):
+def test_checkpoint_finds_iterator_but_accepts_number(direct):
     direct.replace(
         "        self.rew_buf[:] = ",
         "        self.count = getattr(self, 'count', None) or iter(range(999))\n"
@@ -214,7 +214,7 @@ def test_direct_task_that_counts_in_an_iterator_is_found_and_in_a_number_not(dir
 # --- versions ---
 
 
-def test_layout_is_compared_only_where_it_was_recorded(managed):
+def test_layout_needs_recorded_file(managed):
     found, notes = only(managed, "layout")
     assert found == []
     assert "--record-layout" in notes["layout"]
@@ -226,12 +226,12 @@ def test_layout_is_compared_only_where_it_was_recorded(managed):
     ("change", "says"),
     [
         ("order", "column 0 was 'angle[hinge]' and is 'rate[hinge]'"),
-        ("gone", "had 2 columns and has 1, other ones from column 1 on"),
+        ("gone", "had 2 columns and has 1; the first difference is column 1"),
         ("scale", "'rate': scale was [0.1] and is [0.2]"),
         ("group", "is new"),
     ],
 )
-def test_observations_that_changed_since_they_were_recorded_are_found(change, says, managed):
+def test_layout_finds_changed_observations(change, says, managed):
     record_layout(managed.write())
     groups = managed.config["observations"]
     if change == "order":
@@ -247,24 +247,24 @@ def test_observations_that_changed_since_they_were_recorded_are_found(change, sa
     assert "task.layout.json" in finding.hint
 
 
-def test_actions_that_changed_since_they_were_recorded_are_found(direct):
+def test_layout_finds_changed_actions(direct):
     file = record_layout(direct.write())
     direct.path = direct.path.with_name("later")
     file.rename(direct.write() / file.name)
     direct.replace("num_actions = 1", "num_actions = 2")
     direct.replace("self.params.max_effort * actions", "self.params.max_effort * actions[:, :1]")
     ((finding,), _) = only(direct, "layout")
-    assert (finding.where, finding.message) == ("actions", "had 1 columns and has 2, other ones from column 1 on")
+    assert (finding.where, finding.message) == ("actions", "had 1 columns and has 2; the first difference is column 1")
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"observations": 3}'])
-def test_file_that_is_no_layout_is_a_finding(text, managed):
+def test_layout_finds_invalid_file(text, managed):
     (managed.write() / "task.layout.json").write_text(text)
     ((finding,), _) = only(managed, "layout")
-    assert "is no recorded layout" in finding.message
+    assert "is not a recorded layout" in finding.message
 
 
-def test_the_command_records_the_layout_and_says_where(managed, capsys):
+def test_command_records_layout(managed, capsys):
     folder = str(managed.write())
     assert main(["check", folder, "--only", "layout", "--record-layout"]) == 0
     assert "task.layout.json" in capsys.readouterr().err
@@ -279,7 +279,7 @@ def test_the_command_records_the_layout_and_says_where(managed, capsys):
 
 
 @pytest.mark.parametrize("where", ["reward", "reset"])
-def test_python_loop_over_environments_is_found_with_its_line(where, direct):
+def test_speed_finds_python_loop_with_its_line(where, direct):
     if where == "reward":
         direct.replace(
             "        self.rew_buf[:] = 1.0 - self.obs_buf[:, 0].square()",
@@ -300,7 +300,7 @@ def test_python_loop_over_environments_is_found_with_its_line(where, direct):
     assert "steps/s" in notes["speed"]
 
 
-def test_the_callers_trace_function_is_left_in_place(managed):
+def test_speed_restores_trace_function(managed):
     import sys
 
     def trace(frame, event, value):
@@ -322,12 +322,12 @@ needs_warp = pytest.mark.skipif(find_spec("mujoco_warp") is None, reason="MuJoCo
 
 
 @needs_warp
-def test_task_in_order_runs_on_both_engines_and_can_be_captured(managed):
+def test_correct_task_passes_engines_and_captured(managed):
     assert only(managed, "engines", "captured") == ([], {})
 
 
 @needs_warp
-def test_reset_that_only_the_cpu_engine_can_run_is_found(managed):
+def test_engines_finds_reset_for_cpu_only(managed):
     managed.terms = """
 def start_at(env, selection, *, entity: Entity = "robot") -> None:
     entity.write_joint_positions(selection, 0.1 * torch.from_numpy(selection.ids)[:, None].float())
@@ -344,7 +344,7 @@ def start_at(env, selection, *, entity: Entity = "robot") -> None:
 
 
 @needs_warp
-def test_what_differs_between_the_engines_is_found(managed):
+def test_engines_finds_different_reward(managed):
     managed.terms = "def kind(env) -> Tensor:\n    return torch.full((env.num_envs,), float(env.engine.asynchronous))\n"
     managed.config["rewards"]["kind"] = {"func": "kind", "weight": 1.0}
     ((finding,), _) = only(managed, "engines")
@@ -352,7 +352,7 @@ def test_what_differs_between_the_engines_is_found(managed):
 
 
 @needs_warp
-def test_value_that_is_read_back_in_a_step_is_found_with_its_line(managed):
+def test_captured_finds_host_sync_with_its_line(managed):
     managed.terms = (
         "def sign(env, *, entity: Entity = 'robot') -> Tensor:\n"
         "    angle = entity.data.joint_pos[:, 0]\n"
@@ -366,23 +366,23 @@ def test_value_that_is_read_back_in_a_step_is_found_with_its_line(managed):
 
 
 @needs_warp
-def test_direct_task_with_ids_is_not_captured_and_the_reason_is_said(direct):
+def test_captured_is_not_run_for_reset_idx(direct):
     found, notes = only(direct, "engines", "captured")
     assert found == []
     assert "reset_idx takes ids" in notes["captured"]
 
 
 @needs_warp
-def test_model_that_the_gpu_engine_cannot_run_is_not_run_and_the_reason_is_said(managed):
+def test_engines_is_not_run_for_unsupported_model(managed):
     managed.xml = managed.xml.replace("</mujoco>", '<option solver="PGS"/></mujoco>')
     found, notes = only(managed, "engines")
     assert found == []
-    assert "not take it" in notes["engines"]
+    assert "cannot run the model" in notes["engines"]
 
 
 @pytest.fixture
 def shipped(tmp_path):
-    """cartpole with a policy in a folder of the test's own, and that folder."""
+    """Source of cartpole with a copy of its policy, and the folder of the copy."""
     source = find_task("cartpole")
     folder = shutil.copytree(source.policy, tmp_path / "policies" / "cartpole")
     return replace(source, policy=folder), folder
@@ -394,12 +394,12 @@ def edit_manifest(folder, change):
     (folder / "manifest.json").write_text(json.dumps(document))
 
 
-def test_a_shipped_policy_that_fits_is_no_finding(shipped):
+def test_policy_accepts_fitting_shipped_policy(shipped):
     assert list(portability_checks.policy(TaskUnderTest(shipped[0]))) == []
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda m: m["layout"].update(step_dt=0.02), "does not fit the installed task"),
         (lambda m: m["layout"]["observations"]["policy"].reverse(), "does not fit the installed task"),
@@ -408,15 +408,15 @@ def test_a_shipped_policy_that_fits_is_no_finding(shipped):
         (lambda m: m["files"]["policy.safetensors"].update(sha256="0" * 64), "is corrupt"),
     ],
 )
-def test_a_shipped_policy_that_does_not_fit_is_a_finding(shipped, change, said):
+def test_policy_finds_misfit_of_shipped_policy(shipped, change, message):
     source, folder = shipped
     edit_manifest(folder, change)
     (finding,) = portability_checks.policy(TaskUnderTest(source))
     assert finding.severity == "error"
-    assert said in finding.message
+    assert message in finding.message
 
 
-def test_a_task_without_a_policy_is_told_how_to_ship_one(managed):
+def test_policy_is_not_run_without_shipped_policy(managed):
     found, notes = only(managed, "policy")
     assert found == []
     assert "--format bundle" in notes["policy"]

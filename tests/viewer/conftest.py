@@ -1,4 +1,4 @@
-"""A trained cartpole, for those tests that need one."""
+"""Fixture of a trained cartpole."""
 
 import os
 import subprocess
@@ -10,7 +10,7 @@ from support.command_line import cli, empty_folder, weights
 
 @pytest.fixture(scope="session")
 def cartpole_run(tmp_path_factory):
-    """The folder of a run that balances, with its earlier checkpoints."""
+    """Folder of a run whose policy balances the pole, with its earlier checkpoints."""
     runs = tmp_path_factory.mktemp("runs")
     words = ["train", "cartpole", "--runs-dir", str(runs), "--logger", "none", "-q", "agent.save_interval=10"]
     variables = {**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}

@@ -1,4 +1,4 @@
-"""Which requests the browser's viewer answers."""
+"""Requests that the browser's viewer answers or refuses."""
 
 import pytest
 
@@ -14,13 +14,13 @@ def socket(origin="http://localhost:8080", host="localhost:8080"):
 
 @pytest.mark.parametrize("host", ["localhost:8080", "127.0.0.1:8080", "LOCALHOST:8080"])
 @pytest.mark.parametrize("path", ["/", "/index.html", "/model?total_bytes", "/web_client.wasm", "/assets/a[b].ttf"])
-def test_its_own_page_is_answered_under_both_names(host, path):
+def test_own_page_is_answered_for_both_host_names(host, path):
     assert refusal_reason(8080, path, {"host": [host]}) is None
     assert refusal_reason(8080, path, {"host": [host], "origin": [f"http://{host}".lower()]}) is None
 
 
 @pytest.mark.parametrize("path", ["/ui?sid=a", "/state?sid=a", "/state"])
-def test_its_own_page_may_open_its_sockets(path):
+def test_own_page_may_open_sockets(path):
     assert refusal_reason(8080, path, socket()) is None
     assert refusal_reason(8080, path, socket("http://127.0.0.1:8080", "127.0.0.1:8080")) is None
 
@@ -35,13 +35,13 @@ def test_its_own_page_may_open_its_sockets(path):
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("path", ["/", "/model", "/state"])
-def test_a_name_that_is_not_of_this_machine_is_refused(host, path):
+def test_foreign_host_is_refused(host, path):
     assert refusal_reason(8080, path, {"host": [host]}) is not None
     assert refusal_reason(8080, path, socket(f"http://{host}", host)) is not None
 
 
 @pytest.mark.parametrize("given", [{}, {"host": []}, {"host": ["localhost:8080", "localhost:8080"]}])
-def test_a_request_names_one_host(given):
+def test_request_needs_exactly_one_host(given):
     assert refusal_reason(8080, "/", given) is not None
 
 
@@ -53,17 +53,17 @@ def test_a_request_names_one_host(given):
         "http://localhost:8080/", "http://localhost:8080 http://evil.example", "chrome-extension://abc",
     ],
 )  # fmt: skip
-def test_another_page_is_refused(origin):
+def test_foreign_origin_is_refused(origin):
     assert refusal_reason(8080, "/state", socket(origin)) is not None
     assert refusal_reason(8080, "/model", {**OWN, "origin": [origin]}) is not None
 
 
-def test_a_socket_without_an_origin_is_refused():
+def test_socket_without_origin_is_refused():
     assert refusal_reason(8080, "/state", socket(None)) is not None
     assert refusal_reason(8080, "/state", {**OWN, "upgrade": ["websocket"]}) is not None
 
 
-def test_of_two_origins_none_counts():
+def test_two_origins_are_refused():
     assert (
         refusal_reason(8080, "/model", {**OWN, "origin": ["http://localhost:8080", "http://localhost:8080"]})
         is not None
@@ -71,14 +71,14 @@ def test_of_two_origins_none_counts():
 
 
 @pytest.mark.parametrize("path", ["/drop", "/drop?sid=a", "/", "/model", "/ui/", "/state/x", "/dr%6fp", "//state"])
-def test_no_other_socket_is_opened(path):
+def test_other_sockets_are_refused(path):
     assert refusal_reason(8080, path, socket()) is not None
 
 
 @pytest.mark.parametrize(
     "path", ["/../web_server.py", "/assets/..%2f..%2fa.py", "/%2e%2e/a", "/a\\..\\b", "http://x/", "*"]
 )
-def test_a_path_that_leads_elsewhere_is_refused(path):
+def test_path_traversal_is_refused(path):
     assert refusal_reason(8080, path, OWN) is not None
 
 
@@ -94,23 +94,23 @@ def test_a_path_that_leads_elsewhere_is_refused(path):
     ],
 )
 @pytest.mark.parametrize("site", ["cross-site", "same-site"])
-def test_another_page_may_lead_here_and_embed_nothing(site, mode, target, path, answered):
-    said = {**OWN, "sec-fetch-site": [site], "sec-fetch-mode": [mode], "sec-fetch-dest": [target]}
-    assert (refusal_reason(8080, path, said) is None) is answered
+def test_foreign_page_may_link_but_not_embed(site, mode, target, path, answered):
+    headers = {**OWN, "sec-fetch-site": [site], "sec-fetch-mode": [mode], "sec-fetch-dest": [target]}
+    assert (refusal_reason(8080, path, headers) is None) is answered
 
 
 @pytest.mark.parametrize("site", ["none", "same-origin"])
-def test_what_the_page_itself_fetches_is_answered(site):
-    said = {**OWN, "sec-fetch-site": [site], "sec-fetch-mode": ["no-cors"], "sec-fetch-dest": ["script"]}
-    assert refusal_reason(8080, "/web_client.js", said) is None
+def test_own_fetches_are_answered(site):
+    headers = {**OWN, "sec-fetch-site": [site], "sec-fetch-mode": ["no-cors"], "sec-fetch-dest": ["script"]}
+    assert refusal_reason(8080, "/web_client.js", headers) is None
 
 
-def test_the_usual_port_need_not_be_named():
+def test_port_80_is_optional_in_host():
     assert set(allowed_hosts(80)) == {"localhost", "localhost:80", "127.0.0.1", "127.0.0.1:80"}
     assert refusal_reason(80, "/state", {**OPEN, "host": ["localhost"], "origin": ["http://localhost"]}) is None
 
 
-def test_the_page_may_fetch_from_nowhere_else():
+def test_content_security_policy_allows_only_own_server():
     policy = response_headers(8080)["Content-Security-Policy"]
     named = {word for part in policy.split(";") for word in part.split()[1:]}
     assert {word for word in named if "//" in word} == {"ws://localhost:8080", "ws://127.0.0.1:8080"}

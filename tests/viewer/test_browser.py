@@ -1,4 +1,4 @@
-"""`play --viewer web` in a real browser: a trained cartpole is seen to move, is paused, and changes its policy."""
+"""`play --viewer web` in a real browser: a trained cartpole moves, is paused, and gets another policy."""
 
 import io
 import re
@@ -16,9 +16,9 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine"),
 ]
 SCENE = {"x": 215, "y": 30, "width": 425, "height": 330}
-"""The part of the page that shows the simulation alone. [pixels]"""
+"""Part of the page that shows only the simulation [pixels]."""
 PATIENCE = 240.0
-"""How long a page that is drawn without a GPU may take to show something new [s]."""
+"""Longest time in which a page that is drawn without a GPU must change [s]."""
 
 
 @contextmanager
@@ -51,7 +51,7 @@ def until(what, condition):
 
 
 def press(page, key, what, condition):
-    """A key that stays down until its effect is seen: without a GPU a frame may take seconds. It does not repeat."""
+    """Hold a key down until its effect is visible: without a GPU a frame may take seconds. The key does not repeat."""
     page.keyboard.down(key)
     until(what, condition)
     page.keyboard.up(key)
@@ -59,7 +59,7 @@ def press(page, key, what, condition):
 
 
 def differ(one, other):
-    """More than what the renderer's dithering does."""
+    """Return whether two pictures differ by more than the renderer's dithering."""
     return np.abs(one - other).max() > 20
 
 
@@ -70,7 +70,7 @@ def moves(page):
 
 
 def stands_still(page):
-    """For longer than an episode, at whose end a cart stands elsewhere."""
+    """Return whether the picture stays the same for longer than an episode; a reset would change it."""
     pictures = [picture(page)]
     for _ in range(4):
         time.sleep(2.0)
@@ -79,12 +79,12 @@ def stands_still(page):
 
 
 def pole(page):
-    """Pixels of the pole, which is orange."""
+    """Return the pixels of the pole, which is orange."""
     seen = picture(page)
     return (seen[..., 0] > 90) & (seen[..., 0] - seen[..., 2] > 60)
 
 
-def test_a_trained_cartpole_moves_is_paused_and_changes_its_policy(cartpole_run):
+def test_browser_shows_pauses_and_switches_policy(cartpole_run):
     with Playing("--checkpoint", cartpole_run, "--viewer", "web", "--port", 0) as playing:
         with page_of(playing.url) as page:
             until("the pole", lambda: pole(page).sum() > 20)

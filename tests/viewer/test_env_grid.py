@@ -31,7 +31,7 @@ def scene_of(env, count, shown=0):
     return scene, alone
 
 
-def test_each_environment_stands_at_its_place_of_the_grid(env):
+def test_environments_are_drawn_on_grid(env):
     scene, alone = scene_of(env, 4)
     ground = sum(geom.type == mujoco.mjtGeom.mjGEOM_PLANE for geom in scene.geoms[:alone])
     each = alone - ground
@@ -50,13 +50,13 @@ def test_each_environment_stands_at_its_place_of_the_grid(env):
     assert seen.tolist() == [0, each, each, each]
 
 
-def test_the_one_shown_comes_first_and_numbers_wrap_around(env):
+def test_shown_environment_is_first_and_others_wrap_around(env):
     assert EnvGrid(env, 3).others(5) == [0, 1]
     assert EnvGrid(env, 1).others(2) == []
     assert scene_of(env, 1)[0].ngeom == scene_of(env, 1)[1]
 
 
-def test_geoms_for_the_browser_are_copies_that_stay(env):
+def test_geoms_are_copies(env):
     env_grid, scene = EnvGrid(env, 3), mujoco.MjvScene(env.engine.model, maxgeom=1000)
     first = list(env_grid.geoms(scene, 0, mujoco.MjvOption()))
     kept = [geom.pos.copy() for geom in first]
@@ -67,19 +67,19 @@ def test_geoms_for_the_browser_are_copies_that_stay(env):
     assert list(EnvGrid(env, 1).geoms(scene, 0, mujoco.MjvOption())) == []
 
 
-def test_of_too_many_geoms_as_many_as_allowed_are_drawn(env, monkeypatch):
+def test_geoms_are_limited_by_scene_size(env, monkeypatch):
     scene = mujoco.MjvScene(env.engine.model, maxgeom=4)
     assert len(list(EnvGrid(env, 6).geoms(scene, 0, mujoco.MjvOption()))) <= 4
 
 
-def test_the_camera_stands_back_until_all_are_seen(env):
+def test_camera_distance_shows_all_environments(env):
     one, four = (EnvGrid(env, count).fit_camera(free_camera(env.config.viewer)) for count in (1, 4))
     assert four.distance > one.distance + 4.0
     assert four.lookat - one.lookat == pytest.approx(EnvGrid(env, 4).offsets().mean(axis=0))
     assert (one.azimuth, one.elevation) == (four.azimuth, four.elevation)
 
 
-def test_on_terrain_each_stands_where_it_is_and_the_ground_is_drawn_once(tmp_path):
+def test_terrain_uses_true_positions_and_one_ground(tmp_path):
     terrain = {
         "kind": "generator",
         "rows": 2,
@@ -105,7 +105,7 @@ def test_on_terrain_each_stands_where_it_is_and_the_ground_is_drawn_once(tmp_pat
 
 
 @pytest.mark.slow
-def test_four_poles_are_in_the_picture(env, monkeypatch):
+def test_rendered_picture_shows_four_poles(env, monkeypatch):
     for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     pictures = {}

@@ -1,4 +1,4 @@
-"""What commands ask for, in pictures: where it is drawn, in which colour, and where it is not."""
+"""Markers of commands in pictures: their positions and colours, and pictures without them."""
 
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -63,8 +63,8 @@ def _headless(monkeypatch):
         monkeypatch.delenv(name, raising=False)
 
 
-def asking(folder, num_envs=2, *overrides, still=True, sensors=None, **commands):
-    """Critters that are asked for something; unless still, they begin anywhere and move."""
+def commanded_env(folder, num_envs=2, *overrides, still=True, sensors=None, **commands):
+    """Environment of critters with commands; unless `still`, they start at random positions and move."""
     task = yaml.safe_load(CRITTER_TASK) | {"commands": commands, "viewer": VIEWER}
     task["scene"]["sensors"] = sensors or {}
     if still:
@@ -75,13 +75,13 @@ def asking(folder, num_envs=2, *overrides, still=True, sensors=None, **commands)
 
 
 def pictures(env, number=0):
-    """With what is asked, and without."""
+    """Return a picture with markers, and one without."""
     with Renderer(env.engine.model, env.config.viewer) as renderer:
         return renderer.picture(env, number).astype(int), renderer.draw(*env.world(number)).astype(int)
 
 
 def pixel(env, place):
-    """Column and row at which a place of the world is seen."""
+    """Return the column and row of a point of the world in the picture."""
     viewer = env.config.viewer
     eye, ahead = np.array(viewer.eye), np.subtract(viewer.lookat, viewer.eye)
     ahead = ahead / np.linalg.norm(ahead)
@@ -94,7 +94,7 @@ def pixel(env, place):
 
 
 def coloured(seen, bare, color):
-    """Columns and rows of what has been added in a colour. (n, 2)"""
+    """Return the columns and rows of added pixels of a colour. (n, 2)"""
     channel = int(np.argmax(color[:3]))
     rest = np.delete(seen, channel, axis=2).max(axis=2)
     rows, columns = np.nonzero((seen != bare).any(axis=2) & (seen[..., channel] - rest > 60))
@@ -103,7 +103,7 @@ def coloured(seen, bare, color):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
-def test_the_goal_of_reach_is_seen_where_it_is(number):
+def test_reach_goal_is_drawn_at_its_position(number):
     env = build("reach", 2)
     env.reset(seed=3)
     seen, bare = pictures(env, number)
@@ -122,9 +122,9 @@ def test_the_goal_of_reach_is_seen_where_it_is(number):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("vx", "vy"), [(0.8, 0.0), (-0.8, 0.0), (0.0, 0.8), (0.5, -0.5)])
-def test_green_points_where_the_velocity_is_asked_and_blue_where_it_is(tmp_path, vx, vy):
+def test_green_arrow_is_commanded_blue_arrow_is_actual_velocity(tmp_path, vx, vy):
     above = "viewer.eye=[-0.05,0.0,3.5]"  # else an arrow's head may hide its tip
-    env = asking(tmp_path, 1, above, still=False, walk=VELOCITY)
+    env = commanded_env(tmp_path, 1, above, still=False, walk=VELOCITY)
     for name, value in {"vx": vx, "vy": vy, "wz": 0.0}.items():
         env.command_manager.hold(name, value)
     env.step(torch.zeros(1, 4))
@@ -144,8 +144,8 @@ def test_green_points_where_the_velocity_is_asked_and_blue_where_it_is(tmp_path,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wz", [0.7, -0.7])
-def test_a_point_ahead_shows_how_fast_to_turn(tmp_path, wz):
-    env = asking(tmp_path, 1, still=False, walk=VELOCITY)
+def test_turn_rate_marker_position(tmp_path, wz):
+    env = commanded_env(tmp_path, 1, still=False, walk=VELOCITY)
     for name, value in {"vx": 0.0, "vy": 0.0, "wz": wz}.items():
         env.command_manager.hold(name, value)
     env.step(torch.zeros(1, 4))
@@ -159,8 +159,8 @@ def test_a_point_ahead_shows_how_fast_to_turn(tmp_path, wz):
     assert len(coloured(seen, bare, COMMANDED)) > 20
 
 
-def test_a_place_on_the_ground_is_a_ball_with_an_arrow(tmp_path):
-    env = asking(tmp_path, 3, still=False, place=PLACE)
+def test_pose_command_is_sphere_with_arrow(tmp_path):
+    env = commanded_env(tmp_path, 3, still=False, place=PLACE)
     run(env, 3, reset=False)
     ball, arrow = env.markers()
     term = env.command_manager.get_term("place")
@@ -182,16 +182,16 @@ def test_a_place_on_the_ground_is_a_ball_with_an_arrow(tmp_path):
     ],
     ids=["no command", "a command without markers", "no velocity, asked or actual", "not finite"],
 )
-def test_nothing_is_drawn_where_nothing_is_asked(tmp_path, commands):
-    env = asking(tmp_path, 2, **commands)
+def test_no_markers_for_zero_commands(tmp_path, commands):
+    env = commanded_env(tmp_path, 2, **commands)
     seen, bare = pictures(env)
     np.testing.assert_array_equal(seen, bare)
     assert bare.std() > 5
 
 
 @pytest.mark.slow
-def test_a_term_of_ones_own_is_drawn_and_asked_by_pictures_alone(tmp_path):
-    env = asking(tmp_path, 2, own={"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9})
+def test_custom_command_markers_are_computed_only_for_pictures(tmp_path):
+    env = commanded_env(tmp_path, 2, own={"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9})
     term = env.command_manager.get_term("own")
     run(env, 3)
     assert term.calls == 0
@@ -204,12 +204,12 @@ def test_a_term_of_ones_own_is_drawn_and_asked_by_pictures_alone(tmp_path):
 
 
 @pytest.mark.slow
-def test_cameras_that_are_sensors_see_no_markers(tmp_path):
+def test_camera_sensors_do_not_render_markers(tmp_path):
     front = {"kind": "camera", "data": "rgb", "width": 64, "height": 48, "eye": [-2, 0, 0.9], "lookat": [0, 0, 0.9]}
     own = {"func": "beacon", "resampling_time_s": [9, 9], "height": 0.9}
     images = {}
     for name, commands in {"asked": {"own": own}, "alone": {}}.items():
-        env = asking(tmp_path / name, 2, sensors={"front": front}, **commands)
+        env = commanded_env(tmp_path / name, 2, sensors={"front": front}, **commands)
         seen, bare = pictures(env, 1)
         before = env.sensors["front"].image.clone()
         env.sensors["front"].update(0.0)
@@ -223,11 +223,11 @@ def test_cameras_that_are_sensors_see_no_markers(tmp_path):
 
 
 @pytest.mark.slow
-def test_pictures_change_nothing_of_what_is_simulated(tmp_path):
+def test_rendering_does_not_change_simulation(tmp_path):
     commands = {"walk": VELOCITY, "pose": POSE, "place": PLACE}
-    lives = {}
+    steps = {}
     for drawn in (False, True):
-        env = asking(tmp_path / str(drawn), 3, still=False, **commands)
+        env = commanded_env(tmp_path / str(drawn), 3, still=False, **commands)
         results = []
         with Renderer(env.engine.model, env.config.viewer, EnvGrid(env, 3)) if drawn else nullcontext() as renderer:
             for _ in range(20):
@@ -235,21 +235,21 @@ def test_pictures_change_nothing_of_what_is_simulated(tmp_path):
                     renderer.picture(env)
                 results += run(env, 2, reset=False)
         state = env.state_dict()
-        lives[drawn] = [*(value for result in results for value in (*result.obs.values(), result.reward)), state]
-    states = [lives[drawn].pop() for drawn in (False, True)]
-    assert all(torch.equal(one, other) for one, other in zip(*lives.values(), strict=True))
+        steps[drawn] = [*(value for result in results for value in (*result.obs.values(), result.reward)), state]
+    states = [steps[drawn].pop() for drawn in (False, True)]
+    assert all(torch.equal(one, other) for one, other in zip(*steps.values(), strict=True))
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
 
 
 def shapes(scene):
-    """Kind and place of every marker of a scene."""
+    """Return kind and position of all markers of a scene."""
     decor = [geom for geom in scene.geoms[: scene.ngeom] if geom.category == mujoco.mjtCatBit.mjCAT_DECOR]
     return [(int(geom.type), geom.pos.copy()) for geom in decor]
 
 
-def test_in_a_crowd_each_has_its_own_at_its_place(tmp_path):
-    env = asking(tmp_path, 5, still=False, pose=POSE)
+def test_grid_draws_markers_of_each_environment(tmp_path):
+    env = commanded_env(tmp_path, 5, still=False, pose=POSE)
     scene = mujoco.MjvScene(env.engine.model, maxgeom=1000)
     env_grid = EnvGrid(env, 3)
     env_grid.add(scene, 3, mujoco.MjvOption())
@@ -261,8 +261,10 @@ def test_in_a_crowd_each_has_its_own_at_its_place(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_crowds_picture_shows_them_all(tmp_path):
-    env = asking(tmp_path, 4, "scene.env_spacing=2", own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
+def test_grid_picture_shows_all_markers(tmp_path):
+    env = commanded_env(
+        tmp_path, 4, "scene.env_spacing=2", own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0}
+    )
     env_grid, counts = EnvGrid(env, 4), {}
     env.command_manager.get_term("own").given = []
     with Renderer(env.engine.model, env.config.viewer, env_grid) as renderer:
@@ -279,8 +281,8 @@ def test_a_crowds_picture_shows_them_all(tmp_path):
     assert min(counts.values()) > 20
 
 
-def test_the_browser_gets_them_as_copies(tmp_path):
-    env = asking(tmp_path, 2, pose=POSE)
+def test_browser_gets_marker_copies(tmp_path):
+    env = commanded_env(tmp_path, 2, pose=POSE)
     scene = mujoco.MjvScene(env.engine.model, maxgeom=1024)
     found = list(EnvGrid(env, 1).geoms(scene, 1, mujoco.MjvOption()))
     kinds = [int(geom.type) for geom in found]
@@ -292,8 +294,8 @@ def test_the_browser_gets_them_as_copies(tmp_path):
     assert {geom.castshadow for geom in found} == {0}
 
 
-def test_the_window_gets_them_too(tmp_path):
-    env = asking(tmp_path, 2, pose=POSE)
+def test_window_gets_markers(tmp_path):
+    env = commanded_env(tmp_path, 2, pose=POSE)
     playback = Playback(env, zero_policy(env))
     model, _ = env.world(0)
     scene = mujoco.MjvScene(model, maxgeom=100)
@@ -306,18 +308,18 @@ def test_the_window_gets_them_too(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_film_shows_what_is_asked(tmp_path):
+def test_video_shows_markers(tmp_path):
     from PIL import Image
 
-    env = asking(tmp_path, 1, pose=POSE)
+    env = commanded_env(tmp_path, 1, pose=POSE)
     record_episode(env, zero_policy(env), tmp_path / "x.gif", longest_s=0.1)
     with Image.open(tmp_path / "x.gif") as image:
         last = np.asarray(image.convert("RGB")).astype(int)
     assert ((last[..., 1] - np.maximum(last[..., 0], last[..., 2])) > 60).sum() > 20
 
 
-def test_of_more_than_a_scene_holds_as_many_as_it_holds_are_drawn(tmp_path):
-    env = asking(tmp_path, 4, pose=POSE)
+def test_markers_are_limited_by_scene_size(tmp_path):
+    env = commanded_env(tmp_path, 4, pose=POSE)
     scene = mujoco.MjvScene(env.engine.model, maxgeom=6)
     add_markers(scene, env.markers(), range(4), np.zeros((4, 3)))
     assert scene.ngeom == 6
@@ -333,9 +335,9 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("said", WRONG)
-def test_what_is_no_marker_of_every_environment_is_refused_by_the_terms_name(tmp_path, said):
-    env = asking(tmp_path, 4, own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
-    env.command_manager.get_term("own").given = [WRONG[said](4)]
-    with pytest.raises(ConfigError, match=f"commands.own: markers\\(\\) {said}"):
+@pytest.mark.parametrize("message", WRONG)
+def test_invalid_marker_error_names_term(tmp_path, message):
+    env = commanded_env(tmp_path, 4, own={"func": "given", "resampling_time_s": [9, 9], "height": 1.0})
+    env.command_manager.get_term("own").given = [WRONG[message](4)]
+    with pytest.raises(ConfigError, match=f"commands.own: markers\\(\\) {message}"):
         env.markers()

@@ -1,4 +1,4 @@
-"""The window's keys and captions; the window itself needs a display."""
+"""Keys and captions of the window. The window itself would need a display."""
 
 import pytest
 import yaml
@@ -22,7 +22,7 @@ def playback():
 
 
 def commanded(folder):
-    """A playback of a task with a velocity command."""
+    """Return a playback of a task with a velocity command."""
     task = yaml.safe_load(CRITTER_TASK)
     task["commands"] = {
         "velocity": {"func": "uniform_velocity", "resampling_time_s": [1.0, 2.0], "lin_vel_x": [-1.0, 2.0]}
@@ -38,7 +38,7 @@ def pressed(playback, *keys):
     return playback.view
 
 
-def test_the_keys_ask_the_player(playback):
+def test_keys_submit_requests(playback):
     assert pressed(playback, SPACE).paused
     assert not pressed(playback, SPACE).paused
     assert pressed(playback, EQUAL, EQUAL).speed == 4.0
@@ -54,27 +54,27 @@ def test_the_keys_ask_the_player(playback):
 
 
 @pytest.mark.parametrize("key", [PAGE_UP, 65, 0, -1])
-def test_keys_that_mean_nothing_here_do_nothing(playback, key):
+def test_unknown_keys_are_ignored(playback, key):
     before = playback.view
     assert pressed(playback, key) == before
 
 
-def test_keys_turn_commands_within_their_ranges(tmp_path):
+def test_keys_adjust_commands_within_ranges(tmp_path):
     playback = commanded(tmp_path)
     assert pressed(playback, END).held == {}
     assert pressed(playback, INSERT, INSERT).held == {"vy": pytest.approx(0.4)}
     assert pressed(playback, HOME, DELETE).held["vx"] == pytest.approx(-0.3)
     names, values = captions(playback.view)
-    said = dict(zip(names.splitlines(), values.splitlines(), strict=True))
-    assert (said["> vx"], said["vy"], said["wz"]) == ("-0.3", "0.4", "as drawn")
+    captions_by_name = dict(zip(names.splitlines(), values.splitlines(), strict=True))
+    assert (captions_by_name["> vx"], captions_by_name["vy"], captions_by_name["wz"]) == ("-0.3", "0.4", "as drawn")
     pressed(playback, DELETE, DELETE)
     assert playback.view.held["vx"] == pytest.approx(-0.9)
     assert "vx" not in pressed(playback, DELETE).held
 
 
-def test_the_captions_say_what_is_shown(playback):
+def test_captions_show_view(playback):
     names, values = captions(pressed(playback, SPACE, UP))
-    said = dict(zip(names.splitlines(), values.splitlines(), strict=True))
-    assert said["speed"] == "paused"
-    assert said["environment"] == "1 of 3"
-    assert "checkpoint" not in said
+    captions_by_name = dict(zip(names.splitlines(), values.splitlines(), strict=True))
+    assert captions_by_name["speed"] == "paused"
+    assert captions_by_name["environment"] == "1 of 3"
+    assert "checkpoint" not in captions_by_name

@@ -34,7 +34,7 @@ def _headless(monkeypatch):
         monkeypatch.delenv(name, raising=False)
 
 
-def test_the_camera_stands_at_eye_and_looks_at_lookat():
+def test_free_camera_is_at_eye_and_looks_at_lookat():
     camera = free_camera(ViewerConfig(eye=(8.0, 0.0, 5.0), lookat=(0.0, 0.0, 2.0)))
     azimuth, elevation = np.radians(camera.azimuth), np.radians(camera.elevation)
     ahead = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -42,7 +42,7 @@ def test_the_camera_stands_at_eye_and_looks_at_lookat():
 
 
 @pytest.mark.slow
-def test_the_pole_is_in_the_picture_and_moves():
+def test_picture_shows_moving_pole():
     env = make_env(resolve(find_task("cartpole"), overrides=["scene.num_envs=2"]))
     env.reset(seed=1)
     with Renderer(env.engine.model, env.config.viewer) as renderer:
@@ -60,7 +60,7 @@ def test_the_pole_is_in_the_picture_and_moves():
 
 
 @pytest.mark.slow
-def test_the_camera_goes_along_with_the_entity_that_it_follows():
+def test_camera_follows_entity():
     drawn = {}
     for follow in ("robot", None):
         overrides = ["scene.num_envs=1", f"viewer.follow={follow or 'null'}"]
@@ -79,7 +79,7 @@ def test_the_camera_goes_along_with_the_entity_that_it_follows():
 
 
 @pytest.mark.slow
-def test_what_walks_away_keeps_its_light_and_shadow():
+def test_light_follows_entity():
     env = make_env(resolve(find_task("ant-direct"), overrides=["scene.num_envs=1"]))
     env.reset(seed=1)
     model, data = env.world(0)
@@ -92,18 +92,18 @@ def test_what_walks_away_keeps_its_light_and_shadow():
     assert (np.abs(pictures[0] - pictures[1]).max(axis=2) > 20).mean() < 0.01
 
 
-def test_what_is_followed_must_be_in_the_scene():
+def test_unknown_followed_entity_is_rejected():
     with pytest.raises(ConfigError, match=r"there is no entity 'rover' in the scene; entities: robot"):
         resolve(find_task("cartpole"), overrides=["viewer.follow=rover"])
 
 
-def test_drawing_switched_off_is_a_machine_error(monkeypatch):
+def test_disabled_gl_is_machine_error(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
     with pytest.raises(MachineError, match="switched off by MUJOCO_GL=disable"):
         open_context(64, 48)
 
 
-def test_no_gl_at_all_says_what_was_tried_and_what_to_install():
+def test_missing_gl_lists_backends_and_packages():
     code = (
         "import sys\nclass Hidden:\n    def find_spec(name, *_):\n"
         "        if name in ('mujoco.egl', 'mujoco.osmesa'): raise ImportError(name)\n"
@@ -112,14 +112,14 @@ def test_no_gl_at_all_says_what_was_tried_and_what_to_install():
         "try: open_context(64, 48)\nexcept MachineError as e: print(e.message, '|', e.hint)"
     )
     env = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")}
-    said = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True).stdout
-    assert "tried egl" in said
-    assert "osmesa" in said
-    assert "apt install libegl1 libosmesa6" in said
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True).stdout
+    assert "tried egl" in done
+    assert "osmesa" in done
+    assert "apt install libegl1 libosmesa6" in done
 
 
 @pytest.mark.slow
-def test_an_mp4_has_every_picture_at_the_control_rate(tmp_path):
+def test_mp4_has_all_frames_at_control_rate(tmp_path):
     file = tmp_path / "deep" / "er" / "x.mp4"
     with VideoWriter(file, 1 / 60) as writer:
         for picture in PICTURES:
@@ -132,7 +132,7 @@ def test_an_mp4_has_every_picture_at_the_control_rate(tmp_path):
 
 
 @pytest.mark.parametrize(("period", "frames", "duration"), [(0.02, 4, 20), (0.05, 4, 50), (1 / 60, 2, 50)])
-def test_a_gif_plays_at_the_right_speed(tmp_path, period, frames, duration):
+def test_gif_speed_is_right(tmp_path, period, frames, duration):
     from PIL import Image
 
     with VideoWriter(tmp_path / "x.gif", period) as writer:
@@ -144,13 +144,13 @@ def test_a_gif_plays_at_the_right_speed(tmp_path, period, frames, duration):
 
 
 @pytest.mark.parametrize("rate", [10, 20, 24, 25, 30, 50, 60, 60.24, 100, 120, 200, 500])
-def test_a_gifs_frames_are_right_within_two_percent(rate):
+def test_gif_stride_is_right_within_two_percent(rate):
     shown = gif_stride(1 / rate) / rate
     assert abs(round(100 * shown) / (100 * shown) - 1) < 0.02
     assert round(100 * shown) >= 2
 
 
-def test_a_failure_leaves_no_file(tmp_path):
+def test_failed_video_leaves_no_file(tmp_path):
     def fail():
         with VideoWriter(tmp_path / "x.gif", 0.02) as writer:
             writer.add(PICTURES[0])
@@ -161,7 +161,7 @@ def test_a_failure_leaves_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_old_video_stays_until_the_new_one_is_whole(tmp_path):
+def test_old_video_stays_until_new_one_is_complete(tmp_path):
     (tmp_path / "x.gif").write_bytes(b"old")
 
     def fail():
@@ -175,26 +175,26 @@ def test_an_old_video_stays_until_the_new_one_is_whole(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["x.avi", "x", "x.mp4.txt", ".mp4"])
-def test_another_kind_of_file_is_a_usage_error(tmp_path, name):
+def test_other_suffix_is_usage_error(tmp_path, name):
     with pytest.raises(UsageError, match="is not a video file"):
         check_video(tmp_path / name)
 
 
-def test_a_folder_that_cannot_be_made_is_a_machine_error(tmp_path):
+def test_unwritable_folder_is_machine_error(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(MachineError, match="cannot write"):
         VideoWriter(tmp_path / "file" / "x.gif", 0.02)
 
 
-def test_without_ffmpeg_a_video_is_refused_and_a_gif_is_not(monkeypatch, tmp_path):
+def test_missing_ffmpeg_rejects_mp4_but_not_gif(monkeypatch, tmp_path):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "nothing"))
-    with pytest.raises(MachineError, match="IMAGEIO_FFMPEG_EXE names no program") as caught:
+    with pytest.raises(MachineError, match="IMAGEIO_FFMPEG_EXE is not a program") as caught:
         check_video(tmp_path / "x.mp4")
     assert ".gif" in caught.value.hint
     check_video(tmp_path / "x.gif")
 
 
-def test_a_machine_without_any_ffmpeg_is_told_where_to_get_one(monkeypatch, tmp_path):
+def test_missing_ffmpeg_error_says_how_to_install(monkeypatch, tmp_path):
     import imageio_ffmpeg
 
     def fails():
@@ -206,7 +206,7 @@ def test_a_machine_without_any_ffmpeg_is_told_where_to_get_one(monkeypatch, tmp_
     assert "apt install ffmpeg" in caught.value.hint
 
 
-def test_without_imageio_the_pip_line_is_given(monkeypatch, tmp_path):
+def test_missing_imageio_names_pip_command(monkeypatch, tmp_path):
     import importlib.util
 
     real = importlib.util.find_spec
@@ -216,10 +216,10 @@ def test_without_imageio_the_pip_line_is_given(monkeypatch, tmp_path):
     assert caught.value.hint == 'pip install "rlcli[video]"'
 
 
-def test_refusing_a_video_imports_nothing_heavy():
+def test_check_video_imports_nothing_heavy():
     code = (
         "import sys; from pathlib import Path\nfrom rlcli.viewer.video_writer import check_video\n"
         "check_video(Path('x.mp4')); print([m for m in ('torch', 'mujoco', 'numpy', 'imageio') if m in sys.modules])"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert said.stdout.strip() == "[]", said.stderr
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr

@@ -1,4 +1,4 @@
-"""What a person at a viewer may ask of a policy in its environment, without any viewer."""
+"""Requests of a viewer's user, tested without a viewer."""
 
 import copy
 import json
@@ -34,7 +34,7 @@ def playback():
 
 @pytest.fixture
 def counted(playback, monkeypatch):
-    """The playback, and a list that grows with every step of its environment."""
+    """Playback, and a list that grows with every step of its environment."""
     steps, real = [], playback.env.step
 
     def step(*arguments):
@@ -45,7 +45,7 @@ def counted(playback, monkeypatch):
     return playback, steps
 
 
-def test_steps_keep_pace_with_the_clock(counted):
+def test_steps_follow_real_time(counted):
     playback, steps = counted
     for _ in range(30):
         playback.advance(1 / 30)
@@ -53,7 +53,7 @@ def test_steps_keep_pace_with_the_clock(counted):
 
 
 @pytest.mark.parametrize("speed", SPEEDS)
-def test_speed_multiplies_the_pace(counted, speed):
+def test_speed_scales_steps(counted, speed):
     playback, steps = counted
     playback.set_speed(speed)
     for _ in range(40):
@@ -62,7 +62,7 @@ def test_speed_multiplies_the_pace(counted, speed):
     assert playback.view.speed == speed
 
 
-def test_faster_and_slower_stop_at_the_ends(playback):
+def test_change_speed_stops_at_limits(playback):
     for _ in range(20):
         playback.change_speed(1)
     assert playback.speed == 8
@@ -71,7 +71,7 @@ def test_faster_and_slower_stop_at_the_ends(playback):
     assert playback.speed == 1 / 8
 
 
-def test_a_slow_machine_answers_between_steps(counted):
+def test_advance_returns_after_patience(counted):
     playback, steps = counted
     playback.patience = 0.0
     playback.set_speed(8.0)
@@ -79,13 +79,13 @@ def test_a_slow_machine_answers_between_steps(counted):
     assert len(steps) == 1
 
 
-def test_a_long_gap_is_not_caught_up_with(counted):
+def test_long_gap_is_not_caught_up(counted):
     playback, steps = counted
     playback.advance(60.0)
     assert len(steps) <= 15
 
 
-def test_while_paused_no_step_runs_and_the_environment_says_so(counted):
+def test_pause_stops_steps_and_is_playing(counted):
     playback, steps = counted
     playback.submit(playback.pause)
     state = playback.env.state_dict()
@@ -102,7 +102,7 @@ def test_while_paused_no_step_runs_and_the_environment_says_so(counted):
     assert playback.env.is_playing()
 
 
-def test_a_single_step_is_one_and_leaves_it_paused(counted):
+def test_single_step_makes_one_step_and_pauses(counted):
     playback, steps = counted
     playback.submit(playback.single_step)
     for _ in range(5):
@@ -115,7 +115,7 @@ def test_a_single_step_is_one_and_leaves_it_paused(counted):
     assert len(steps) == 3
 
 
-def test_a_step_that_fails_leaves_it_paused(playback, monkeypatch):
+def test_failing_step_leaves_playback_paused(playback, monkeypatch):
     playback.pause()
 
     def fail(action):
@@ -128,7 +128,7 @@ def test_a_step_that_fails_leaves_it_paused(playback, monkeypatch):
     assert playback.env.is_playing() is False
 
 
-def test_reset_begins_new_episodes_also_while_paused(playback):
+def test_reset_works_while_paused(playback):
     for _ in range(20):
         playback.advance(0.1)
     playback.submit(playback.pause)
@@ -143,7 +143,7 @@ def test_reset_begins_new_episodes_also_while_paused(playback):
     assert bool((playback.env.episode_length_buf == 1).all())
 
 
-def test_the_environment_shown_wraps_around(playback):
+def test_shown_environment_wraps_around(playback):
     playback.show(-1)
     playback.advance(0.0)
     assert playback.view.shown == 2
@@ -153,7 +153,7 @@ def test_the_environment_shown_wraps_around(playback):
     assert playback.view.episode_s == pytest.approx(playback.env.episode_length_buf[0] * playback.env.step_dt)
 
 
-def test_what_is_asked_in_another_thread_is_done_between_steps(playback):
+def test_submitted_request_runs_between_steps(playback):
     done = []
     thread = threading.Thread(target=lambda: playback.submit(lambda: done.append(threading.get_ident())))
     thread.start()
@@ -167,14 +167,14 @@ def test_what_is_asked_in_another_thread_is_done_between_steps(playback):
 
 
 def forces(env, newtons):
-    """On the cart, along its rail."""
+    """Return a force on the cart along its rail. (nbody, 6) [N, N m]"""
     model = env.engine.model
     given = np.zeros((model.nbody, 6))
     given[model.nbody - 2, np.abs(model.jnt_axis[0]).argmax()] = newtons
     return given
 
 
-def test_a_push_reaches_the_environment_shown_alone():
+def test_push_acts_only_on_shown_environment():
     pushed, free = (Playback(env, zero_policy(env)) for env in (cartpole(), cartpole()))
     for one in (pushed, free):
         one.show(1)
@@ -187,7 +187,7 @@ def test_a_push_reaches_the_environment_shown_alone():
     assert apart[0] == apart[2] == 0.0
 
 
-def test_after_a_push_nothing_of_it_is_left(playback):
+def test_push_leaves_no_force_behind(playback):
     playback.push(forces(playback.env, 50.0))
     playback.advance(0.1)
     playback.push(None)
@@ -195,7 +195,7 @@ def test_after_a_push_nothing_of_it_is_left(playback):
     assert not playback.env.engine.field("xfrc_applied").any()
 
 
-def test_a_reset_under_a_push_leaves_no_force(playback):
+def test_reset_during_push_leaves_no_force(playback):
     playback.push(forces(playback.env, 1e4))
     ended = playback.ended.clone()
     for _ in range(40):
@@ -204,7 +204,7 @@ def test_a_reset_under_a_push_leaves_no_force(playback):
     assert not playback.env.engine.field("xfrc_applied").any()
 
 
-def test_a_force_of_the_task_outlasts_a_push(playback):
+def test_push_keeps_forces_of_task(playback):
     field = playback.env.engine.field("xfrc_applied")
     field[0, 1, 2] = 3.0
     before = field.clone()
@@ -215,7 +215,7 @@ def test_a_force_of_the_task_outlasts_a_push(playback):
 
 
 @pytest.mark.parametrize("bad", [np.zeros((1, 6)), np.full((5, 6), np.nan), np.zeros(7), np.full((3, 6), np.inf)])
-def test_a_push_that_is_none_is_ignored(playback, bad):
+def test_invalid_push_is_ignored(playback, bad):
     playback.push(bad)
     playback.advance(0.1)
     assert playback.env.divergences == 0
@@ -244,7 +244,7 @@ def commanded(folder, **more):
     return Playback(env, zero_policy(env))
 
 
-def test_held_commands_reach_the_policy_through_draws_and_resets(tmp_path):
+def test_held_command_survives_resampling_and_reset(tmp_path):
     playback = commanded(tmp_path / "t")
     seen = []
     act = playback.act
@@ -267,7 +267,7 @@ def test_held_commands_reach_the_policy_through_draws_and_resets(tmp_path):
     assert len({value for row in seen[2:] for value in row[:, 0].tolist()}) > 3
 
 
-def test_the_sliders_are_those_of_the_command_terms(tmp_path):
+def test_knobs_are_command_elements(tmp_path):
     view = commanded(tmp_path / "t").view
     assert [(knob.name, knob.low, knob.high) for knob in view.knobs] == [
         ("vx", -1.0, 2.0),
@@ -276,7 +276,7 @@ def test_the_sliders_are_those_of_the_command_terms(tmp_path):
     ]
 
 
-def test_of_two_terms_with_one_element_the_term_is_named(tmp_path):
+def test_knobs_of_two_terms_have_term_names(tmp_path):
     playback = commanded(tmp_path / "t", second=copy.deepcopy(VELOCITY))
     assert [knob.name for knob in playback.view.knobs][:2] == ["velocity.vx", "velocity.vy"]
     playback.hold("second.vx", 1.5)
@@ -287,7 +287,7 @@ def test_of_two_terms_with_one_element_the_term_is_named(tmp_path):
         playback.hold("vx", 1.0)
 
 
-def test_a_wrong_command_lists_the_right_ones(tmp_path):
+def test_unknown_command_error_lists_valid_names(tmp_path):
     playback = commanded(tmp_path / "t")
     with pytest.raises(UsageError) as caught:
         playback.hold("vz", 1.0)
@@ -298,7 +298,7 @@ def test_a_wrong_command_lists_the_right_ones(tmp_path):
 
 
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
-def test_a_task_without_commands_says_so(task):
+def test_hold_command_without_commands_is_usage_error(task):
     env = make_env(resolve(find_task(task), overrides=["scene.num_envs=1", "sim.engine_threads=1"]))
     with pytest.raises(UsageError) as caught:
         hold_command(env, "vx", 1.0)
@@ -311,7 +311,7 @@ def test_a_task_without_commands_says_so(task):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A run with a few checkpoints, that nobody has trained for long."""
+    """Run with a few checkpoints, trained only briefly."""
     from rlcli.cli.app import main
 
     runs = tmp_path_factory.mktemp("runs")
@@ -326,7 +326,7 @@ def trained(tmp_path_factory):
 
 @pytest.fixture
 def playing(trained, tmp_path, caplog):
-    """A playback of a copy of that run, the copy, and the captured log."""
+    """Playback of a copy of that run, the copy, and the captured log."""
     folder = tmp_path / "run"
     shutil.copytree(trained, folder)
     env = cartpole()
@@ -337,7 +337,7 @@ def playing(trained, tmp_path, caplog):
 
 
 def copy_as(folder, step):
-    """A further checkpoint, as training writes it: whole, under its name at once."""
+    """Add a checkpoint as training does: complete, by renaming it to its final name."""
     newest = sorted((folder / "checkpoints").glob("0*"))[-1]
     fresh = folder / "checkpoints" / "writing"
     shutil.copytree(newest, fresh)
@@ -346,7 +346,7 @@ def copy_as(folder, step):
     fresh.rename(folder / "checkpoints" / f"{step:012d}")
 
 
-def test_switching_changes_the_policy_within_the_episode(playing):
+def test_switch_changes_policy_within_episode(playing):
     playback, _, log = playing
     obs = playback.env.reset()["policy"]
     for _ in range(5):
@@ -362,7 +362,7 @@ def test_switching_changes_the_policy_within_the_episode(playing):
     assert torch.equal(playback.env.episode_length_buf, lengths)
 
 
-def test_checkpoints_that_appear_are_listed_and_followed(playing):
+def test_new_checkpoints_are_listed_and_followed(playing):
     playback, folder, log = playing
     have = playback.view.checkpoints
     copy_as(folder, 1000)
@@ -383,7 +383,7 @@ def test_checkpoints_that_appear_are_listed_and_followed(playing):
     assert playback.checkpoint == 2000
 
 
-def test_a_checkpoint_that_was_pruned_is_said_to_be_gone_and_the_policy_stays(playing):
+def test_removed_checkpoint_is_reported_and_policy_stays(playing):
     playback, folder, log = playing
     first, newest = playback.view.checkpoints[0], playback.checkpoint
     act = playback.act
@@ -393,8 +393,8 @@ def test_a_checkpoint_that_was_pruned_is_said_to_be_gone_and_the_policy_stays(pl
     assert playback.act is act
     assert playback.view.checkpoint == newest
     assert first not in playback.view.checkpoints
-    assert f"step {first} cannot be played, step {newest} goes on" in log.messages[0]
-    assert "not there any more" in playback.view.message
+    assert f"step {first} cannot be played, step {newest} continues" in log.messages[0]
+    assert "does not exist any more" in playback.view.message
 
 
 @pytest.mark.parametrize(
@@ -409,7 +409,7 @@ def test_a_checkpoint_that_was_pruned_is_said_to_be_gone_and_the_policy_stays(pl
         ),
     ],
 )
-def test_a_damaged_checkpoint_is_reported_and_the_policy_stays(playing, damage):
+def test_damaged_checkpoint_is_reported_and_policy_stays(playing, damage):
     playback, folder, log = playing
     first, act = playback.view.checkpoints[0], playback.act
     damage(folder / "checkpoints" / f"{first:012d}")
@@ -421,7 +421,7 @@ def test_a_damaged_checkpoint_is_reported_and_the_policy_stays(playing, damage):
     assert playback.steps > 0
 
 
-def test_a_run_that_disappears_leaves_the_policy_playing(playing):
+def test_removed_run_keeps_policy(playing):
     playback, folder, _ = playing
     shutil.rmtree(folder)
     playback.set_follow(True)

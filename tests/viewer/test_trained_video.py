@@ -1,4 +1,4 @@
-"""`play --video` of a policy that balances: as many pictures as steps, at the control rate, of a pole that stands."""
+"""`play --video` of a balancing policy: one frame for each step, at the control rate, with an upright pole."""
 
 import json
 import os
@@ -17,18 +17,18 @@ np.savez(sys.argv[2], frames=np.stack([frame for frame in reader]), fps=reader.g
 """
 
 
-def test_the_pole_of_a_trained_policy_stands_in_its_video(cartpole_run, tmp_path):
+def test_video_of_trained_policy_shows_upright_pole(cartpole_run, tmp_path):
     variables = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")}
     words = ["play", "--checkpoint", "latest", "--video", "x.mp4", "--json", "--runs-dir", cartpole_run.parent.parent]
     words += ["viewer.width=320", "viewer.height=240"]
     command = [sys.executable, "-m", "rlcli", *map(str, words)]
     done = subprocess.run(command, cwd=tmp_path, env=variables, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
-    said = json.loads(done.stdout)
+    document = json.loads(done.stdout)
     subprocess.run([sys.executable, "-c", READ, tmp_path / "x.mp4", tmp_path / "x.npz"], check=True)
     with np.load(tmp_path / "x.npz") as read:
         frames, fps = read["frames"], float(read["fps"])
-    assert len(frames) == said["frames"] == 300
+    assert len(frames) == document["frames"] == 300
     assert fps == pytest.approx(60.0, rel=1e-3)
     assert min(frame.std() for frame in frames) > 10
     for frame in frames[120:].astype(int):

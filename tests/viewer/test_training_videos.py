@@ -1,4 +1,4 @@
-"""`train --video-every`: clips of the policy as it learns, which training neither notices nor fails with."""
+"""`train --video-every`: videos of the current policy, which neither change nor stop the training."""
 
 import json
 import subprocess
@@ -48,7 +48,7 @@ def without_times(run):
     return [{name: value for name, value in row.items() if not name.startswith("Perf/")} for row in rows]
 
 
-def test_a_machine_that_cannot_draw_says_so_before_there_is_a_run(cli, monkeypatch):
+def test_missing_gl_is_reported_before_run_is_created(cli, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "off")
     done = cli("train", *SMALL, "--video-every", 2)
     assert done.code == 10
@@ -56,7 +56,7 @@ def test_a_machine_that_cannot_draw_says_so_before_there_is_a_run(cli, monkeypat
     assert not Path("runs").exists()
 
 
-def test_a_missing_encoder_is_said_before_there_is_a_run(cli, monkeypatch):
+def test_missing_encoder_is_reported_before_run_is_created(cli, monkeypatch):
     import importlib.util as util
 
     find = util.find_spec
@@ -67,19 +67,19 @@ def test_a_missing_encoder_is_said_before_there_is_a_run(cli, monkeypatch):
     assert not Path("runs").exists()
 
 
-def test_without_clips_nothing_is_drawn(cli, monkeypatch):
+def test_training_without_videos_opens_no_renderer(cli, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "off")
     assert cli("train", *SMALL, "--max-iterations", 1, "--video-every", 0).code == 0
 
 
-def test_only_the_process_that_writes_the_run_films(tmp_path):
+def test_only_rank_0_films(tmp_path):
     run = SimpleNamespace(folder=tmp_path, record={"seed": 1})
     for writes in (True, False):
         job = Job(run, None, [], video_every=2, writes=writes)
         assert (_training_videos(job, StopRequest()) is not None) == writes
 
 
-def test_a_clip_that_fails_is_said_once_and_the_generators_are_as_before(caplog):
+def test_failed_video_warns_once_and_restores_rng(caplog):
     def make():
         torch.rand(3)
         raise OSError("the driver is gone")
@@ -95,7 +95,7 @@ def test_a_clip_that_fails_is_said_once_and_the_generators_are_as_before(caplog)
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "agent"), [("cartpole", "sb3-ppo"), ("cartpole-direct", "ppo")])
-def test_clips_change_nothing_of_training(cli, weights, task, agent):
+def test_videos_do_not_change_training(cli, weights, task, agent):
     words = (task, *SMALL[1:], *PICTURE, "--agent", agent, "--max-iterations", 4)
     assert cli("train", *words, "--name", "plain").code == 0
     assert cli("train", *words, "--name", "filmed", "--video-every", 2).code == 0
@@ -115,7 +115,7 @@ def test_clips_change_nothing_of_training(cli, weights, task, agent):
 
 
 @pytest.mark.slow
-def test_a_resumed_run_goes_on_filming_until_told_not_to(cli, weights):
+def test_resumed_run_keeps_filming_unless_disabled(cli, weights):
     words = (*SMALL, *PICTURE, "--agent", "ppo", "agent.save_interval=1", "--max-iterations", 4)
     assert cli("train", *words, "--name", "plain").code == 0
     assert cli("train", *words, "--name", "filmed", "--video-every", 1).code == 0
@@ -132,18 +132,18 @@ def test_a_resumed_run_goes_on_filming_until_told_not_to(cli, weights):
 
 
 @pytest.mark.slow
-def test_training_goes_on_where_clips_cannot_be_written(cli):
+def test_training_continues_if_video_cannot_be_written(cli):
     assert cli("train", *SMALL, *PICTURE, "--max-iterations", 1, "--name", "a").code == 0
     run = run_of("a")
     (run / "videos").write_text("in the way")
     done = cli("train", "--resume", run, "--max-iterations", 3, "--video-every", 1, "-q")
     assert done.code == 0
-    assert done.err.count("warning: no clip") == 1
+    assert done.err.count("warning: no video") == 1
     assert len(without_times(run)) == 3
 
 
 @pytest.mark.slow
-def test_a_clip_is_abandoned_when_training_is_asked_to_stop(cli, caplog):
+def test_video_is_aborted_when_training_stops(cli, caplog):
     from rlcli.envs.make import make_env
     from rlcli.runs.checkpoint import open_checkpoint
     from rlcli.runs.restore import resolve_run
@@ -155,6 +155,7 @@ def test_a_clip_is_abandoned_when_training_is_asked_to_stop(cli, caplog):
     env = make_env(resolve_run(run, play=True, flags={"scene.num_envs": 1}))
     policy = open_checkpoint(checkpoint).policy()
     films = TrainingVideos(lambda: env, run.folder / "videos", 1, lambda: int(env.episode_length_buf[0]) > 2)
+    caplog.clear()  # records of the training
     assert films.record(lambda: policy, 1) is None
     assert (caplog.messages, clips(run_of("a"))) == ([], [])
     films.close()

@@ -1,4 +1,4 @@
-"""The server of `play --viewer web`, asked as a stranger would ask it; no browser takes part."""
+"""Server of `play --viewer web`: requests of other pages and programs, sent without a browser."""
 
 import json
 import signal
@@ -25,7 +25,7 @@ def playing(tmp_path_factory):
 
 
 def ask(playing, path, *lines):
-    """The head and the first bytes of the body of the answer to a request of these header lines."""
+    """Send a request with these header lines; return the head and the first bytes of the body of the response."""
     text = "\r\n".join([f"GET {path} HTTP/1.1", *lines, "", ""])
     with socket.create_connection(("127.0.0.1", playing.port), timeout=PATIENCE) as connection:
         connection.sendall(text.encode())
@@ -42,7 +42,7 @@ def status(answer):
     return int(answer.split()[1])
 
 
-def test_the_address_and_the_tunnel_are_said(playing):
+def test_address_and_ssh_tunnel_are_printed(playing):
     assert f"open {playing.url} in a browser" in playing.err
     assert "viewer: web (as asked)" in playing.err
     (line,) = [line for line in playing.err.splitlines() if "ssh -N" in line]
@@ -52,7 +52,7 @@ def test_the_address_and_the_tunnel_are_said(playing):
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
 @pytest.mark.parametrize("path", ["/", "/web_client.js", "/model?total_bytes", "/assets/pbr.filamat"])
-def test_its_own_page_is_served_and_closed_to_others(playing, name, path):
+def test_own_page_is_served_with_headers(playing, name, path):
     answer = ask(playing, path, f"Host: {name}:{playing.port}")
     head = answer.partition("\r\n\r\n")[0].lower()
     assert status(answer) == 200
@@ -62,7 +62,7 @@ def test_its_own_page_is_served_and_closed_to_others(playing, name, path):
 
 
 @pytest.mark.parametrize("path", ["/state?sid=a", "/ui?sid=a"])
-def test_its_own_page_opens_its_sockets(playing, path):
+def test_own_page_opens_sockets(playing, path):
     own = (f"Host: {playing.host}", f"Origin: http://{playing.host}")
     assert status(ask(playing, path, *own, *UPGRADE)) == 101
 
@@ -84,19 +84,19 @@ STRANGERS = {
 
 @pytest.mark.parametrize("upgrade", [(), UPGRADE], ids=["page", "socket"])
 @pytest.mark.parametrize("lines", STRANGERS.values(), ids=list(STRANGERS))
-def test_a_stranger_is_refused(playing, lines, upgrade):
+def test_foreign_requests_are_refused(playing, lines, upgrade):
     for path in ("/", "/model", "/state?sid=a"):
         answer = ask(playing, path, *(line.format(port=playing.port) for line in lines), *upgrade)
         assert status(answer) in (400, 403), answer
         assert "mujoco" not in answer.lower()
 
 
-def test_a_socket_that_names_no_page_is_refused(playing):
+def test_socket_without_origin_is_refused(playing):
     assert status(ask(playing, "/state?sid=a", f"Host: {playing.host}", *UPGRADE)) == 403
 
 
 @pytest.mark.parametrize("upgrade", [(), UPGRADE], ids=["page", "socket"])
-def test_no_model_is_taken_from_a_browser(playing, upgrade):
+def test_model_upload_is_refused(playing, upgrade):
     own = (f"Host: {playing.host}", f"Origin: http://{playing.host}")
     assert status(ask(playing, "/drop?sid=a", *own, *upgrade)) in (403, 426)
     assert status(ask(playing, "/drop?sid=a", *own, *UPGRADE)) == 403
@@ -105,12 +105,12 @@ def test_no_model_is_taken_from_a_browser(playing, upgrade):
 @pytest.mark.parametrize(
     "path", ["/../web_server.py", "/..%2fweb_server.py", "/assets/../../../__init__.py", "/etc/passwd"]
 )
-def test_no_file_of_the_machine_is_served(playing, path):
+def test_local_files_are_not_served(playing, path):
     assert status(ask(playing, path, f"Host: {playing.host}")) in (403, 404)
 
 
 def listening(process):
-    """Addresses at which a process listens, as the kernel writes them."""
+    """Return the addresses at which a process listens, in the format of the kernel."""
     links = [link.readlink().name for link in Path(f"/proc/{process}/fd").iterdir() if link.is_symlink()]
     inodes = {name[8:-1] for name in map(str, links) if name.startswith("socket:[")}
     found = []
@@ -124,14 +124,14 @@ def listening(process):
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="only Linux tells who listens where")
-def test_nothing_listens_beyond_this_machine(playing):
+def test_server_listens_only_on_loopback(playing):
     found = listening(playing.process.pid)
     assert (f"{playing.port:04X}") in [port for _, _, port in found]
     assert {(table, address) for table, address, _ in found} == {("tcp", "0100007F")}
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="only Linux tells who listens where")
-def test_the_inner_connection_takes_nobody_else(playing):
+def test_inner_listener_accepts_only_own_process(playing):
     inner = [int(port, 16) for _, _, port in listening(playing.process.pid) if int(port, 16) != playing.port]
     assert len(inner) == 1
     with socket.create_connection(("127.0.0.1", inner[0]), timeout=PATIENCE) as connection:
@@ -147,7 +147,7 @@ def ended(connection):
         return True
 
 
-def test_a_port_in_use_is_said_with_what_to_do(playing, capfd, monkeypatch, tmp_path):
+def test_port_in_use_error_has_hint(playing, capfd, monkeypatch, tmp_path):
     from rlcli.cli.app import main
 
     monkeypatch.chdir(tmp_path)
@@ -160,7 +160,7 @@ def test_a_port_in_use_is_said_with_what_to_do(playing, capfd, monkeypatch, tmp_
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_once_stopped_nothing_listens_and_stdout_is_one_document_or_nothing(tmp_path, stop):
+def test_stopped_server_frees_port_and_stdout_is_one_document(tmp_path, stop):
     with Playing(*START, "--port", 0, "--json", RLCLI_RUNS_DIR=str(tmp_path)) as one:
         assert status(ask(one, "/", f"Host: {one.host}")) == 200
         one.process.send_signal(stop)

@@ -1,4 +1,4 @@
-"""A policy is watched while it trains."""
+"""Playback of a policy during its training."""
 
 import logging
 import os
@@ -23,7 +23,7 @@ WORDS += ["sim.engine_threads=1", "agent.torch_threads=1", "agent.save_interval=
 
 
 @pytest.mark.slow
-def test_each_new_checkpoint_of_a_running_training_is_played(tmp_path, caplog):
+def test_playback_follows_checkpoints_of_running_training(tmp_path, caplog):
     torch.set_num_threads(1)
     variables = {**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
     command = [sys.executable, "-m", "rlcli", *WORDS, "--runs-dir", str(tmp_path)]
@@ -47,7 +47,7 @@ def test_each_new_checkpoint_of_a_running_training_is_played(tmp_path, caplog):
             played.add(playback.view.checkpoint)
         steps = playback.steps
         assert steps > 0
-        assert all(said.startswith("now playing step ") for said in caplog.messages)
+        assert all(message.startswith("now playing step ") for message in caplog.messages)
     finally:
         training.send_signal(signal.SIGINT)
         training.wait(timeout=240)

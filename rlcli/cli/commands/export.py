@@ -13,7 +13,7 @@ from rlcli.cli.ui.options import CheckpointRef, RunsDir, TaskOfPolicy
 from rlcli.errors import UsageError, listing
 
 if TYPE_CHECKING:
-    from rlcli.deploy.closed_loop import ReferenceEnv, Verdict
+    from rlcli.deploy.closed_loop import ClosedLoopResult, ReferenceEnv
     from rlcli.runs.checkpoint import Checkpoint
     from rlcli.runs.policy_ref import Choice
     from rlcli.runs.run import Run
@@ -86,16 +86,16 @@ def _default_file(choice: Choice, format_: str) -> Path:
 
 def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | None) -> ReferenceEnv:
     from rlcli.deploy.closed_loop import open_reference
-    from rlcli.deploy.onboard_program import require_room
+    from rlcli.deploy.onboard_program import check_overwrites
     from rlcli.runs.trusted_tasks import named_task
 
     if choice.run is None and choice.bundle is None:
         raise UsageError(f"{choice.folder} lies outside a run", hint="--verify needs the run's configuration")
-    require_room(file)
+    check_overwrites(file)
     return open_reference(choice, saved, None if task is None else named_task(task))
 
 
-def _verify(reference: ReferenceEnv, saved: Checkpoint, file: Path, format_: str, episodes: int) -> Verdict:
+def _verify(reference: ReferenceEnv, saved: Checkpoint, file: Path, format_: str, episodes: int) -> ClosedLoopResult:
     """Run the file in plain MuJoCo, and print what was found."""
     from rlcli.deploy.closed_loop import verify
 
@@ -117,9 +117,9 @@ def _verify(reference: ReferenceEnv, saved: Checkpoint, file: Path, format_: str
     )
     if verdict.synchronized_return is not None:
         console.info(
-            f"every number agrees, and yet the returns part by {verdict.return_difference:.2%}: the motion magnifies"
-            " rounding; lived side by side, with rounding set aside in each step, the mean return is"
-            f" {verdict.synchronized_return:.6g}, and {verdict.disagreeing_steps} steps did not agree"
+            f"observations and actions agree, but returns differ by {verdict.return_difference:.2%}: rounding errors"
+            " grow chaotically; re-synchronised after every step, the mean return is"
+            f" {verdict.synchronized_return:.6g}, and the states disagree after {verdict.disagreeing_steps} steps"
         )
     return verdict
 

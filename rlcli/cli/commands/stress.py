@@ -137,7 +137,7 @@ def _show(result: StressResult, policy: str, against: str | None) -> list[HeatMa
     maps = heat_maps(result.sweeps, values, metric)
     for heat_map in maps:
         console.data("")
-        console.heat_map(heat_map.title, f"{heat_map.row_name} / {heat_map.column_name}".strip(" /"), heat_map)
+        console.heat_map(heat_map.title, f"{heat_map.rows.name} / {heat_map.columns.name}".strip(" /"), heat_map)
     worst = result.worst
     entry = {**result.grid, **result.searched}[worst][metric]
     where = "found by the search" if worst in result.searched else "of the grid"

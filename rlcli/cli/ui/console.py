@@ -117,17 +117,17 @@ class Console:
 
     def heat_map(self, title: str, corner: str, heat_map: HeatMap) -> None:
         """Print a map of numbers on stdout, in colours where stdout is a terminal: red is low, green is high."""
-        cells = zip(heat_map.rows, heat_map.cells, strict=True)
+        cells = zip(heat_map.rows.values, heat_map.cells, strict=True)
         rows = [[name, *(f"{number:.2f}" for number in numbers)] for name, numbers in cells]
         if self.json or not supports_styles(sys.stdout):
             self.data(title)
-            self.table([corner, *heat_map.columns], rows)
+            self.table([corner, *heat_map.columns.values], rows)
             return
         from rlcli.cli.ui.tables import draw_map
 
         styles = [[_shade(heat_map.share(number)) for number in numbers] for numbers in heat_map.cells]
         heading = [plain(title) + ":", plain(corner)]
-        draw_map(heading, [*map(plain, heat_map.columns)], [[*map(plain, row)] for row in rows], styles)
+        draw_map(heading, [*map(plain, heat_map.columns.values)], [[*map(plain, row)] for row in rows], styles)
 
 
 def _shade(share: float) -> str:

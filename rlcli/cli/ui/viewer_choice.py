@@ -137,7 +137,7 @@ def _open(session: Session, name: str, reason: str, port: int | None, drawn: int
             console.info(line)
 
     port = DEFAULT_PORT if port is None else port
-    run(playback, title=_title(session), together=drawn, port=port, ready=ready)
+    run(playback, title=_title(session), num_drawn=drawn, port=port, ready=ready)
     console.document(
         "play",
         video=None,

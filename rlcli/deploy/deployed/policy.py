@@ -1,8 +1,8 @@
-"""A trained policy that needs numpy alone: `outputs = run({"obs": obs})`, rows of float32 in and out.
+"""A trained policy that needs only numpy: `outputs = run({"obs": obs})`, rows of float32 in and out.
 
-`METADATA` says what the columns are; outputs are `action`, what env.step takes, and `command`, what the actuators
-receive. With a memory, inputs have `h_in` and `c_in` besides, zeros when an episode begins, and outputs `h_out` and
-`c_out`, the next step's inputs. `run` keeps nothing from call to call; an `Episode` does.
+`METADATA` describes the columns. The outputs are `action`, the argument of env.step, and `command`, what the actuators
+receive. A recurrent policy also has the inputs `h_in` and `c_in`, zeros when an episode begins, and the outputs `h_out`
+and `c_out`, the inputs of the next step. `run` stores nothing between calls; an `Episode` does.
 """
 
 import base64
@@ -16,18 +16,15 @@ WEIGHTS = ""
 
 
 def run(inputs):
-    """(n, observations) -> name: (n, columns); layers compute in float64"""
+    """Compute the outputs, (n, columns) each, from observations (n, observations). Layers compute in float64."""
     x = np.asarray(inputs["obs"], np.float32)
     if NETWORK["normalize"]:
         x = (x - _W["mean"]) * _W["scale"]
-        x = (
-            x
-            if NETWORK["normalize_clip"] is None
-            else np.clip(x, -NETWORK["normalize_clip"], NETWORK["normalize_clip"])
-        )
+        clip = NETWORK["normalize_clip"]
+        x = x if clip is None else np.clip(x, -clip, clip)
     x, outputs = x.astype(np.float64), {}
     if NETWORK["pictures"]:
-        x = _seen(x)
+        x = _convolve_pictures(x)
     if NETWORK["cells"]:
         hidden, cells = [], []
         for layer, (h, c) in enumerate(zip(inputs["h_in"], inputs["c_in"], strict=True)):
@@ -54,7 +51,7 @@ def run(inputs):
 
 
 class Episode:
-    """Remembers for one robot: past steps of observation terms with a history, and the policy's memory."""
+    """State of one robot's episode: the history of observation terms, and the policy's hidden state."""
 
     def __init__(self):
         self.terms, self.rows, self.memory = METADATA["observations"], {}, {}
@@ -62,46 +59,47 @@ class Episode:
             self.memory[part["input"]] = np.zeros(part["single"], np.float32)
 
     def step(self, now):
-        """From the observation of this step alone, each term's columns once, to action and command, a row each."""
-        start, seen = 0, []
+        """Return action and command for the observation of this step, which has each term once, without history."""
+        start, values = 0, []
         for term in self.terms:
             width = term["size"] // term["history"]
             row = np.asarray(now, np.float32)[start : start + width]
-            rows = self.rows.get(term["name"], [row] * term["history"])  # an episode's first value fills it
+            rows = self.rows.get(term["name"], [row] * term["history"])  # the first value fills the history
             self.rows[term["name"]] = [*rows[1:], row]
-            seen += self.rows[term["name"]]
+            values += self.rows[term["name"]]
             start += width
-        out = run({"obs": np.concatenate(seen)[None], **self.memory})
+        out = run({"obs": np.concatenate(values)[None], **self.memory})
         self.memory = {part["input"]: out[part["output"]] for part in METADATA["memory"]}
         return out["action"][0], out["command"][0]
 
 
-def _seen(x):
-    """Pictures through their convolutions, (channels, rows, columns) each; then the columns that are no picture's."""
-    found, kept, end = [], [], 0
+def _convolve_pictures(x):
+    """Apply the convolutions to the pictures, (channels, rows, columns) each; the other columns follow unchanged."""
+    features, others, end = [], [], 0
     for number, (start, steps, *shape) in enumerate(NETWORK["pictures"]):
         stop = start + int(np.prod(shape))
         pixels, (c, h, w) = x[:, start:stop], shape
         if NETWORK["motion"] is not None and steps > 1:
             frames = pixels.reshape(len(x), steps, -1)
-            changed = NETWORK["motion"] * (frames[:, -1:] - frames[:, :-1])
-            pixels = np.concatenate([changed, frames[:, -1:]], axis=1).reshape(len(x), -1)
+            change = NETWORK["motion"] * (frames[:, -1:] - frames[:, :-1])
+            pixels = np.concatenate([change, frames[:, -1:]], axis=1).reshape(len(x), -1)
         for layer, (edge, step) in enumerate(NETWORK["windows"]):
             down, right = (step * np.arange((size - edge) // step + 1) for size in (h, w))
+            # convolution as a matrix product: each row of `index` has the pixels below one kernel position
             window = (np.arange(c)[:, None, None] * h + np.arange(edge)[:, None]) * w + np.arange(edge)
             index = (down[:, None] * w + right).reshape(-1, 1) + window.reshape(1, -1)
             pixels = pixels[:, index] @ _W[f"cw{number}_{layer}"].T + _W[f"cb{number}_{layer}"]
             pixels = _ACTIVATIONS[NETWORK["activation"]](pixels).transpose(0, 2, 1)
             c, h, w = pixels.shape[1], len(down), len(right)
             pixels = pixels.reshape(len(x), -1)
-        found.append(pixels)
-        kept.append(x[:, end:start])
+        features.append(pixels)
+        others.append(x[:, end:start])
         end = stop
-    return np.concatenate([*found, *kept, x[:, end:]], axis=1)
+    return np.concatenate([*features, *others, x[:, end:]], axis=1)
 
 
 def _sigmoid(x):
-    small = np.exp(-np.abs(x))
+    small = np.exp(-np.abs(x))  # of -|x|, so that exp cannot overflow
     return np.where(x >= 0, 1.0, small) / (1.0 + small)
 
 

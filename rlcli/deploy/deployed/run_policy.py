@@ -1,8 +1,8 @@
-"""Lets an exported policy drive its robot in MuJoCo: `python run_policy.py [STEPS]`. Needs numpy, mujoco, onnxruntime.
+"""Runs an exported policy on its robot in MuJoCo: `python run_policy.py [STEPS]`. Needs numpy, mujoco, onnxruntime.
 
-For a robot keep `Controller`: every `step_dt` seconds give `act` an object with the fields that formulas name (qpos,
-qvel, ...; SI, quaternions w x y z, joints where `deployment.joints` says) and send what it returns, in the order of
-`deployment.actuators`; `reset` before an episode. `inputs`: `command/NAME`, `observation/NAME` without a formula.
+On a robot use `Controller`: call `reset` before an episode, then `act` every `step_dt` seconds. `data` has the fields
+that formulas read (qpos, qvel, ...; SI units, quaternions w x y z, joints at the addresses in `deployment.joints`).
+`inputs` are `command/NAME`, and `observation/NAME` without formula. Controls have the order of `deployment.actuators`.
 """
 
 import json
@@ -29,28 +29,28 @@ OPS: dict = {
 class Controller:
     def __init__(self, file):
         session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
-        self.about = json.loads(session.get_modelmeta().custom_metadata_map["rlcli"])
+        self.metadata = json.loads(session.get_modelmeta().custom_metadata_map["rlcli"])
         self.policy = lambda x: dict(zip([o.name for o in session.get_outputs()], session.run(None, x), strict=True))
-        self.plan = self.about["deployment"]
-        self.ends = np.reshape([a["range"] or (-np.inf, np.inf) for a in self.plan["actuators"]], (-1, 2)).T
+        self.plan = self.metadata["deployment"]
+        self.bounds = np.reshape([a["range"] or (-np.inf, np.inf) for a in self.plan["actuators"]], (-1, 2)).T
         self.reset()
 
-    def reset(self):  # histories fill with the first value that comes; filters and memories begin at zero
-        self.steps, self.past, self.history = 0, {}, {}
-        self.action = np.zeros(self.about["outputs"]["action"]["shape"][1], np.float32)
-        self.memory = {part["input"]: np.zeros(part["single"], np.float32) for part in self.about["memory"]}
+    def reset(self):  # the first value fills a history; filters and hidden states begin at zero
+        self.steps, self.filters, self.history = 0, {}, {}
+        self.action = np.zeros(self.metadata["outputs"]["action"]["shape"][1], np.float32)
+        self.memory = {part["input"]: np.zeros(part["single"], np.float32) for part in self.metadata["memory"]}
 
-    def value(self, f, data, given):  # of a formula: constants, what is measured or given, or made of other rows
+    def value(self, f, data, given):  # of a formula f: constants, fields of data, inputs, or an operation on formulas
         if "op" not in f:
             row = np.ravel(getattr(data, f["field"]) if "field" in f else given[f["given"]] if "given" in f else f)
             return np.float32(row[f["at"]] if "at" in f else row)
         of = [self.value(part, data, given) for part in f["of"]]
         if f["op"] != "filter":
             return OPS[f["op"]](*of)
-        xs, ys = self.past.get(f["key"], ([0 * of[0]] * len(f["b"]), [0 * of[0]] * len(f["a"])))
-        xs = [of[0], *xs[:-1]]  # newest first, as the weights b of inputs and a of earlier outputs
+        xs, ys = self.filters.get(f["key"], ([0 * of[0]] * len(f["b"]), [0 * of[0]] * len(f["a"])))
+        xs = [of[0], *xs[:-1]]  # newest first, like the weights b of the inputs and a of the earlier outputs
         y = np.float32(sum(map(np.multiply, f["b"], xs)) - sum(map(np.multiply, f["a"], ys)))
-        self.past[f["key"]] = xs, [y, *ys][: len(ys)]
+        self.filters[f["key"]] = xs, [y, *ys][: len(ys)]
         return y
 
     def act(self, data, inputs):
@@ -60,11 +60,11 @@ class Controller:
             self.history[term["name"]] = [*self.history.get(term["name"], [now] * term["history"])[1:], now]
         self.obs = np.concatenate([row for rows in self.history.values() for row in rows])
         out = self.policy({"obs": self.obs[None], **self.memory})
-        self.memory = {part["input"]: out[part["output"]] for part in self.about["memory"]}
+        self.memory = {part["input"]: out[part["output"]] for part in self.metadata["memory"]}
         self.action, self.steps, ctrl = out["action"][0], self.steps + 1, np.array(data.ctrl)
         for control in self.plan["controls"]:
             ctrl[control["ctrl"]] = self.value(control["value"] or [], data, out)
-        return np.clip(ctrl, *self.ends)
+        return np.clip(ctrl, *self.bounds)
 
 
 if __name__ == "__main__":
@@ -75,6 +75,6 @@ if __name__ == "__main__":
     mujoco.mj_forward(model, data)
     for _ in range(steps := int((*sys.argv, "300")[1])):
         data.ctrl[:] = controller.act(data, {f"command/{c['name']}": np.zeros(c["size"]) for c in plan["commands"]})
-        mujoco.mj_step(model, data, controller.about["decimation"])
-        mujoco.mj_step1(model, data)  # positions, velocities and their sensors of the state as it is now
+        mujoco.mj_step(model, data, controller.metadata["decimation"])
+        mujoco.mj_step1(model, data)  # mj_step leaves positions and sensors of the state before it
     print(f"{steps} steps, {data.time:.2f} s; qpos", *np.round(data.qpos, 3))

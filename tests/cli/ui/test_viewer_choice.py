@@ -235,7 +235,7 @@ def test_a_server_that_does_not_ask_the_gate_is_ended():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 7
-    assert "asked with a foreign Host, it answers 200" in done.stderr
+    assert "answers a request with a foreign Host by 200, expected 403" in done.stderr
     assert done.stdout == ""
 
 
