@@ -32,7 +32,7 @@ def started(*words, folder):
     return done.stdout
 
 
-def test_training_and_evaluating_collect_as_usual_once_they_run(tmp_path):
+def test_train_and_eval_restore_gc_thresholds(tmp_path):
     small = ["--num-envs", "8", "--quiet"]
     assert "as usual again" in started(
         "train", "cartpole", "--max-iterations", "1", *small, "--runs-dir", "runs", folder=tmp_path
@@ -40,7 +40,7 @@ def test_training_and_evaluating_collect_as_usual_once_they_run(tmp_path):
     assert "as usual again" in started("eval", "cartpole", "--episodes", "8", *small, folder=tmp_path)
 
 
-def test_a_program_that_calls_the_command_line_keeps_its_own_settings():
+def test_main_called_from_python_keeps_gc_thresholds():
     before = gc.get_threshold()
     assert main(["show", "cartpole"]) == 0
     assert gc.get_threshold() == before

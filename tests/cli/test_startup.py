@@ -33,11 +33,11 @@ def imported(words, wanted):
     ],
     ids=lambda value: "-".join(value) if isinstance(value, list) else "",
 )
-def test_a_command_that_computes_nothing_imports_nothing_that_does(words, unwanted):
+def test_light_command_imports_nothing_heavy(words, unwanted):
     assert imported(words, unwanted)[:2] == (0, [])
 
 
-def test_a_command_imports_no_other_command(tmp_path):
+def test_command_imports_no_other_command(tmp_path):
     assert imported(["runs", "--runs-dir", str(tmp_path)], {"rlcli.cli.commands.train", "rlcli.cli.commands.sweep"})[
         :2
     ] == (0, [])
@@ -45,7 +45,7 @@ def test_a_command_imports_no_other_command(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "agent"), [("cartpole", "sb3-ppo"), ("cartpole-direct", "ppo"), ("cartpole", "sac")])
-def test_training_imports_no_compiler_and_nothing_that_draws(task, agent, tmp_path):
+def test_train_imports_no_compiler_or_plotting_library(task, agent, tmp_path):
     words = ["train", task, "--agent", agent, "--num-envs", "4", "--max-iterations", "1", "-q"]
     words += ["--device", "cpu", "--runs-dir", str(tmp_path)]
     code, found, said = imported(words, REST)

@@ -82,7 +82,7 @@ def test_what_is_shown(cli, trained):
     first, *_ = done.out.splitlines()
     assert (
         first
-        == "cartpole: 4 episodes each, seed 42, the same ones; 30 steps of 0.0166667 s at most, episode_length_s=0.5"
+        == "cartpole: the same 4 episodes for each, seed 42; at most 30 steps of 0.0166667 s, episode_length_s=0.5"
     )
     assert "P(IMPROVEMENT)" in done.out
     assert f"return: {run.name} - zero" in done.out

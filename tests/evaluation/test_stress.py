@@ -171,8 +171,8 @@ def test_a_run_a_checkpoint_or_a_task_is_stressed(cli, only_run):
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        ((), 2, "stress what?"),
-        (("cartpole",), 2, "sweep what?"),
+        ((), 2, "no run, task or checkpoint given"),
+        (("cartpole",), 2, "no --sweep given"),
         (("cartpole", "--sweep", "gravity"), 2, "is not NAME=LOW:HIGH"),
         (("cartpole", "--policy", "zero", "--sweep", "gravty=1:2"), 2, "did you mean 'gravity'"),
         (("cartpole", "--policy", "zero", "--sweep", "body_mass.pol=1:2"), 2, "did you mean 'pole'"),
@@ -212,7 +212,7 @@ def test_the_map_is_drawn(cli, name):
     words += ("--against", "zero", "--episodes", 2)
     done = cli(*words, "-o", name)
     assert done.code == 0, done.err
-    assert f"drawn to {name}" in done.err
+    assert f"wrote {name}" in done.err
     content = Path(name).read_bytes()
     if name.endswith("svg"):
         text = content.decode()

@@ -139,7 +139,7 @@ def test_a_task_that_draws_from_torchs_generator_says_that_other_numbers_of_envi
     said = cli("play", sampled, *arguments, "--json")
     assert said.code == 0
     assert said.json["shared_draws"] is True
-    assert "with another --num-envs than 5 the episode is another" in said.err
+    assert "the episode is only the same with --num-envs 5" in said.err
     whole = cli("eval", sampled, "--policy", "zero", "--num-envs", "5", "--episodes", "35", "--record", "all.st")
     assert whole.code == 0
     mine = [e for e in read_trajectory(coin_file("").parent / "all.st").header.episodes if e.env == 3][6]

@@ -38,7 +38,7 @@ RATE = ("--param", "agent.learning_rate=log:1e-4:1e-2")
         ("a.b=1,2.5,null", (1, 2.5, None), False),
     ],
 )
-def test_a_parameter_is_a_range_or_a_choice(text, bounds, log):
+def test_read_parameters_of_ranges_and_choices(text, bounds, log):
     (parameter,) = read_parameters([text])
     assert (parameter.key, parameter.bounds, parameter.log) == ("a.b", bounds, log)
     for bound in bounds:
@@ -49,12 +49,12 @@ def test_a_parameter_is_a_range_or_a_choice(text, bounds, log):
     "text",
     ["a.b", "a.b=", "=1:2", "a.b=2:1", "a.b=1:1", "a.b=log:0:1", "a.b=x:y", "a.b=3", "a.b=1,1", "a.b=[1", "a b=1:2"],
 )
-def test_what_is_no_range_is_refused_with_the_parameter(text):
+def test_malformed_parameter_is_usage_error(text):
     with pytest.raises(UsageError, match="--param"):
         read_parameters([text])
 
 
-def test_a_key_is_varied_once():
+def test_repeated_key_is_usage_error():
     with pytest.raises(UsageError, match="twice"):
         read_parameters(["a.b=1:2", "a.b=3:4"])
 
@@ -69,48 +69,48 @@ def test_a_key_is_varied_once():
         ("reward_terms.alive", Objective("reward_terms.alive")),
     ],
 )
-def test_an_objective_says_what_and_when(text, objective):
+def test_read_objective(text, objective):
     said = read_objective(text)
     assert (said.key, said.seconds, said.steps) == (objective.key, objective.seconds, objective.steps)
 
 
 @pytest.mark.parametrize("text", ["", "speed@@3s", "succes", "success@s", "success@-3s", "return@0s", "reward_terms."])
-def test_what_is_no_objective_is_refused(text):
+def test_malformed_objective_is_usage_error(text):
     with pytest.raises(UsageError, match="--objective"):
         read_objective(text)
 
 
-def test_an_objective_is_read_from_the_document_of_an_evaluation():
+def test_objective_reads_evaluation_document():
     document = {"success": {"rate": 0.5}, "return": {"mean": 3.0}, "reward_terms": {"alive": {"mean": 2.0}}}
     assert Objective("success").read(document) == 0.5
     assert Objective("return").read(document) == 3.0
     assert Objective("reward_terms.alive").read(document) == 2.0
-    with pytest.raises(UsageError, match="does not tell"):
+    with pytest.raises(UsageError, match="not in the results"):
         Objective("length").read(document)
 
 
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        ((), 2, "nothing is to be varied"),
+        ((), 2, "no --param given"),
         (("--param", "agent.learning_rat=1e-4:1e-3"), 3, "learning_rate"),
         (("--param", "agent.learning_rate=-1.0:1e-3"), 3, "learning_rate"),
         ((*RATE, "--objective", "sucess"), 2, "--objective"),
         ((*RATE, "--name", "../x"), 2, "--name"),
         ((*RATE, "--pruner", "medan"), 2, "median"),
-        ((*RATE, "--storage", "nonsense"), 2, "no address of a database"),
-        ((*RATE, "--storage", "nodialect://host/x"), 2, "no address of a database"),
-        ((*RATE, "--objective", "return@1000", "--max-steps", "10"), 2, "how long"),
+        ((*RATE, "--storage", "nonsense"), 2, "is not the URL of a database"),
+        ((*RATE, "--storage", "nodialect://host/x"), 2, "is not the URL of a database"),
+        ((*RATE, "--objective", "return@1000", "--max-steps", "10"), 2, "already limits the length"),
     ],
 )
-def test_a_mistake_is_one_message_and_nothing_is_begun(cli, words, code, said):
+def test_invalid_arguments_start_nothing(cli, words, code, said):
     result = cli("sweep", "cartpole", *words)
     assert result.code == code, result.err
     assert said in result.err
     assert not list(Path().glob("runs/*/*/trial-*"))
 
 
-def test_a_storage_that_cannot_be_reached_is_the_machines_fault_and_its_password_is_not_said(cli):
+def test_unreachable_storage_is_machine_error_without_password(cli):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
@@ -122,7 +122,7 @@ def test_a_storage_that_cannot_be_reached_is_the_machines_fault_and_its_password
 
 
 @pytest.mark.slow
-def test_another_sweep_of_the_same_name_is_refused_and_the_same_one_is_joined(cli):
+def test_same_sweep_is_joined_and_other_settings_are_refused(cli):
     begun = cli("sweep", "cartpole", *SMALL, *RATE, "--trials", 1, "--max-iterations", 1, "--episodes", 4, "--json")
     assert begun.code == 0, begun.err
     for change in (["--param", "agent.gamma=0.9:0.99"], ["--objective", "success"], ["--seed", "3"], ["--minimize"]):
@@ -175,7 +175,7 @@ def assert_whole(document, trials):
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)  # many processes, on whatever else the machine does
-def test_two_processes_one_of_them_killed_and_begun_again_end_with_every_trial_once(start):
+def test_killed_and_restarted_process_completes_every_trial_once(start):
     trials = 12
     one, other = (sweep(start, "--trials", trials) for _ in range(2))
     folder = Path("runs/cartpole/sweep-sweep")
@@ -195,7 +195,7 @@ def test_two_processes_one_of_them_killed_and_begun_again_end_with_every_trial_o
 
 
 @pytest.mark.slow
-def test_a_sweep_that_is_stopped_goes_on_with_the_trial_it_was_at(start, cli):
+def test_stopped_sweep_resumes_its_trial(start, cli):
     process = sweep(start, "--trials", 2)
     folder = Path("runs/cartpole/sweep-sweep")
     deadline = time.monotonic() + 100
@@ -205,14 +205,15 @@ def test_a_sweep_that_is_stopped_goes_on_with_the_trial_it_was_at(start, cli):
     out, err = process.communicate(timeout=100)
     assert process.returncode == 75, err
     assert (
-        "goes on" in json.loads(out.rpartition("\n{")[2].join(["{", ""]) if out.count("\n{") else out)["error"]["hint"]
+        "to continue"
+        in json.loads(out.rpartition("\n{")[2].join(["{", ""]) if out.count("\n{") else out)["error"]["hint"]
     )
     out, err = sweep(start, "--trials", 2).communicate(timeout=200)
     assert_whole(json.loads(out), 2)
 
 
 @pytest.mark.slow
-def test_a_time_limit_ends_training_and_the_policy_of_that_moment_is_judged(cli):
+def test_time_limit_ends_training_and_policy_is_evaluated(cli):
     result = cli(
         *("sweep", "cartpole", *SMALL, *RATE, "--trials", 1, "--objective", "success@2s"),
         *("--max-iterations", 100_000, "--episodes", 8, "--json"),
@@ -226,7 +227,7 @@ def test_a_time_limit_ends_training_and_the_policy_of_that_moment_is_judged(cli)
 
 
 @pytest.mark.slow
-def test_settings_that_no_trial_survives_end_the_sweep_with_what_is_wrong(cli):
+def test_sweep_ends_after_three_failed_trials(cli):
     words = ("--param", "agent.learning_rate=1e30,1e31,1e32", "--trials", 8, "--max-iterations", 3)
     result = cli("sweep", "cartpole", *SMALL, *words)
     assert result.code == 6, result.err
@@ -235,7 +236,7 @@ def test_settings_that_no_trial_survives_end_the_sweep_with_what_is_wrong(cli):
 
 
 @pytest.mark.slow
-def test_a_sweep_whose_only_trial_fails_says_so(cli):
+def test_sweep_with_single_failed_trial_is_an_error(cli):
     words = ("--param", "agent.learning_rate=1e30,1e31", "--trials", 1, "--max-iterations", 3)
     result = cli("sweep", "cartpole", *SMALL, *words, "--json")
     assert result.code == 6, result.err
@@ -247,7 +248,7 @@ def test_a_sweep_whose_only_trial_fails_says_so(cli):
 
 
 @pytest.mark.slow
-def test_a_trial_whose_process_was_killed_before_its_result_was_told_is_judged_and_not_trained_again(cli):
+def test_trained_trial_without_result_is_only_evaluated(cli):
     words = ("sweep", "cartpole", *SMALL, *RATE, "--max-iterations", 2, "--episodes", 4)
     first = cli(*words, "--trials", 1, "--json").json
     folder = Path(first["sweep"])
@@ -264,7 +265,7 @@ def test_a_trial_whose_process_was_killed_before_its_result_was_told_is_judged_a
 
 
 @pytest.mark.slow
-def test_a_full_disk_costs_no_trial(cli):
+def test_full_disk_loses_no_trial(cli):
     small = Path("small")
     small.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=120k", "none", small], capture_output=True).returncode:
@@ -283,7 +284,7 @@ def test_a_full_disk_costs_no_trial(cli):
 
 
 @pytest.mark.slow
-def test_the_preset_is_the_trial_without_its_budget(cli):
+def test_preset_equals_trial_without_budget(cli):
     Path("more.yaml").write_text("rewards: {alive: {weight: 2.0}}\nagent: {gamma: 0.9}\n")
     words = ("--param", "agent.actor.hidden.0=8:12", "--trials", 1, "--max-iterations", 1, "--episodes", 4)
     done = cli("sweep", "cartpole", "--num-envs", 16, "--agent", "ppo", "--config", "more.yaml", *words, "--json")
@@ -301,11 +302,11 @@ def test_the_preset_is_the_trial_without_its_budget(cli):
     assert own["agents"]["ppo"]["actor"]["hidden"][0] == done.json["best"]["params"]["agent.actor.hidden.0"]
 
 
-def test_an_objective_that_is_not_finite_is_no_number():
+def test_non_finite_objective_is_nan():
     assert math.isnan(Objective("values.x").read({"values": {"x": {"mean": None}}}))
 
 
-def test_an_objective_that_the_task_does_not_tell_is_said_before_anything_is_trained(cli):
+def test_unknown_objective_term_fails_before_training(cli):
     for objective, said in (("reward_terms.aliv", "did you mean 'alive'"), ("terminations.nope", "time_out")):
         result = cli("sweep", "cartpole", *SMALL, *RATE, "--objective", objective)
         assert result.code == 2
@@ -349,7 +350,7 @@ def database():
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)  # many processes, on whatever else the machine does
-def test_machines_that_share_a_database_share_a_sweep(start, cli, database):
+def test_machines_share_sweep_through_database(start, cli, database):
     trials = 4
     processes = [
         sweep(start, "--trials", trials, "--storage", database, "--runs-dir", folder) for folder in ("here", "there")

@@ -39,7 +39,7 @@ def finish(search, count):
     return drawn
 
 
-def test_the_same_seed_draws_the_same_trials_and_another_seed_others(tmp_path):
+def test_seed_determines_trials(tmp_path):
     first, again, other = (
         finish(begin(tmp_path / name, seed=seed), 12) for name, seed in (("a", 3), ("b", 3), ("c", 4))
     )
@@ -48,7 +48,7 @@ def test_the_same_seed_draws_the_same_trials_and_another_seed_others(tmp_path):
     assert len({values["agent.learning_rate"] for values in first}) == 12
 
 
-def test_a_trial_draws_by_its_number_whichever_process_begins_it(tmp_path):
+def test_trial_values_depend_on_number_not_process(tmp_path):
     alone = finish(begin(tmp_path / "alone"), 6)
     one, other = begin(tmp_path / "both"), begin(tmp_path / "both")
     trials = [search.claim() for search in (one, other, other, one, other, one)]
@@ -56,7 +56,7 @@ def test_a_trial_draws_by_its_number_whichever_process_begins_it(tmp_path):
     assert [trial.values for trial in trials] == alone
 
 
-def test_a_trial_whose_process_is_gone_goes_on_with_what_it_had_drawn(tmp_path):
+def test_abandoned_trial_keeps_its_values(tmp_path):
     gone, other = begin(tmp_path), begin(tmp_path)
     left = gone.claim()
     assert other.claim().number == 1, "while it is worked on it is nobody else's"
@@ -65,7 +65,7 @@ def test_a_trial_whose_process_is_gone_goes_on_with_what_it_had_drawn(tmp_path):
     assert (taken.number, taken.values, taken.folder) == (0, left.values, left.folder)
 
 
-def test_a_trial_that_ends_while_another_process_looks_is_not_begun_again(tmp_path):
+def test_trial_ending_during_claim_is_not_restarted(tmp_path):
     one, other = begin(tmp_path), begin(tmp_path)
     trial = one.claim()
     seen = other.trials()
@@ -82,7 +82,7 @@ def test_a_trial_that_ends_while_another_process_looks_is_not_begun_again(tmp_pa
         type(other).trials = fresh
 
 
-def test_three_processes_begin_every_trial_once(tmp_path):
+def test_concurrent_claims_start_each_trial_once(tmp_path):
     begun, wrong = [], []
 
     def work():
@@ -103,7 +103,7 @@ def test_three_processes_begin_every_trial_once(tmp_path):
     assert sorted(begun) == list(range(12))
 
 
-def test_more_trials_may_be_wanted_later(tmp_path):
+def test_number_of_trials_can_grow(tmp_path):
     finish(begin(tmp_path, trials=2), 2)
     more = begin(tmp_path, trials=3)
     assert len(finish(more, 1)) == 1
@@ -111,7 +111,7 @@ def test_more_trials_may_be_wanted_later(tmp_path):
     assert begin(tmp_path, trials=2).claim() is None
 
 
-def test_machines_that_begin_the_last_trial_at_once_leave_no_trial_too_many(tmp_path):
+def test_surplus_trial_of_other_machine_does_not_count(tmp_path):
     storage = f"sqlite:///{tmp_path / 'trials.db'}"
     here, there = (begin(tmp_path / name, storage, trials=1) for name in ("here", "there"))
     held = here.claim()
@@ -127,7 +127,7 @@ def test_machines_that_begin_the_last_trial_at_once_leave_no_trial_too_many(tmp_
     assert len(finish(begin(tmp_path / "here", storage, trials=2), 1)) == 1, "the surplus one is not counted"
 
 
-def test_a_line_that_a_full_disk_has_cut_short_is_dropped_and_the_sweep_goes_on(tmp_path):
+def test_partial_journal_line_is_dropped(tmp_path):
     drawn = finish(begin(tmp_path), 3)
     journal = tmp_path / JOURNAL
     whole = journal.read_bytes()
@@ -140,7 +140,7 @@ def test_a_line_that_a_full_disk_has_cut_short_is_dropped_and_the_sweep_goes_on(
 
 
 @pytest.mark.parametrize("damage", [b"nonsense\n", b"{}\n", b"5\n", b"\xff\xfe\n", b"\n"])
-def test_a_journal_that_is_damaged_is_named(tmp_path, damage):
+def test_corrupt_journal_is_checkpoint_error(tmp_path, damage):
     finish(begin(tmp_path), 2)
     with (tmp_path / JOURNAL).open("ab") as journal:
         journal.write(damage)
@@ -149,7 +149,7 @@ def test_a_journal_that_is_damaged_is_named(tmp_path, damage):
             look()
 
 
-def test_a_sweep_that_has_lost_its_journal_does_not_begin_anew_among_its_old_runs(tmp_path):
+def test_missing_journal_is_checkpoint_error(tmp_path):
     finish(begin(tmp_path), 2)
     (tmp_path / JOURNAL).unlink()
     for look in (begin, read_sweep):
@@ -160,27 +160,27 @@ def test_a_sweep_that_has_lost_its_journal_does_not_begin_anew_among_its_old_run
 @pytest.mark.parametrize(
     "change", [{"params": ["agent.gamma=0.9:0.99"]}, {"pruner": "median"}, {"seed": 4}, {"overrides": ["a=1"]}]
 )
-def test_another_sweep_in_the_same_folder_is_refused(tmp_path, change):
+def test_different_settings_in_same_folder_are_refused(tmp_path, change):
     begin(tmp_path)
     with pytest.raises(UsageError, match="is another sweep"):
         begin(tmp_path, **change)
 
 
-def test_a_task_of_the_same_name_in_another_place_is_another_sweep(tmp_path):
+def test_task_from_other_folder_is_other_sweep(tmp_path):
     begin(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/one"})
     with pytest.raises(UsageError, match="is another sweep"):
         begin(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/two"})
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"kind": "sweep", "task": "cartpole"}', '{"kind": "seeds", "task": "a"}'])
-def test_a_folder_that_is_not_a_whole_sweep_is_named(tmp_path, text):
+def test_malformed_study_file_is_checkpoint_error(tmp_path, text):
     begin(tmp_path)
     (tmp_path / "study.json").write_text(text)
     with pytest.raises(CheckpointError, match=r"study\.json|study of seeds"):
         read_sweep(tmp_path)
 
 
-def test_a_database_that_goes_away_is_the_machines_fault_and_its_password_is_not_said(tmp_path):
+def test_lost_database_is_machine_error_without_password(tmp_path):
     file = tmp_path / "trials.db"
     search = begin(tmp_path / "sweep", f"sqlite:///{file}")
     trial = search.claim()
@@ -189,10 +189,10 @@ def test_a_database_that_goes_away_is_the_machines_fault_and_its_password_is_not
         with pytest.raises(MachineError, match="cannot be reached") as caught, storage_errors("x://me:secret@host/y"):
             use()
         assert "secret" not in caught.value.message
-        assert "goes on" in caught.value.hint
+        assert "to continue" in caught.value.hint
 
 
-def test_a_change_within_a_list_is_written_as_the_whole_list():
+def test_preset_writes_whole_list_for_changed_element():
     resolved = resolve(find_task("cartpole"), agent="ppo", overrides=["agent.actor.hidden.0=8", "sim.dt=0.01"])
     hidden = list(resolved.agent.actor.hidden)
     assert hidden[0] == 8

@@ -19,7 +19,7 @@ def runs(tmp_path):
     return [*made, write_run(folder, "cartpole-direct", rows=learning())]
 
 
-def test_one_run_is_drawn_into_itself(cli, runs):
+def test_single_run_is_drawn_into_its_folder(cli, runs):
     said = cli("plot", runs[0].folder)
     file = runs[0].folder / "plots" / "curves.png"
     assert (said.code, said.out.strip()) == (0, str(file))
@@ -28,7 +28,7 @@ def test_one_run_is_drawn_into_itself(cli, runs):
         assert len(image.getcolors(1 << 20)) > 10
 
 
-def test_several_runs_are_drawn_here_and_seeds_are_one_curve(cli, runs, tmp_path):
+def test_seeds_of_one_configuration_share_a_curve(cli, runs, tmp_path):
     said = cli("plot", "cartpole", "--json")
     assert said.code == 0
     assert said.json["file"] == "curves.png"
@@ -52,7 +52,7 @@ def test_several_runs_are_drawn_here_and_seeds_are_one_curve(cli, runs, tmp_path
         (["FOLDER0", "FOLDER0", "cartpole"], [[1, 2, 3]]),
     ],
 )
-def test_runs_are_named_by_folder_name_task_or_latest(cli, runs, references, seeds):
+def test_run_references(cli, runs, references, seeds):
     names = {f"FOLDER{i}": run.folder for i, run in enumerate(runs)} | {
         f"NAME{i}": f"cartpole/{run.folder.name}" for i, run in enumerate(runs)
     }
@@ -62,7 +62,7 @@ def test_runs_are_named_by_folder_name_task_or_latest(cli, runs, references, see
 
 
 @pytest.mark.parametrize("kind", ["svg", "pdf", "png"])
-def test_the_same_runs_give_the_same_bytes(cli, runs, kind):
+def test_figure_bytes_are_reproducible(cli, runs, kind):
     pictures = []
     for name in ("a", "b"):
         assert cli("plot", "cartpole", "-o", f"{name}.{kind}", "--metrics", "return").code == 0
@@ -71,7 +71,7 @@ def test_the_same_runs_give_the_same_bytes(cli, runs, kind):
     assert pictures[0][:4] in (b"<?xm", b"%PDF", b"\x89PNG")
 
 
-def test_another_process_with_settings_of_its_own_gives_the_same_bytes(cli, runs, tmp_path, environment):
+def test_figure_ignores_matplotlibrc(cli, runs, tmp_path, environment):
     assert cli("plot", "cartpole", "-o", "a.svg", "--metrics", "return").code == 0
     (tmp_path / "matplotlibrc").write_text("lines.linewidth: 9\nfont.size: 30\nbackend: TkAgg\n")
     line = [sys.executable, "-m", "rlcli", "plot", "cartpole", "-o", "b.svg", "-q", "--metrics", "return"]
@@ -80,7 +80,7 @@ def test_another_process_with_settings_of_its_own_gives_the_same_bytes(cli, runs
     assert Path("a.svg").read_bytes() == Path("b.svg").read_bytes()
 
 
-def test_a_picture_holds_what_was_chosen_over_the_axis_that_was_chosen(cli, runs):
+def test_figure_has_chosen_metrics_and_axis(cli, runs):
     text = {}
     for axis in ("steps", "iterations", "time"):
         assert cli("plot", runs[0].folder, "-o", "x.svg", "--x", axis, "--metrics", "Loss,rewards").code == 0
@@ -96,7 +96,7 @@ def test_a_picture_holds_what_was_chosen_over_the_axis_that_was_chosen(cli, runs
     ("arguments", "code", "said"),
     [
         (["latest", "--metrics", "retrun"], 2, "did you mean 'return'"),
-        (["latest", "--metrics", ","], 2, "--metrics names none"),
+        (["latest", "--metrics", ","], 2, "--metrics names no metric"),
         (["latest", "--x", "step"], 2, "did you mean 'steps'"),
         (["latest", "-o", "x.jpg"], 2, "name it *.png, *.svg, *.pdf"),
         (["latest", "-o", "runs"], 2, "is not a picture"),
@@ -107,7 +107,7 @@ def test_a_picture_holds_what_was_chosen_over_the_axis_that_was_chosen(cli, runs
         ([], 2, "Missing argument"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_in_words(cli, runs, arguments, code, said):
+def test_invalid_arguments_are_one_message(cli, runs, arguments, code, said):
     Path("folder.png").mkdir()
     result = cli("plot", *arguments)
     assert (result.code, result.out) == (code, "")
@@ -117,14 +117,14 @@ def test_what_cannot_be_drawn_is_refused_in_words(cli, runs, arguments, code, sa
     assert [file.name for file in Path().glob("*.png")] == ["folder.png"]
 
 
-def test_without_matplotlib_the_message_has_the_pip_line(cli, runs, monkeypatch):
+def test_missing_matplotlib_names_pip_command(cli, runs, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: None)
     said = cli("plot", "latest")
     assert said.code == 7
     assert 'pip install "rlcli[plot]"' in said.err
 
 
-def test_a_run_without_metrics_is_refused_alone_and_passed_over_among_others(cli, runs, tmp_path):
+def test_run_without_metrics_is_skipped_among_others(cli, runs, tmp_path):
     empty = write_run(tmp_path / "runs", seed=9)
     said = cli("plot", empty.folder)
     assert said.code == 5
@@ -135,7 +135,7 @@ def test_a_run_without_metrics_is_refused_alone_and_passed_over_among_others(cli
     assert any("has no metrics yet" in note for note in said.json["notes"])
 
 
-def test_a_link_in_the_place_of_the_plots_is_not_followed(cli, runs, tmp_path):
+def test_link_instead_of_plots_folder_is_not_followed(cli, runs, tmp_path):
     outside = tmp_path / "outside"
     outside.mkdir()
     (runs[0].folder / "plots").symlink_to(outside)
@@ -144,7 +144,7 @@ def test_a_link_in_the_place_of_the_plots_is_not_followed(cli, runs, tmp_path):
     assert list(outside.iterdir()) == []
 
 
-def test_names_of_strangers_are_drawn_as_text(cli, tmp_path):
+def test_untrusted_names_are_drawn_as_text(cli, tmp_path):
     odd = "$x^{2</text><script>alert(1)</script>\u202e\x07"
     rows = learning(**{f"Episode_Reward/{odd}": 1.0, "Episode_Reward/_hidden": 2.0, "Episode_Reward/漢字": 3.0})
     run = write_run(tmp_path / "runs", rows=rows, agent="td3")
@@ -155,7 +155,7 @@ def test_names_of_strangers_are_drawn_as_text(cli, tmp_path):
     assert "_hidden" in text
 
 
-def test_more_colours_than_there_are_are_told_apart_by_the_line(cli, tmp_path):
+def test_many_curves_differ_in_line_style(cli, tmp_path):
     run = write_run(tmp_path / "runs", rows=learning(**{f"Episode_Reward/term{i}": float(i) for i in range(12)}))
     assert cli("plot", run.folder, "-o", "x.svg", "--metrics", "rewards").code == 0
     assert "stroke-dasharray" in Path("x.svg").read_text()

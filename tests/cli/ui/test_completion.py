@@ -58,7 +58,7 @@ def a_run(here):
     return make
 
 
-def test_commands_options_and_tasks_are_offered(offered):
+def test_completion_of_commands_options_and_tasks(offered):
     assert offered("tra") == ["train"]
     assert offered("train", "cartpole-") == ["cartpole-camera", "cartpole-direct"]
     assert "--max-iterations" in offered("train", "cartpole", "--max")
@@ -76,11 +76,11 @@ def test_commands_options_and_tasks_are_offered(offered):
         (("import", "s"), ["sb3"]),
     ],
 )
-def test_choices_are_offered(offered, words, expected):
+def test_completion_of_choices(offered, words, expected):
     assert offered(*words) == expected
 
 
-def test_agents_are_those_of_the_task_on_the_line(offered, small):
+def test_completion_of_agents_uses_task_on_command_line(offered, small):
     agents = "  small: {trainer: sb3, algorithm: ppo, max_iterations: 1}\n"
     task = small((agents, agents + "  smart: {trainer: sb3, algorithm: sac, max_iterations: 1}\n"))
     assert offered("train", task, "--agent", "") == ["small", "smart"]
@@ -89,7 +89,7 @@ def test_agents_are_those_of_the_task_on_the_line(offered, small):
     assert offered("train", "no-such-task", "--agent", "") == []
 
 
-def test_runs_are_offered_newest_first_from_the_folder_that_holds_them(offered, a_run, monkeypatch):
+def test_completion_of_runs_is_newest_first_from_runs_dir(offered, a_run, monkeypatch):
     for age, name in ((200, "older"), (100, "newer")):
         folder = a_run(name)
         os.utime(folder, (1e9 - age, 1e9 - age))
@@ -105,7 +105,7 @@ def test_runs_are_offered_newest_first_from_the_folder_that_holds_them(offered, 
 
 
 @pytest.mark.parametrize("words", [("train", "cartpole-"), ("train", "cartpole", "--agent", ""), ("watch", "")])
-def test_nothing_heavy_is_imported_for_a_key_press(here, words):
+def test_completion_imports_nothing_heavy(here, words):
     command = [sys.executable, "-c", ASKED]
     env = os.environ | question(words, "bash")
     done = subprocess.run(command, env=env, capture_output=True, text=True, cwd=here, timeout=120)
@@ -113,7 +113,7 @@ def test_nothing_heavy_is_imported_for_a_key_press(here, words):
     assert done.stderr.strip() == "[]"
 
 
-def test_zsh_and_fish_are_told_what_a_task_is(offered):
+def test_completion_in_zsh_and_fish_has_task_summaries(offered):
     (line,) = offered("train", "cartpole-d", shell="fish")
     name, said = line.split("\t")
     assert name == "cartpole-direct"
@@ -121,7 +121,7 @@ def test_zsh_and_fish_are_told_what_a_task_is(offered):
     assert '"cartpole-direct":"' in "\n".join(offered("train", "cartpole-d", shell="zsh"))
 
 
-def test_broken_settings_and_broken_tasks_disturb_no_completion(offered, small, tmp_path, monkeypatch):
+def test_completion_works_with_broken_settings_and_tasks(offered, small, tmp_path, monkeypatch):
     (tmp_path / "mine.yaml").write_text("[")
     monkeypatch.setenv("RLCLI_SETTINGS", str(tmp_path / "mine.yaml"))
     assert offered("tra") == ["train"]
@@ -130,7 +130,7 @@ def test_broken_settings_and_broken_tasks_disturb_no_completion(offered, small, 
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash on this machine")
-def test_bash_completes_with_the_function_that_rlcli_prints(here, tmp_path):
+def test_bash_completion_function_works(here, tmp_path):
     program = tmp_path / "bin" / "rlcli"
     program.parent.mkdir()
     program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m rlcli "$@"\n')

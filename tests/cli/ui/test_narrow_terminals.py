@@ -48,7 +48,7 @@ def narrow(here):
 
 
 @pytest.mark.slow
-def test_tables_fit_forty_columns_and_no_letter_is_lost(narrow, rlcli):
+def test_tables_fit_forty_columns_without_truncation(narrow, rlcli):
     code, lines = narrow("list-tasks", "cartpole")
     assert code == 0
     assert max(map(len, lines)) <= 40
@@ -61,7 +61,7 @@ def test_tables_fit_forty_columns_and_no_letter_is_lost(narrow, rlcli):
 
 
 @pytest.mark.slow
-def test_differences_are_whole_on_forty_columns(narrow, small):
+def test_diff_is_complete_on_forty_columns(narrow, small):
     code, lines = narrow("diff", small(), "sim.dt=0.005", "viewer.width=320")
     assert code == 9
     assert "Traceback" not in "\n".join(lines)
@@ -78,7 +78,7 @@ def test_differences_are_whole_on_forty_columns(narrow, small):
         ["train", "nothing"], ["watch"], ["report", "latest"], ["import", "oige", "gone.yaml"], ["plot", "latest"],
     ],
 )  # fmt: skip
-def test_a_pipe_holds_text_alone(in_process, arguments):
+def test_pipe_output_has_no_control_characters(in_process, arguments):
     _, out, err = in_process(*arguments)
     assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f]", out + err)
     assert "Traceback" not in err
@@ -86,7 +86,7 @@ def test_a_pipe_holds_text_alone(in_process, arguments):
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_every_command_can_be_quiet_and_say_more_and_has_a_summary_that_is_whole(in_process, command):
+def test_command_has_common_options_and_complete_summary(in_process, command):
     code, out, _ = in_process(command, "--help")
     assert code == 0
     for option in ("-q, --quiet", "-v, --verbose", "--json", "--debug"):
