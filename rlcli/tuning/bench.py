@@ -8,6 +8,7 @@ fewer gradient steps per sample would be no gain.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import os
 import statistics
@@ -26,7 +27,6 @@ from rlcli.training.setup import make_trainer
 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
-    from rlcli.envs.vec_env import VecEnv
     from rlcli.rl.trainer import Trainer
 
 SIZES = (16, 64, 256, 1_024, 4_096, 16_384)
@@ -161,16 +161,15 @@ class Bench:
     ) -> None:
         self.findings = Findings()
         self._resolve, self._pace, self._announce, self._show = resolve, pace, announce, show
-        self._present = resolve({})
-        agent = self._present.agent
+        present = resolve({})
+        agent = present.agent
         assert agent is not None
         self.horizon_key = next((key for key in HORIZONS if isinstance(getattr(agent, key, None), int)), None)
-        engine, update = threads(self._present)
+        engine, update = threads(present)
         horizon = None if self.horizon_key is None else int(getattr(agent, self.horizon_key))
-        minibatches = getattr(agent, "num_minibatches", None)
-        if getattr(agent, "minibatch_size", None) is not None:
-            minibatches = None
-        self.present = Setting(self._present.task.scene.num_envs, horizon, minibatches, engine, update)
+        fixed_size = getattr(agent, "minibatch_size", None) is not None
+        minibatches = None if fixed_size else getattr(agent, "num_minibatches", None)
+        self.present = Setting(present.task.scene.num_envs, horizon, minibatches, engine, update)
 
     def run(self) -> Findings:
         """Run all measurements; `findings` holds those that are finished."""
@@ -208,31 +207,19 @@ class Bench:
         if reason is not None:
             return Stepped(num_envs, engine_threads, left_out=reason)
         torch.set_num_threads(1)  # as in a rollout
-        env = make_env(
-            self._resolve({"scene.num_envs": num_envs, "sim.engine_threads": engine_threads}), seed=42, device="cpu"
-        )
-        try:
+        resolved = self._resolve({"scene.num_envs": num_envs, "sim.engine_threads": engine_threads})
+        with contextlib.closing(make_env(resolved, seed=42, device="cpu")) as env, torch.inference_mode():
             generator = torch.Generator().manual_seed(42)
             shape = (_ACTIONS, num_envs, env.layout.action_size)
-            actions = torch.rand(shape, generator=generator) * 2.0 - 1.0
+            actions = itertools.cycle(torch.rand(shape, generator=generator) * 2.0 - 1.0)
             env.reset(seed=42)
-            taken = 0
-
-            def step() -> None:
-                nonlocal taken
-                env.step(actions[taken % _ACTIONS])
-                taken += 1
-
-            with torch.inference_mode():
-                for _ in range(3):
-                    step()
-                before = dict(env.seconds)
-                blocks = list(_blocks(step, self._pace))
+            for _ in range(3):  # warm-up
+                env.step(next(actions))
+            before = dict(env.seconds)
+            blocks = _blocks(lambda: env.step(next(actions)), self._pace)
             physics = (env.seconds["physics"] - before["physics"]) / (env.seconds["step"] - before["step"])
-            middle = statistics.median(blocks)
-            return Stepped(num_envs, engine_threads, num_envs / middle, physics, _spread(blocks), resident())
-        finally:
-            env.close()
+            rate = num_envs / statistics.median(blocks)
+            return Stepped(num_envs, engine_threads, rate, physics, _spread(blocks), resident())
 
     def _too_large(self, num_envs: int) -> str | None:
         """Return the reason for not building so many environments; None if they can be built."""
@@ -285,39 +272,23 @@ class Bench:
         if reason is not None:
             return Trained(setting, alike, left_out=reason)
         try:
-            env, trainer = self._build(setting)
+            with self._open_training(setting) as training:
+                training.iterate()  # warm-up
+                training.seconds.clear()
+                training.blocks = _blocks(training.iterate, self._pace)
+                return training.row(setting, alike=alike)
         except ConfigError as error:
             if setting == self.present:
                 raise
             return Trained(setting, alike, left_out=error.problems[0].message)
-        try:
-            parts: list[Mapping[str, float]] = []
-            iterate = _iteration(trainer, parts)
-            iterate()
-            parts.clear()
-            blocks = list(_blocks(iterate, self._pace))
-            return self._trained(setting, alike, trainer, blocks, parts)
-        finally:
-            env.close()
 
-    def _trained(
-        self, setting: Setting, alike: bool, trainer: Trainer, blocks: list[float], parts: list[Mapping[str, float]]
-    ) -> Trained:
-        total = sum(sum(each.values()) for each in parts)
-        names = dict.fromkeys(name for each in parts for name in each)
-        shares = {name: sum(each.get(name, 0.0) for each in parts) / total for name in names}
-        middle, spread = statistics.median(blocks), _spread(blocks)
-        return Trained(setting, alike, trainer.steps_per_iteration, middle, shares, spread, resident())
-
-    def _build(self, setting: Setting) -> tuple[VecEnv, Trainer]:
-        resolved = self._resolve(self.changes(setting))
-        trainer, env = make_trainer(resolved, 42, "cpu", setting.torch_threads)
-        try:
+    @contextlib.contextmanager
+    def _open_training(self, setting: Setting) -> Iterator[_Training]:
+        """Context with a training that has started."""
+        trainer, env = make_trainer(self._resolve(self.changes(setting)), 42, "cpu", setting.torch_threads)
+        with contextlib.closing(env):
             trainer.start()
-        except BaseException:
-            env.close()
-            raise
-        return env, trainer
+            yield _Training(trainer)
 
     def _compare(self, best: Trained) -> None:
         """Measure the best and the present setting again, in alternation, so that other load affects both alike."""
@@ -325,24 +296,44 @@ class Bench:
         if best.setting == present.setting:
             self.findings.present = self.findings.recommended = present
             return
-        self._announce(f"in alternation: {_describe(present.setting)} and {_describe(best.setting)}")
+        settings = (present.setting, best.setting)
+        self._announce(f"in alternation: {' and '.join(map(_describe, settings))}")
         with contextlib.ExitStack() as stack:
-            built: list[tuple[Trained, Trainer, list[float], list[Mapping[str, float]]]] = []
-            for row in (present, best):
-                env, trainer = self._build(row.setting)
-                stack.callback(env.close)
-                built.append((row, trainer, [], []))
+            trainings = [stack.enter_context(self._open_training(setting)) for setting in settings]
             for _ in range(1 + max(3, self._pace.blocks)):
-                for _, trainer, blocks, parts in built:
-                    blocks.append(_block(_iteration(trainer, parts), self._pace.block_s))
-            # the first block of each warms up
-            rows = [self._trained(row.setting, True, t, blocks[1:], parts) for row, t, blocks, parts in built]
-        present, best = rows
+                for training in trainings:
+                    training.blocks.append(_block(training.iterate, self._pace.block_s))
+            for training in trainings:
+                del training.blocks[0]  # warm-up
+            present, best = (training.row(each, alike=True) for training, each in zip(trainings, settings, strict=True))
         assert present.seconds is not None
         assert best.seconds is not None
         noise = max(present.spread or 0.0, best.spread or 0.0)
         better = best.seconds < present.seconds * min(WORTH, 1.0 - noise)
         self.findings.present, self.findings.recommended = present, best if better else present
+
+
+@dataclass(slots=True)
+class _Training:
+    """Trainer with the durations of its iterations."""
+
+    trainer: Trainer
+    blocks: list[float] = field(default_factory=list)
+    """Mean duration of an iteration in each block [s]."""
+    seconds: list[Mapping[str, float]] = field(default_factory=list)
+    """Part -> duration [s], for each iteration."""
+
+    def iterate(self) -> None:
+        """Run one iteration."""
+        self.seconds.append(self.trainer.iterate().seconds)
+
+    def row(self, setting: Setting, *, alike: bool) -> Trained:
+        """Return the measurement."""
+        total = sum(sum(parts.values()) for parts in self.seconds)
+        names = dict.fromkeys(name for parts in self.seconds for name in parts)
+        shares = {name: sum(parts.get(name, 0.0) for parts in self.seconds) / total for name in names}
+        samples, median = self.trainer.steps_per_iteration, statistics.median(self.blocks)
+        return Trained(setting, alike, samples, median, shares, _spread(self.blocks), resident())
 
 
 def load() -> float | None:
@@ -353,22 +344,17 @@ def load() -> float | None:
         return None
 
 
-def _iteration(trainer: Trainer, parts: list[Mapping[str, float]]) -> Callable[[], None]:
-    """Return a function that runs an iteration and appends the seconds of its parts."""
-    return lambda: parts.append(trainer.iterate().seconds)
-
-
-def _blocks(call: Callable[[], None], pace: Pace) -> Iterator[float]:
-    """Yield the mean seconds of a call in each block; measure more blocks if they differ."""
+def _blocks(call: Callable[[], object], pace: Pace) -> list[float]:
+    """Return the mean seconds of a call in each block; measure more blocks if they differ."""
     blocks: list[float] = []
     for _ in range(pace.rounds):
         blocks += [_block(call, pace.block_s) for _ in range(pace.blocks)]
         if _spread(blocks) <= UNSTEADY:
             break
-    yield from blocks
+    return blocks
 
 
-def _block(call: Callable[[], None], min_s: float) -> float:
+def _block(call: Callable[[], object], min_s: float) -> float:
     """Repeat a call for at least `min_s`; return the mean duration of a call [s]."""
     begin, calls = time.perf_counter(), 0
     while True:

@@ -59,15 +59,10 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             trials = _journal(folder, create) if storage is None else _database(storage)
+        study: dict[str, Any] = {"study_name": name, "storage": trials, "pruner": pruner}
         if not create:
-            return optuna.load_study(study_name=name, storage=trials, pruner=pruner)
-        return optuna.create_study(
-            storage=trials,
-            study_name=name,
-            load_if_exists=True,
-            direction=settings["direction"],
-            pruner=pruner,
-        )
+            return optuna.load_study(**study)
+        return optuna.create_study(**study, direction=settings["direction"], load_if_exists=True)
     except KeyError:
         raise CheckpointError(
             f"there is no sweep '{name}' in {without_password(storage) if storage else folder}"

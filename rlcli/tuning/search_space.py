@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 _RANGE = re.compile(r"(log:)?([^:,\[\]]+):([^:,\[\]]+)")
 _OBJECTIVE = re.compile(
-    r"((?:success|return|length)|(?:reward_terms|terminations)\.[^@\s]+)(?:@([0-9.e+]+)(s|steps)?)?"
+    r"((?:success|return|length)|(?:reward_terms|terminations)\.[^@\s]+)"
+    r"(?:@((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e\+?[0-9]+)?)(s|steps)?)?"
 )
 _MAX_BOUND = {int: 2**53, float: 1e300}
 """Largest bounds of a range: a float represents each such integer exactly, and the width of a range is finite."""
@@ -115,21 +116,16 @@ def read_objective(text: str) -> Objective:
         UsageError: for anything else.
     """
     found = _OBJECTIVE.fullmatch(text)
-    try:
-        if found is None:
-            raise ValueError
-        if found[2] is None:
-            return Objective(found[1])
-        number = float(found[2])
-        if not 0.0 < number < 1e12:
-            raise ValueError
-        return Objective(found[1], seconds=number) if found[3] == "s" else Objective(found[1], steps=int(number))
-    except ValueError:
+    number = float(found[2] or 1.0) if found else 0.0
+    if found is None or not 0.0 < number < 1e12:
         raise UsageError(
             f"--objective '{text}' is not valid",
             hint="return, success, length, reward_terms.NAME or terminations.NAME; @30s after 30 s of training, @2e6"
             " after 2,000,000 steps",
-        ) from None
+        )
+    if found[2] is None:
+        return Objective(found[1])
+    return Objective(found[1], seconds=number) if found[3] == "s" else Objective(found[1], steps=int(number))
 
 
 def _read(text: str) -> Parameter:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rlcli.cli.ui.console import console
-from rlcli.cli.ui.options import RunRef, RunsDir, TaskFolder, video_file
+from rlcli.cli.ui.options import RunRef, RunsDir, TaskFolder, choice, video_file
 from rlcli.errors import RlcliError, UsageError, require_known
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ _MAX_COLUMNS = 12
 def command(
     run: RunRef,
     case: Annotated[int | None, typer.Argument(min=0)] = None,
-    sort: Annotated[str, typer.Option(metavar="ORDER")] = "when",
+    sort: Annotated[str, choice("ORDER", *_SORT_KEYS)] = "when",
     steps: Annotated[int, typer.Option(min=1)] = 8,
     video: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
     task: TaskFolder = None,

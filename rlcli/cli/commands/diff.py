@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rlcli.cli.ui.completion import runs_and_tasks, words
+from rlcli.cli.ui.completion import runs_and_tasks
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.difference_table import report_differences
-from rlcli.cli.ui.options import Agent, RunsDir
+from rlcli.cli.ui.options import Agent, RunsDir, choice
 from rlcli.errors import CheckpointError, TaskError, UsageError, did_you_mean, listing, require_known
 from rlcli.registry import TASKS, catalog, task_source
 
@@ -28,10 +28,7 @@ def command(
         typer.Argument(autocompletion=runs_and_tasks, metavar="A [KEY.PATH=VALUE]... [B [KEY.PATH=VALUE]...]"),
     ],
     only: Annotated[
-        list[str] | None,
-        typer.Option(
-            autocompletion=words("configuration", "environment", "metrics", "weights", "policy"), metavar="PART"
-        ),
+        list[str] | None, choice("PART", "configuration", "environment", "metrics", "weights", "policy")
     ] = None,
     agent: Agent = None,
     runs_dir: RunsDir = None,

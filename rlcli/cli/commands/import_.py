@@ -13,7 +13,7 @@ import typer
 from rlcli.cli.ui.completion import tasks
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.help_text import HelpGroup
-from rlcli.cli.ui.options import Agent, RunName, RunsDir, add_command
+from rlcli.cli.ui.options import Agent, RunName, RunsDir, add_command, choice
 from rlcli.errors import TaskError, UsageError, require_known
 from rlcli.registry.formats import known_formats, load_format, missing_formats, usable_formats
 
@@ -37,11 +37,8 @@ rlcli import rsl-rl model_1000.pt --task quadruped-flat
 
 Task = Annotated[str, typer.Option("--task", autocompletion=tasks, metavar="TASK", help="Task of the policy.")]
 _ACTIVATION = "Activation of the hidden layers: elu, relu, tanh or silu. [default: that of the library]"
-Activation = Annotated[str | None, typer.Option(metavar="NAME", help=_ACTIVATION)]
-Bound = Annotated[
-    float | None,
-    typer.Option("--action-bound", help="Largest absolute action of the policy. [default: 1 for sb3, none for rsl-rl]"),
-]
+Activation = Annotated[str | None, choice("NAME", "elu", "relu", "tanh", "silu", help=_ACTIVATION)]
+Bound = Annotated[float | None, typer.Option(help="Largest absolute action. [default: 1 (sb3), none (rsl-rl)]")]
 
 
 def sb3(

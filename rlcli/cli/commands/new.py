@@ -8,11 +8,12 @@ from typing import Annotated
 import typer
 
 from rlcli.cli.ui.console import console
+from rlcli.cli.ui.options import choice
 
 
 def command(
     name: Annotated[str, typer.Argument()],
-    flavour: Annotated[str, typer.Option(metavar="FLAVOUR")] = "yaml",
+    flavour: Annotated[str, choice("FLAVOUR", "yaml", "direct")] = "yaml",
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="FOLDER")] = None,
 ) -> None:
     """Write the package of a new task with model, configuration, code and tests.

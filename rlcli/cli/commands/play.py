@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rlcli.cli.ui import options
-from rlcli.cli.ui.completion import words
 from rlcli.cli.ui.console import console
 from rlcli.errors import UsageError
 from rlcli.viewer.protocol import VIEWERS
@@ -28,9 +27,7 @@ def command(
     checkpoint: options.CheckpointRef = None,
     policy: options.Policy = "trained",
     video: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
-    viewer: Annotated[
-        str | None, typer.Option(autocompletion=words("auto", *VIEWERS, "none"), metavar="VIEWER")
-    ] = None,
+    viewer: Annotated[str | None, options.choice("VIEWER", "auto", *VIEWERS, "none")] = None,
     port: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
     drawn: Annotated[int, typer.Option("--show", min=1)] = 1,
     commands: Annotated[list[str] | None, typer.Option("--command", metavar="NAME=X")] = None,

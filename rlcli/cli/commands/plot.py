@@ -9,7 +9,7 @@ import typer
 
 from rlcli.cli.ui.completion import runs_and_tasks
 from rlcli.cli.ui.console import console
-from rlcli.cli.ui.options import RunsDir, check_output
+from rlcli.cli.ui.options import RunsDir, check_output, choice
 from rlcli.errors import MachineError, UsageError, require_known
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def command(
     runs: Annotated[list[str], typer.Argument(autocompletion=runs_and_tasks, metavar="RUN")],
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE")] = None,
     metrics: Annotated[str | None, typer.Option(metavar="NAMES")] = None,
-    x: Annotated[str, typer.Option(metavar="AXIS")] = "steps",
+    x: Annotated[str, choice("AXIS", "steps", "iterations", "time")] = "steps",
     runs_dir: RunsDir = None,
 ) -> None:
     """Draw learning curves of runs. Several seeds become their interquartile mean with a 95 % interval.

@@ -33,7 +33,7 @@ def command(
     minimize: Annotated[bool, typer.Option("--minimize")] = False,
     episodes: Annotated[int, typer.Option(min=1)] = 200,
     jobs: Annotated[int, typer.Option(min=1)] = 1,
-    pruner: Annotated[str, typer.Option(metavar="PRUNER")] = "median",
+    pruner: Annotated[str, options.choice("PRUNER", "median", "none")] = "median",
     storage: Annotated[str | None, typer.Option(metavar="URL")] = None,
     name: Annotated[str, typer.Option()] = "sweep",
     plot: Annotated[bool, typer.Option("--plot")] = False,
@@ -77,6 +77,7 @@ def command(
     from rlcli.runs.run_ref import default_runs_dir
     from rlcli.training.launch import TrainingRequest
     from rlcli.training.signals import StopRequest
+    from rlcli.tuning.optuna_storage import check_optuna, storage_errors
     from rlcli.tuning.search_space import HINT
 
     _check_options(ctx, task)
@@ -84,33 +85,32 @@ def command(
     request.overrides, request.flags = overrides or [], flags(scene__num_envs=num_envs)
     request.budget, request.loggers = options.budget(max_iterations, max_steps), ["none"]
     stop = StopRequest(ends_process=console.owns_process)
-    if task == "show":
-        _show(request, storage, plot)
-    elif task == "compare":
-        _compare(request, seeds, until, episodes, storage, stop)
-    elif task is None:
+    if task is None:
         raise UsageError("no task given", hint="rlcli sweep TASK --param agent.learning_rate=log:1e-4:1e-2")
-    elif not param:
+    if task not in _OPTIONS and not param:
         raise UsageError("no --param given", hint=f"--param {HINT}")
-    else:
-        direction = "minimize" if minimize else "maximize"
-        settings: dict[str, Any] = {"params": list(param), "objective": objective, "direction": direction}
-        settings |= {"name": name, "episodes": episodes, "pruner": pruner, "trials": trials}
-        _search(request, task, settings, storage, jobs, stop)
+    check_optuna()
+    with storage_errors(storage):
+        if task == "show":
+            _show(request, storage, plot)
+        elif task == "compare":
+            _compare(request, seeds, until, episodes, storage, stop)
+        else:
+            direction = "minimize" if minimize else "maximize"
+            settings: dict[str, Any] = {"params": list(param or ()), "objective": objective, "direction": direction}
+            settings |= {"name": name, "episodes": episodes, "pruner": pruner, "trials": trials}
+            _search(request, task, settings, storage, jobs, stop)
 
 
 def _show(request: TrainingRequest, storage: str | None, plot: bool) -> None:
     """Print the trials of a sweep, and draw them with --plot."""
     from rlcli.cli.ui.sweep_tables import print_sweep
-    from rlcli.tuning.optuna_storage import check_optuna, storage_errors
     from rlcli.tuning.sweep import draw_sweep, find_sweep
 
-    check_optuna()
-    with storage_errors(storage):
-        sweep = find_sweep(request.overrides, request.runs, storage)
-        if plot:
-            console.data(str(draw_sweep(sweep)))
-        print_sweep(sweep)
+    sweep = find_sweep(request.overrides, request.runs, storage)
+    if plot:
+        console.data(str(draw_sweep(sweep)))
+    print_sweep(sweep)
 
 
 def _compare(
@@ -119,34 +119,26 @@ def _compare(
     """Compare the best trial's settings with the task's own."""
     from rlcli.cli.ui.sweep_tables import print_comparison
     from rlcli.runs.study import read_seeds
-    from rlcli.tuning.optuna_storage import check_optuna, storage_errors
     from rlcli.tuning.sweep import find_sweep
     from rlcli.tuning.sweep_compare import compare
 
-    check_optuna()
     names = [word for word in request.overrides if "=" not in word]
     request.overrides = [word for word in request.overrides if "=" in word]
-    with storage_errors(storage):
-        sweep = find_sweep(names, request.runs, storage)
-        comparison = compare(sweep, request, read_seeds(seeds), until, episodes, stop)
+    sweep = find_sweep(names, request.runs, storage)
+    comparison = compare(sweep, request, read_seeds(seeds), until, episodes, stop)
     print_comparison(comparison)
     if comparison.exit_code:
         raise typer.Exit(comparison.exit_code)
 
 
 def _search(
-    request: TrainingRequest,
-    task: str,
-    settings: dict[str, Any],
-    storage: str | None,
-    jobs: int,
-    stop: StopRequest,
+    request: TrainingRequest, task: str, settings: dict[str, Any], storage: str | None, jobs: int, stop: StopRequest
 ) -> None:
     """Create or join a sweep, and run trials until none is left or a signal arrives."""
     from rlcli.cli.ui.sweep_tables import print_sweep
     from rlcli.runs.run import require_name
     from rlcli.runs.trusted_tasks import named_task
-    from rlcli.tuning.optuna_storage import check_optuna, storage_errors, without_password
+    from rlcli.tuning.optuna_storage import without_password
     from rlcli.tuning.search_space import read_objective, read_parameters
     from rlcli.tuning.sweep import open_sweep
     from rlcli.tuning.sweep_trials import TrialRunner, check_parameters, write_preset
@@ -158,33 +150,29 @@ def _search(
             message = f"--objective {settings['objective']} already limits the length of a training"
             raise UsageError(message, hint="leave out --max-iterations and --max-steps")
         request.budget = {"agent.max_iterations": None, "agent.max_steps": objective.steps}
-    check_optuna()
     request.source = named_task(task)
     resolved = check_parameters(request, parameters, objective)
+    settings |= {name: getattr(request, name) for name in ("overrides", "flags", "budget", "seed")}
     settings |= {
         "task": resolved.source.name,
         "agent": resolved.agent_name,
-        "overrides": request.overrides,
-        "flags": request.flags,
-        "budget": request.budget,
         "config": None if request.config is None else request.config.read_text(encoding="utf-8"),
-        "seed": request.seed,
         "storage": None if storage is None else without_password(storage).rpartition("@")[2],
     }
     source = {key: value for key, value in resolved.source.record().items() if key != "version"}
     folder, wanted = request.runs / resolved.source.name / f"sweep-{settings['name']}", settings["trials"]
-    with storage_errors(storage):
-        sweep = open_sweep(folder, settings, source, parameters, storage)
-        console.info(f"sweep {sweep.folder}: {len(sweep.ended())} of {wanted} trials have ended")
-        try:
-            with stop:
-                TrialRunner(sweep, request, objective, jobs, stop).run()
-        finally:
-            sweep.release()
-        if stop.signal is not None and len(sweep.ended()) < wanted:
-            raise Stopped("stopped on request", exit_code=stop.exit_code, hint="run the same command again to continue")
-        write_preset(sweep, request)
-        print_sweep(sweep)
+    sweep = open_sweep(folder, settings, source, parameters, storage)
+    console.info(f"sweep {sweep.folder}: {len(sweep.ended())} of {wanted} trials have ended")
+    try:
+        with stop:
+            TrialRunner(sweep, request, objective, jobs, stop).run()
+    finally:
+        sweep.release()
+    if stop.signal is not None and len(sweep.ended()) < wanted:
+        hint = "run the same command again to continue"
+        raise Stopped("stopped on request", exit_code=stop.exit_code, hint=hint)
+    write_preset(sweep, request)
+    print_sweep(sweep)
 
 
 def _check_options(ctx: typer.Context, task: str | None) -> None:

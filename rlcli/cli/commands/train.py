@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rlcli.cli.ui import options
-from rlcli.cli.ui.completion import checkpoints, runs, words
+from rlcli.cli.ui.completion import checkpoints, runs
 from rlcli.cli.ui.console import console
+from rlcli.cli.ui.options import choice
 from rlcli.errors import Stopped, UsageError
 from rlcli.formats import log_notes
 
@@ -34,10 +35,7 @@ def command(
     max_steps: options.MaxSteps = None,
     device: options.Device = "auto",
     gpus: Annotated[int | None, typer.Option(min=1)] = None,
-    logger: Annotated[
-        list[str] | None,
-        typer.Option(autocompletion=words("tensorboard", "wandb", "mlflow", "trackio", "none"), metavar="LOGGER"),
-    ] = None,
+    logger: Annotated[list[str] | None, choice("LOGGER", "tensorboard", "wandb", "mlflow", "trackio", "none")] = None,
     video_every: Annotated[int | None, typer.Option(min=0)] = None,
     config: options.ConfigFile = None,
     resume: Annotated[str | None, typer.Option(autocompletion=runs, metavar="RUN")] = None,

@@ -19,11 +19,18 @@ CHOOSE = "auto"
 """Value of an option that is given without its value (`--video`)."""
 MAX_SEED = 2**62
 
+
+def choice(metavar: str, *names: str, help: str | None = None) -> Any:
+    """Return the declaration of an option whose values a shell completes."""
+    return typer.Option(autocompletion=words(*names), metavar=metavar, help=help)
+
+
 _TASK = typer.Argument(
     autocompletion=tasks, metavar="TASK", help="Name of a task, distribution:name, or a folder with a task.yaml."
 )
 _POLICY_TASK = "Task: its newest run is used, else the policy shipped with the task. Not needed with --checkpoint."
 _OVERRIDES = "Overrides of settings; agent.KEY=VALUE changes the chosen agent."
+_AGENT = "Agent of the task. [default: the task's]"
 _CONFIG = "YAML file merged over the task; its key `agent` changes the chosen agent."
 _SEED = "Seed of all random numbers; -1 draws one and records it."
 _TASK_FOLDER = "Folder of the task's code, if the task is not installed and its folder has moved."
@@ -36,37 +43,21 @@ TaskOfPolicy = Annotated[str | None, typer.Argument(autocompletion=tasks, metava
 Overrides = Annotated[list[str] | None, typer.Argument(metavar="KEY.PATH=VALUE", help=_OVERRIDES)]
 RunRef = Annotated[str, typer.Argument(autocompletion=runs, metavar="RUN", help="Folder or name of a run, or latest.")]
 ConfigFile = Annotated[Path | None, typer.Option(metavar="FILE", help=_CONFIG)]
-Agent = Annotated[
-    str | None,
-    typer.Option(autocompletion=agents, metavar="NAME", help="Agent of the task. [default: the task's]"),
-]
+Agent = Annotated[str | None, typer.Option(autocompletion=agents, metavar="NAME", help=_AGENT)]
 NumEnvs = Annotated[int | None, typer.Option(help="Sets scene.num_envs. [default: the task's]")]
 Seed = Annotated[int, typer.Option(min=-1, max=MAX_SEED, help=_SEED)]
-Device = Annotated[
-    str,
-    typer.Option(autocompletion=words("auto", "cpu", "cuda"), metavar="DEVICE", help="auto, cpu, cuda or cuda:N."),
-]
+Device = Annotated[str, choice("DEVICE", "auto", "cpu", "cuda", help="auto, cpu, cuda or cuda:N.")]
 RunName = Annotated[str | None, typer.Option(help="Text at the end of the run folder's name.")]
 MaxIterations = Annotated[int | None, typer.Option(help="Iterations of each training. [default: the agent's]")]
 MaxSteps = Annotated[int | None, typer.Option(help="Environment steps of each training. [default: the agent's]")]
 TaskFolder = Annotated[str | None, typer.Option(metavar="FOLDER", help=_TASK_FOLDER)]
 RunsDir = Annotated[Path | None, typer.Option(help=_RUNS_DIR)]
 Record = Annotated[Path | None, typer.Option(metavar="FILE", help="Record the episodes to FILE, for rlcli replay.")]
-_MODES = words("all", "succeeded", "failed", "separate")
-RecordMode = Annotated[str, typer.Option(autocompletion=_MODES, metavar="MODE", help=_RECORD_MODE)]
+RecordMode = Annotated[str, choice("MODE", "all", "succeeded", "failed", "separate", help=_RECORD_MODE)]
 CheckpointRef = Annotated[str | None, typer.Option(autocompletion=checkpoints, metavar="CHECKPOINT", help=_CHECKPOINT)]
-Policy = Annotated[
-    str,
-    typer.Option(
-        autocompletion=words("trained", "zero", "random", "lqr"),
-        metavar="POLICY",
-        help="trained, zero, random or lqr.",
-    ),
-]
+Policy = Annotated[str, choice("POLICY", "trained", "zero", "random", "lqr", help="trained, zero, random or lqr.")]
 Stochastic = Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")]
-ProbeTimeout = Annotated[
-    float, typer.Option("--probe-timeout", help="Time limit of the check of each task, trainer or driver [s].")
-]
+ProbeTimeout = Annotated[float, typer.Option("--probe-timeout", help="Time limit per task, trainer or driver [s].")]
 Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Accepted; windows open only on request.")]
 
 

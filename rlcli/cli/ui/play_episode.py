@@ -65,6 +65,7 @@ def play_episode(
         record: file to record the episode to.
         watch: opens a viewer at the start of the episode; returns whether there was one.
     """
+    from rlcli.replay.episode_recorder import EpisodeRecorder
     from rlcli.replay.rerun_episode import run_episode, start_episode
 
     policy = session.policy
@@ -75,12 +76,17 @@ def play_episode(
         session.start = (env_id, start.obs)
         if watch():
             return
-    frames = 0
-    recorded: list[str] = []
+    frames, recorded = 0, []
     if video is not None:
-        last, frames = _film(session, start, env_id, video)
+        with film(session, video, env_id) as filming:
+            last = run_episode(session.env, filming.act, start.obs, env_id)
+        frames, fps, backend = filming.writer.frames, filming.writer.fps, filming.renderer.backend
+        console.info(f"{frames} frames at {fps:g} per second, drawn with {backend}")
     elif record is not None:
-        last, recorded = _record(session, start, env_id, record)
+        with EpisodeRecorder(session.env, 1, only=env_id) as recorder:
+            last = run_episode(session.env, session.act, start.obs, env_id)
+        recorded = [str(written) for written in recorder.save(record)]
+        console.info(f"recorded to {recorded[0]}")
     else:
         last = run_episode(session.env, session.act, start.obs, env_id)
     outcome, origin = _outcome(last, env_id), _origin(session, start, env_id, episode)
@@ -118,27 +124,6 @@ def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) ->
         **{"env": env_id, "episode": episode, "seed": session.policy.seed, "num_envs": session.env.num_envs},
         **{"lived_before": start.episodes_before, "because_of": start.reasons, "shared_draws": shared},
     }
-
-
-def _record(session: Session, start: EpisodeStart, env_id: int, file: Path) -> tuple[StepResult, list[str]]:
-    from rlcli.replay.episode_recorder import EpisodeRecorder
-    from rlcli.replay.rerun_episode import run_episode
-
-    with EpisodeRecorder(session.env, 1, only=env_id) as recorder:
-        last = run_episode(session.env, session.act, start.obs, env_id)
-    recorded = [str(written) for written in recorder.save(file)]
-    console.info(f"recorded to {recorded[0]}")
-    return last, recorded
-
-
-def _film(session: Session, start: EpisodeStart, env_id: int, file: Path) -> tuple[StepResult, int]:
-    from rlcli.replay.rerun_episode import run_episode
-
-    with film(session, file, env_id) as filming:
-        last = run_episode(session.env, filming.act, start.obs, env_id)
-    writer = filming.writer
-    console.info(f"{writer.frames} frames at {writer.fps:g} per second, drawn with {filming.renderer.backend}")
-    return last, writer.frames
 
 
 @dataclass(slots=True)
