@@ -1,4 +1,4 @@
-"""What MUJOCO_GL and DISPLAY may say wrongly: told as what it is, not as a bug."""
+"""Wrong values of MUJOCO_GL and DISPLAY, and of names on the command line, have clear messages."""
 
 import os
 import subprocess
@@ -28,7 +28,7 @@ def test_invalid_mujoco_gl_lists_valid_values(tmp_path):
 
 @pytest.mark.slow
 def test_unreachable_display_falls_back_to_other_backend(tmp_path):
-    """Something else draws, or what was tried is told."""
+    """Another backend draws, or the message lists the backends that were tried."""
     words = ("play", "cartpole", "--policy", "zero", "--num-envs", "1", "--video", "x.mp4")
     done = rlcli(tmp_path, *words, DISPLAY=":77", MUJOCO_GL="")
     assert done.returncode in (0, 10), done.stderr

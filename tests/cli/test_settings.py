@@ -1,4 +1,4 @@
-"""The user's settings: what they change, what comes before them, and what a broken file is answered with."""
+"""User settings: their effects, their precedence, and the messages of a broken file."""
 
 import json
 import os
@@ -19,7 +19,7 @@ from rlcli.training.loggers import LOGGERS
 
 @pytest.fixture
 def settings(tmp_path, monkeypatch):
-    """settings(text) writes them; the file."""
+    """Return a function that writes the settings file and returns its path."""
     file = tmp_path / "my settings.yaml"
     monkeypatch.setenv("RLCLI_SETTINGS", str(file))
 
@@ -33,17 +33,17 @@ def settings(tmp_path, monkeypatch):
 def test_precedence_of_flag_variable_settings_and_default(settings, in_process, monkeypatch, tmp_path):
     settings(f"runs_dir: '{tmp_path}/of-settings'\n")
 
-    def said(*flags):
+    def error_output(*flags):
         return in_process("runs", *flags)[2]
 
     monkeypatch.delenv("RLCLI_RUNS_DIR", raising=False)
-    assert f"no run in {tmp_path}/of-settings" in said()
+    assert f"no run in {tmp_path}/of-settings" in error_output()
     monkeypatch.setenv("RLCLI_RUNS_DIR", "of-variable")
-    assert "no run in of-variable" in said()
-    assert "no run in of-flag" in said("--runs-dir", "of-flag")
+    assert "no run in of-variable" in error_output()
+    assert "no run in of-flag" in error_output("--runs-dir", "of-flag")
     monkeypatch.delenv("RLCLI_RUNS_DIR")
     monkeypatch.setenv("RLCLI_SETTINGS", "none")
-    assert "no run in runs" in said()
+    assert "no run in runs" in error_output()
 
 
 def test_home_folder_is_expanded_and_library_ignores_settings(settings, in_process, monkeypatch, tmp_path):
@@ -104,7 +104,7 @@ def test_plugins_setting_hides_other_plugins(settings, in_process, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("verbosity: loud\n", ":1:1: verbosity: expected 'quiet', 'normal' or 'verbose', found 'loud'"),
         ("# mine\nveiwer: none\n", ":2:1: veiwer: unknown key 'veiwer'; did you mean 'viewer'?"),
@@ -120,12 +120,12 @@ def test_plugins_setting_hides_other_plugins(settings, in_process, monkeypatch):
         ("runs_dir: \x00\n", ":1:11: "),
     ],
 )
-def test_broken_settings_are_one_message_with_exit_code_3(settings, in_process, text, said):
+def test_broken_settings_are_one_message_with_exit_code_3(settings, in_process, text, message):
     file = settings(text)
     for command in (["runs"], ["list-tasks"], ["train", "cartpole"], ["show", "cartpole"]):
         code, out, err = in_process(*command)
         assert (code, out) == (3, "")
-        assert err.startswith(f"error: {file}{said}")
+        assert err.startswith(f"error: {file}{message}")
         assert len(err.splitlines()) == 1
     assert json.loads(in_process("runs", "--json")[1])["error"]["exit_code"] == 3
 
@@ -170,33 +170,33 @@ def test_settings_have_same_choices_as_flags():
     assert not {"tasks", "agent", "device", "seed"} & set(UserSettings.model_fields)
 
 
-def colored(arguments, tmp_path, **variables):
-    """What a command writes on a terminal of 120 columns."""
+def terminal_output(arguments, tmp_path, **variables):
+    """Return the output of a command on a terminal of 120 columns."""
     leader, follower = pty.openpty()
     env = {**os.environ, "TERM": "xterm", "COLUMNS": "120", **variables}
     process = subprocess.Popen([sys.executable, "-m", "rlcli", *arguments], stdout=follower, env=env, cwd=tmp_path)
     os.close(follower)
-    said = b""
+    output = b""
     try:
         while chunk := os.read(leader, 65536):
-            said += chunk
-    except OSError:  # Linux's way to say that the other end is closed
+            output += chunk
+    except OSError:  # Linux raises this when the other end is closed
         pass
     os.close(leader)
     assert process.wait() == 0
-    return said
+    return output
 
 
 def test_colors_on_terminal_follow_variables_and_settings(settings, tmp_path):
     settings("{}")
     command = ["list-tasks", "cartpole"]
-    assert b"\x1b[" in colored(command, tmp_path)
-    assert b"\x1b[" not in colored(command, tmp_path, NO_COLOR="1")
-    assert b"\x1b[" not in colored(command, tmp_path, TERM="dumb")
-    assert b"\x1b[" in colored(command, tmp_path, NO_COLOR="")
+    assert b"\x1b[" in terminal_output(command, tmp_path)
+    assert b"\x1b[" not in terminal_output(command, tmp_path, NO_COLOR="1")
+    assert b"\x1b[" not in terminal_output(command, tmp_path, TERM="dumb")
+    assert b"\x1b[" in terminal_output(command, tmp_path, NO_COLOR="")
     settings("color: never\n")
-    assert b"\x1b[" not in colored(command, tmp_path)
-    assert b"\x1b[" in colored(command, tmp_path, FORCE_COLOR="1")
+    assert b"\x1b[" not in terminal_output(command, tmp_path)
+    assert b"\x1b[" in terminal_output(command, tmp_path, FORCE_COLOR="1")
 
 
 def test_colors_in_pipe_only_if_forced(settings, rlcli):

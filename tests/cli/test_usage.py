@@ -1,4 +1,4 @@
-"""The command line itself: help, flags, usage errors, the one JSON document, streams that go away."""
+"""Command line: help, flags, usage errors, JSON documents of errors, and closed streams."""
 
 import json
 import os
@@ -13,7 +13,7 @@ HEAVY = ["torch", "mujoco", "numpy", "stable_baselines3"]
 
 
 def document(text):
-    """The one JSON document on stdout."""
+    """Parse the single JSON document on stdout."""
     content = json.loads(text)
     assert content["schema"] == 1
     return content
@@ -49,7 +49,7 @@ def test_missing_command_prints_help_on_stderr(in_process):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["tran", "cartpole"], "Did you mean 'train'?"),
         (["show"], "Missing argument 'TASK'"),
@@ -64,13 +64,13 @@ def test_missing_command_prints_help_on_stderr(in_process):
         (["play", "cartpole", "--policy", "traned"], "did you mean 'trained'"),
     ],
 )
-def test_usage_errors_exit_with_2(in_process, arguments, said):
+def test_usage_errors_exit_with_2(in_process, arguments, message):
     code, out, err = in_process(*arguments)
     assert (code, out) == (2, "")
-    assert said in err
+    assert message in err
     assert "Traceback" not in err
     code, out, _ = in_process(*arguments, "--json")
-    if arguments[-1] != "--num-envs":  # it takes what follows as its value
+    if arguments[-1] != "--num-envs":  # it takes the next word as its value
         error = document(out)["error"]
         assert (code, error["kind"], error["exit_code"]) == (2, "usage", 2)
 
@@ -129,7 +129,7 @@ def test_underscores_are_accepted_for_hyphens(in_process):
     ],
 )
 def test_error_prints_one_document_with_exit_code(in_process, here, monkeypatch, arguments, code, kind):
-    monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")  # the trainers of others are not there
+    monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")  # hides trainers of other distributions
     found, out, err = in_process(*arguments, "--json")
     error = document(out)["error"]
     assert (found, error["exit_code"], error["kind"]) == (code, code, kind)
@@ -140,7 +140,7 @@ def test_error_prints_one_document_with_exit_code(in_process, here, monkeypatch,
     found, out, err = in_process(*arguments)
     assert (found, out) == (code, "")
     assert "Traceback" not in err
-    assert list(here.iterdir()) == []  # nothing half-written
+    assert list(here.iterdir()) == []  # no partial files
 
 
 def test_debug_prints_traceback(in_process):
@@ -236,7 +236,7 @@ def test_exception_in_rlcli_is_reported_as_bug(in_process, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["train", "--task", "cartpole"], "rlcli train cartpole"),
         (["play", "--load_run", "x"], "--checkpoint RUN"),
@@ -245,7 +245,7 @@ def test_exception_in_rlcli_is_reported_as_bug(in_process, monkeypatch):
         (["train", "cartpole", "events.reset_cart.params.position=[0,1]"], "stand beside its 'func'"),
     ],
 )
-def test_options_of_other_programs_have_hints(in_process, arguments, said):
+def test_options_of_other_programs_have_hints(in_process, arguments, message):
     code, _, err = in_process(*arguments)
     assert code in (2, 3)
-    assert said in err
+    assert message in err

@@ -130,9 +130,9 @@ def test_the_first_policy_is_the_one_that_must_not_fall_short(cli, trained):
         (("nowhere",), 2, "--compare nowhere: with what?"),
         (("lqr", "zero"), 2, "none of these is a run"),
         (("nowhere", "zero"), 5, "no run 'nowhere'"),
-        (("a", "b", "--checkpoint", "c"), 2, "as words"),
-        (("a", "b", "--policy", "zero"), 2, "as words"),
-        (("a", "b", "--record", "x.safetensors"), 2, "as words"),
+        (("a", "b", "--checkpoint", "c"), 2, "as arguments"),
+        (("a", "b", "--policy", "zero"), 2, "as arguments"),
+        (("a", "b", "--record", "x.safetensors"), 2, "as arguments"),
     ],
 )
 def test_mistakes_are_one_message_and_a_code(cli, words, code, said):

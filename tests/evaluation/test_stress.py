@@ -90,7 +90,7 @@ def test_the_known_answer_stands_beside_it(cli):
     assert "LQR SUCCESS" in text
     assert "success, zero" in text
     assert "success, lqr" in text
-    assert "as it is" in text
+    assert "nominal" in text
     assert "worst of the grid: gravity" in text
 
 

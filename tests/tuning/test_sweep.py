@@ -1,4 +1,4 @@
-"""Sweeps: what is drawn, what a mistake says, and that processes which come and go end with every trial once."""
+"""Sweeps: parsing, error messages, and several processes that run each trial exactly once."""
 
 import getpass
 import json
@@ -70,8 +70,8 @@ def test_repeated_key_is_usage_error():
     ],
 )
 def test_read_objective(text, objective):
-    said = read_objective(text)
-    assert (said.key, said.seconds, said.steps) == (objective.key, objective.seconds, objective.steps)
+    found = read_objective(text)
+    assert (found.key, found.seconds, found.steps) == (objective.key, objective.seconds, objective.steps)
 
 
 @pytest.mark.parametrize("text", ["", "speed@@3s", "succes", "success@s", "success@-3s", "return@0s", "reward_terms."])
@@ -90,7 +90,7 @@ def test_objective_reads_evaluation_document():
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "message"),
     [
         ((), 2, "no --param given"),
         (("--param", "agent.learning_rat=1e-4:1e-3"), 3, "learning_rate"),
@@ -103,10 +103,10 @@ def test_objective_reads_evaluation_document():
         ((*RATE, "--objective", "return@1000", "--max-steps", "10"), 2, "already limits the length"),
     ],
 )
-def test_invalid_arguments_start_nothing(cli, words, code, said):
+def test_invalid_arguments_start_nothing(cli, words, code, message):
     result = cli("sweep", "cartpole", *words)
     assert result.code == code, result.err
-    assert said in result.err
+    assert message in result.err
     assert not list(Path().glob("runs/*/*/trial-*"))
 
 
@@ -123,23 +123,23 @@ def test_unreachable_storage_is_machine_error_without_password(cli):
 
 @pytest.mark.slow
 def test_same_sweep_is_joined_and_other_settings_are_refused(cli):
-    begun = cli("sweep", "cartpole", *SMALL, *RATE, "--trials", 1, "--max-iterations", 1, "--episodes", 4, "--json")
-    assert begun.code == 0, begun.err
+    first = cli("sweep", "cartpole", *SMALL, *RATE, "--trials", 1, "--max-iterations", 1, "--episodes", 4, "--json")
+    assert first.code == 0, first.err
     for change in (["--param", "agent.gamma=0.9:0.99"], ["--objective", "success"], ["--seed", "3"], ["--minimize"]):
         other = cli("sweep", "cartpole", *SMALL, *RATE, *change, "--trials", 1, "--max-iterations", 1, "--episodes", 4)
         assert other.code == 2, other.err
         assert "is another sweep" in other.err
     again = cli("sweep", "cartpole", *SMALL, *RATE, "--trials", 1, "--max-iterations", 1, "--episodes", 4, "--json")
-    assert again.json["trials"] == begun.json["trials"]
+    assert again.json["trials"] == first.json["trials"]
     shown = cli("sweep", "show", "sweep", "--json")
-    assert shown.json["trials"] == begun.json["trials"]
+    assert shown.json["trials"] == first.json["trials"]
     assert shown.json["best"]["trial"] == 0
     drawn = cli("sweep", "show", "--plot")
     assert drawn.code == 0, drawn.err
     assert Path("runs/cartpole/sweep-sweep/sweep.svg").stat().st_size > 1000
-    preset = yaml.safe_load(Path(begun.json["preset"]).read_text())
-    assert preset["agent"]["learning_rate"] == pytest.approx(begun.json["best"]["params"]["agent.learning_rate"])
-    used = cli("show", "cartpole", "--config", begun.json["preset"], "--json")
+    preset = yaml.safe_load(Path(first.json["preset"]).read_text())
+    assert preset["agent"]["learning_rate"] == pytest.approx(first.json["best"]["params"]["agent.learning_rate"])
+    used = cli("show", "cartpole", "--config", first.json["preset"], "--json")
     assert used.code == 0, used.err
     missing = cli("sweep", "show", "other")
     assert missing.code == 5
@@ -153,7 +153,7 @@ def sweep(start, *words):
     )
 
 
-def worked_on(folder):
+def started_trials(folder):
     return [run for run in folder.glob("trial-*") if (run / "metrics.jsonl").exists()]
 
 
@@ -161,7 +161,7 @@ def assert_whole(document, trials):
     assert [trial["trial"] for trial in document["trials"]] == list(range(trials))
     assert {trial["state"] for trial in document["trials"]} == {"complete"}
     rates = [trial["params"]["agent.learning_rate"] for trial in document["trials"]]
-    assert len(set(rates)) == trials, "no trial is there twice"
+    assert len(set(rates)) == trials, "no trial is repeated"
     for trial in document["trials"]:
         record = json.loads((Path(trial["run"]) / "run.json").read_text())
         assert record["state"] == "finished"
@@ -174,13 +174,13 @@ def assert_whole(document, trials):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)  # many processes, on whatever else the machine does
+@pytest.mark.timeout(1200)  # many processes on a possibly busy machine
 def test_killed_and_restarted_process_completes_every_trial_once(start):
     trials = 12
     one, other = (sweep(start, "--trials", trials) for _ in range(2))
     folder = Path("runs/cartpole/sweep-sweep")
     deadline = time.monotonic() + 200
-    while len(worked_on(folder)) < 3 and time.monotonic() < deadline:
+    while len(started_trials(folder)) < 3 and time.monotonic() < deadline:
         time.sleep(0.05)
     one.send_signal(signal.SIGKILL)
     one.wait()
@@ -199,7 +199,7 @@ def test_stopped_sweep_resumes_its_trial(start, cli):
     process = sweep(start, "--trials", 2)
     folder = Path("runs/cartpole/sweep-sweep")
     deadline = time.monotonic() + 100
-    while not worked_on(folder) and time.monotonic() < deadline:
+    while not started_trials(folder) and time.monotonic() < deadline:
         time.sleep(0.02)
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=100)
@@ -253,8 +253,8 @@ def test_trained_trial_without_result_is_only_evaluated(cli):
     first = cli(*words, "--trials", 1, "--json").json
     folder = Path(first["sweep"])
     journal = (folder / "journal.log").read_text().splitlines(keepends=True)
-    told = next(place for place, line in enumerate(journal) if '"op_code":6' in line and '"state":1' in line)
-    (folder / "journal.log").write_text("".join(journal[:told]))
+    result_line = next(number for number, line in enumerate(journal) if '"op_code":6' in line and '"state":1' in line)
+    (folder / "journal.log").write_text("".join(journal[:result_line]))
     (folder / "best.yaml").unlink()
     trained = (folder / "trial-0000" / "metrics.jsonl").read_bytes()
     again = cli(*words, "--trials", 2, "--json").json
@@ -307,10 +307,10 @@ def test_non_finite_objective_is_nan():
 
 
 def test_unknown_objective_term_fails_before_training(cli):
-    for objective, said in (("reward_terms.aliv", "did you mean 'alive'"), ("terminations.nope", "time_out")):
+    for objective, message in (("reward_terms.aliv", "did you mean 'alive'"), ("terminations.nope", "time_out")):
         result = cli("sweep", "cartpole", *SMALL, *RATE, "--objective", objective)
         assert result.code == 2
-        assert said in result.err
+        assert message in result.err
     assert not Path("runs").exists()
 
 
@@ -322,17 +322,17 @@ def postgres_programs():
 
 @pytest.fixture
 def database():
-    """The address of an empty PostgreSQL database on loopback, which ends with the test."""
+    """URL of an empty PostgreSQL database on the loopback interface, which stops after the test."""
     programs = postgres_programs()
     if programs is None:
         pytest.skip("PostgreSQL's server is not on this machine (apt-get install postgresql)")
     pytest.importorskip("psycopg", reason="pip install 'psycopg[binary]'")
-    place = Path(tempfile.mkdtemp(prefix="rlcli-postgres-"))  # pytest's own folders are closed to other users
+    place = Path(tempfile.mkdtemp(prefix="rlcli-postgres-"))  # other users cannot read the folders of pytest
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     settings, user = {}, getpass.getuser()
-    if os.geteuid() == 0:  # its server refuses to be root's
+    if os.geteuid() == 0:  # the server refuses to run as root
         user = "nobody"
         shutil.chown(place, "nobody")
         settings = {"user": "nobody"}
@@ -349,7 +349,7 @@ def database():
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)  # many processes, on whatever else the machine does
+@pytest.mark.timeout(1200)  # many processes on a possibly busy machine
 def test_machines_share_sweep_through_database(start, cli, database):
     trials = 4
     processes = [
@@ -364,7 +364,7 @@ def test_machines_share_sweep_through_database(start, cli, database):
     assert [trial["trial"] for trial in last["trials"]] == list(range(trials))
     assert {trial["state"] for trial in last["trials"]} == {"complete"}
     runs = [run.name for folder in ("here", "there") for run in Path(folder).glob("cartpole/sweep-sweep/trial-*")]
-    assert sorted(runs) == [f"trial-{number:04d}" for number in range(trials)], "each was trained on one of them"
+    assert sorted(runs) == [f"trial-{number:04d}" for number in range(trials)], "each was trained on one machine"
     shown = cli("sweep", "show", "here/cartpole/sweep-sweep", "--storage", database, "--json")
     assert shown.json["ended"] == trials
     assert "--storage" in cli("sweep", "show", "here/cartpole/sweep-sweep").err

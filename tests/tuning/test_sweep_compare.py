@@ -1,4 +1,4 @@
-"""`sweep compare`: how long the best trial's settings and the task's own take until the policy is good enough."""
+"""`sweep compare`: time to a threshold with the best trial's settings and the task's own."""
 
 import json
 import shutil
@@ -41,7 +41,7 @@ def test_time_to_threshold_sums_rollouts_and_updates():
     assert time_to_threshold(rows, Threshold("success", 0.99)) == Reached(8.0, 400, 4)
     assert time_to_threshold(rows, Threshold("success", 0.5)) == Reached(4.0, 200, 2)
     assert time_to_threshold(rows, Threshold("success", 1.0)) is None
-    assert time_to_threshold(rows, Threshold("return", 0.0)) is None, "nothing was said of it"
+    assert time_to_threshold(rows, Threshold("return", 0.0)) is None, "the rows have no return"
 
 
 def test_median_counts_unreached_seeds_as_infinite():
@@ -51,7 +51,7 @@ def test_median_counts_unreached_seeds_as_infinite():
 
 @pytest.fixture(scope="module")
 def runs_with_a_sweep(tmp_path_factory):
-    """The runs folder of a sweep of one trial that is over."""
+    """The runs folder of a finished sweep with one trial."""
     folder = tmp_path_factory.mktemp("swept")
     words = [
         "--param",
@@ -84,7 +84,7 @@ def test_compare_trains_both_arms_until_threshold(cli):
     assert done.code == 0, done.err
     compared = done.json["compared"]
     order = [(one["policy"], one["seed"]) for one in compared]
-    assert order == [("default", 0), ("best", 0), ("best", 1), ("default", 1)], "a slower hour slows both"
+    assert order == [("default", 0), ("best", 0), ("best", 1), ("default", 1)], "a slow period affects both arms"
     for one in compared:
         assert one["state"] == "reached"
         first = rows_of(one["run"])[0]
@@ -101,14 +101,14 @@ def test_compare_trains_both_arms_until_threshold(cli):
     assert done.json["ratios"]["seconds"] == pytest.approx(medians["best"]["seconds"] / medians["default"]["seconds"])
     again = cli(*words)
     assert again.code == 0
-    assert len(list(FOLDER.glob("compare-*"))) == 4, "what was trained is not trained again"
+    assert len(list(FOLDER.glob("compare-*"))) == 4, "finished trainings are not repeated"
     lines = again.out.splitlines()
     assert lines[0].split() == ["SEED", "DEFAULT", "S", "STEPS", "TRIAL", "0", "S", "STEPS"]
     assert [line.split()[0] for line in lines[1:]] == ["0", "1", "median", "ratio"]
     assert f"{compared[0]['seconds']:.2f}" in lines[1]
     json_again = cli(*words, "--json").json
     assert json_again["medians"] == medians
-    assert cli("sweep", "show", "--json").json["trials"][0]["trial"] == 0, "the sweep is what it was"
+    assert cli("sweep", "show", "--json").json["trials"][0]["trial"] == 0, "the sweep is unchanged"
 
 
 @pytest.mark.slow
@@ -122,7 +122,7 @@ def test_unreached_threshold_has_no_time(cli):
     assert done.json["medians"]["best"] == {"seconds": None, "steps": None}
     assert done.json["ratios"] == {"seconds": None, "steps": None}
     longer = cli("sweep", "compare", *words, "--max-iterations", 3, "--json")
-    assert [len(rows_of(one["run"])) for one in longer.json["compared"]] == [3, 3], "another budget, other runs"
+    assert [len(rows_of(one["run"])) for one in longer.json["compared"]] == [3, 3], "another budget has other runs"
 
 
 @pytest.mark.slow
@@ -149,7 +149,7 @@ def test_stopped_comparison_resumes(cli, start):
 @pytest.mark.slow
 @pytest.mark.usefixtures("swept")
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "message"),
     [
         (("--until", "sucess=1"), 2, "--until"),
         (("--seeds", "3..1"), 2, "is empty"),
@@ -159,22 +159,22 @@ def test_stopped_comparison_resumes(cli, start):
         (("--trials", "3"), 2, "--trials is not an option of sweep compare"),
     ],
 )
-def test_invalid_arguments_train_nothing(cli, words, code, said):
+def test_invalid_arguments_train_nothing(cli, words, code, message):
     result = cli("sweep", "compare", *words)
     assert result.code == code, result.err
-    assert said in result.err
+    assert message in result.err
     assert not list(FOLDER.glob("compare-*"))
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("show", "--trials", "3"), "--trials is not an option of sweep show"),
         (("cartpole", "--plot"), "rlcli sweep show"),
         (("cartpole", "--until", "success=1"), "rlcli sweep compare"),
     ],
 )
-def test_option_of_other_form_is_usage_error(cli, words, said):
+def test_option_of_other_form_is_usage_error(cli, words, message):
     result = cli("sweep", *words)
     assert result.code == 2
-    assert said in result.err
+    assert message in result.err

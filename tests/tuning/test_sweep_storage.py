@@ -1,4 +1,4 @@
-"""The trials of a sweep without their trainings: who begins which, what is drawn, and a storage that is damaged."""
+"""Trials of a sweep without training: claims of several processes, sampled values, and damaged storage."""
 
 import json
 import threading
@@ -24,13 +24,13 @@ SETTINGS = {
 SOURCE = {"name": "cartpole", "distribution": "rlcli", "folder": None}
 
 
-def begin(folder, storage=None, source=SOURCE, **changes):
+def open_or_join(folder, storage=None, source=SOURCE, **changes):
     settings = {**SETTINGS, "storage": storage and without_password(storage), **changes}
     return open_sweep(folder, settings, source, read_parameters(PARAMS), storage)
 
 
 def finish(search, count):
-    """Trials that are told a value as soon as they are begun; what was drawn for each."""
+    """Claim trials and complete them at once; return the values of each."""
     drawn = []
     for _ in range(count):
         trial = search.claim()
@@ -41,7 +41,7 @@ def finish(search, count):
 
 def test_seed_determines_trials(tmp_path):
     first, again, other = (
-        finish(begin(tmp_path / name, seed=seed), 12) for name, seed in (("a", 3), ("b", 3), ("c", 4))
+        finish(open_or_join(tmp_path / name, seed=seed), 12) for name, seed in (("a", 3), ("b", 3), ("c", 4))
     )
     assert first == again
     assert not [values for values in first if values in other]
@@ -49,24 +49,24 @@ def test_seed_determines_trials(tmp_path):
 
 
 def test_trial_values_depend_on_number_not_process(tmp_path):
-    alone = finish(begin(tmp_path / "alone"), 6)
-    one, other = begin(tmp_path / "both"), begin(tmp_path / "both")
+    alone = finish(open_or_join(tmp_path / "alone"), 6)
+    one, other = open_or_join(tmp_path / "both"), open_or_join(tmp_path / "both")
     trials = [search.claim() for search in (one, other, other, one, other, one)]
     assert [trial.number for trial in trials] == [0, 1, 2, 3, 4, 5]
     assert [trial.values for trial in trials] == alone
 
 
 def test_abandoned_trial_keeps_its_values(tmp_path):
-    gone, other = begin(tmp_path), begin(tmp_path)
+    gone, other = open_or_join(tmp_path), open_or_join(tmp_path)
     left = gone.claim()
-    assert other.claim().number == 1, "while it is worked on it is nobody else's"
+    assert other.claim().number == 1, "a claimed trial belongs to one process"
     gone.release()
     taken = other.claim()
     assert (taken.number, taken.values, taken.folder) == (0, left.values, left.folder)
 
 
 def test_trial_ending_during_claim_is_not_restarted(tmp_path):
-    one, other = begin(tmp_path), begin(tmp_path)
+    one, other = open_or_join(tmp_path), open_or_join(tmp_path)
     trial = one.claim()
     seen = other.trials()
     one.tell(trial, 1.0)
@@ -83,40 +83,40 @@ def test_trial_ending_during_claim_is_not_restarted(tmp_path):
 
 
 def test_concurrent_claims_start_each_trial_once(tmp_path):
-    begun, wrong = [], []
+    started, errors = [], []
 
     def work():
         try:
-            search = begin(tmp_path)
+            search = open_or_join(tmp_path)
             while (trial := search.claim()) is not None:
-                begun.append(trial.number)
+                started.append(trial.number)
                 search.tell(trial, 1.0)
         except BaseException as error:
-            wrong.append(error)
+            errors.append(error)
 
     threads = [threading.Thread(target=work) for _ in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert not wrong
-    assert sorted(begun) == list(range(12))
+    assert not errors
+    assert sorted(started) == list(range(12))
 
 
 def test_number_of_trials_can_grow(tmp_path):
-    finish(begin(tmp_path, trials=2), 2)
-    more = begin(tmp_path, trials=3)
+    finish(open_or_join(tmp_path, trials=2), 2)
+    more = open_or_join(tmp_path, trials=3)
     assert len(finish(more, 1)) == 1
     assert more.claim() is None
-    assert begin(tmp_path, trials=2).claim() is None
+    assert open_or_join(tmp_path, trials=2).claim() is None
 
 
 def test_surplus_trial_of_other_machine_does_not_count(tmp_path):
     storage = f"sqlite:///{tmp_path / 'trials.db'}"
-    here, there = (begin(tmp_path / name, storage, trials=1) for name in ("here", "there"))
+    here, there = (open_or_join(tmp_path / name, storage, trials=1) for name in ("here", "there"))
     held = here.claim()
     fresh = type(there).trials
-    answers = [[], []]  # to the other machine there is none yet
+    answers = [[], []]  # the other machine sees no trial yet
     type(there).trials = lambda search: answers.pop() if answers else fresh(search)
     try:
         assert there.claim() is None
@@ -124,15 +124,15 @@ def test_surplus_trial_of_other_machine_does_not_count(tmp_path):
         type(there).trials = fresh
     here.tell(held, 1.0)
     assert [trial.number for trial in here.trials()] == [0]
-    assert len(finish(begin(tmp_path / "here", storage, trials=2), 1)) == 1, "the surplus one is not counted"
+    assert len(finish(open_or_join(tmp_path / "here", storage, trials=2), 1)) == 1, "the surplus trial does not count"
 
 
 def test_partial_journal_line_is_dropped(tmp_path):
-    drawn = finish(begin(tmp_path), 3)
+    drawn = finish(open_or_join(tmp_path), 3)
     journal = tmp_path / JOURNAL
     whole = journal.read_bytes()
     journal.write_bytes(whole + b'{"op_code":4,"wor' + b"x" * 10_000)
-    search = begin(tmp_path)
+    search = open_or_join(tmp_path)
     assert [search.values(trial) for trial in search.trials()] == drawn
     finish(search, 2)
     assert [json.loads(line)["op_code"] for line in journal.read_bytes().splitlines()]
@@ -141,18 +141,18 @@ def test_partial_journal_line_is_dropped(tmp_path):
 
 @pytest.mark.parametrize("damage", [b"nonsense\n", b"{}\n", b"5\n", b"\xff\xfe\n", b"\n"])
 def test_corrupt_journal_is_checkpoint_error(tmp_path, damage):
-    finish(begin(tmp_path), 2)
+    finish(open_or_join(tmp_path), 2)
     with (tmp_path / JOURNAL).open("ab") as journal:
         journal.write(damage)
-    for look in (lambda: begin(tmp_path).trials(), lambda: read_sweep(tmp_path).trials()):
+    for look in (lambda: open_or_join(tmp_path).trials(), lambda: read_sweep(tmp_path).trials()):
         with pytest.raises(CheckpointError, match=f"{JOURNAL} is corrupt"):
             look()
 
 
 def test_missing_journal_is_checkpoint_error(tmp_path):
-    finish(begin(tmp_path), 2)
+    finish(open_or_join(tmp_path), 2)
     (tmp_path / JOURNAL).unlink()
-    for look in (begin, read_sweep):
+    for look in (open_or_join, read_sweep):
         with pytest.raises(CheckpointError, match="lost its trials"):
             look(tmp_path)
 
@@ -161,20 +161,20 @@ def test_missing_journal_is_checkpoint_error(tmp_path):
     "change", [{"params": ["agent.gamma=0.9:0.99"]}, {"pruner": "median"}, {"seed": 4}, {"overrides": ["a=1"]}]
 )
 def test_different_settings_in_same_folder_are_refused(tmp_path, change):
-    begin(tmp_path)
+    open_or_join(tmp_path)
     with pytest.raises(UsageError, match="is another sweep"):
-        begin(tmp_path, **change)
+        open_or_join(tmp_path, **change)
 
 
 def test_task_from_other_folder_is_other_sweep(tmp_path):
-    begin(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/one"})
+    open_or_join(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/one"})
     with pytest.raises(UsageError, match="is another sweep"):
-        begin(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/two"})
+        open_or_join(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/two"})
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"kind": "sweep", "task": "cartpole"}', '{"kind": "seeds", "task": "a"}'])
 def test_malformed_study_file_is_checkpoint_error(tmp_path, text):
-    begin(tmp_path)
+    open_or_join(tmp_path)
     (tmp_path / "study.json").write_text(text)
     with pytest.raises(CheckpointError, match=r"study\.json|study of seeds"):
         read_sweep(tmp_path)
@@ -182,7 +182,7 @@ def test_malformed_study_file_is_checkpoint_error(tmp_path, text):
 
 def test_lost_database_is_machine_error_without_password(tmp_path):
     file = tmp_path / "trials.db"
-    search = begin(tmp_path / "sweep", f"sqlite:///{file}")
+    search = open_or_join(tmp_path / "sweep", f"sqlite:///{file}")
     trial = search.claim()
     file.write_bytes(b"")
     for use in (search.trials, search.claim, lambda: search.tell(trial, 1.0)):

@@ -1,4 +1,4 @@
-"""Several seeds in one study: each is the run that it would be alone, and a study that was stopped goes on."""
+"""Studies of several seeds: each run equals a single training, and a stopped study resumes."""
 
 import json
 import os
@@ -39,7 +39,7 @@ def test_malformed_seeds_are_usage_error(text):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--seeds", "0..1", "--seed", "3"), "contradict"),
         (("--seeds", "0..1", "--gpus", "1"), "contradict"),
@@ -48,10 +48,10 @@ def test_malformed_seeds_are_usage_error(text):
         (("--seeds", "0..1", "agent.learning_rat=1"), "learning_rate"),
     ],
 )
-def test_invalid_arguments_create_nothing(cli, words, said):
+def test_invalid_arguments_create_nothing(cli, words, message):
     result = cli("train", "cartpole", *words)
     assert result.code in (2, 3)
-    assert said in result.err
+    assert message in result.err
     assert not Path("runs").exists()
 
 
@@ -80,7 +80,7 @@ def test_seed_of_study_equals_single_run(cli):
     assert named.code == 5
     assert "study of several runs" in named.err
     again = cli("train", "--resume", study, "--json")
-    assert again.code == 0, "a finished study is finished"
+    assert again.code == 0, "resuming a finished study does nothing"
     assert again.json["together"] == several.json["together"]
 
 
@@ -90,8 +90,8 @@ def test_stopped_study_resumes(start, cli, number):
     process = start("train", "cartpole", *SMALL, "--max-iterations", 60, "--seeds", "0..2", "--jobs", 2, "--json")
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline:
-        told = [file for file in Path("runs").glob("*/*/seed-*/metrics.jsonl") if file.stat().st_size]
-        if len(told) >= 2:
+        with_metrics = [file for file in Path("runs").glob("*/*/seed-*/metrics.jsonl") if file.stat().st_size]
+        if len(with_metrics) >= 2:
             break
         time.sleep(0.05)
     process.send_signal(number)
@@ -140,7 +140,7 @@ def test_failed_seed_is_named(cli):
 
 @pytest.mark.slow
 def test_finished_study_continues_with_new_budget(cli):
-    steady = (*SMALL, "agent.schedule=constant")  # another schedule knows where its budget ends
+    steady = (*SMALL, "agent.schedule=constant")  # other schedules depend on the budget
     done = cli("train", "cartpole", *steady, "--max-iterations", 2, "--seeds", "4..5", "--jobs", 5, "--json")
     assert done.code == 0, done.err
     longer = cli("train", "--resume", study_folder(), "--max-iterations", 3, "--logger", "tensorboard", "--json")
@@ -148,7 +148,7 @@ def test_finished_study_continues_with_new_budget(cli):
     alone = cli("train", "cartpole", *steady, "--max-iterations", 3, "--seed", 5, "--runs-dir", "alone", "--json")
     assert [row["step"] for row in longer.json["runs"]] == [3 * 32 * 16] * 2
     assert rows_of(study_folder() / "seed-5") == rows_of(Path(alone.json["run"]))
-    assert list((study_folder() / "seed-5").rglob("events.out.tfevents*")), "further options hold for each"
+    assert list((study_folder() / "seed-5").rglob("events.out.tfevents*")), "options apply to each run"
 
 
 @pytest.mark.slow
@@ -158,9 +158,9 @@ def test_study_with_single_seed_has_no_interval(cli):
     assert [(row["seed"], row["state"]) for row in done.json["runs"]] == [(7, "finished")]
     (run,) = list_runs(Path("runs"), "cartpole")
     assert run.folder == study_folder() / "seed-7"
-    told = cli("train", "--resume", study_folder())
-    assert told.code == 0
-    assert "nan" not in told.out
+    resumed = cli("train", "--resume", study_folder())
+    assert resumed.code == 0
+    assert "nan" not in resumed.out
 
 
 @pytest.mark.slow

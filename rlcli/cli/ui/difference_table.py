@@ -42,7 +42,7 @@ def report_differences(command: str, sections: Sequence[Section], left: str, rig
     if kinds := [f"{name} {counts[name]}" for name in CATEGORIES if counts[name]]:
         console.data(f"differences: {', '.join(kinds)}")
     if first is None:
-        console.data("only cosmetic differences" if counts else "no difference")
+        console.data("no difference, except cosmetic ones" if counts else "no difference")
     else:
         section, found = first
         sides = " | ".join(_sides(found))

@@ -1,4 +1,4 @@
-"""`rlcli autopsy`: what a training kept, listed and shown, by whomever the run was written."""
+"""`rlcli autopsy`: recorded episodes of own and untrusted runs are listed and shown."""
 
 import json
 import os
@@ -21,7 +21,7 @@ TRAIN = ("--max-iterations", "3", "--logger", "none", "--quiet", "agent.autopsy.
 
 @pytest.fixture(scope="module")
 def trained_once(tmp_path_factory):
-    """A run of the coin, whose episodes fail at once or last to the end; made once."""
+    """Folder for a run of the coin task, whose episodes fail at once or last to the end; trained once."""
     return tmp_path_factory.mktemp("once")
 
 
@@ -38,12 +38,12 @@ def trained(coin, cli, trained_once, only_run):
         data["task"]["folder"] = moved
         record.write_text(json.dumps(data))
         for file in files(only_run()):
-            rewritten(file, document=lambda d: d["task"].update(folder=moved))
+            rewrite(file, document=lambda d: d["task"].update(folder=moved))
     return only_run()
 
 
-def rewritten(file, document=lambda d: None, tensors=lambda t: None):
-    """A case as an attacker may write it: with a digest that is right."""
+def rewrite(file, document=lambda d: None, tensors=lambda t: None):
+    """Rewrite a case as an attacker could, with a correct digest."""
     with safe_open(file, "pt") as opened:
         data = json.loads(opened.metadata()["rlcli"])
         values = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
@@ -120,17 +120,17 @@ def test_unknown_case_is_usage_error(trained, cli):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["--sort", "lenth"], "did you mean 'length'"),
         (["--video", "x.mp4"], "--video draws one case"),
         (["0", "--video", "x.avi"], "is not a video file"),
     ],
 )
-def test_invalid_options_are_usage_errors(trained, cli, arguments, said):
+def test_invalid_options_are_usage_errors(trained, cli, arguments, message):
     shown = cli("autopsy", trained, *arguments)
     assert shown.code == 2
-    assert said in shown.err
+    assert message in shown.err
 
 
 def test_disabled_autopsy_records_nothing(coin, cli, only_run):
@@ -153,7 +153,7 @@ def test_gpu_run_explains_missing_cases(trained, cli):
 
 
 def test_untrusted_task_code_is_not_run(trained, cli, monkeypatch, tmp_path):
-    monkeypatch.setenv("RLCLI_STATE_DIR", str(tmp_path / "nobody"))
+    monkeypatch.setenv("RLCLI_STATE_DIR", str(tmp_path / "empty"))
     (Path("coin") / "task.py").write_text("import pathlib; pathlib.Path('executed').touch()")
     shown = cli("autopsy", trained, "0")
     assert shown.code == 0
@@ -192,7 +192,7 @@ ATTACKS = {
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_corrupt_case_is_skipped_with_file_and_reason(trained, cli, attack):
     first, *others = files(trained)
-    rewritten(first, **ATTACKS[attack])
+    rewrite(first, **ATTACKS[attack])
     shown = cli("autopsy", trained, "--json")
     assert shown.code == 0
     assert [case["file"] for case in shown.json["cases"]] == [str(file) for file in others]
@@ -201,7 +201,7 @@ def test_corrupt_case_is_skipped_with_file_and_reason(trained, cli, attack):
 
 
 def test_untrusted_text_has_no_control_characters(trained, cli):
-    rewritten(files(trained)[0], document=lambda d: d["episodes"][0].update(causes=["\x1b[2J\x1b]0;owned\x07"]))
+    rewrite(files(trained)[0], document=lambda d: d["episodes"][0].update(causes=["\x1b[2J\x1b]0;owned\x07"]))
     for arguments in ((), ("0",)):
         shown = cli("autopsy", trained, *arguments)
         assert shown.code == 0

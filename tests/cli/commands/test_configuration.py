@@ -1,4 +1,4 @@
-"""show, validate and train as far as the configuration: what they print, what they load, how they fail."""
+"""`show`, `validate` and the configuration step of `train`: output, imports and errors."""
 
 import json
 import subprocess
@@ -11,7 +11,7 @@ HEAVY = {"torch", "mujoco", "numpy", "stable_baselines3"}
 
 
 def modules_after(arguments, here):
-    """Exit code of a command, and the heavy modules that it loaded."""
+    """Run a command; return its exit code, the heavy modules that it imported, and its stderr."""
     program = (
         "import sys; from rlcli.cli.app import main; code = main(sys.argv[1:]);"
         f"print(); print(code, *sorted(set(sys.modules) & {HEAVY!r}))"
@@ -65,11 +65,11 @@ def column(env, *, entity: Entity = "robot"):
 )
 def test_wrong_shape_of_term_is_reported_once(in_process, small, old, new, place):
     task = small((old, new), terms=COLUMN)
-    told = "'column' gave a tensor of shape (4, 2), expected a tensor of shape (4,)"
+    message = "'column' gave a tensor of shape (4, 2), expected a tensor of shape (4,)"
     for command in (["play", task, "--policy", "zero", "--viewer", "none"], ["train", task]):
         code, _, err = in_process(*command)
         assert code == 3
-        assert [line for line in err.splitlines() if "error" in line] == [f"error: small/task.yaml:{place}: {told}"]
+        assert [line for line in err.splitlines() if "error" in line] == [f"error: small/task.yaml:{place}: {message}"]
 
 
 def test_train_without_agent_is_config_error(in_process, small):
@@ -217,7 +217,7 @@ def test_validate_deep_reports_all_problems_at_once(in_process, small):
 
 
 @pytest.mark.parametrize(
-    ("model", "override", "said"),
+    ("model", "override", "message"),
     [
         (None, "", "no file 'model.xml'"),
         ("<mujoco>", "", "'model.xml' is not a valid MJCF"),
@@ -233,10 +233,10 @@ def test_validate_deep_reports_all_problems_at_once(in_process, small):
         ("<mujoco/>", "scene.entities.robot.model=task.yaml", "'task.yaml' is not a valid MJCF"),
     ],
 )
-def test_validate_deep_of_broken_model(in_process, small, model, override, said):
+def test_validate_deep_of_broken_model(in_process, small, model, override, message):
     code, _, err = in_process("validate", small(model=model), "--deep", *filter(None, [override]))
     assert code == 3
-    assert said in err
+    assert message in err
     assert "Traceback" not in err
 
 

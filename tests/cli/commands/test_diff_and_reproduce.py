@@ -1,4 +1,4 @@
-"""`rlcli diff` names where two runs part; `rlcli reproduce` trains one again and compares."""
+"""`rlcli diff` reports the first difference of two runs; `rlcli reproduce` trains a run again and compares."""
 
 import json
 import shutil
@@ -19,7 +19,7 @@ SMALL += ("--logger", "none")
 
 @pytest.fixture
 def trained(cli, coin):
-    """Train the coin; its run folder."""
+    """Return a function that trains the coin task and returns the run folder."""
 
     def train(*arguments):
         result = cli("train", coin, *SMALL, *arguments)
@@ -30,7 +30,7 @@ def trained(cli, coin):
 
 
 _TRAINED = []
-"""The run of this process's tests: each gets a copy."""
+"""The run that all tests of this process copy."""
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def run(request):
 
 @pytest.fixture
 def copy(run):
-    """A copy of the run, to be changed."""
+    """A copy of the run for changes."""
     return Path(shutil.copytree(run, run.with_name("copy")))
 
 
@@ -58,7 +58,7 @@ def last(run):
 
 
 def replace(folder, part, change):
-    """Change a part of a checkpoint, and its manifest with it."""
+    """Change one file of a checkpoint, and its entry in the manifest."""
     file = folder / f"{part}.safetensors"
     tensors = load_file(file)
     change(tensors)
@@ -124,7 +124,9 @@ def test_run_and_task_compare_configuration_and_files(cli, run, coin):
     assert sections(result)["files"] == []
     same = cli("diff", coin, *SMALL[:3], "agent.max_iterations=3", run, "--json")
     assert (same.code, sections(same)["configuration"]) == (0, [])
-    model = Path(shutil.copytree(coin, "other")) / "model.xml"  # not of the task that this process's runs share
+    model = (
+        Path(shutil.copytree(coin, "other")) / "model.xml"
+    )  # a copy, because all runs of this process share the task
     model.write_text(model.read_text().replace('mass="1"', 'mass="2"'))
     changed = cli("diff", "./other", *SMALL[:3], "agent.max_iterations=3", run, "--json")
     assert (changed.code, [d["where"] for d in sections(changed)["files"]]) == (9, ["model.xml"])
@@ -233,7 +235,7 @@ def test_corrupt_file_is_checkpoint_error(cli, run, copy):
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "said"),
+    ("file", "content", "message"),
     [
         ("config.yaml", b"a: &a [*a]\n", "config.yaml:1:"),
         ("config.yaml", b"a: !!python/object/apply:os.system [true]\n", "config.yaml:1:"),
@@ -244,11 +246,11 @@ def test_corrupt_file_is_checkpoint_error(cli, run, copy):
         ("run.json", b"[" * 100_000, "run.json is corrupt"),
     ],
 )
-def test_malformed_run_file_is_checkpoint_error(cli, run, copy, file, content, said):
+def test_malformed_run_file_is_checkpoint_error(cli, run, copy, file, content, message):
     (copy / file).write_bytes(content)
     result = cli("diff", run, copy)
     assert result.code == 5
-    assert said in result.err
+    assert message in result.err
 
 
 def test_untrusted_text_has_no_control_characters(cli, run, copy):

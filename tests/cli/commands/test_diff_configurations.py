@@ -1,4 +1,4 @@
-"""`rlcli diff` on configurations: what differs is said with what it is of, and only the cosmetic is no difference."""
+"""`rlcli diff` on configurations: differences have a category, and cosmetic ones do not count."""
 
 import json
 
@@ -11,7 +11,7 @@ LIGHTER = ("joints: [slider]", "joints: [slider], scale: 2.0")
 
 @pytest.fixture
 def diff(in_process):
-    """diff(arguments...) -> (exit code, its document)."""
+    """Return a function that runs `rlcli diff` and returns (exit code, document)."""
 
     def run(*arguments):
         code, out, err = in_process("diff", *arguments, "--json")
@@ -22,7 +22,7 @@ def diff(in_process):
 
 
 def found(document):
-    """Where -> category of all that differs."""
+    """Return key -> category of all differences."""
     return {d["where"]: d["category"] for s in document["sections"] for d in s["differences"]}
 
 
@@ -137,7 +137,7 @@ def test_category_of_key(path, kind):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["cartpole"], 2, "two runs or tasks are compared, found 1: cartpole"),
         (["cartpole", "cartpole", "cartpole"], 2, "found 3"),
@@ -146,13 +146,13 @@ def test_category_of_key(path, kind):
         (["cartpole", "sim.tm=1"], 3, "unknown key 'tm'"),
         (["cartpole", "gone.yaml"], 4, "no file 'gone.yaml'"),
         (["cartpole", "ant", "--only", "weights"], 2, "--only applies to two runs"),
-        (["cartpole", "ant", "--agent", "nobody"], 3, "no agent 'nobody'"),
+        (["cartpole", "ant", "--agent", "missing"], 3, "no agent 'missing'"),
     ],
 )
-def test_invalid_comparison_is_one_message(in_process, arguments, code, said):
+def test_invalid_comparison_is_one_message(in_process, arguments, code, message):
     got, out, err = in_process("diff", *arguments)
     assert (got, out) == (code, "")
-    assert said in err
+    assert message in err
     assert "Traceback" not in err
 
 

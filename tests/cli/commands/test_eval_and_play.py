@@ -1,4 +1,4 @@
-"""`rlcli eval` and `rlcli play`: which policy, how it is judged, and what comes out."""
+"""`rlcli eval` and `rlcli play`: choice of the policy, limits, results, videos and exit codes."""
 
 import json
 import subprocess
@@ -22,8 +22,8 @@ print(json.dumps({"fps": meta.get("fps"), "duration": meta.get("duration"), "fra
 
 
 def read_video(file):
-    said = subprocess.run([sys.executable, "-c", READ, str(file)], capture_output=True, text=True)
-    return json.loads(said.stdout)
+    result = subprocess.run([sys.executable, "-c", READ, str(file)], capture_output=True, text=True)
+    return json.loads(result.stdout)
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def trained(cli, only_run):
 
 
 def test_short_episodes_are_not_overrepresented(cli, coin):
-    # 400 short episodes end long before the first long one: counting the first to finish would find no success
+    # 400 short episodes end before the first long one: counting the first to end would give a success rate of 0
     result = cli("eval", coin, "--policy", "zero", "--episodes", 400, "--json").json
     assert result["episodes"] == 400
     rate = result["success"]["rate"]
@@ -135,14 +135,14 @@ def test_evaluation_is_saved_in_run(cli, trained):
     from rlcli.runs.eval_store import read_evaluation
     from rlcli.runs.run import open_run
 
-    said = cli("eval", "--checkpoint", trained, "--episodes", 4, "--json").json
+    result = cli("eval", "--checkpoint", trained, "--episodes", 4, "--json").json
     kept = read_evaluation(open_run(trained), "000000000128")
-    assert kept == {key: value for key, value in said.items() if key in kept}
+    assert kept == {key: value for key, value in result.items() if key in kept}
     assert kept["command"] == "eval"
-    assert kept["return"] == said["return"]
+    assert kept["return"] == result["return"]
     assert read_evaluation(open_run(trained), "000000000000") is None
     cli("eval", "--checkpoint", trained, "--episodes", 5)
-    assert read_evaluation(open_run(trained), "000000000128")["episodes"] == 5  # the newest counts
+    assert read_evaluation(open_run(trained), "000000000128")["episodes"] == 5  # the newest evaluation is kept
 
 
 @pytest.mark.parametrize(
@@ -301,9 +301,9 @@ def test_unknown_video_format_fails_before_heavy_imports(start, name):
         f"code = main(['play', 'cartpole', '--policy', 'zero', '--video', {name + '.txt'!r}])\n"
         "print(code, [m for m in ('torch', 'mujoco') if m in sys.modules])"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert said.stdout.strip() == "2 []"
-    assert "is not a video file" in said.stderr
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.stdout.strip() == "2 []"
+    assert "is not a video file" in result.stderr
 
 
 def test_video_without_gl_is_machine_error(cli, trained, monkeypatch):
@@ -324,7 +324,7 @@ def test_missing_imageio_is_dependency_error(cli, monkeypatch):
     assert 'pip install "rlcli[video]"' in done.err
 
 
-# --- a run needs nothing but itself ---
+# --- a run is self-contained ---
 
 
 def test_run_keeps_its_configuration_when_task_changes(cli, coin):

@@ -1,4 +1,4 @@
-"""`rlcli new`: a package that installs, keeps the contract and learns; a name that cannot be is refused."""
+"""`rlcli new`: the package is complete and valid; invalid names are refused."""
 
 import ast
 import json
@@ -67,7 +67,7 @@ def test_schema_has_own_terms_and_finds_mistakes(in_process, here):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("MyArm", "did you mean 'my-arm'?"),
         ("my_arm", "did you mean 'my-arm'?"),
@@ -89,10 +89,10 @@ def test_schema_has_own_terms_and_finds_mistakes(in_process, here):
         ("rlcli-tasks", "there is a Python module 'rlcli_tasks' already"),
     ],
 )
-def test_invalid_name_writes_nothing(in_process, here, name, said):
+def test_invalid_name_writes_nothing(in_process, here, name, message):
     code, _, err = in_process("new", name)
     assert code == 2
-    assert said in err
+    assert message in err
     assert not list(here.iterdir())
 
 
@@ -117,7 +117,7 @@ def test_empty_and_nested_folders_are_filled(in_process, here):
     (here / "empty").mkdir()
     before = (here / "empty").stat().st_ino
     assert in_process("new", "my-arm", "-o", "empty")[0] == 0
-    assert (here / "empty").stat().st_ino == before  # a shell may stand in it
+    assert (here / "empty").stat().st_ino == before  # it may be the current folder of a shell
     assert in_process("new", "my-arm", "-o", "deep/er/arm")[0] == 0
     assert files_of(here / "empty") == files_of(here / "deep" / "er" / "arm")
     assert {path.name for path in here.iterdir()} == {"empty", "deep"}
@@ -131,7 +131,7 @@ def test_current_folder_as_output(in_process, here):
 
 
 def test_failed_write_leaves_nothing(monkeypatch, here, capfd):
-    """The disk fills up while the last file is written."""
+    """The disk is full when the last file is written."""
     import rlcli.config.dump
 
     def full(*arguments):

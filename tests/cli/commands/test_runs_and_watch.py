@@ -1,4 +1,4 @@
-"""`rlcli runs` and `rlcli watch`: what became of trainings, told from their files, whoever wrote these."""
+"""`rlcli runs` and `rlcli watch`: state of trainings from the files of own and untrusted runs."""
 
 import json
 import os
@@ -40,7 +40,7 @@ def write_rows(run, *rows):
 
 @pytest.fixture
 def made():
-    """Make a run: its rows, how it ended (None: it still runs), and entries of run.json."""
+    """Return a function that makes a run from metric rows, a final state (None: running) and entries of run.json."""
     locked = []
 
     def make(name="a", rows=(), state=None, task="arm", checkpoint=True, started="2026-01-01T10:00:00+00:00", **record):
@@ -303,7 +303,7 @@ def test_watch_follows_run_to_its_end(start, made):
         process = start("watch", run.folder, stderr=err)
         until(lambda: "iteration 1/40" in Path("err").read_text())
         write_rows(run, row(2), row(3, **{"Train/success_rate": 0.75}))
-        time.sleep(1.0)  # the lines of a watcher are seconds apart
+        time.sleep(1.0)  # `watch` prints a line every few seconds
         assert process.poll() is None
         run.update(state="diverged", reason="the learner's loss is not finite", iteration=3, step=192)
         run.unlock()
@@ -329,7 +329,7 @@ def test_ctrl_c_stops_watch_but_not_the_run(start, made):
 
 
 def on_a_terminal(*words):
-    """What a command writes to a terminal, and its exit code."""
+    """Run a command on a terminal; return its output and its exit code."""
     pid, terminal = pty.fork()
     if pid == 0:
         os.environ.update(TERM="xterm-256color", COLUMNS="160", LINES="50")
@@ -355,7 +355,7 @@ def test_watch_shows_live_table_on_terminal(made):
     assert code == 0
     for word in ("iteration 2/40", "128 steps", "physics  50%", "reward terms", "alive", "fell", "25.0%", "learner"):
         assert word in text, word
-    assert shown.count("\x1b[?25l") <= shown.count("\x1b[?25h")  # the cursor is back
+    assert shown.count("\x1b[?25l") <= shown.count("\x1b[?25h")  # the cursor is visible again
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Forty columns, and no terminal at all: what commands print stays whole, and a pipe holds text alone."""
+"""Output on a terminal of 40 columns is complete, and output in a pipe is plain text."""
 
 import os
 import pty
@@ -11,7 +11,7 @@ import pytest
 
 from rlcli.cli.app import COMMANDS
 
-fcntl = pytest.importorskip("fcntl", reason="pseudo-terminals are those of Unix")
+fcntl = pytest.importorskip("fcntl", reason="pseudo-terminals need Unix")
 termios = pytest.importorskip("termios")
 
 STYLES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
@@ -19,7 +19,7 @@ STYLES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 @pytest.fixture
 def narrow(here):
-    """narrow(arguments...) -> (exit code, lines) of a command on a terminal of 40 columns."""
+    """Return a function that runs a command on a terminal of 40 columns and returns (exit code, lines)."""
 
     def run(*arguments):
         leader, follower = pty.openpty()
@@ -34,15 +34,15 @@ def narrow(here):
             env=env | {"TERM": "xterm-256color"},
         )
         os.close(follower)
-        said = b""
+        output = b""
         try:
             while chunk := os.read(leader, 65536):
-                said += chunk
-        except OSError:  # Linux's way to say that the other end is closed
+                output += chunk
+        except OSError:  # Linux raises this when the other end is closed
             pass
         os.close(leader)
         code = process.wait()
-        return code, STYLES.sub("", said.decode()).replace("\r\n", "\n").split("\n")
+        return code, STYLES.sub("", output.decode()).replace("\r\n", "\n").split("\n")
 
     return run
 
@@ -66,8 +66,8 @@ def test_diff_is_complete_on_forty_columns(narrow, small):
     assert code == 9
     assert "Traceback" not in "\n".join(lines)
     flat = "".join(lines).replace(" ", "")
-    for said in ("sim.dt", "0.005", "override'sim.dt=0.005'", "viewer.width", "differences:physics1,cosmetic1"):
-        assert said in flat
+    for output in ("sim.dt", "0.005", "override'sim.dt=0.005'", "viewer.width", "differences:physics1,cosmetic1"):
+        assert output in flat
 
 
 @pytest.mark.parametrize(

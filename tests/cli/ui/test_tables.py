@@ -1,4 +1,4 @@
-"""Tables on a terminal fit its width: nothing is cut, and a row that is too wide becomes a block of lines."""
+"""Tables fit the width of a terminal: nothing is truncated, and a row that is too wide becomes a block of lines."""
 
 import io
 import re
@@ -22,7 +22,7 @@ ROWS = [
 
 @pytest.fixture
 def terminal(monkeypatch, capsys):
-    """Of a given width; what was printed on it, as lines."""
+    """Return a function that prints on a terminal of a given width and returns the lines."""
 
     def shown(width, draw):
         monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
@@ -45,13 +45,13 @@ def test_fitting_table_has_one_line_per_row(terminal):
 def test_wide_table_becomes_blocks_without_truncation(terminal, width):
     lines = terminal(width, lambda: console.table(COLUMNS, ROWS))
     assert max(map(len, lines)) <= width
-    said = "\n".join(lines)
-    assert "…" not in said
+    output = "\n".join(lines)
+    assert "…" not in output
     assert "RUN cartpole/2026-11-21_17-35-25" in lines
     assert "RUN cartpole/2026-11-21_17-32-47" in lines
     for name, cell in zip(COLUMNS[1:6], ROWS[0][1:6], strict=True):
-        assert f"{name} {cell}" in said
-    assert "STATE interrupted: resumable" in said
+        assert f"{name} {cell}" in output
+    assert "STATE interrupted: resumable" in output
 
 
 def test_empty_cells_are_left_out_of_blocks(terminal):
@@ -101,14 +101,14 @@ def test_live_table_keeps_numbers_with_their_units(width):
     screen = Console(file=io.StringIO(), width=width)
     view._live = Live(console=screen)
     screen.print(view._table(progress_of([row], 240, 12.0)))
-    said = screen.file.getvalue()
+    output = screen.file.getvalue()
     for whole in ("rlcli train cartpole", "iteration 80/240", "655,360 steps", "54,613 steps/s", "0:24 left"):
-        assert whole in said
+        assert whole in output
 
 
 def test_remaining_time_includes_time_between_iterations():
-    """Clips, evaluations and checkpoints take time that no iteration tells."""
+    """Videos, evaluations and checkpoints take time that is not part of any iteration."""
     row = {"iteration": 50, "step": 5000, "Perf/collection_time": 0.1, "Perf/learning_time": 0.1}
     assert progress_of([row], 100, 10.0).remaining_s == pytest.approx(10.0)
     assert progress_of([row], 100, 30.0).remaining_s == pytest.approx(30.0)
-    assert progress_of([row], 100, 0.0).remaining_s == pytest.approx(10.0)  # how long it trained is not known
+    assert progress_of([row], 100, 0.0).remaining_s == pytest.approx(10.0)  # the trained time is unknown

@@ -1,4 +1,4 @@
-"""Which viewer `play` opens and why, and the mistakes that may be made on the way."""
+"""Choice of the viewer of `play`, invalid combinations of options, and missing display, OpenGL or viewer."""
 
 import contextlib
 import hashlib
@@ -94,7 +94,7 @@ def test_play_prints_viewer_and_reason(cli):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("--viewer", "wbe"), "did you mean 'web'"),
         (("--viewer", "browser"), "auto, native, web, none"),
@@ -112,10 +112,10 @@ def test_play_prints_viewer_and_reason(cli):
         (("--command", "vx=1", "--record", "x.safetensors"), "--record with --command"),
     ],
 )
-def test_contradicting_flags_are_usage_errors(cli, arguments, said):
+def test_contradicting_flags_are_usage_errors(cli, arguments, message):
     done = cli(*ZERO, *arguments)
     assert done.code == 2
-    assert said in done.err.replace("\nhint: ", "; hint: ")
+    assert message in done.err.replace("\nhint: ", "; hint: ")
     assert done.out == ""
     assert not list(Path().iterdir())
 
@@ -127,12 +127,12 @@ def walker(tmp_path):
     task["commands"] = {
         "velocity": {"func": "uniform_velocity", "resampling_time_s": [0.1, 0.2], "lin_vel_x": [0.9, 1.0]}
     }
-    task["rewards"] = {"asked": {"func": "asked", "weight": 1.0}}
+    task["rewards"] = {"command": {"func": "command", "weight": 1.0}}
     folder = tmp_path / "walker"
     folder.mkdir()
     (folder / "critter.xml").write_text(CRITTER)
     (folder / "terms.py").write_text(
-        "def asked(env):\n    '''The command. (num_envs,)'''\n"
+        "def command(env):\n    '''The command. (num_envs,)'''\n"
         "    return env.command_manager.get_command('velocity')[:, 0]\n"
     )
     (folder / "task.yaml").write_text(yaml.safe_dump(task, sort_keys=False))
@@ -142,8 +142,8 @@ def walker(tmp_path):
 def test_command_is_held_without_viewer(cli, walker):
     arguments = ("play", walker, "--policy", "zero", "--viewer", "none", "--json")
     drawn, held = (cli(*arguments, *more).json for more in ((), ("--command", "vx=-2.0,wz=0", "--command", "vy=0.5")))
-    assert drawn["reward_terms"]["asked"]["mean"] > 0.0
-    assert held["reward_terms"]["asked"]["mean"] / held["length"]["mean"] == pytest.approx(-2.0 * 0.02, rel=0.05)
+    assert drawn["reward_terms"]["command"]["mean"] > 0.0
+    assert held["reward_terms"]["command"]["mean"] / held["length"]["mean"] == pytest.approx(-2.0 * 0.02, rel=0.05)
 
 
 def test_unknown_command_lists_valid_ones(cli, walker):
@@ -152,7 +152,7 @@ def test_unknown_command_lists_valid_ones(cli, walker):
     assert "commands: vx, vy, wz" in done.err
 
 
-# --- what the machine lacks ---
+# --- missing display, viewer or OpenGL ---
 
 
 def test_macos_without_mjpython_names_command(cli, monkeypatch):
@@ -188,7 +188,7 @@ def test_macos_without_mjpython_falls_back_to_web_viewer(cli, monkeypatch):
     assert opened == [8080]
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="X is asked here")
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs X")
 def test_unreachable_display_fails_at_once(start, environment):
     done = start(*ZERO, "--viewer", "native", env={**environment, "DISPLAY": ":4242"})
     out, err = done.communicate(timeout=120)
@@ -229,7 +229,7 @@ def test_mujoco_without_web_viewer_is_dependency_error(cli, monkeypatch):
 
 
 def test_server_without_access_checks_is_stopped():
-    """Were MuJoCo to serve in another way, requests would come past the gate: that is found out before they do."""
+    """If another version of MuJoCo served requests without the access checks, the server must not start."""
     code = (
         "import sys; from rlcli.viewer import secured_web_server as server; from rlcli.cli.app import main\n"
         "server._serve_with_checks = lambda server, port: server.serve\n"
